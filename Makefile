@@ -1,0 +1,68 @@
+# make demo | test | lint | bench: each builds what it needs of the environment first.
+#
+#   PYTHON     the interpreter the environment is made from   (make test PYTHON=python3.11)
+#   VENV       where the environment lies
+#   PIP_FLAGS  extra options for pip install
+
+PYTHON    ?= python3
+VENV      ?= .venv
+PIP_FLAGS ?=
+BIN       := $(VENV)/bin
+
+# The pins of constraints.txt hold for Python 3.11 and later; 3.10 takes what pip finds.
+PINS    = $$($(BIN)/python -c 'import sys; print("-c constraints.txt" if sys.version_info >= (3, 11) else "")')
+INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check $(PIP_FLAGS) $(PINS)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test lint bench clean $(VENV)
+
+help:  ## list the targets
+	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-7s %s\n", $$1, $$2 }'
+
+demo: $(VENV)/.installed  ## run the demo (runtime packages only)
+	$(BIN)/python demo.py
+
+test: $(VENV)/.installed-dev  ## run the tests
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.installed-dev  ## check style, types and import order
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.installed-bench  ## time a training step
+	$(BIN)/python benchmarks/training_step.py
+
+clean:  ## remove the environment and the caches, keep the runs
+	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# --- environment: one stamp per set of packages ---------------------------------------------
+
+$(VENV): $(VENV)/.installed-dev
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+# PyBullet has Linux wheels for Python 3.10 and 3.11 only; building it from source is not tried.
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing the runtime packages into $(VENV)"
+	@if $(INSTALL) --dry-run --no-deps --only-binary pybullet pybullet >/dev/null 2>&1; then \
+	    $(INSTALL) --only-binary pybullet -e '.[panda]'; \
+	else \
+	    echo "no PyBullet wheel for this Python: the PyBullet parts (Panda) are skipped"; \
+	    $(INSTALL) -e .; \
+	fi
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	@echo "installing the test and lint tools into $(VENV)"
+	@$(INSTALL) -e '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-bench: $(VENV)/.installed
+	@echo "installing what the benchmarks compare with into $(VENV)"
+	@$(INSTALL) -e '.[bench]'
+	@touch $@

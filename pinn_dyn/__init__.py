@@ -1,0 +1,1 @@
+"""Physics-informed neural networks that learn robot dynamics obeying mechanics."""

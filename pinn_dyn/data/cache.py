@@ -1,0 +1,74 @@
+"""A disk cache for arrays that took long to make."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from filelock import FileLock
+
+log = logging.getLogger(__name__)
+
+Arrays = Mapping[str, np.ndarray]
+
+
+def cache_key(description: object) -> str:
+    """SHA-256 of a JSON-serializable description, the first 16 hexadecimal digits."""
+    text = json.dumps(description, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def load_or_make(folder: Path, name: str, description: object, make: Callable[[], Arrays]) -> Arrays:
+    """Load the arrays of a description from the cache, or make and store them.
+
+    A file is ``<name>-<key>.npz``: plain arrays without pickle, with the description beside them.
+    It is written under another name and moved into place, so a reader never sees half a file; a
+    lock lets one process make it while others wait. On reading, the archive's checksums are
+    verified; a damaged file is reported, kept aside as ``.damaged`` and made again.
+
+    Args:
+        folder: the cache folder, made if missing.
+        name: readable first part of the file name.
+        description: everything the arrays depend on, JSON-serializable.
+        make: computes the arrays.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}-{cache_key(description)}.npz"
+    with FileLock(f"{path}.lock"):
+        if path.exists():
+            try:
+                return _read(path)
+            except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+                aside = path.with_suffix(".damaged")
+                os.replace(path, aside)
+                log.warning(
+                    "cache file %s is damaged (%s); kept as %s and made again",
+                    path,
+                    error,
+                    aside.name,
+                )
+        arrays = make()
+        _write(path, arrays, description)
+    return arrays
+
+
+def _read(path: Path) -> Arrays:
+    # numpy reads each member to its end, where zipfile compares the checksum.
+    with np.load(path, allow_pickle=False) as archive:
+        return {key: archive[key] for key in archive.files if key != "description"}
+
+
+def _write(path: Path, arrays: Arrays, description: object) -> None:
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, description=np.array(json.dumps(description)), **dict(arrays))
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,199 @@
+"""Excitation signals: what the actuators are asked to do while data are taken."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+Signal = Callable[[np.ndarray], np.ndarray]
+"""Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
+
+
+def _check_positive(owner: object, **values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise ValueError(
+                f"{type(owner).__name__}: {name} is {value}, expected a positive number"
+            )
+
+
+def _check_range(owner: object, name: str, bounds: Sequence[float]) -> None:
+    if len(bounds) != 2 or not 0 < bounds[0] <= bounds[1]:
+        raise ValueError(
+            f"{type(owner).__name__}: {name} is {list(bounds)}, expected [low, high] with "
+            "0 < low <= high"
+        )
+
+
+class Excitation(abc.ABC):
+    """A family of random input signals, drawn with a seed.
+
+    Each drawn signal moves about ``offset`` with a peak drawn uniformly from
+    ``[amplitude/3, amplitude]``, separately for each input.
+    """
+
+    @abc.abstractmethod
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+        """Draw ``count`` signals for times from 0 to ``duration`` s."""
+
+
+@dataclass(frozen=True)
+class _Bounded(Excitation):
+    offset: Sequence[float]
+    amplitude: Sequence[float]
+
+    def __post_init__(self) -> None:
+        if len(self.offset) != len(self.amplitude):
+            raise ValueError(
+                f"{type(self).__name__}: offset has {len(self.offset)} entries and amplitude "
+                f"{len(self.amplitude)}, expected one of each per input"
+            )
+        if min(self.amplitude) < 0:
+            raise ValueError(
+                f"{type(self).__name__}: amplitude is {list(self.amplitude)}, expected no "
+                "negative entry"
+            )
+
+    def _scaled(self, shape: np.ndarray, peak: np.ndarray) -> np.ndarray:
+        """offset + peak * shape, for a shape ``(count, T, M)`` within [-1, 1]."""
+        return np.asarray(self.offset) + peak[:, None, :] * shape
+
+    def _peaks(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        low = np.asarray(self.amplitude, dtype=float)
+        return low * rng.uniform(1 / 3, 1.0, (count, len(low)))
+
+
+@dataclass(frozen=True)
+class MultiSine(_Bounded):
+    """u_i(t) = offset_i + peak_i sum_h w_ih sin(2 pi f_ih t + phi_ih), with sum_h w_ih = 1.
+
+    Args:
+        offset: mean of each input, ``(M,)``.
+        amplitude: largest peak of each input, ``(M,)``.
+        frequency: [low, high] in Hz; each f_ih is drawn from it, uniform in its logarithm.
+        harmonics: number of sines; 1 gives a plain sine.
+    """
+
+    frequency: Sequence[float] = (0.1, 1.0)
+    harmonics: int = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_range(self, "frequency", self.frequency)
+        _check_positive(self, harmonics=self.harmonics)
+
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+        """Draw ``count`` multi-sines; they do not depend on the duration."""
+        peak = self._peaks(count, rng)
+        shape = (*peak.shape, self.harmonics)
+        frequency = np.exp(rng.uniform(*np.log(np.asarray(self.frequency)), shape))
+        phase = rng.uniform(0, 2 * np.pi, shape)
+        weight = rng.dirichlet(np.ones(self.harmonics), peak.shape)
+
+        def signal(t: np.ndarray) -> np.ndarray:
+            angle = 2 * np.pi * frequency[:, None] * t[:, None, None] + phase[:, None]
+            return self._scaled((weight[:, None] * np.sin(angle)).sum(-1), peak)
+
+        return signal
+
+
+@dataclass(frozen=True)
+class Chirp(_Bounded):
+    """u_i(t) = offset_i + peak_i sin(phi_i + 2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))).
+
+    Args:
+        offset: mean of each input, ``(M,)``.
+        amplitude: largest peak of each input, ``(M,)``.
+        frequency: [f_0, f_1] in Hz, swept over the duration T; half of the inputs sweep down.
+    """
+
+    frequency: Sequence[float] = (0.1, 2.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_range(self, "frequency", self.frequency)
+
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+        """Draw ``count`` chirps that sweep the whole band within ``duration`` s."""
+        peak = self._peaks(count, rng)
+        phase = rng.uniform(0, 2 * np.pi, peak.shape)
+        down = rng.random(peak.shape) < 0.5
+        start = np.where(down, self.frequency[1], self.frequency[0])
+        rate = np.where(down, -1, 1) * (self.frequency[1] - self.frequency[0]) / duration
+
+        def signal(t: np.ndarray) -> np.ndarray:
+            time = t[:, None]
+            cycles = start[:, None] * time + 0.5 * rate[:, None] * time**2
+            return self._scaled(np.sin(phase[:, None] + 2 * np.pi * cycles), peak)
+
+        return signal
+
+
+@dataclass(frozen=True)
+class Steps(_Bounded):
+    """Levels held for random times, joined by minimum-jerk ramps of ``rise_time``.
+
+    Args:
+        offset: mean of each input, ``(M,)``.
+        amplitude: largest peak of each input, ``(M,)``.
+        hold: [low, high] in s; each level lasts a time drawn from it, ramp included.
+        rise_time: length of a ramp in s, at most ``hold[0]``; a jump would fall between samples.
+    """
+
+    hold: Sequence[float] = (0.5, 2.0)
+    rise_time: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_range(self, "hold", self.hold)
+        _check_positive(self, rise_time=self.rise_time)
+        if self.rise_time > self.hold[0]:
+            raise ValueError(
+                f"Steps: rise_time is {self.rise_time} s, expected at most the shortest hold, "
+                f"{self.hold[0]} s"
+            )
+
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+        """Draw ``count`` sequences of levels that cover ``duration`` s."""
+        peak = self._peaks(count, rng)
+        number = int(np.ceil(duration / self.hold[0])) + 1
+        shape = (*peak.shape, number)
+        level = rng.uniform(-1, 1, shape)
+        start = np.cumsum(rng.uniform(*self.hold, shape), axis=-1)
+        jump = np.diff(level, axis=-1)
+
+        def signal(t: np.ndarray) -> np.ndarray:
+            ramp = (t[:, None, None] - start[:, None, :, :-1]) / self.rise_time
+            ramp = np.clip(ramp, 0.0, 1.0)
+            smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
+            return self._scaled(level[:, None, :, 0] + (jump[:, None] * smooth).sum(-1), peak)
+
+        return signal
+
+
+@dataclass(frozen=True)
+class Mixture(Excitation):
+    """Signals of several kinds in turn: the k-th is drawn from ``parts[k % len(parts)]``."""
+
+    parts: Sequence[Excitation]
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ValueError("Mixture: parts is empty, expected at least one excitation")
+
+    def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
+        """Draw ``count`` signals, shared out among the parts in turn."""
+        kinds = len(self.parts)
+        sizes = [len(range(k, count, kinds)) for k in range(kinds)]
+        signals = [
+            part.draw(size, duration, rng) for part, size in zip(self.parts, sizes, strict=True)
+        ]
+        order = np.argsort(np.concatenate([np.arange(k, count, kinds) for k in range(kinds)]))
+
+        def signal(t: np.ndarray) -> np.ndarray:
+            return np.concatenate([part(t) for part in signals])[order]
+
+        return signal

@@ -1,0 +1,255 @@
+"""Simulated data sets: a mechanical system under random inputs from random initial states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pinn_dyn.data.cache import Arrays, load_or_make
+from pinn_dyn.data.excitation import Excitation
+from pinn_dyn.data.simulation import simulate
+from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.mechanics import MechanicalSystem, Trajectory
+
+# Part of the cache key: raise it when the same description would give other numbers.
+_VERSION = 1
+_SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class InitialStates:
+    """A box from which initial states are drawn uniformly.
+
+    Args:
+        q_low, q_high: bounds of the configuration, ``(N,)``.
+        v_max: bound of the speed of each coordinate, ``(N,)``.
+
+    Raises:
+        ValueError: if the lengths differ, a bound is not finite, or a lower one exceeds the upper.
+    """
+
+    q_low: Sequence[float]
+    q_high: Sequence[float]
+    v_max: Sequence[float]
+
+    def __post_init__(self) -> None:
+        if not len(self.q_low) == len(self.q_high) == len(self.v_max):
+            raise ValueError(
+                f"InitialStates: q_low, q_high and v_max have {len(self.q_low)}, "
+                f"{len(self.q_high)} and {len(self.v_max)} entries, expected the same number"
+            )
+        bounds = np.array([self.q_low, self.q_high, self.v_max], dtype=float)
+        if not np.isfinite(bounds).all():
+            raise ValueError(f"InitialStates: bounds are {bounds.tolist()}, expected finite numbers")
+        if (bounds[0] > bounds[1]).any() or (bounds[2] < 0).any():
+            raise ValueError(
+                f"InitialStates: q_low = {list(self.q_low)}, q_high = {list(self.q_high)}, v_max = "
+                f"{list(self.v_max)}: expected q_low <= q_high and v_max >= 0"
+            )
+
+    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """``count`` initial configurations and velocities, both ``(count, N)``."""
+        v_max = np.asarray(self.v_max, dtype=float)
+        shape = (count, len(v_max))
+        return rng.uniform(self.q_low, self.q_high, shape), rng.uniform(-v_max, v_max, shape)
+
+
+class SimulatedSource(DataSource):
+    """Trajectories of a known system, simulated once and cached on disk.
+
+    Training trajectories combine every initial state with every input; validation and test
+    trajectories each have an initial state and an input of their own, which no training
+    trajectory has.
+
+    Args:
+        name: short name of the data set.
+        system: the truth.
+        excitation: family of input signals.
+        initial_states: box of initial states.
+        duration: length of each trajectory, s.
+        step: sample time, s.
+        train_initial_states: number of initial states for training.
+        train_inputs: number of inputs for training.
+        validation: number of validation trajectories.
+        test: number of test trajectories.
+        seed: seed of all initial states and inputs.
+        rtol, atol: tolerances of the solver.
+        cache: folder of the cache; ``~`` is the home folder.
+        labels: name and unit of each coordinate, N of them.
+        input_labels: name and unit of each input, M of them.
+
+    Raises:
+        ValueError: on a step longer than the duration, a count below 1, or sizes that do not
+            match the system.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        system: MechanicalSystem,
+        excitation: Excitation,
+        initial_states: InitialStates,
+        duration: float,
+        step: float,
+        train_initial_states: int,
+        train_inputs: int,
+        validation: int,
+        test: int,
+        seed: int,
+        rtol: float,
+        atol: float,
+        cache: str,
+        labels: Sequence[str],
+        input_labels: Sequence[str],
+    ):
+        if not 0 < step <= duration:
+            raise ValueError(
+                f"{name}: step is {step} s and duration {duration} s, expected 0 < step <= duration"
+            )
+        for key, value in (
+            ("train_initial_states", train_initial_states),
+            ("train_inputs", train_inputs),
+            ("validation", validation),
+            ("test", test),
+        ):
+            if value < 1:
+                raise ValueError(f"{name}: {key} is {value}, expected at least 1")
+        for key, found, expected in (
+            ("initial_states", len(initial_states.q_low), system.num_coordinates),
+            ("labels", len(labels), system.num_coordinates),
+            ("input_labels", len(input_labels), system.num_inputs),
+        ):
+            if found != expected:
+                raise ValueError(f"{name}: {key} has {found} entries, the system needs {expected}")
+        self.name = name
+        self.system = system
+        self.excitation = excitation
+        self.initial_states = initial_states
+        self.duration = duration
+        self.step = step
+        self.counts = {
+            "train": (train_initial_states, train_inputs),
+            "validation": (validation, validation),
+            "test": (test, test),
+        }
+        self.seed = seed
+        self.rtol = rtol
+        self.atol = atol
+        self.cache = Path(cache).expanduser()
+        self.labels = list(labels)
+        self.input_labels = list(input_labels)
+
+    def load(self) -> Splits:
+        """The trajectories, from the cache or newly simulated."""
+        arrays = load_or_make(self.cache, self.name, self.describe(), self._simulate)
+        t = torch.from_numpy(arrays["t"])
+        splits: dict[str, list[Trajectory]] = {}
+        for split in _SPLITS:
+            q, v, u = (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
+            splits[split] = [
+                Trajectory(t, q[k], v[k], u[k], p=self._momenta(arrays, split, k))
+                for k in range(q.shape[0])
+            ]
+        return Splits(splits["train"], splits["validation"], splits["test"], self._momentum)
+
+    def describe(self) -> dict[str, object]:
+        """Everything the trajectories depend on: the key of the cache."""
+        public = {
+            key: value
+            for key, value in vars(self.system).items()
+            if isinstance(value, (int, float, str, bool)) and not key.startswith("_")
+        }
+        return {
+            "version": _VERSION,
+            "system": {"class": type(self.system).__name__, **public},
+            "excitation": _describe_excitation(self.excitation),
+            "initial_states": _plain(asdict(self.initial_states)),
+            "duration": self.duration,
+            "step": self.step,
+            "counts": self.counts,
+            "seed": self.seed,
+            "rtol": self.rtol,
+            "atol": self.atol,
+        }
+
+    def _simulate(self) -> Arrays:
+        samples = round(self.duration / self.step) + 1
+        t = np.arange(samples) * self.step
+        starts, signals, pick = [], [], []
+        # One generator per split: more test trajectories do not change the training set.
+        for index, split in enumerate(_SPLITS):
+            rng = np.random.default_rng([self.seed, index])
+            states, inputs = self.counts[split]
+            starts.append(self.initial_states.draw(states, rng))
+            signals.append(self.excitation.draw(inputs, self.duration, rng))
+            if split == "train":
+                pick.append(np.array([(a, b) for a in range(states) for b in range(inputs)]))
+            else:
+                pick.append(np.array([(a, a) for a in range(states)]))
+
+        def signal(time: np.ndarray) -> np.ndarray:
+            drawn = [part(time) for part in signals]
+            return np.concatenate([d[p[:, 1]] for d, p in zip(drawn, pick, strict=True)])
+
+        q0 = np.concatenate([s[0][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
+        v0 = np.concatenate([s[1][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
+        q, v = simulate(
+            self.system,
+            q0,
+            v0,
+            signal,
+            t,
+            rtol=self.rtol,
+            atol=self.atol,
+            progress=f"simulating {len(q0)} trajectories of {self.name}",
+        )
+        ends = np.cumsum([0, *(len(p) for p in pick)])
+        arrays = {"t": t}
+        for index, split in enumerate(_SPLITS):
+            part = slice(ends[index], ends[index + 1])
+            arrays[f"{split}_q"], arrays[f"{split}_v"] = q[part], v[part]
+            arrays[f"{split}_u"] = signals[index](t)[pick[index][:, 1]]
+            if split != "train":
+                arrays[f"{split}_p"] = self._momentum(
+                    torch.from_numpy(q[part]), torch.from_numpy(v[part])
+                ).numpy()
+        return arrays
+
+    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        """p = M(q) v, in pieces that fit the processor's cache."""
+        size = q.shape[-1]
+        pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
+        with torch.no_grad():
+            return torch.cat([self.system.momentum(a, b) for a, b in pieces]).reshape(q.shape)
+
+    @staticmethod
+    def _momenta(arrays: Arrays, split: str, k: int) -> Tensor | None:
+        key = f"{split}_p"
+        return torch.from_numpy(arrays[key][k]) if key in arrays else None
+
+
+def _describe_excitation(excitation: Excitation) -> dict[str, object]:
+    parts: Callable[[object], object] = lambda value: (  # noqa: E731
+        [_describe_excitation(part) for part in value]  # type: ignore[attr-defined]
+        if isinstance(value, Sequence) and value and isinstance(value[0], Excitation)
+        else _plain(value)
+    )
+    return {
+        "class": type(excitation).__name__,
+        **{key: parts(value) for key, value in vars(excitation).items()},
+    }
+
+
+def _plain(value: object) -> object:
+    """Lists and dicts of plain values, from whatever sequence type a config gave."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(v) for v in value]
+    return value

@@ -1,0 +1,45 @@
+"""The contract of a data set: trajectories, split by whole trajectories."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pinn_dyn.mechanics import Trajectory
+
+
+@dataclass(frozen=True)
+class Splits:
+    """Trajectories for training, validation and test; no trajectory is in two of them.
+
+    Attributes:
+        train, validation, test: the trajectories.
+        momentum: p = M(q) v where the truth is known, ``(*batch, N), (*batch, N) -> (*batch, N)``;
+            None for measured data.
+    """
+
+    train: list[Trajectory]
+    validation: list[Trajectory]
+    test: list[Trajectory]
+    momentum: Callable[[Tensor, Tensor], Tensor] | None = None
+
+
+class DataSource(abc.ABC):
+    """Where trajectories come from: a simulation or a log.
+
+    Attributes:
+        name: short name, for tables and titles.
+        labels: name and unit of each coordinate.
+        input_labels: name and unit of each input.
+    """
+
+    name: str
+    labels: list[str]
+    input_labels: list[str]
+
+    @abc.abstractmethod
+    def load(self) -> Splits:
+        """The trajectories; a second call, or a second process, reads them from the cache."""

@@ -1,0 +1,230 @@
+"""Windows: short pieces of training trajectories, the samples that a network sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from pinn_dyn.mechanics import Coordinates, Interpolation, Trajectory
+from pinn_dyn.models.statistics import Statistics
+
+
+@dataclass(frozen=True)
+class Windows:
+    """B windows of H steps; with H = 1 these are the paper's transition pairs.
+
+    A step spans ``stride`` samples of the data; the input keeps all its samples.
+
+    Attributes:
+        t: times of the steps from the window's start, ``(H + 1,)``, s.
+        t_input: times of the input samples, ``(H * stride + 1,)``, s.
+        q, v: state at the start, ``(B, N)``.
+        p: momentum at the start, ``(B, N)``; empty ``(B, 0)`` where there is none.
+        dq, dv, dp: increments from the start to each step, ``(B, H, N)``; taken in double
+            precision, as they are far smaller than the states.
+        u: input, ``(B, H * stride + 1, M)``.
+        interpolation: how u moves between samples.
+    """
+
+    t: Tensor
+    t_input: Tensor
+    q: Tensor
+    v: Tensor
+    p: Tensor
+    dq: Tensor
+    dv: Tensor
+    dp: Tensor
+    u: Tensor
+    interpolation: Interpolation
+
+    def __len__(self) -> int:
+        return self.q.shape[0]
+
+    def __getitem__(self, index: Tensor) -> Windows:
+        """The windows at the positions ``index``."""
+        return self._map(lambda value: value[index])
+
+    def to(self, device: torch.device, dtype: torch.dtype | None = None) -> Windows:
+        """All tensors on a device and, where given, in a dtype."""
+        moved = self._map(lambda value: value.to(device, dtype))
+        return Windows(
+            **{
+                item.name: getattr(moved, item.name).to(device, dtype)
+                if item.name in ("t", "t_input")
+                else getattr(moved, item.name)
+                for item in fields(self)
+            }
+        )
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Windows:
+        kept = ("t", "t_input", "interpolation")
+        return Windows(
+            **{
+                item.name: getattr(self, item.name)
+                if item.name in kept
+                else change(getattr(self, item.name))
+                for item in fields(self)
+            }
+        )
+
+    def start(self, coordinates: Coordinates) -> Tensor:
+        """State at the start, ``(B, 2N)``: (q, v) or (q, p)."""
+        return torch.cat([self.q, self.v if coordinates == "velocity" else self.p], dim=-1)
+
+    def increments(self, coordinates: Coordinates) -> Tensor:
+        """Increments to each step, ``(B, H, 2N)``, of (q, v) or (q, p)."""
+        return torch.cat([self.dq, self.dv if coordinates == "velocity" else self.dp], dim=-1)
+
+    def statistics(self) -> Statistics:
+        """Means and standard deviations over the windows."""
+        one = torch.ones_like(self.q[0])
+
+        def spread(values: Tensor) -> Tensor:
+            std = values.std(0, correction=0)
+            return torch.where(std > 1e-12, std, torch.ones_like(std))
+
+        has_momentum = self.p.shape[-1] > 0
+        velocity_std = spread(self.increments("velocity"))
+        return Statistics(
+            q_mean=self.q.mean(0),
+            q_std=spread(self.q),
+            v_std=spread(self.v),
+            p_std=spread(self.p) if has_momentum else one,
+            u_mean=self.u.mean((0, 1)),
+            u_std=spread(self.u.flatten(0, 1)),
+            velocity_increment_std=velocity_std,
+            momentum_increment_std=spread(self.increments("momentum"))
+            if has_momentum
+            else torch.ones_like(velocity_std),
+            step=float(self.t[1]),
+        )
+
+
+def draw_windows(
+    trajectories: list[Trajectory],
+    *,
+    count: int,
+    steps: int,
+    stride: int,
+    seed: int,
+    momentum: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> Windows:
+    """Draw windows at random starts, uniform over all starts of all trajectories.
+
+    Args:
+        trajectories: the training trajectories, each ``(T, N)``, with one sample time.
+        count: number of windows B.
+        steps: steps H of a window.
+        stride: samples in a step.
+        seed: seed of the starts.
+        momentum: p = M(q) v, for data without recorded momenta.
+
+    Raises:
+        ValueError: on counts below 1, differing sample times, trajectories shorter than a window,
+            or more windows than there are starts.
+    """
+    for name, value in (("count", count), ("steps", steps), ("stride", stride)):
+        if value < 1:
+            raise ValueError(f"{name} is {value}, expected at least 1")
+    span = steps * stride
+    sample = float(trajectories[0].t[1] - trajectories[0].t[0])
+    for k, item in enumerate(trajectories):
+        spacing = item.t.diff()
+        if (spacing - sample).abs().max() > 1e-6 * sample:
+            raise ValueError(
+                f"training trajectory {k} has sample times from {float(spacing.min()):g} to "
+                f"{float(spacing.max()):g} s, expected {sample:g} s throughout: resample it first"
+            )
+    starts = torch.tensor([max(item.t.shape[0] - span, 0) for item in trajectories])
+    total = int(starts.sum())
+    if total < count:
+        raise ValueError(
+            f"{count} windows of {span} samples ({span * sample:g} s) were asked for, but the "
+            f"{len(trajectories)} training trajectories have only {total} starts for them: ask for "
+            "fewer pairs, a shorter window or more data"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    # Starts without repetition, also where there are too many of them for a permutation.
+    flat = torch.unique(torch.randint(total, (count,), generator=generator))
+    while flat.shape[0] < count:
+        more = torch.randint(total, (count,), generator=generator)
+        flat = torch.unique(torch.cat([flat, more]))
+    flat = flat[torch.randperm(flat.shape[0], generator=generator)[:count]]
+    ends = starts.cumsum(0)
+    which = torch.searchsorted(ends, flat, right=True)
+    offset = flat - (ends - starts)[which]
+
+    knots = torch.arange(steps + 1) * stride
+    q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(which, offset, strict=True)])
+    v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(which, offset, strict=True)])
+    u = torch.stack(
+        [trajectories[i].u[k : k + span + 1] for i, k in zip(which, offset, strict=True)]
+    )
+    if momentum is not None:
+        p = momentum(q, v)
+    elif all(item.p is not None for item in trajectories):
+        p = torch.stack(
+            [trajectories[i].p[k + knots] for i, k in zip(which, offset, strict=True)]  # type: ignore[index]
+        )
+    else:
+        p = q.new_zeros((count, steps + 1, 0))
+    return Windows(
+        t=knots.double() * sample,
+        t_input=torch.arange(span + 1, dtype=torch.float64) * sample,
+        q=q[:, 0],
+        v=v[:, 0],
+        p=p[:, 0],
+        dq=q[:, 1:] - q[:, :1],
+        dv=v[:, 1:] - v[:, :1],
+        dp=p[:, 1:] - p[:, :1],
+        u=u,
+        interpolation=trajectories[0].interpolation,
+    )
+
+
+class WindowDataset(Dataset[Windows]):
+    """Windows in memory; an item is a whole batch, picked by a tensor of positions."""
+
+    def __init__(self, windows: Windows):
+        self.windows = windows
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __getitem__(self, index: Tensor) -> Windows:
+        return self.windows[index]
+
+
+class BatchSampler(Sampler[Tensor]):
+    """Batches of an epoch: ``batches`` of them, from as many shuffled passes as they need.
+
+    The order depends on the seed and the epoch alone, so a resumed training sees the batches that
+    an uninterrupted one would have seen.
+    """
+
+    def __init__(self, size: int, *, batch_size: int, batches: int, seed: int):
+        self.size = size
+        self.batch_size = batch_size
+        self.batches = batches
+        self.seed = seed
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by the trainer at the start of each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.batches
+
+    def __iter__(self) -> Iterator[Tensor]:
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
+        per_pass = max(self.size // self.batch_size, 1)
+        for number in range(self.batches):
+            if number % per_pass == 0:
+                order = torch.randperm(self.size, generator=generator)
+            first = (number % per_pass) * self.batch_size
+            yield order[first : first + self.batch_size]

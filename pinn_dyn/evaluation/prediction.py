@@ -1,0 +1,165 @@
+"""Roll-outs of a model along test trajectories, over the whole horizon or window by window."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics import Predictor, Trajectory
+
+_Model = TypeVar("_Model", bound=Predictor)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted and true configurations of K trajectories at the same times.
+
+    Attributes:
+        t: times, ``(T,)``, s.
+        q_hat: predicted configuration, ``(K, T, N)``; NaN where the roll-out broke down.
+        q: true configuration, ``(K, T, N)``.
+    """
+
+    t: Tensor
+    q_hat: Tensor
+    q: Tensor
+
+    def error(self) -> Tensor:
+        """e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
+        return torch.linalg.vector_norm(self.q_hat - self.q, dim=-1)
+
+
+def predict_trajectories(
+    model: Predictor, truth: Trajectory, *, step: float | None = None
+) -> Prediction:
+    """Roll the model out from each true initial state under the true input.
+
+    The roll-out runs in float64 on a copy of the model in evaluation mode. Where a trajectory
+    breaks down (a mass matrix that is no longer positive definite), all of its q_hat is NaN.
+
+    Args:
+        model: what predicts, with N coordinates and M inputs.
+        truth: K test trajectories stacked, q ``(K, T, N)``.
+        step: step of the roll-out in s, an integer multiple of the sample time; None takes the
+            data's own sample times.
+
+    Raises:
+        ValueError: if the trajectories are not stacked, the step is no multiple of the sample
+            time, or a momentum is needed and was not recorded.
+    """
+    _require_stacked(truth)
+    stride = 1 if step is None else _samples_of("step", step, truth.t)
+    prediction = _roll_out(
+        double_copy(model, truth.q.device),
+        truth.state(model.coordinates)[:, 0].double(),
+        truth.t.double(),
+        truth.u.double(),
+        stride,
+        truth,
+    )
+    return Prediction(truth.t[::stride].double(), prediction, truth.q[:, ::stride].double())
+
+
+def predict_windows(
+    model: Predictor, truth: Trajectory, *, window: float, step: float | None = None
+) -> Prediction:
+    """The same as :func:`predict_trajectories`, the state re-set to the true one every window.
+
+    At the time of a re-set the prediction is the end of the window before. The last window is
+    left out if the trajectory ends within it. All windows are rolled out as one batch.
+
+    Args:
+        model: what predicts, with N coordinates and M inputs.
+        truth: K test trajectories stacked, q ``(K, T, N)``, with a constant sample time.
+        window: time between two re-sets in s, an integer multiple of the step.
+        step: step of the roll-out in s, an integer multiple of the sample time, or None.
+
+    Raises:
+        ValueError: as :func:`predict_trajectories`, if the window is no multiple of the step, or
+            if the trajectory is shorter than one window.
+    """
+    _require_stacked(truth)
+    stride = 1 if step is None else _samples_of("step", step, truth.t)
+    samples = _samples_of("window", window, truth.t)
+    if samples % stride:
+        raise ValueError(
+            f"window is {window} s and step is {step} s: expected a window that is an integer "
+            "multiple of the step"
+        )
+    windows = (truth.t.shape[0] - 1) // samples
+    if windows < 1:
+        raise ValueError(
+            f"window is {window} s, but the trajectories last only {truth.duration:g} s: "
+            "use a shorter window"
+        )
+    last = windows * samples
+    x0 = truth.state(model.coordinates)[:, :last:samples].double()
+    # (K, windows, samples + 1, M): neighbouring windows share the sample between them.
+    u = truth.u[:, : last + 1].double().unfold(1, samples + 1, samples).movedim(-1, -2)
+    ends = _roll_out(
+        double_copy(model, truth.q.device),
+        x0.flatten(0, 1),
+        truth.t[: samples + 1].double(),
+        u.flatten(0, 1),
+        stride,
+        truth,
+    )[:, 1:]
+    q = truth.q[:, : last + 1 : stride].double()
+    q_hat = torch.cat([q[:, :1], ends.reshape(q.shape[0], -1, q.shape[-1])], dim=1)
+    return Prediction(truth.t[: last + 1 : stride].double(), q_hat, q)
+
+
+def double_copy(model: _Model, device: torch.device) -> _Model:
+    """A copy of the model in float64 and evaluation mode; the model itself stays as it is."""
+    return copy.deepcopy(model).to(device=device, dtype=torch.float64).eval()
+
+
+def _roll_out(
+    model: Predictor, x0: Tensor, t: Tensor, u: Tensor, stride: int, truth: Trajectory
+) -> Tensor:
+    """Predicted q ``(B, T, N)`` at every ``stride``-th sample; NaN rows where it broke down."""
+    try:
+        with torch.no_grad():
+            states = model.predict(x0, t[::stride], u, t_input=t, interpolation=truth.interpolation)
+        return states[..., : truth.q.shape[-1]]
+    except torch.linalg.LinAlgError:
+        # One broken trajectory stops the whole batch: halve it until that one is alone.
+        if x0.shape[0] == 1:
+            return x0.new_full((1, t[::stride].shape[0], truth.q.shape[-1]), torch.nan)
+        half = x0.shape[0] // 2
+        return torch.cat(
+            [
+                _roll_out(model, x0[:half], t, u[:half], stride, truth),
+                _roll_out(model, x0[half:], t, u[half:], stride, truth),
+            ]
+        )
+
+
+def _require_stacked(truth: Trajectory) -> None:
+    if truth.q.ndim != 3:
+        raise ValueError(
+            f"truth.q has shape {tuple(truth.q.shape)}, expected (K, T, N): stack([...]) the "
+            "test trajectories first"
+        )
+
+
+def _samples_of(name: str, duration: float, t: Tensor) -> int:
+    """How many sample times a duration holds; an error unless that is a positive integer."""
+    steps = t.double().diff()
+    sample_time = float(steps.mean())
+    if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:
+        raise ValueError(
+            f"{name} is {duration} s, but the sample time varies between {float(steps.min()):g} "
+            f"and {float(steps.max()):g} s: {name} needs a constant one, resample the data first"
+        )
+    count = round(duration / sample_time)
+    if count < 1 or abs(duration / sample_time - count) > 1e-3:
+        raise ValueError(
+            f"{name} is {duration} s and the sample time of the data is {sample_time:g} s: "
+            f"expected a {name} that is a positive integer multiple of it"
+        )
+    return count

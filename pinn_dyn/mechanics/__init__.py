@@ -1,0 +1,18 @@
+"""The equations of mechanics: systems, states, trajectories and their integration."""
+
+from pinn_dyn.mechanics.integration import rollout
+from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor
+from pinn_dyn.mechanics.system import MechanicalSystem, Terms
+from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation, Trajectory, stack
+
+__all__ = [
+    "ContinuousPredictor",
+    "Coordinates",
+    "Interpolation",
+    "MechanicalSystem",
+    "Predictor",
+    "Terms",
+    "Trajectory",
+    "rollout",
+    "stack",
+]

@@ -1,0 +1,45 @@
+"""Checks and small linear algebra on batched tensors, shared by every room."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def require_last_dim(name: str, value: Tensor, size: int, symbol: str) -> None:
+    """Check that ``value`` has shape ``(*batch, size)``.
+
+    Raises:
+        ValueError: if the last dimension differs; the message names the argument.
+    """
+    if value.ndim == 0 or value.shape[-1] != size:
+        raise ValueError(
+            f"{name} has shape {tuple(value.shape)}, expected (*batch, {size}): "
+            f"the last dimension must be {symbol} = {size}"
+        )
+
+
+def require_finite(name: str, value: Tensor) -> None:
+    """Check that ``value`` holds neither NaN nor infinity.
+
+    Raises:
+        ValueError: naming the argument, how many entries are bad and where the first one is.
+    """
+    bad = ~torch.isfinite(value)
+    if bad.any():
+        first = tuple(int(i) for i in bad.nonzero()[0])
+        raise ValueError(
+            f"{name} has {int(bad.sum())} non-finite entries, the first at index {first} "
+            f"({float(value[first])}): expected finite numbers only"
+        )
+
+
+def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Batched product: matrix ``(*batch, n, m)`` times vector ``(*batch, m)``."""
+    return (matrix * vector.unsqueeze(-2)).sum(-1)
+
+
+def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Solve ``matrix x = vector`` for a symmetric positive definite matrix, by Cholesky."""
+    factor = torch.linalg.cholesky(matrix)
+    return torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)

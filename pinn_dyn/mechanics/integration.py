@@ -1,0 +1,137 @@
+"""Roll-outs: integrate a state derivative under a sampled input."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torchdiffeq import odeint
+
+from pinn_dyn.mechanics.arrays import require_finite
+from pinn_dyn.mechanics.trajectory import Interpolation
+
+Derivative = Callable[[Tensor, Tensor], Tensor]
+"""Maps a state ``(*batch, S)`` and an input ``(*batch, M)`` to dx/dt ``(*batch, S)``."""
+
+
+class SampledInput:
+    """An input known at sample times, linear or held in between.
+
+    Args:
+        t: sample times, ``(K,)``, increasing.
+        u: samples, ``(*batch, K, M)``.
+        interpolation: ``"linear"``, or ``"hold"`` for piecewise constant.
+    """
+
+    def __init__(self, t: Tensor, u: Tensor, interpolation: Interpolation):
+        if u.ndim < 2 or u.shape[-2] != t.shape[0]:
+            raise ValueError(
+                f"u has shape {tuple(u.shape)}, expected (*batch, {t.shape[0]}, M): "
+                f"one input for each of the {t.shape[0]} sample times"
+            )
+        if interpolation not in ("linear", "hold"):
+            raise ValueError(f"interpolation is {interpolation!r}, expected 'linear' or 'hold'")
+        # Sample index first: one row is one contiguous (*batch, M) block.
+        self._u = u.movedim(-2, 0).contiguous()
+        self._t = t.to(u.dtype).tolist()
+        self._linear = interpolation == "linear"
+
+    def __call__(self, time: Tensor) -> Tensor:
+        """The input ``(*batch, M)`` at a time; the end samples hold outside the range."""
+        now = float(time)
+        last = len(self._t) - 1
+        index = min(max(bisect.bisect_right(self._t, now) - 1, 0), last)
+        if not self._linear or index == last:
+            return self._u[index]
+        weight = (now - self._t[index]) / (self._t[index + 1] - self._t[index])
+        return torch.lerp(self._u[index], self._u[index + 1], max(weight, 0.0))
+
+
+def rollout_increments(
+    derivative: Derivative,
+    x0: Tensor,
+    t: Tensor,
+    u: Tensor,
+    *,
+    t_input: Tensor | None = None,
+    interpolation: Interpolation = "linear",
+    substeps: int = 1,
+) -> Tensor:
+    """Integrate dx/dt = f(x, u(t)) and return the increments x(t_k) - x(t_0).
+
+    The increment, not the state, is the integrated variable: with a small step in float32 an
+    increment is far below the resolution of the state it is added to.
+
+    The method is torchdiffeq's ``rk4``, the four-stage fourth-order 3/8 rule, one step per
+    interval of ``t`` (or ``substeps`` of them). With ``interpolation="hold"`` the stages at the
+    ends of a step use the input of that step, not of its neighbours.
+
+    Args:
+        derivative: f, maps ``(*batch, S)`` and ``(*batch, M)`` to ``(*batch, S)``.
+        x0: initial state, ``(*batch, S)``.
+        t: times of the solution, ``(T,)``, s.
+        u: input samples, ``(*batch, K, M)``.
+        t_input: times of the input samples, ``(K,)``, s; ``t`` if None.
+        interpolation: how u moves between its samples.
+        substeps: steps of the integrator between two times of ``t``.
+
+    Returns:
+        Increments, ``(*batch, T, S)``; those at t_0 are zero.
+
+    Raises:
+        ValueError: on fewer than 2 times, substeps below 1, shapes that do not match, or a
+            non-finite initial state.
+    """
+    if t.ndim != 1 or t.shape[0] < 2:
+        raise ValueError(f"t has shape {tuple(t.shape)}, expected (T,) with at least 2 times")
+    if substeps < 1:
+        raise ValueError(f"substeps is {substeps}, expected at least 1")
+    if u.shape[:-2] != x0.shape[:-1]:
+        raise ValueError(
+            f"u has batch shape {tuple(u.shape[:-2])}, x0 has {tuple(x0.shape[:-1])}: "
+            "expected the same batch"
+        )
+    require_finite("the initial state x0", x0)
+    signal = SampledInput(t if t_input is None else t_input, u, interpolation)
+
+    def increment_rate(time: Tensor, increment: Tensor) -> Tensor:
+        return derivative(x0 + increment, signal(time))
+
+    # One dtype throughout, so that the solver's times and the input's times compare exactly.
+    t = t.to(x0.dtype)
+    grid = t
+    if substeps > 1:
+        fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
+        inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
+        grid = torch.cat([inner.flatten(), t[-1:]])
+    solution = odeint(
+        increment_rate,
+        torch.zeros_like(x0),
+        grid,
+        method="rk4",
+        options={"perturb": interpolation == "hold"},
+    )
+    return solution[::substeps].movedim(0, -2)
+
+
+def rollout(
+    derivative: Derivative,
+    x0: Tensor,
+    t: Tensor,
+    u: Tensor,
+    *,
+    t_input: Tensor | None = None,
+    interpolation: Interpolation = "linear",
+    substeps: int = 1,
+) -> Tensor:
+    """States x(t_k), ``(*batch, T, S)``, of dx/dt = f(x, u(t)) from ``x0``.
+
+    The state is (q, v) or (q, p), whichever ``derivative`` takes. Arguments and errors are those
+    of :func:`rollout_increments`.
+    """
+    increments = rollout_increments(
+        derivative, x0, t, u, t_input=t_input, interpolation=interpolation, substeps=substeps
+    )
+    return x0.unsqueeze(-2) + increments

@@ -1,0 +1,103 @@
+"""The prediction contract: what every model, mechanical or black box, can do."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from pinn_dyn.mechanics.arrays import require_last_dim
+from pinn_dyn.mechanics.integration import rollout_increments
+from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation
+
+
+class Predictor(nn.Module, abc.ABC):
+    """Predicts how a state moves under a given input.
+
+    Attributes:
+        num_coordinates: N, the dimension of q.
+        num_inputs: M, the dimension of u.
+        coordinates: ``"velocity"`` if the state is (q, v), ``"momentum"`` if it is (q, p).
+    """
+
+    def __init__(self, num_coordinates: int, num_inputs: int, coordinates: Coordinates):
+        super().__init__()
+        for name, value in (("num_coordinates", num_coordinates), ("num_inputs", num_inputs)):
+            if value < 1:
+                raise ValueError(f"{name} is {value}, expected at least 1")
+        self.num_coordinates = num_coordinates
+        self.num_inputs = num_inputs
+        self.coordinates: Coordinates = coordinates
+
+    @abc.abstractmethod
+    def increments(
+        self,
+        x0: Tensor,
+        t: Tensor,
+        u: Tensor,
+        *,
+        t_input: Tensor | None = None,
+        interpolation: Interpolation = "linear",
+    ) -> Tensor:
+        """Increments x(t_k) - x(t_0), ``(*batch, T, 2N)``, from ``x0`` ``(*batch, 2N)``.
+
+        ``u`` ``(*batch, K, M)`` is sampled at ``t_input`` ``(K,)``, or at ``t`` if None.
+        """
+
+    @final
+    def predict(
+        self,
+        x0: Tensor,
+        t: Tensor,
+        u: Tensor,
+        *,
+        t_input: Tensor | None = None,
+        interpolation: Interpolation = "linear",
+    ) -> Tensor:
+        """States x(t_k), ``(*batch, T, 2N)``; arguments as for :meth:`increments`."""
+        require_last_dim("x0", x0, 2 * self.num_coordinates, "2N")
+        require_last_dim("u", u, self.num_inputs, "M")
+        increments = self.increments(x0, t, u, t_input=t_input, interpolation=interpolation)
+        return x0.unsqueeze(-2) + increments
+
+
+class ContinuousPredictor(Predictor):
+    """A predictor given by a state derivative dx/dt = f(x, u), integrated by RK4."""
+
+    _compiled: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    @abc.abstractmethod
+    def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """dx/dt, ``(*batch, 2N)``, of the state x ``(*batch, 2N)`` under u ``(*batch, M)``."""
+
+    def compile_derivative(self) -> None:
+        """Use a compiled state derivative while the model is in training mode.
+
+        Only the derivative is compiled, not the unrolled integrator: that keeps compilation
+        short. Validation and test run eagerly, as their batch shapes vary.
+        """
+        self._compiled = torch.compile(self.state_derivative)
+
+    @final
+    def increments(
+        self,
+        x0: Tensor,
+        t: Tensor,
+        u: Tensor,
+        *,
+        t_input: Tensor | None = None,
+        interpolation: Interpolation = "linear",
+    ) -> Tensor:
+        """Integrate the state derivative, one RK4 step per interval of ``t``."""
+        compiled = self._compiled if self.training else None
+        return rollout_increments(
+            compiled or self.state_derivative,
+            x0,
+            t,
+            u,
+            t_input=t_input,
+            interpolation=interpolation,
+        )

@@ -1,0 +1,212 @@
+"""The one contract that truth and learned models share: the mechanical system."""
+
+from __future__ import annotations
+
+import abc
+from typing import NamedTuple, final
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics.arrays import matvec, require_last_dim, spd_solve
+from pinn_dyn.mechanics.predictor import ContinuousPredictor
+from pinn_dyn.mechanics.trajectory import Coordinates
+
+
+class Terms(NamedTuple):
+    """The terms of the equation of motion at one configuration.
+
+    ``M`` mass matrix ``(*batch, N, N)``, ``D`` damping matrix ``(*batch, N, N)``,
+    ``G`` potential force ``(*batch, N)``, ``A`` input matrix ``(*batch, N, M)``.
+    """
+
+    M: Tensor
+    D: Tensor
+    G: Tensor
+    A: Tensor
+
+
+class MechanicalSystem(ContinuousPredictor):
+    """A mechanical system with dissipation and an input matrix.
+
+    Lagrangian form, paper eq. (armdynamics)::
+
+        M(q) dv/dt + C(q, v) v + G(q) + D(q) v = A(q) u,      G = dV/dq
+
+    Hamiltonian form, paper eq. (hamiltonian_dyn), with p = M(q) v::
+
+        dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) dH/dp + A(q) u
+
+    Symbols: q configuration ``(*batch, N)``, v velocity ``(*batch, N)``, a acceleration
+    ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
+    force ``(*batch, N)``; SI units and radians.
+
+    A subclass gives the four abstract terms. The ``_``-methods below derive everything else by
+    automatic differentiation; a subclass that knows closed formulas may override those.
+    """
+
+    def __init__(
+        self, num_coordinates: int, num_inputs: int, coordinates: Coordinates = "velocity"
+    ):
+        super().__init__(num_coordinates, num_inputs, coordinates)
+
+    @abc.abstractmethod
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """M(q), ``(*batch, N, N)``, symmetric positive definite."""
+
+    @abc.abstractmethod
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q), ``(*batch,)``, J."""
+
+    @abc.abstractmethod
+    def damping_matrix(self, q: Tensor) -> Tensor:
+        """D(q), ``(*batch, N, N)``, symmetric positive semi-definite."""
+
+    @abc.abstractmethod
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """A(q), ``(*batch, N, M)``."""
+
+    # What a subclass may replace by closed formulas.
+
+    def _potential_force(self, q: Tensor) -> Tensor:
+        _, pullback = torch.func.vjp(lambda x: self.potential_energy(x).sum(), q)
+        (force,) = pullback(torch.ones((), dtype=q.dtype, device=q.device))
+        return force
+
+    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """M(q) a + C(q, v) v, with C(q, v) v = (dM/dt) v - d(v^T M v / 2)/dq."""
+        mass, mass_rate = torch.func.jvp(self.mass_matrix, (q,), (v,))
+        return matvec(mass, a) + matvec(mass_rate, v) - self._kinetic_gradient(q, v)
+
+    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+        """The a that solves M(q) a + C(q, v) v + G(q) = force."""
+        bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
+        return spd_solve(self.mass_matrix(q), force - bias)
+
+    def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        """(dH/dq, dH/dp): dH/dp = M^-1 p = v and dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v."""
+        v = self._velocity(q, p)
+        return self._potential_force(q) - self._kinetic_gradient(q, v), v
+
+    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        return matvec(self.mass_matrix(q), v)
+
+    def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
+        return spd_solve(self.mass_matrix(q), p)
+
+    def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
+        """d(v^T M(q) v / 2)/dq at fixed v, one reverse pass through the mass matrix."""
+        _, pullback = torch.func.vjp(self.mass_matrix, q)
+        (gradient,) = pullback(0.5 * v.unsqueeze(-1) * v.unsqueeze(-2))
+        return gradient
+
+    # What every mechanical system can then do.
+
+    @final
+    def terms(self, q: Tensor) -> Terms:
+        """M(q), D(q), G(q) and A(q) together."""
+        self._check(q=q)
+        return Terms(
+            self.mass_matrix(q),
+            self.damping_matrix(q),
+            self._potential_force(q),
+            self.input_matrix(q),
+        )
+
+    @final
+    def potential_force(self, q: Tensor) -> Tensor:
+        """G(q) = dV/dq, ``(*batch, N)``."""
+        self._check(q=q)
+        return self._potential_force(q)
+
+    @final
+    def coriolis_matrix(self, q: Tensor, v: Tensor) -> Tensor:
+        """C(q, v), ``(*batch, N, N)``, from the Christoffel symbols of the first kind::
+
+            C_ij = sum_k (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k / 2
+
+        With this choice dM/dt - 2 C is skew-symmetric (Murray, Li, Sastry 1994, Lemma 4.2).
+        """
+        self._check(q=q, v=v)
+        basis = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
+        slopes = torch.stack(
+            [
+                torch.func.jvp(self.mass_matrix, (q,), (direction.expand_as(q),))[1]
+                for direction in basis
+            ],
+            dim=-1,
+        )  # (*batch, i, j, k) = dM_ij / dq_k
+        symbols = slopes + slopes.transpose(-1, -2) - slopes.movedim(-1, -3)
+        return 0.5 * matvec(symbols, v.unsqueeze(-2))
+
+    @final
+    def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """a = M^-1 (A u - C v - G - D v), ``(*batch, N)``; paper eq. (armdynamics)."""
+        self._check(q=q, v=v, u=u)
+        force = matvec(self.input_matrix(q), u) - matvec(self.damping_matrix(q), v)
+        return self._acceleration(q, v, force)
+
+    @final
+    def inverse_dynamics(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """tau = M a + C v + G + D v, ``(*batch, N)``, the generalized force that gives ``a``."""
+        self._check(q=q, v=v, a=a)
+        conservative = self._inertial_force(q, v, a) + self._potential_force(q)
+        return conservative + matvec(self.damping_matrix(q), v)
+
+    @final
+    def momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        """p = M(q) v, ``(*batch, N)``."""
+        self._check(q=q, v=v)
+        return self._momentum(q, v)
+
+    @final
+    def velocity(self, q: Tensor, p: Tensor) -> Tensor:
+        """v = M(q)^-1 p, ``(*batch, N)``."""
+        self._check(q=q, p=p)
+        return self._velocity(q, p)
+
+    @final
+    def kinetic_energy(self, q: Tensor, v: Tensor) -> Tensor:
+        """T = v^T M(q) v / 2, ``(*batch,)``, J."""
+        return 0.5 * (self.momentum(q, v) * v).sum(-1)
+
+    @final
+    def total_energy(self, q: Tensor, v: Tensor) -> Tensor:
+        """E = T + V, ``(*batch,)``, J."""
+        return self.kinetic_energy(q, v) + self.potential_energy(q)
+
+    @final
+    def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """dE/dt = v^T A(q) u - v^T D(q) v, ``(*batch,)``, W: what enters less what is lost."""
+        self._check(q=q, v=v, u=u)
+        supplied = matvec(self.input_matrix(q), u) - matvec(self.damping_matrix(q), v)
+        return (v * supplied).sum(-1)
+
+    @final
+    def velocity_derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """d(q, v)/dt, ``(*batch, 2N)``, Lagrangian form; the argument of a (q, v) roll-out."""
+        q, v = x.chunk(2, dim=-1)
+        return torch.cat([v, self.forward_dynamics(q, v, u)], dim=-1)
+
+    @final
+    def momentum_derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """d(q, p)/dt, ``(*batch, 2N)``, Hamiltonian form; the argument of a (q, p) roll-out."""
+        q, p = x.chunk(2, dim=-1)
+        self._check(q=q, p=p, u=u)
+        grad_q, v = self._hamiltonian_gradient(q, p)
+        force = matvec(self.input_matrix(q), u) - matvec(self.damping_matrix(q), v)
+        return torch.cat([v, force - grad_q], dim=-1)
+
+    @final
+    def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """dx/dt in the system's own coordinates, (q, v) or (q, p)."""
+        if self.coordinates == "momentum":
+            return self.momentum_derivative(x, u)
+        return self.velocity_derivative(x, u)
+
+    def _check(self, **values: Tensor) -> None:
+        for name, value in values.items():
+            if name == "u":
+                require_last_dim(name, value, self.num_inputs, "M")
+            else:
+                require_last_dim(name, value, self.num_coordinates, "N")

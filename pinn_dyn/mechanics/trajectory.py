@@ -1,0 +1,139 @@
+"""Trajectories: what is simulated, measured, predicted and compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Coordinates = Literal["velocity", "momentum"]
+"""Which variable completes the state x: (q, v) or (q, p) with p = M(q) v."""
+
+Interpolation = Literal["linear", "hold"]
+"""How the input moves between two samples: on a straight line, or held at the earlier one."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A sampled motion under a sampled input.
+
+    Attributes:
+        t: sample times in s, ``(T,)``, strictly increasing.
+        q: configuration, ``(*batch, T, N)``.
+        v: velocity dq/dt, ``(*batch, T, N)``.
+        u: input, ``(*batch, T, M)``.
+        p: momentum M(q) v, ``(*batch, T, N)``, or None where it was not recorded.
+        interpolation: how ``u`` moves between samples.
+
+    Raises:
+        ValueError: on shapes that do not match or times that do not increase.
+    """
+
+    t: Tensor
+    q: Tensor
+    v: Tensor
+    u: Tensor
+    p: Tensor | None = None
+    interpolation: Interpolation = "linear"
+
+    def __post_init__(self) -> None:
+        samples = self.t.shape[0] if self.t.ndim == 1 else -1
+        if samples < 2:
+            raise ValueError(
+                f"t has shape {tuple(self.t.shape)}, expected (T,) with at least 2 samples"
+            )
+        if not bool((self.t[1:] > self.t[:-1]).all()):
+            k = int((self.t[1:] <= self.t[:-1]).nonzero()[0])
+            raise ValueError(
+                f"t must increase strictly, but t[{k}] = {float(self.t[k])} "
+                f"is followed by t[{k + 1}] = {float(self.t[k + 1])}"
+            )
+        for name in ("q", "v", "u", "p"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            expected = (samples, value.shape[-1]) if name == "u" else (samples, self.q.shape[-1])
+            if value.ndim < 2 or tuple(value.shape[-2:]) != expected:
+                raise ValueError(
+                    f"{name} has shape {tuple(value.shape)}, expected (*batch, {expected[0]}, "
+                    f"{expected[1]}) to match t and q"
+                )
+        if self.interpolation not in ("linear", "hold"):
+            raise ValueError(
+                f"interpolation is {self.interpolation!r}, expected 'linear' or 'hold'"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample in s."""
+        return float(self.t[-1] - self.t[0])
+
+    def state(self, coordinates: Coordinates) -> Tensor:
+        """Stacked state ``(*batch, T, 2N)``: (q, v) or (q, p).
+
+        Raises:
+            ValueError: if momenta are asked for and were not recorded.
+        """
+        if coordinates == "velocity":
+            return torch.cat([self.q, self.v], dim=-1)
+        if self.p is None:
+            raise ValueError(
+                "this trajectory has no momentum p, which a Hamiltonian model needs: use a data "
+                "set that records it (with_momentum=true), or a Lagrangian model"
+            )
+        return torch.cat([self.q, self.p], dim=-1)
+
+    def until(self, horizon: float) -> Trajectory:
+        """The part of the trajectory up to ``horizon`` seconds after its start.
+
+        Raises:
+            ValueError: if the trajectory is shorter than the horizon.
+        """
+        step = float(self.t[1] - self.t[0])
+        if self.duration < horizon - 0.5 * step:
+            raise ValueError(
+                f"horizon is {horizon} s, but the trajectory lasts only {self.duration:g} s"
+            )
+        count = int(torch.searchsorted(self.t, self.t[0] + horizon + 0.5 * step))
+        return Trajectory(
+            t=self.t[:count],
+            q=self.q[..., :count, :],
+            v=self.v[..., :count, :],
+            u=self.u[..., :count, :],
+            p=None if self.p is None else self.p[..., :count, :],
+            interpolation=self.interpolation,
+        )
+
+
+def stack(trajectories: list[Trajectory]) -> Trajectory:
+    """Stack trajectories that share their sample times into one batched trajectory.
+
+    Raises:
+        ValueError: on an empty list, or on trajectories whose sample times differ.
+    """
+    if not trajectories:
+        raise ValueError("trajectories is empty: expected at least one")
+    first = trajectories[0]
+    for index, other in enumerate(trajectories):
+        # Sample times are compared from each trajectory's own start.
+        same = other.t.shape == first.t.shape and torch.allclose(
+            other.t - other.t[0], first.t - first.t[0], rtol=0, atol=1e-9
+        )
+        if not same:
+            raise ValueError(
+                f"trajectory {index} has other sample times than trajectory 0 "
+                f"({other.t.shape[0]} and {first.t.shape[0]} samples): resample them first"
+            )
+    with_momentum = all(item.p is not None for item in trajectories)
+    return Trajectory(
+        t=first.t - first.t[0],
+        q=torch.stack([item.q for item in trajectories]),
+        v=torch.stack([item.v for item in trajectories]),
+        u=torch.stack([item.u for item in trajectories]),
+        p=torch.stack([item.p for item in trajectories if item.p is not None])
+        if with_momentum
+        else None,
+        interpolation=first.interpolation,
+    )

@@ -1,0 +1,36 @@
+"""Learned dynamics: Lagrangian and Hamiltonian networks, their heads, and black boxes."""
+
+from pinn_dyn.models.black_box import AccelerationMLP, NextStateMLP
+from pinn_dyn.models.hamiltonian import HamiltonianNetwork
+from pinn_dyn.models.heads import (
+    CholeskyFactor,
+    ConstantCholesky,
+    ConstantInput,
+    FixedCholesky,
+    FixedInput,
+    InputMatrix,
+    NetworkCholesky,
+    NetworkInput,
+    NetworkPotential,
+)
+from pinn_dyn.models.lagrangian import LagrangianNetwork
+from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.statistics import Statistics
+
+__all__ = [
+    "MLP",
+    "AccelerationMLP",
+    "CholeskyFactor",
+    "ConstantCholesky",
+    "ConstantInput",
+    "FixedCholesky",
+    "FixedInput",
+    "HamiltonianNetwork",
+    "InputMatrix",
+    "LagrangianNetwork",
+    "NetworkCholesky",
+    "NetworkInput",
+    "NetworkPotential",
+    "NextStateMLP",
+    "Statistics",
+]

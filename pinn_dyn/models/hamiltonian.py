@@ -1,0 +1,97 @@
+"""The Hamiltonian network: learns the inverse mass, V, D and A; its state is (q, p)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.structured import (
+    CholeskyHead,
+    InputHead,
+    PotentialHead,
+    StructuredNetwork,
+    lower_solve,
+    upper_solve,
+)
+
+
+class HamiltonianNetwork(StructuredNetwork):
+    """Hamiltonian network with dissipation and a learned input matrix.
+
+    The mass head gives W(q) = L L^T = M(q)^-1, as the paper's tables show; with
+    H = p^T W p / 2 + V, paper eq. (hamiltonian_dyn) reads::
+
+        dq/dt = W p,    dp/dt = -G - d(p^T W p / 2)/dq - D W p + A u
+
+    One reverse pass through the mass head gives the gradient; nothing is solved or inverted.
+
+    Args:
+        statistics: scales of the data; needs momenta.
+        inverse_mass, potential, damping, input: builders of the heads.
+    """
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        inverse_mass: CholeskyHead,
+        potential: PotentialHead,
+        damping: CholeskyHead,
+        input: InputHead,
+    ):
+        super().__init__(statistics, "momentum", potential, damping, input)
+        self.inverse_mass = inverse_mass(
+            size=self.num_coordinates,
+            scale=(statistics.v_std / statistics.p_std).sqrt(),
+            mean=statistics.q_mean,
+            std=statistics.q_std,
+        )
+
+    def inverse_mass_matrix(self, q: Tensor) -> Tensor:
+        """W(q) = M(q)^-1 = L L^T, ``(*batch, N, N)``."""
+        return self.inverse_mass.matrix(q)
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """M(q) = W(q)^-1, ``(*batch, N, N)``."""
+        return self.inverse_mass(q).cholesky_inverse()
+
+    def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        factor, tape = self.inverse_mass.linearize(q)
+        w = matvec(factor.transpose(-1, -2), p)
+        kinetic = self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
+        return kinetic + self._potential_force(q), matvec(factor, w)
+
+    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        factor = self.inverse_mass(q)
+        return upper_solve(factor, lower_solve(factor, v))
+
+    def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
+        return matvec(self.inverse_mass_matrix(q), p)
+
+    def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
+        """d(v^T M v / 2)/dq at fixed v = -d(p^T W p / 2)/dq at fixed p = M v."""
+        factor, tape = self.inverse_mass.linearize(q)
+        w = lower_solve(factor, v)
+        p = upper_solve(factor, w)
+        return -self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
+
+    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """M a + C v = M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
+        factor, bias, mass_rate_p = self._factor_and_rates(q, v)
+        return upper_solve(factor, lower_solve(factor, a - mass_rate_p)) + bias
+
+    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+        """a = (dW/dt) p + W dp/dt."""
+        factor, bias, rate_p = self._factor_and_rates(q, v)
+        rest = force - bias - self._potential_force(q)
+        return rate_p + matvec(factor, matvec(factor.transpose(-1, -2), rest))
+
+    def _factor_and_rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """L, d(p^T W p / 2)/dq and (dW/dt) p, with p = M v and the rate along v."""
+        factor, tape = self.inverse_mass.linearize(q)
+        w = lower_solve(factor, v)
+        p = upper_solve(factor, w)
+        rate = self.inverse_mass.pushforward(tape, v)
+        rate_p = matvec(rate, w) + matvec(factor, matvec(rate.transpose(-1, -2), p))
+        gradient = self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
+        return factor, gradient, rate_p

@@ -1,0 +1,395 @@
+"""Heads: the learned terms, each a network, a learned constant or a fixed value."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pinn_dyn.models.mlp import MLP, Tape
+
+
+class CholeskyFactor(nn.Module, abc.ABC):
+    """A lower triangular L(q) ``(*batch, N, N)``, for a matrix L L^T that is never indefinite.
+
+    ``linearize`` returns L and a tape; ``pushforward`` gives dL for a tangent dq, ``pullback``
+    gives the gradient in q for a cotangent of L.
+    """
+
+    @abc.abstractmethod
+    def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
+        """L(q), ``(*batch, N, N)``, and the tape for the passes below."""
+
+    @abc.abstractmethod
+    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
+        """dL, ``(*batch, N, N)``, for dq ``(*batch, N)``."""
+
+    @abc.abstractmethod
+    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
+        """Gradient of <cotangent, L(q)> in q, ``(*batch, N)``."""
+
+    def forward(self, q: Tensor) -> Tensor:
+        """L(q), ``(*batch, N, N)``."""
+        return self.linearize(q)[0]
+
+    def matrix(self, q: Tensor) -> Tensor:
+        """L(q) L(q)^T, ``(*batch, N, N)``."""
+        factor = self(q)
+        return factor @ factor.transpose(-1, -2)
+
+
+class NetworkCholesky(CholeskyFactor):
+    """L(q) = diag(scale) * tril(network(q)), with a positive diagonal.
+
+    The network has N (N + 1)/2 outputs y, the first N for the diagonal (paper, section Sub-Network
+    Structures). With ``diagonal="softplus"`` or ``"relu"``::
+
+        L_ii = scale_i (act(y_i) + epsilon),   L_ij = scale_i y_ij  (i > j)
+
+    With a ``bound`` b the entries cannot leave a range (the paper's scaled sigmoid for a real
+    arm, b = 3.5)::
+
+        L_ii = scale_i (b sigmoid(y_i) + epsilon),   L_ij = scale_i b (2 sigmoid(y_ij) - 1)
+
+    Args:
+        size: N.
+        scale: typical size of the rows of L, ``(N,)``; from the data.
+        mean, std: normalization of q, ``(N,)``; from the data.
+        hidden: widths of the hidden layers.
+        activation: activation of the hidden layers.
+        diagonal: what keeps the diagonal non-negative, softplus or relu.
+        epsilon: smallest diagonal entry in units of the scale; 0 allows a semi-definite matrix.
+        bound: b above, or None.
+
+    Raises:
+        ValueError: on an unknown diagonal, a negative epsilon or a bound that is not positive.
+    """
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        scale: Tensor,
+        mean: Tensor,
+        std: Tensor,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+        diagonal: Literal["softplus", "relu"] = "softplus",
+        epsilon: float = 1e-3,
+        bound: float | None = None,
+    ):
+        super().__init__()
+        if diagonal not in ("softplus", "relu"):
+            raise ValueError(f"diagonal is {diagonal!r}, expected 'softplus' or 'relu'")
+        if epsilon < 0:
+            raise ValueError(f"epsilon is {epsilon}, expected zero or a positive number")
+        if bound is not None and not bound > 0:
+            raise ValueError(f"bound is {bound}, expected a positive number or none")
+        self.size = size
+        self.diagonal = diagonal
+        self.epsilon = epsilon
+        self.bound = bound
+        outputs = size * (size + 1) // 2
+        self.network = MLP(size, outputs, hidden, activation, mean, std)
+        with torch.no_grad():
+            # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
+            last = self.network.layers[-1]
+            assert isinstance(last, nn.Linear)
+            last.weight.mul_(0.1)
+            last.bias[:size] = 0.54 if diagonal == "softplus" else 1.0
+        self.register_buffer("scale", scale.float())
+        rows, columns = torch.tril_indices(size, size, offset=-1)
+        order = [row * size + row for row in range(size)]
+        order += [int(r) * size + int(c) for r, c in zip(rows, columns, strict=True)]
+        # Position of each entry of the flat matrix in y; entries above the diagonal read a zero.
+        source = torch.full((size * size,), outputs)
+        source[torch.tensor(order)] = torch.arange(outputs)
+        self.register_buffer("_source", source, persistent=False)
+        self.register_buffer("_target", torch.tensor(order), persistent=False)
+
+    def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
+        """L(q) and its tape."""
+        y, tape = self.network.linearize(q)
+        diagonal, lower = y[..., : self.size], y[..., self.size :]
+        if self.bound is not None:
+            sigmoid, side = torch.sigmoid(diagonal), torch.sigmoid(lower)
+            diagonal, diagonal_slope = (
+                self.bound * sigmoid,
+                self.bound * sigmoid * (1 - sigmoid),
+            )
+            lower, lower_slope = self.bound * (2 * side - 1), 2 * self.bound * side * (1 - side)
+        else:
+            if self.diagonal == "softplus":
+                diagonal, diagonal_slope = F.softplus(diagonal), torch.sigmoid(diagonal)
+            else:
+                diagonal, diagonal_slope = F.relu(diagonal), (diagonal > 0).to(y.dtype)
+            lower_slope = torch.ones_like(lower)
+        values = torch.cat([diagonal + self.epsilon, lower], dim=-1)
+        slopes = torch.cat([diagonal_slope, lower_slope], dim=-1)
+        return self._assemble(values), (*tape, slopes)
+
+    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
+        """dL for dq."""
+        return self._assemble(tape[-1] * self.network.pushforward(tape[:-1], dq))
+
+    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
+        """Gradient of <cotangent, L(q)> in q."""
+        scaled = (cotangent * self.scale.unsqueeze(-1)).flatten(-2)
+        return self.network.pullback(tape[:-1], scaled[..., self._target] * tape[-1])
+
+    def _assemble(self, values: Tensor) -> Tensor:
+        padded = F.pad(values, (0, 1))
+        lower = padded[..., self._source].unflatten(-1, (self.size, self.size))
+        return lower * self.scale.unsqueeze(-1)
+
+
+class ConstantCholesky(CholeskyFactor):
+    """L = diag(scale) * tril(parameters), the same at every q.
+
+    Args:
+        size: N.
+        scale: typical size of the rows of L, ``(N,)``; from the data.
+        mean, std: not used by a constant; every head takes the same arguments from the model.
+        epsilon: smallest diagonal entry in units of the scale.
+    """
+
+    def __init__(
+        self, *, size: int, scale: Tensor, mean: Tensor, std: Tensor, epsilon: float = 1e-3
+    ):
+        super().__init__()
+        self.epsilon = epsilon
+        self.raw_diagonal = nn.Parameter(torch.full((size,), 0.54))
+        self.lower = nn.Parameter(torch.zeros(size, size))
+        self.register_buffer("scale", scale.float())
+
+    def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
+        """L and an empty tape."""
+        diagonal = torch.diag_embed(F.softplus(self.raw_diagonal) + self.epsilon)
+        factor = (diagonal + self.lower.tril(-1)) * self.scale.unsqueeze(-1)
+        return factor.expand(*q.shape[:-1], *factor.shape), ()
+
+    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
+        """Zero: L does not depend on q."""
+        size = dq.shape[-1]
+        return dq.new_zeros((*dq.shape[:-1], size, size))
+
+    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
+        """Zero: L does not depend on q."""
+        return torch.zeros_like(cotangent[..., 0])
+
+
+class FixedCholesky(CholeskyFactor):
+    """L = the Cholesky factor of a given constant matrix, not learned.
+
+    Args:
+        size: N.
+        scale, mean, std: not used; every head takes the same arguments from the model.
+        value: the symmetric positive semi-definite matrix, ``(N, N)``.
+
+    Raises:
+        ValueError: if the matrix is not N x N, not symmetric or not positive semi-definite.
+    """
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        scale: Tensor,
+        mean: Tensor,
+        std: Tensor,
+        value: Sequence[Sequence[float]],
+    ):
+        super().__init__()
+        matrix = torch.tensor(value, dtype=torch.float64)
+        if matrix.shape != (size, size) or not torch.equal(matrix, matrix.T):
+            raise ValueError(
+                f"FixedCholesky: value has shape {tuple(matrix.shape)}, expected a symmetric "
+                f"({size}, {size}) matrix"
+            )
+        eigenvalues, vectors = torch.linalg.eigh(matrix)
+        if eigenvalues[0] < -1e-12 * eigenvalues[-1].abs():
+            raise ValueError(
+                f"FixedCholesky: value has the eigenvalue {float(eigenvalues[0]):.4g}, expected "
+                "a positive semi-definite matrix"
+            )
+        # A QR factor of the square root is a Cholesky factor that also exists for a singular one.
+        root = (vectors * eigenvalues.clamp(min=0).sqrt()).T
+        upper = torch.linalg.qr(root).R
+        sign = torch.where(upper.diagonal() < 0, -1.0, 1.0).to(upper)
+        self.register_buffer("factor", (sign[:, None] * upper).T.float().contiguous())
+
+    def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
+        """L and an empty tape."""
+        return self.factor.expand(*q.shape[:-1], *self.factor.shape), ()
+
+    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
+        """Zero: L does not depend on q."""
+        size = dq.shape[-1]
+        return dq.new_zeros((*dq.shape[:-1], size, size))
+
+    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
+        """Zero: L does not depend on q."""
+        return torch.zeros_like(cotangent[..., 0])
+
+
+class NetworkPotential(nn.Module):
+    """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
+
+    K = S S^T is a learned constant: an elastic or gravity well is mostly quadratic, and the
+    network then only has to learn what is left.
+
+    Args:
+        size: N.
+        scale: typical energy, J; from the data.
+        mean, std: normalization of q, ``(N,)``; from the data.
+        hidden: widths of the hidden layers.
+        activation: activation of the hidden layers.
+        quadratic: whether the K term is there; false is the paper's plain network.
+    """
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        scale: float,
+        mean: Tensor,
+        std: Tensor,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+        quadratic: bool = True,
+    ):
+        super().__init__()
+        self.network = MLP(size, 1, hidden, activation, mean, std)
+        self.register_buffer("scale", torch.tensor(float(scale)))
+        self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None
+
+    def forward(self, q: Tensor) -> Tensor:
+        """V(q), ``(*batch,)``, J."""
+        value = self.network(q).squeeze(-1)
+        if self.stiffness_root is not None:
+            z = (q - self.network.mean) / self.network.std
+            value = value + 0.5 * (z @ self.stiffness_root).square().sum(-1)
+        return self.scale * value
+
+    def gradient(self, q: Tensor) -> Tensor:
+        """G(q) = dV/dq, ``(*batch, N)``, by one reverse pass."""
+        y, tape = self.network.linearize(q)
+        force = self.network.pullback(tape, torch.ones_like(y))
+        if self.stiffness_root is not None:
+            z = (q - self.network.mean) / self.network.std
+            root = self.stiffness_root
+            force = force + (z @ root) @ root.T / self.network.std
+        return self.scale * force
+
+
+class InputMatrix(nn.Module, abc.ABC):
+    """A(q) ``(*batch, N, M)``."""
+
+    @abc.abstractmethod
+    def forward(self, q: Tensor) -> Tensor:
+        """A(q), ``(*batch, N, M)``."""
+
+
+class NetworkInput(InputMatrix):
+    """A(q) = scale_i * network(q), reshaped to N x M (paper, figure A-NN).
+
+    Args:
+        size: N.
+        inputs: M.
+        scale: typical size of the entries of each column, ``(M,)``; from the data.
+        mean, std: normalization of q, ``(N,)``; from the data.
+        hidden: widths of the hidden layers.
+        activation: activation of the hidden layers.
+        bound: largest entry in units of the scale (scaled sigmoid), or None for no bound.
+
+    Raises:
+        ValueError: on a bound that is not positive.
+    """
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        inputs: int,
+        scale: Tensor,
+        mean: Tensor,
+        std: Tensor,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+        bound: float | None = None,
+    ):
+        super().__init__()
+        if bound is not None and not bound > 0:
+            raise ValueError(f"bound is {bound}, expected a positive number or none")
+        self.shape = (size, inputs)
+        self.bound = bound
+        self.network = MLP(size, size * inputs, hidden, activation, mean, std)
+        self.register_buffer("scale", scale.float())
+
+    def forward(self, q: Tensor) -> Tensor:
+        """A(q), ``(*batch, N, M)``."""
+        y = self.network(q).unflatten(-1, self.shape)
+        if self.bound is not None:
+            y = self.bound * (2 * torch.sigmoid(y) - 1)
+        return self.scale * y
+
+
+class ConstantInput(InputMatrix):
+    """A = scale * parameters, the same at every q.
+
+    Args:
+        size: N.
+        inputs: M.
+        scale: typical size of the entries of each column, ``(M,)``; from the data.
+        mean, std: not used by a constant; every head takes the same arguments from the model.
+    """
+
+    def __init__(self, *, size: int, inputs: int, scale: Tensor, mean: Tensor, std: Tensor):
+        super().__init__()
+        self.raw = nn.Parameter(torch.eye(size, inputs))
+        self.register_buffer("scale", scale.float())
+
+    def forward(self, q: Tensor) -> Tensor:
+        """A, ``(*batch, N, M)``."""
+        value = self.scale * self.raw
+        return value.expand(*q.shape[:-1], *value.shape)
+
+
+class FixedInput(InputMatrix):
+    """A = a given constant matrix, not learned.
+
+    Args:
+        size: N.
+        inputs: M.
+        scale, mean, std: not used; every head takes the same arguments from the model.
+        value: the matrix, ``(N, M)``; the identity if None, which needs N = M.
+
+    Raises:
+        ValueError: if the matrix is not N x M.
+    """
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        inputs: int,
+        scale: Tensor,
+        mean: Tensor,
+        std: Tensor,
+        value: Sequence[Sequence[float]] | None = None,
+    ):
+        super().__init__()
+        matrix = torch.eye(inputs) if value is None else torch.tensor(value, dtype=torch.float32)
+        if matrix.shape != (size, inputs):
+            raise ValueError(
+                f"FixedInput: value has shape {tuple(matrix.shape)}, expected ({size}, {inputs})"
+            )
+        self.register_buffer("value", matrix)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """A, ``(*batch, N, M)``."""
+        return self.value.expand(*q.shape[:-1], *self.value.shape)

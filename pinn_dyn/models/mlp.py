@@ -1,0 +1,108 @@
+"""A multilayer perceptron with explicit tangent and reverse passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+Tape = tuple[Tensor, ...]
+"""Slopes of the hidden activations at one input, kept for the tangent and reverse passes."""
+
+
+def _softplus(z: Tensor) -> tuple[Tensor, Tensor]:
+    return F.softplus(z), torch.sigmoid(z)
+
+
+def _tanh(z: Tensor) -> tuple[Tensor, Tensor]:
+    y = torch.tanh(z)
+    return y, 1 - y * y
+
+
+def _silu(z: Tensor) -> tuple[Tensor, Tensor]:
+    s = torch.sigmoid(z)
+    return z * s, s * (1 + z * (1 - s))
+
+
+ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
+    "softplus": _softplus,
+    "tanh": _tanh,
+    "silu": _silu,
+}
+"""Smooth activations, each as (value, slope); dynamics need two derivatives, so no ReLU here."""
+
+
+class MLP(nn.Module):
+    """y = W_n s(... s(W_1 (x - mean)/std + b_1) ...) + b_n.
+
+    :meth:`linearize` runs the network once and keeps the slopes of its activations; from these
+    :meth:`pushforward` gives J dx (tangent pass) and :meth:`pullback` J^T dy (reverse pass), as
+    ordinary tensor operations: they can be differentiated again and compiled.
+
+    Args:
+        inputs: size of x.
+        outputs: size of y.
+        hidden: widths of the hidden layers.
+        activation: one of softplus, tanh, silu.
+        mean, std: normalization of x, ``(inputs,)``; none if left out.
+
+    Raises:
+        ValueError: on an unknown activation, or widths below 1.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+        mean: Tensor | None = None,
+        std: Tensor | None = None,
+    ):
+        super().__init__()
+        if activation not in ACTIVATIONS:
+            raise ValueError(
+                f"activation is {activation!r}, expected one of {', '.join(ACTIVATIONS)}"
+            )
+        if any(width < 1 for width in hidden):
+            raise ValueError(f"hidden is {list(hidden)}, expected widths of at least 1")
+        self._activation = ACTIVATIONS[activation]
+        sizes = [inputs, *hidden, outputs]
+        self.layers = nn.ModuleList(
+            nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)
+        )
+        for layer in self.layers:
+            assert isinstance(layer, nn.Linear)
+            nn.init.xavier_normal_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        self.register_buffer("mean", torch.zeros(inputs) if mean is None else mean.float())
+        self.register_buffer("std", torch.ones(inputs) if std is None else std.float())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
+        return self.linearize(x)[0]
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
+        """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
+        h = (x - self.mean) / self.std
+        tape = []
+        for layer in self.layers[:-1]:
+            h, slope = self._activation(layer(h))
+            tape.append(slope)
+        return self.layers[-1](h), tuple(tape)
+
+    def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
+        """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
+        h = dx / self.std
+        for layer, slope in zip(self.layers[:-1], tape, strict=True):
+            h = F.linear(h, layer.weight) * slope
+        return F.linear(h, self.layers[-1].weight)
+
+    def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
+        """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
+        h = dy @ self.layers[-1].weight
+        for layer, slope in zip(reversed(self.layers[:-1]), reversed(tape), strict=True):
+            h = (h * slope) @ layer.weight
+        return h / self.std

@@ -1,0 +1,5 @@
+"""Analytic and simulated robots, the truth that models are compared with."""
+
+from pinn_dyn.systems.soft_arm import SoftArm
+
+__all__ = ["SoftArm"]

@@ -1,0 +1,356 @@
+"""A soft arm of n constant-curvature segments, the plant of the paper's first two tasks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import matvec, spd_solve
+from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
+
+
+class _Points(NamedTuple):
+    """Backbone points of all segments in the world frame: S = segments * nodes of them."""
+
+    jacobian: Tensor  # (*batch, S, 3, N), dr/dq
+    bias: Tensor | None  # (*batch, S, 3), (dJ/dt) v
+
+
+class _Tip(NamedTuple):
+    """Frame at the end of a segment, in the world frame."""
+
+    position: Tensor  # (*batch, 3)
+    rotation: Tensor  # (*batch, 3, 3)
+    linear: Tensor  # (*batch, 3, N), Jacobian of the position
+    angular: Tensor  # (*batch, 3, N), Jacobian of the angular velocity
+    linear_bias: Tensor  # (*batch, 3), (d linear/dt) v
+    angular_bias: Tensor  # (*batch, 3), (d angular/dt) v
+
+
+class SoftArm(MechanicalSystem):
+    """Piecewise-constant-curvature arm with mass spread along its backbone.
+
+    Each segment has q_i = (dx, dy, dl): bending of the tip frame along x and y in rad and
+    elongation in m. With theta^2 = dx^2 + dy^2 and L = length + dl, the backbone point at
+    s in [0, 1] in the frame of the segment's base is::
+
+        r(s) = L [dx (1 - cos(s theta))/theta^2, dy (1 - cos(s theta))/theta^2, sin(s theta)/theta]
+
+    and the tip frame is turned by theta about the axis (-dy, dx, 0). Then::
+
+        M = sum_i mass_i int J^T J ds          (point masses, no rotational inertia)
+        V = sum_i stiffness |q_i|^2 / 2 - mass_i gravity int z ds      (the arm hangs along +z)
+        D = damping I
+        A = [A_1 ... A_n],  A_i = transposed Jacobian of (-omega_x, -omega_y, v_z) of tip i, in
+                            its own frame: two bending torques in Nm and an axial force in N
+
+    The integrals are Gauss-Legendre sums; Stumpff functions take the place of every division by
+    theta, so the straight arm is no special case. Bending up to theta = 2 pi per segment.
+
+    Source: paper, section Simulation Results, in the parametrization of Della Santina, Bicchi and
+    Rus 2020 (IEEE RA-L 5(2)); the constants reproduce the paper's tables.
+
+    Args:
+        segments: n, number of segments; N = M = 3 n.
+        mass: mass of each segment, kg.
+        length: rest length of each segment, m.
+        gravity: gravitational acceleration along +z, m/s^2.
+        stiffness: elastic stiffness of each coordinate, Nm/rad for bending, N/m for elongation.
+        damping: viscous damping of each coordinate, Nms/rad and Ns/m.
+        nodes: Gauss-Legendre nodes per segment; 10 are exact to 1e-12 for theta <= 3.
+
+    Raises:
+        ValueError: on segments < 1, nodes < 1, mass or length not positive, or negative gravity,
+            stiffness or damping.
+    """
+
+    def __init__(
+        self,
+        segments: int = 1,
+        *,
+        mass: float = 0.3,
+        length: float = 0.2,
+        gravity: float = 9.81,
+        stiffness: float = 1.0,
+        damping: float = 0.1,
+        nodes: int = 10,
+    ):
+        for name, value in (("segments", segments), ("nodes", nodes)):
+            if value < 1:
+                raise ValueError(f"SoftArm: {name} is {value}, expected at least 1")
+        for name, value in (("mass", mass), ("length", length)):
+            if not value > 0:
+                raise ValueError(f"SoftArm: {name} is {value}, expected a positive number")
+        for name, value in (("gravity", gravity), ("stiffness", stiffness), ("damping", damping)):
+            if not value >= 0:
+                raise ValueError(f"SoftArm: {name} is {value}, expected zero or a positive number")
+        super().__init__(num_coordinates=3 * segments, num_inputs=3 * segments)
+        self.segments = segments
+        self.mass = mass
+        self.length = length
+        self.gravity = gravity
+        self.stiffness = stiffness
+        self.damping = damping
+        points, weights = np.polynomial.legendre.leggauss(nodes)
+        self.register_buffer("_s", torch.tensor((points + 1) / 2, dtype=torch.float64))
+        self.register_buffer("_weights", torch.tensor(weights / 2, dtype=torch.float64))
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """M(q) = sum_i mass_i int J^T J ds, ``(*batch, N, N)``."""
+        points, _ = self._chain(q)
+        return self._gram(points.jacobian)
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q) = stiffness |q|^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
+        height = q.new_zeros(q.shape[:-1])
+        position = q.new_zeros((*q.shape[:-1], 3))
+        rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
+        weights = self._weights.to(q)
+        for index in range(self.segments):
+            local = self._local_points(q[..., 3 * index : 3 * index + 3], self._s.to(q))
+            world = position.unsqueeze(-2) + local @ rotation.transpose(-1, -2)
+            height = height + world[..., 2] @ weights
+            position, rotation = self._tip_frame(q, index, position, rotation)
+        elastic = 0.5 * self.stiffness * (q * q).sum(-1)
+        return elastic - self.mass * self.gravity * height
+
+    def damping_matrix(self, q: Tensor) -> Tensor:
+        """D = damping I, ``(*batch, N, N)``."""
+        eye = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
+        return (self.damping * eye).expand(*q.shape[:-1], -1, -1)
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """A(q) = [A_1 ... A_n], ``(*batch, N, 3 n)``."""
+        _, tips = self._chain(q, nodes=self._s[:0])
+        columns = []
+        for tip in tips:
+            angular = tip.rotation.transpose(-1, -2) @ tip.angular
+            linear = tip.rotation.transpose(-1, -2) @ tip.linear
+            rows = torch.stack([-angular[..., 0, :], -angular[..., 1, :], linear[..., 2, :]], -1)
+            columns.append(rows)
+        return torch.cat(columns, dim=-1)
+
+    def tip_positions(self, q: Tensor) -> Tensor:
+        """World position of each segment's tip, ``(*batch, n, 3)``, m."""
+        position = q.new_zeros((*q.shape[:-1], 3))
+        rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
+        tips = []
+        for index in range(self.segments):
+            position, rotation = self._tip_frame(q, index, position, rotation)
+            tips.append(position)
+        return torch.stack(tips, dim=-2)
+
+    # Closed formulas in place of automatic differentiation: for point masses
+    # C(q, v) v = sum m J^T (dJ/dt) v, which needs no derivative of M.
+
+    def _potential_force(self, q: Tensor) -> Tensor:
+        points, _ = self._chain(q)
+        return self._potential_force_of(q, points.jacobian)
+
+    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        points, _ = self._chain(q, v)
+        return matvec(self._gram(points.jacobian), a) + self._coriolis_force_of(points)
+
+    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+        points, _ = self._chain(q, v)
+        bias = self._coriolis_force_of(points) + self._potential_force_of(q, points.jacobian)
+        return spd_solve(self._gram(points.jacobian), force - bias)
+
+    def _point_masses(self, like: Tensor) -> Tensor:
+        return self.mass * self._weights.to(like).repeat(self.segments)
+
+    def _gram(self, jacobian: Tensor) -> Tensor:
+        weighted = jacobian * self._point_masses(jacobian)[:, None, None]
+        rows = jacobian.flatten(-3, -2)
+        return rows.transpose(-1, -2) @ weighted.flatten(-3, -2)
+
+    def _coriolis_force_of(self, points: _Points) -> Tensor:
+        assert points.bias is not None
+        force = points.bias * self._point_masses(points.bias)[:, None]
+        return matvec(points.jacobian.flatten(-3, -2).transpose(-1, -2), force.flatten(-2))
+
+    def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
+        lift = (jacobian[..., 2, :] * self._point_masses(q)[:, None]).sum(-2)
+        return self.stiffness * q - self.gravity * lift
+
+    # Kinematics of the chain.
+
+    def _chain(
+        self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None
+    ) -> tuple[_Points, list[_Tip]]:
+        """Points at the nodes and tip frames of all segments; bias terms only where v is given."""
+        batch, size = q.shape[:-1], self.num_coordinates
+        s = (self._s if nodes is None else nodes).to(q)
+        ends = torch.cat([s, s.new_ones(1)])
+        base: _Tip | None = None
+        jacobians, biases, tips = [], [], []
+        for index in range(self.segments):
+            block = slice(3 * index, 3 * index + 3)
+            local_v = None if v is None else v[..., block]
+            r, jac, bias, turn, spin, spin_bias = self._segment(q[..., block], local_v, ends)
+            if size > 3:
+                wide = q.new_zeros((*batch, ends.shape[0], 3, size))
+                wide[..., block] = jac
+                wide_spin = q.new_zeros((*batch, 3, size))
+                wide_spin[..., block] = spin
+                jac, spin = wide, wide_spin
+            if base is not None:
+                r, jac, bias, turn, spin, spin_bias = _carry(
+                    base, v, r, jac, bias, turn, spin, spin_bias
+                )
+            jacobians.append(jac[..., :-1, :, :])
+            biases.append(bias[..., :-1, :])
+            base = _Tip(
+                r[..., -1, :], turn, jac[..., -1, :, :], spin, bias[..., -1, :], spin_bias
+            )
+            tips.append(base)
+        points = _Points(torch.cat(jacobians, -3), None if v is None else torch.cat(biases, -2))
+        return points, tips
+
+    def _segment(
+        self, q: Tensor, v: Tensor | None, s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """One segment in the frame of its base.
+
+        Returns r ``(*batch, S, 3)``, its Jacobian ``(*batch, S, 3, 3)`` and bias (dJ/dt) v
+        ``(*batch, S, 3)`` at the points ``s`` (the last one is the tip); the tip's rotation
+        ``(*batch, 3, 3)``, Jacobian of the angular velocity ``(*batch, 3, 3)`` and its bias.
+        """
+        dx, dy, dl = (x.unsqueeze(-1) for x in q.unbind(-1))
+        length = self.length + dl
+        square = dx * dx + dy * dy
+        c = stumpff(square * s * s)
+        c1x, c2x, c3x = first_slopes(c)
+        # r = L [dx F, dy F, E] with F, E functions of theta^2 and their slopes.
+        s2 = s * s
+        bend, reach = s2 * c[2], s * c[1]
+        bend_x, reach_x = s2 * s2 * c2x, s2 * s * c1x
+        r = torch.stack([length * dx * bend, length * dy * bend, length * reach], dim=-1)
+        cross = 2 * length * dx * dy * bend_x
+        twice = 2 * length * reach_x
+        jacobian = torch.stack(
+            [
+                torch.stack([length * (bend + 2 * dx * dx * bend_x), cross, dx * bend], -1),
+                torch.stack([cross, length * (bend + 2 * dy * dy * bend_x), dy * bend], -1),
+                torch.stack([twice * dx, twice * dy, reach], -1),
+            ],
+            dim=-2,
+        )
+        turn, spin = _turn(q, c)
+        if v is None:
+            return r, jacobian, torch.zeros_like(r), turn, spin, torch.zeros_like(q)
+
+        vx, vy, vl = (x.unsqueeze(-1) for x in v.unbind(-1))
+        c1xx, c2xx = second_slopes(c)
+        rate = 2 * (dx * vx + dy * vy)
+        second = 2 * (vx * vx + vy * vy)
+        bend_1 = bend_x * rate
+        bend_2 = s2 * s2 * s2 * c2xx * rate * rate + bend_x * second
+        reach_1 = reach_x * rate
+        reach_2 = s2 * s2 * s * c1xx * rate * rate + reach_x * second
+        bias = torch.stack(
+            [
+                2 * vl * (vx * bend + dx * bend_1) + length * (2 * vx * bend_1 + dx * bend_2),
+                2 * vl * (vy * bend + dy * bend_1) + length * (2 * vy * bend_1 + dy * bend_2),
+                2 * vl * reach_1 + length * reach_2,
+            ],
+            dim=-1,
+        )
+        return r, jacobian, bias, turn, spin, _spin_bias(q, v, c, c2x, c3x)
+
+    def _local_points(self, q: Tensor, s: Tensor) -> Tensor:
+        dx, dy, dl = (x.unsqueeze(-1) for x in q.unbind(-1))
+        c = stumpff((dx * dx + dy * dy) * s * s)
+        shape = torch.stack([dx * s * s * c[2], dy * s * s * c[2], s * c[1]], dim=-1)
+        return (self.length + dl).unsqueeze(-1) * shape
+
+    def _tip_frame(
+        self, q: Tensor, index: int, position: Tensor, rotation: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        block = q[..., 3 * index : 3 * index + 3]
+        end = self._local_points(block, q.new_ones(1)).squeeze(-2)
+        square = (block[..., :2] ** 2).sum(-1, keepdim=True)
+        turn, _ = _turn(block, stumpff(square))
+        return position + matvec(rotation, end), rotation @ turn
+
+
+def _turn(q: Tensor, c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Rotation exp([w]x), w = (-dy, dx, 0), and the Jacobian of its angular velocity.
+
+    omega = (I + c_2 [w]x + c_3 [w]x^2) dw/dt in the frame of the base.
+    """
+    dx, dy, _ = q.unbind(-1)
+    w = torch.stack([-dy, dx, torch.zeros_like(dx)], dim=-1)
+    skew = _skew(w)
+    squared = skew @ skew
+    eye = torch.eye(3, dtype=q.dtype, device=q.device)
+    c1, c2, c3 = (c[k][..., -1, None, None] for k in (1, 2, 3))
+    to_axis = torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=q.dtype, device=q.device)
+    return eye + c1 * skew + c2 * squared, (eye + c2 * skew + c3 * squared) @ to_axis
+
+
+def _spin_bias(q: Tensor, v: Tensor, c: tuple[Tensor, ...], c2x: Tensor, c3x: Tensor) -> Tensor:
+    """d/dt of (I + c_2 [w]x + c_3 [w]x^2), times dw/dt: the bias of the angular acceleration."""
+    dx, dy, _ = q.unbind(-1)
+    vx, vy, _ = v.unbind(-1)
+    zero = torch.zeros_like(dx)
+    w, rate = torch.stack([-dy, dx, zero], -1), torch.stack([-vy, vx, zero], -1)
+    growth = 2 * (dx * vx + dy * vy).unsqueeze(-1)
+    c3, c2x, c3x = c[3][..., -1:], c2x[..., -1:], c3x[..., -1:]
+    w_rate = torch.linalg.cross(w, rate)
+    # [rate]x rate vanishes, and so does [w]x [rate]x rate.
+    return (
+        c2x * growth * w_rate
+        + c3x * growth * torch.linalg.cross(w, w_rate)
+        + c3 * torch.linalg.cross(rate, w_rate)
+    )
+
+
+def _carry(
+    base: _Tip,
+    v: Tensor | None,
+    r: Tensor,
+    jac: Tensor,
+    bias: Tensor,
+    turn: Tensor,
+    spin: Tensor,
+    spin_bias: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Move one segment's kinematics from the frame of its base into the world frame."""
+    rotation = base.rotation
+    arm = r @ rotation.transpose(-1, -2)  # (*batch, S, 3)
+    own = rotation.unsqueeze(-3) @ jac
+    world_r = base.position.unsqueeze(-2) + arm
+    world_jac = base.linear.unsqueeze(-3) + own - _skew(arm) @ base.angular.unsqueeze(-3)
+    world_spin = base.angular + rotation @ spin
+    if v is None:
+        return world_r, world_jac, bias, rotation @ turn, world_spin, spin_bias
+
+    omega = matvec(base.angular, v).unsqueeze(-2)
+    own_rate = matvec(own, v[..., None, :])
+    own_spin = matvec(rotation @ spin, v)
+    world_bias = (
+        base.linear_bias.unsqueeze(-2)
+        + torch.linalg.cross(base.angular_bias.unsqueeze(-2).expand_as(arm), arm)
+        + torch.linalg.cross(
+            omega.expand_as(arm), torch.linalg.cross(omega.expand_as(arm), arm) + 2 * own_rate
+        )
+        + bias @ rotation.transpose(-1, -2)
+    )
+    world_spin_bias = (
+        base.angular_bias
+        + matvec(rotation, spin_bias)
+        + torch.linalg.cross(omega.squeeze(-2), own_spin)
+    )
+    return world_r, world_jac, world_bias, rotation @ turn, world_spin, world_spin_bias
+
+
+def _skew(w: Tensor) -> Tensor:
+    """[w]x, ``(*batch, 3, 3)``, the matrix of the cross product with w ``(*batch, 3)``."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

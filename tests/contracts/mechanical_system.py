@@ -1,0 +1,379 @@
+"""What every mechanical system must satisfy, analytic or learned.
+
+Inherit :class:`MechanicalSystemContract` in a test class and override the ``system`` fixture.
+Derivatives are checked against finite differences of M and V, in float64, and the dynamics
+against the balance of energy; no check repeats the computation that it tests.
+"""
+
+import copy
+from typing import NamedTuple
+
+import pytest
+import torch
+from scipy.integrate import simpson
+from torch import Tensor
+
+from pinn_dyn.mechanics import MechanicalSystem, rollout
+from tests.support.finite_differences import assert_near, partial_derivatives, slope
+
+
+class Configurations(NamedTuple):
+    """A batch of eight points to test at, float64."""
+
+    q: Tensor  # (8, N)
+    v: Tensor  # (8, N)
+    a: Tensor  # (8, N)
+    u: Tensor  # (8, M)
+
+
+def product(matrix, vector):
+    return torch.einsum("...ij,...j->...i", matrix, vector)
+
+
+def quantities(system, at):
+    """Everything that the contract computes: value and the shape of one sample, by name."""
+    q, v, a, u = at
+    n, m = system.num_coordinates, system.num_inputs
+    terms = system.terms(q)
+    return {
+        "mass_matrix": (system.mass_matrix(q), (n, n)),
+        "damping_matrix": (system.damping_matrix(q), (n, n)),
+        "input_matrix": (system.input_matrix(q), (n, m)),
+        "potential_energy": (system.potential_energy(q), ()),
+        "potential_force": (system.potential_force(q), (n,)),
+        "terms.M": (terms.M, (n, n)),
+        "terms.D": (terms.D, (n, n)),
+        "terms.G": (terms.G, (n,)),
+        "terms.A": (terms.A, (n, m)),
+        "coriolis_matrix": (system.coriolis_matrix(q, v), (n, n)),
+        "forward_dynamics": (system.forward_dynamics(q, v, u), (n,)),
+        "inverse_dynamics": (system.inverse_dynamics(q, v, a), (n,)),
+        "momentum": (system.momentum(q, v), (n,)),
+        "velocity": (system.velocity(q, a), (n,)),
+        "kinetic_energy": (system.kinetic_energy(q, v), ()),
+        "total_energy": (system.total_energy(q, v), ()),
+        "power": (system.power(q, v, u), ()),
+        "velocity_derivative": (system.velocity_derivative(torch.cat([q, v], -1), u), (2 * n,)),
+        "momentum_derivative": (system.momentum_derivative(torch.cat([q, a], -1), u), (2 * n,)),
+    }
+
+
+class MechanicalSystemContract:
+    """The suite. Tolerances are relative to the largest entry of what is compared."""
+
+    exact_tolerance = 1e-9
+    """Between two float64 computations of the same quantity."""
+    difference_tolerance = 1e-7
+    """Between a derivative and the five-point stencil with ``difference_step``."""
+    difference_step = 1e-3
+    float32_tolerance = 1e-3
+    """Between float32 and float64; the accelerations lose the condition number of M."""
+    steps = 12
+    """Even number of integrator steps in a roll-out."""
+    step_times_rate = 0.03
+    """Step of a roll-out times the largest eigenvalue of the dynamics at its start."""
+    rollout_tolerance = 1e-5
+    """Between roll-outs: fourth order in the step, at most (2 0.03)^4 for the energies."""
+
+    @pytest.fixture
+    def system(self) -> MechanicalSystem:
+        """The implementation, in float64."""
+        raise NotImplementedError("override the fixture 'system'")
+
+    @pytest.fixture
+    def configurations(self, system) -> Configurations:
+        """Where to test; override if the system lives in another range than [-1, 1]."""
+        generator = torch.Generator().manual_seed(0)
+        n, m = system.num_coordinates, system.num_inputs
+        values = (
+            2 * torch.rand(8, size, generator=generator, dtype=torch.float64) - 1
+            for size in (n, n, n, m)
+        )
+        return Configurations(*values)
+
+    @pytest.fixture(autouse=True)
+    def _values_only(self):
+        """No graph is recorded, as in a deployed controller; gradients are tested on their own."""
+        with torch.no_grad():
+            yield
+
+    # Shapes and types.
+
+    @pytest.mark.parametrize("batch", [(), (8,), (2, 4)], ids=["unbatched", "B", "B1xB2"])
+    def test_any_batch_shape_gives_the_same_numbers(self, system, configurations, batch):
+        if batch == ():
+            at = Configurations(*(x[3] for x in configurations))
+            reference = [quantities(system, Configurations(*(x[3:4] for x in configurations)))]
+        else:
+            at = Configurations(*(x.reshape(*batch, -1) for x in configurations))
+            reference = [
+                quantities(system, Configurations(*(x[i] for x in configurations))) for i in (0, 7)
+            ]
+        for name, (value, shape) in quantities(system, at).items():
+            assert value.shape == (*batch, *shape), name
+            ends = value.reshape(-1, *shape)[[0, -1] if batch else [0]]
+            expected = torch.stack([sample[name][0].reshape(shape) for sample in reference])
+            assert_near(ends, expected, self.exact_tolerance, scale=1e-12 + expected.abs().max())
+
+    def test_float32_in_gives_float32_out_close_to_float64(self, system, configurations):
+        exact = quantities(system, configurations)
+        at = Configurations(*(x.float() for x in configurations))
+        for name, (value, _) in quantities(copy.deepcopy(system).float(), at).items():
+            assert value.dtype == torch.float32, name
+            scale = max(1e-6, float(exact[name][0].abs().max()))
+            assert_near(value.double(), exact[name][0], self.float32_tolerance, scale)
+
+    @pytest.mark.parametrize(
+        ("call", "wrong"),
+        [
+            ("terms", "q"),
+            ("potential_force", "q"),
+            ("coriolis_matrix", "q"),
+            ("coriolis_matrix", "v"),
+            ("forward_dynamics", "q"),
+            ("forward_dynamics", "v"),
+            ("forward_dynamics", "u"),
+            ("inverse_dynamics", "q"),
+            ("inverse_dynamics", "v"),
+            ("inverse_dynamics", "a"),
+            ("momentum", "q"),
+            ("momentum", "v"),
+            ("velocity", "q"),
+            ("velocity", "p"),
+            ("kinetic_energy", "v"),
+            ("total_energy", "q"),
+            ("power", "q"),
+            ("power", "v"),
+            ("power", "u"),
+        ],
+    )
+    def test_a_wrong_shape_is_refused_by_name(self, system, configurations, call, wrong):
+        names = {
+            "terms": "q",
+            "potential_force": "q",
+            "coriolis_matrix": "qv",
+            "forward_dynamics": "qvu",
+            "inverse_dynamics": "qva",
+            "momentum": "qv",
+            "velocity": "qp",
+            "kinetic_energy": "qv",
+            "total_energy": "qv",
+            "power": "qvu",
+        }[call]
+        values = dict(configurations._asdict(), p=configurations.a)
+        values[wrong] = torch.cat([values[wrong], values[wrong][..., :1]], -1)
+        with pytest.raises(ValueError, match=rf"^{wrong} has shape"):
+            getattr(system, call)(*(values[name] for name in names))
+
+    @pytest.mark.parametrize("wrong", ["x0", "u"])
+    def test_prediction_refuses_a_wrong_shape_by_name(self, system, configurations, wrong):
+        q, v, _, u = configurations
+        values = {"x0": torch.cat([q, v], -1), "u": torch.stack([u, u], -2)}
+        values[wrong] = values[wrong][..., :-1]
+        t = torch.tensor([0.0, 0.1], dtype=torch.float64)
+        with pytest.raises(ValueError, match=rf"^{wrong} has shape"):
+            system.predict(values["x0"], t, values["u"])
+
+    # The four terms.
+
+    def test_mass_matrix_is_symmetric_positive_definite(self, system, configurations):
+        mass = system.mass_matrix(configurations.q)
+        assert_near(mass, mass.mT, self.exact_tolerance)
+        assert torch.linalg.eigvalsh(mass).min() > 0
+
+    def test_damping_matrix_is_symmetric_positive_semidefinite(self, system, configurations):
+        damping = system.damping_matrix(configurations.q)
+        scale = 1e-12 + damping.abs().max()
+        assert_near(damping, damping.mT, self.exact_tolerance, scale)
+        assert torch.linalg.eigvalsh(damping).min() >= -self.exact_tolerance * scale
+
+    def test_terms_agree_with_the_single_functions(self, system, configurations):
+        q = configurations.q
+        mass, damping, force, inputs = system.terms(q)
+        assert_near(mass, system.mass_matrix(q), self.exact_tolerance)
+        assert_near(damping, system.damping_matrix(q), self.exact_tolerance, scale=1)
+        assert_near(force, system.potential_force(q), self.exact_tolerance)
+        assert_near(inputs, system.input_matrix(q), self.exact_tolerance)
+
+    def test_potential_force_is_the_slope_of_the_potential_energy(self, system, configurations):
+        q = configurations.q
+        expected = partial_derivatives(system.potential_energy, q, self.difference_step)
+        assert_near(system.potential_force(q), expected, self.difference_tolerance)
+
+    # The Coriolis terms.
+
+    def test_mass_rate_minus_twice_coriolis_is_skew_symmetric(self, system, configurations):
+        q, v, _, _ = configurations
+        mass_rate = slope(lambda e: system.mass_matrix(q + e * v), self.difference_step)
+        rest = mass_rate - 2 * system.coriolis_matrix(q, v)
+        scale = self._coriolis_scale(system, configurations)
+        assert_near(rest, -rest.mT, self.difference_tolerance, scale)
+
+    def test_coriolis_force_is_that_of_the_lagrangian(self, system, configurations):
+        q, v, _, _ = configurations
+        slopes = partial_derivatives(system.mass_matrix, q, self.difference_step)
+        # d/dt (dT/dv) - dT/dq at a = 0, with slopes[i, j, k] = dM_ij / dq_k.
+        expected = torch.einsum("bijk,bk,bj->bi", slopes, v, v)
+        expected -= 0.5 * torch.einsum("bjki,bj,bk->bi", slopes, v, v)
+        scale = self._coriolis_scale(system, configurations)
+        force = product(system.coriolis_matrix(q, v), v)
+        assert_near(force, expected, self.difference_tolerance, scale)
+        lost = product(system.damping_matrix(q), v)
+        rest = system.inverse_dynamics(q, v, 0 * v) - system.potential_force(q) - lost
+        assert_near(rest, expected, self.difference_tolerance, scale + lost.abs().max())
+
+    def _coriolis_scale(self, system, configurations):
+        """Magnitude of (dM/dq) v v if M changes by its own size over one unit of q."""
+        speed = configurations.v.abs().max()
+        return system.mass_matrix(configurations.q).abs().max() * (speed + speed**2)
+
+    # The dynamics.
+
+    def test_inverse_dynamics_undoes_forward_dynamics(self, system, configurations):
+        q, v, _, u = configurations
+        a = system.forward_dynamics(q, v, u)
+        tau = product(system.input_matrix(q), u)
+        assert_near(system.inverse_dynamics(q, v, a), tau, self.exact_tolerance)
+
+    def test_velocity_undoes_momentum(self, system, configurations):
+        q, v, _, _ = configurations
+        assert_near(system.velocity(q, system.momentum(q, v)), v, self.exact_tolerance)
+
+    def test_momentum_and_kinetic_energy_are_those_of_the_mass_matrix(self, system, configurations):
+        q, v, _, _ = configurations
+        p = product(system.mass_matrix(q), v)
+        assert_near(system.momentum(q, v), p, self.exact_tolerance)
+        assert_near(system.kinetic_energy(q, v), 0.5 * (p * v).sum(-1), self.exact_tolerance)
+
+    def test_hamiltonian_and_lagrangian_form_agree(self, system, configurations):
+        q, v, _, u = configurations
+        mass = system.mass_matrix(q)
+        mass_rate = slope(lambda e: system.mass_matrix(q + e * v), self.difference_step)
+        a = system.forward_dynamics(q, v, u)
+        expected = product(mass_rate, v) + product(mass, a)
+        derivative = system.momentum_derivative(torch.cat([q, product(mass, v)], -1), u)
+        q_rate, p_rate = derivative.chunk(2, -1)
+        assert_near(q_rate, v, self.exact_tolerance)
+        assert_near(p_rate, expected, self.difference_tolerance)
+
+    def test_state_derivative_is_that_of_the_systems_own_coordinates(self, system, configurations):
+        q, v, _, u = configurations
+        x = torch.cat([q, v], -1)
+        own = system.momentum_derivative if system.coordinates == "momentum" else None
+        expected = (own or system.velocity_derivative)(x, u)
+        assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
+
+    def test_closed_formulas_agree_with_automatic_differentiation(self, system, configurations):
+        q, v, a, _ = configurations
+        arguments = {
+            "_potential_force": (q,),
+            "_inertial_force": (q, v, a),
+            "_acceleration": (q, v, a),
+            "_hamiltonian_gradient": (q, a),
+            "_momentum": (q, v),
+            "_velocity": (q, a),
+            "_kinetic_gradient": (q, v),
+        }
+        for name, values in arguments.items():
+            own = getattr(system, name)(*values)
+            base = getattr(MechanicalSystem, name)(system, *values)
+            pairs = zip(own, base, strict=True) if isinstance(own, tuple) else [(own, base)]
+            for actual, expected in pairs:
+                scale = max(1e-12, float(expected.abs().max()))
+                assert_near(actual, expected, self.exact_tolerance, scale)
+
+    # Energy.
+
+    def test_power_is_the_rate_of_the_total_energy(self, system, configurations):
+        q, v, _, u = configurations
+        a = system.forward_dynamics(q, v, u)
+        # A time step in which the velocity does not change by more than about one unit.
+        step = self.difference_step / max(1.0, float(a.abs().max()))
+        expected = slope(
+            lambda e: system.total_energy(q + e * v + 0.5 * e * e * a, v + e * a), step
+        )
+        assert_near(system.power(q, v, u), expected, self.difference_tolerance)
+
+    def test_rollout_keeps_the_balance_of_energy(self, system, configurations):
+        """E(T) - E(0) is the integral of v^T A u - v^T D v.
+
+        The input is one straight line over the whole roll-out, so the power is smooth, and both
+        the integrator and Simpson's rule are of fourth order in the step.
+        """
+        t, x = self._rollout(system, configurations, system.velocity_derivative)
+        q, v = x.chunk(2, -1)
+        u = self._input(configurations, t)
+        supplied = (product(system.input_matrix(q), u) * v).sum(-1)
+        lost = (product(system.damping_matrix(q), v) * v).sum(-1)
+        work = torch.from_numpy(simpson((supplied - lost).numpy(), x=t.numpy(), axis=-1))
+        energy = system.total_energy(q, v)
+        turnover = simpson((supplied.abs() + lost.abs()).numpy(), x=t.numpy(), axis=-1).max()
+        change = energy[..., -1] - energy[..., 0]
+        assert_near(change, work, self.rollout_tolerance, scale=turnover)
+
+    def test_rollouts_in_velocity_and_momentum_give_the_same_motion(self, system, configurations):
+        _, lagrangian = self._rollout(system, configurations, system.velocity_derivative)
+        _, hamiltonian = self._rollout(system, configurations, system.momentum_derivative)
+        q, v = lagrangian.chunk(2, -1)
+        q_hamiltonian, p = hamiltonian.chunk(2, -1)
+        moved = (q - q[..., :1, :]).abs().max()
+        assert_near(q_hamiltonian, q, self.rollout_tolerance, scale=moved)
+        assert_near(system.velocity(q_hamiltonian, p), v, self.rollout_tolerance)
+
+    def _step(self, system, configurations):
+        """A step that resolves the fastest motion of the linearized dynamics."""
+        q, v, _, u = configurations
+        x = torch.cat([q, v], -1)
+        jacobian = partial_derivatives(
+            lambda x: system.velocity_derivative(x, u), x, self.difference_step
+        )
+        return self.step_times_rate / float(torch.linalg.eigvals(jacobian).abs().max())
+
+    def _input(self, configurations, t):
+        """From u to -u on a straight line, ``(8, T, M)``."""
+        return (1 - 2 * t / t[-1])[:, None] * configurations.u[:, None, :]
+
+    def _rollout(self, system, configurations, derivative):
+        q, v, _, _ = configurations
+        end = self.steps * self._step(system, configurations)
+        t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
+        second = v if derivative == system.velocity_derivative else system.momentum(q, v)
+        u = self._input(configurations, t[[0, -1]])
+        return t, rollout(derivative, torch.cat([q, second], -1), t, u, t_input=t[[0, -1]])
+
+    # Gradients.
+
+    def test_gradients_through_an_rk4_step_match_finite_differences(self, system, configurations):
+        """Of a scalar of the increments, by the initial state, the input and each parameter."""
+        q, v, a, u = configurations
+        second = v if system.coordinates == "velocity" else system.momentum(q, v)
+        x0, u = torch.cat([q, second], -1), torch.stack([u, -u], -2)
+        t = torch.tensor([0.0, self._step(system, configurations)], dtype=torch.float64)
+        weights = torch.cat([a, v], -1) / t[-1]
+
+        def loss():
+            return (weights * system.increments(x0, t, u)[..., -1, :]).sum()
+
+        leaves = {"x0": x0, "u": u, **dict(system.named_parameters())}
+        with torch.enable_grad():
+            for leaf in leaves.values():
+                leaf.requires_grad_(True)
+            gradients = torch.autograd.grad(loss(), list(leaves.values()), allow_unused=True)
+        generator = torch.Generator().manual_seed(1)
+        for (name, leaf), gradient in zip(leaves.items(), gradients, strict=True):
+            direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
+            direction /= direction.norm()
+            start = leaf.detach().clone()
+
+            def shifted(e, leaf=leaf, start=start, direction=direction):
+                leaf.copy_(start + e * direction)
+                value = loss()
+                leaf.copy_(start)
+                return value
+
+            expected = slope(shifted, self.difference_step)
+            gradient = torch.zeros_like(leaf) if gradient is None else gradient
+            actual = (gradient * direction).sum()
+            error = float((actual - expected).abs())
+            scale = float(gradient.norm()) + float(loss().abs())
+            assert error <= self.difference_tolerance * scale, (name, actual, expected)

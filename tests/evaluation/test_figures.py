@@ -1,0 +1,104 @@
+import matplotlib.image
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from pinn_dyn.evaluation import (
+    Prediction,
+    compare_terms,
+    error_figure,
+    save,
+    terms_figure,
+    trajectory_figure,
+)
+from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.systems import SoftArm
+
+
+@pytest.fixture
+def truth():
+    t = torch.linspace(0, 2, 41, dtype=torch.float64)
+    phase = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)[:, None]
+    q = torch.stack([torch.sin(t + phase), torch.cos(2 * t + phase)], dim=-1)
+    return Trajectory(t, q, torch.zeros_like(q), q[..., :1], interpolation="hold")
+
+
+@pytest.fixture
+def predictions(truth):
+    def prediction(q_hat):
+        return Prediction(truth.t[::2], q_hat[:, ::2], truth.q[:, ::2])
+
+    away = truth.q + torch.exp(8 * truth.t)[:, None] - 1
+    broken = truth.q.clone()
+    broken[1] = torch.nan
+    return {
+        "good": prediction(truth.q + 0.01 * truth.t[:, None]),
+        "runaway": prediction(away),
+        "fragile": prediction(broken + 0.02),
+    }
+
+
+def check_picture(figure, path):
+    assert isinstance(figure, Figure)
+    save(figure, path)
+    pixels = matplotlib.image.imread(path)
+    assert pixels.shape[1] == pytest.approx(150 * figure.get_figwidth(), abs=1)
+    assert np.ptp(pixels[..., :3]) > 0.5
+
+
+def test_trajectories_keep_the_range_of_the_truth(truth, predictions, tmp_path):
+    figure = trajectory_figure(
+        truth, predictions, trajectory=1, title="fake", labels=["x (m)", "y (rad)"]
+    )
+    check_picture(figure, tmp_path / "new" / "trajectories.png")
+    first, second, inputs = figure.axes
+    assert first.get_ylim()[1] < 2 * float(truth.q.max())
+    notes = first.get_title(loc="right")
+    # exp(8 t) - 1 leaves a margin of some 0.4 within the first 0.1 s.
+    assert "runaway leaves the panel at 0.1 s" in notes
+    assert "fragile broke down" in notes
+    assert "good" not in notes
+    assert [ax.get_ylabel() for ax in (first, second)] == ["x (m)", "y (rad)"]
+    assert inputs.get_xlabel() == "time (s)"
+    assert inputs.lines[0].get_drawstyle() == "steps-post"
+    assert figure.get_suptitle() == "fake"
+
+
+def test_labels_must_fit_the_coordinates(truth, predictions):
+    with pytest.raises(ValueError, match="labels has 1 entries, expected 2"):
+        trajectory_figure(truth, predictions, trajectory=0, title="fake", labels=["x"])
+
+
+def test_error_over_time_counts_the_diverged(predictions, tmp_path):
+    figure = error_figure(predictions, title="fake", label="error (m)")
+    check_picture(figure, tmp_path / "error.png")
+    ax = figure.axes[0]
+    assert ax.get_yscale() == "log"
+    assert ax.get_ylabel() == "error (m)"
+    labels = [line.get_label() for line in ax.lines]
+    assert labels == ["good", "runaway (3 of 3 diverged)", "fragile (1 of 3 diverged)"]
+    good, _, fragile = ax.lines
+    prediction = predictions["good"]
+    np.testing.assert_allclose(good.get_ydata(), 0.01 * 2**0.5 * prediction.t[1:])
+    np.testing.assert_allclose(fragile.get_ydata(), 0.02 * 2**0.5)
+
+
+def test_colours_follow_the_order_of_the_models(truth, predictions):
+    lines = trajectory_figure(truth, predictions, trajectory=0, title="fake").axes[0].lines
+    errors = error_figure(predictions, title="fake").axes[0].lines
+    colours = [line.get_color() for line in errors]
+    assert [line.get_color() for line in lines[1:]] == colours
+    assert len(set(colours)) == 3
+
+
+@pytest.mark.parametrize(("inverse_mass", "shown"), [(False, "0.00173"), (True, "593")])
+def test_terms_are_annotated(inverse_mass, shown, tmp_path):
+    q = torch.tensor([[0.8, 0.2, 0.3], [1.2, -0.2, 0.15]])
+    comparison = compare_terms(SoftArm(damping=0.12), SoftArm(), q)
+    figure = terms_figure(comparison, configuration=1, title="fake", inverse_mass=inverse_mass)
+    check_picture(figure, tmp_path / "terms.png")
+    assert len(figure.axes) == 8
+    assert shown in [text.get_text() for text in figure.axes[0].texts]
+    assert len(figure.axes[2].texts) == 3  # G is one column
+    assert figure.axes[5].get_xlabel() == "error 20 %"

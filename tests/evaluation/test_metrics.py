@@ -1,0 +1,241 @@
+import math
+
+import pytest
+import torch
+
+from pinn_dyn.evaluation import predict_trajectories, predict_windows, rollout_metrics
+from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
+from pinn_dyn.systems import SoftArm
+
+
+class PointMass(ContinuousPredictor):
+    """dv/dt = gain u: RK4 is exact for an input that is linear in between."""
+
+    def __init__(self, gain=1.0, coordinates="velocity"):
+        super().__init__(1, 1, coordinates)
+        self.gain = torch.nn.Parameter(torch.tensor(gain))
+
+    def state_derivative(self, x, u):
+        assert not self.training
+        return torch.cat([x[..., 1:], self.gain * u], dim=-1)
+
+
+class Fragile(Predictor):
+    """Stands still, and breaks down as a whole batch if any start is negative."""
+
+    def __init__(self):
+        super().__init__(1, 1, "velocity")
+
+    def increments(self, x0, t, u, *, t_input=None, interpolation="linear"):
+        if bool((x0[..., 0] < 0).any()):
+            raise torch.linalg.LinAlgError("not positive-definite")
+        return x0.new_zeros(*x0.shape[:-1], t.shape[0], 2)
+
+
+def ramps(count=3, samples=13, sample_time=0.25):
+    """Point masses under u = c t: q = q0 + v0 t + c t^3 / 6 for each."""
+    t = sample_time * torch.arange(samples, dtype=torch.float64)
+    c = torch.arange(1, count + 1, dtype=torch.float64)[:, None]
+    q = 0.1 * c + 0.5 * t + c * t**3 / 6
+    v = 0.5 + c * t**2 / 2
+    u = c * t
+    return Trajectory(t, q[..., None], v[..., None], u[..., None])
+
+
+def test_metrics_of_a_case_computed_by_hand():
+    # Errors (0, 3, 0, 5) and (0, 1, 2, 1), from vectors whose norms are whole numbers.
+    t = torch.tensor([2.0, 3.0, 4.0, 5.0])  # the horizon counts from the first time
+    q = torch.tensor([[0.0, 1.0], [2.0, 0.0], [0.0, 3.0], [4.0, 1.0]]).repeat(2, 1, 1)
+    off = torch.tensor(
+        [
+            [[0.0, 0.0], [0.0, -3.0], [0.0, 0.0], [3.0, 4.0]],
+            [[0.0, 0.0], [1.0, 0.0], [0.0, 2.0], [-1.0, 0.0]],
+        ]
+    )
+    found = rollout_metrics(q + off, q, t, thresholds={"low": 0.5, "mid": 1.5, "high": 9.0})
+    assert found.to_dict() == pytest.approx(
+        {
+            "trajectories": 2,
+            "diverged": 0,
+            "horizon": 3.0,
+            "error_mean": 12 / 8,
+            "error_std": math.sqrt(40 / 8 - 1.5**2),
+            "error_median": 1.0,
+            "error_worst": 2.0,
+            "worst_trajectory": 0,
+            "squared_error_mean": 40 / 8,
+            "squared_error_variance": (81 + 625 + 1 + 16 + 1) / 8 - 25,
+            "error_first_half": 4 / 4,
+            "error_second_half": 8 / 4,
+            "valid_time_low": 1.0,
+            "valid_time_mid": (1.0 + 2.0) / 2,
+            "valid_time_high": 3.0,
+        }
+    )
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e9])
+def test_a_diverged_trajectory_is_counted_and_left_out(bad):
+    t = torch.linspace(0, 1, 5, dtype=torch.float64)
+    q = torch.sin(t)[None, :, None].repeat(3, 1, 1)
+    q_hat = q + 0.5
+    q_hat[1, 3] = bad
+    found = rollout_metrics(q_hat, q, t, thresholds={"wide": 0.6})
+    assert found.diverged == 1
+    assert found.error_mean == pytest.approx(0.5)
+    assert found.error_second_half == pytest.approx(0.5)
+    assert (found.error_worst, found.worst_trajectory) == (math.inf, 1)
+    # The diverged one is valid until t = 0.75, the others up to the horizon.
+    assert found.valid_time["wide"] == pytest.approx((1 + 0.75 + 1) / 3)
+
+
+def test_all_diverged_gives_infinity_and_never_nan():
+    t = torch.linspace(0, 1, 5)
+    q = torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(0))
+    figures = rollout_metrics(q * math.nan, q, t, thresholds={"x": 0.1}).to_dict()
+    assert not any(math.isnan(value) for value in figures.values())
+    assert figures["diverged"] == 2
+    for name in ("mean", "std", "median", "worst", "first_half", "second_half"):
+        assert figures[f"error_{name}"] == math.inf
+    assert figures["squared_error_mean"] == figures["squared_error_variance"] == math.inf
+    assert figures["valid_time_x"] == 0
+
+
+def test_a_truth_that_never_moves_does_not_make_every_error_a_divergence():
+    q = torch.ones(1, 4, 2)
+    found = rollout_metrics(q + 0.1, q, torch.arange(4.0), thresholds={})
+    assert found.diverged == 0
+
+
+def test_metrics_refuse_shapes_that_do_not_match():
+    q = torch.zeros(2, 5, 3)
+    with pytest.raises(ValueError, match=r"q_hat has shape \(5, 3\).*expected \(K, T, N\)"):
+        rollout_metrics(q[0], q, torch.arange(5.0), thresholds={})
+    with pytest.raises(ValueError, match="q has non-finite"):
+        rollout_metrics(q, q / 0, torch.arange(5.0), thresholds={})
+
+
+@pytest.mark.parametrize(("step", "stride"), [(None, 1), (0.25, 1), (0.5, 2), (1.0, 4)])
+def test_prediction_meets_the_closed_solution(step, stride):
+    truth = ramps()
+    prediction = predict_trajectories(PointMass(), truth, step=step)
+    assert torch.equal(prediction.t, truth.t[::stride])
+    assert torch.equal(prediction.q, truth.q[:, ::stride])
+    torch.testing.assert_close(prediction.q_hat, prediction.q, rtol=0, atol=1e-12)
+
+
+def test_the_model_of_the_caller_is_left_alone():
+    model = PointMass(gain=1 / 3).train()  # and the copy asserts that it is not in training
+    prediction = predict_trajectories(model, ramps())
+    assert model.gain.dtype == torch.float32
+    assert model.training
+    assert prediction.q_hat.dtype == torch.float64
+    assert not prediction.q_hat.requires_grad
+
+
+def test_windows_are_set_back_to_the_true_state():
+    truth = ramps()  # 12 intervals of 0.25 s
+    model = PointMass(gain=2.0)
+    prediction = predict_windows(model, truth, window=1.0)
+    assert torch.equal(prediction.t, truth.t)
+    # By hand: a window from t0 doubles the acceleration c t, so it errs by c times the
+    # integral of (s - r) r over r in (t0, s), (s - t0)^2 (s + 2 t0) / 6.
+    c = torch.arange(1, 4, dtype=torch.float64)[:, None]
+    start = torch.tensor([0.0] * 5 + [1.0] * 4 + [2.0] * 4, dtype=torch.float64)
+    expected = c * (truth.t - start) ** 2 * (truth.t + 2 * start) / 6
+    torch.testing.assert_close(prediction.error(), expected)
+
+
+def test_one_window_as_long_as_the_horizon_is_the_full_rollout():
+    truth, model = ramps(), PointMass(gain=2.0)
+    full = predict_trajectories(model, truth, step=0.5)
+    windowed = predict_windows(model, truth, window=3.0, step=0.5)
+    for name in ("t", "q", "q_hat"):
+        torch.testing.assert_close(getattr(windowed, name), getattr(full, name), rtol=0, atol=0)
+
+
+def test_an_incomplete_last_window_is_left_out():
+    prediction = predict_windows(PointMass(), ramps(), window=1.25)
+    assert prediction.t[-1] == 2.5
+    torch.testing.assert_close(prediction.q_hat, prediction.q)
+
+
+def test_a_breakdown_costs_only_its_own_trajectory():
+    t = torch.arange(3.0)
+    q = torch.tensor([1.0, 2.0, -3.0, 4.0, -5.0])[:, None, None].expand(5, 3, 1)
+    zero = torch.zeros(5, 3, 1)
+    prediction = predict_trajectories(Fragile(), Trajectory(t, q, zero, zero))
+    broken = torch.isnan(prediction.q_hat).all(dim=(1, 2))
+    assert broken.tolist() == [False, False, True, False, True]
+    assert torch.equal(prediction.q_hat[~broken], prediction.q[~broken])
+
+
+def test_a_momentum_model_starts_from_the_momentum():
+    truth = ramps()
+    truth = Trajectory(truth.t, truth.q, 7 * truth.v, truth.u, p=truth.v)
+    model = PointMass(coordinates="momentum")
+    for prediction in (
+        predict_trajectories(model, truth),
+        predict_windows(model, truth, window=1.0),
+    ):
+        torch.testing.assert_close(prediction.q_hat, prediction.q)
+
+
+def test_the_input_moves_as_the_trajectory_says():
+    t = torch.arange(4, dtype=torch.float64)
+    u = torch.tensor([1.0, 0.0, -1.0, 5.0], dtype=torch.float64)
+    v = torch.tensor([0.0, 1.0, 1.0, 0.0], dtype=torch.float64)
+    q = torch.tensor([0.0, 0.5, 1.5, 2.0], dtype=torch.float64)
+    truth = Trajectory(t, *(x[None, :, None] for x in (q, v, u)), interpolation="hold")
+    prediction = predict_trajectories(PointMass(), truth)
+    torch.testing.assert_close(prediction.q_hat, prediction.q)
+
+
+def test_errors_name_what_does_not_fit():
+    truth, model = ramps(), PointMass()
+    with pytest.raises(ValueError, match=r"step is 0\.3 s and the sample time .* 0\.25 s"):
+        predict_trajectories(model, truth, step=0.3)
+    with pytest.raises(ValueError, match=r"step is 0\.1 s and the sample time .* 0\.25 s"):
+        predict_trajectories(model, truth, step=0.1)
+    with pytest.raises(ValueError, match=r"window is 0\.75 s and step is 0\.5 s"):
+        predict_windows(model, truth, window=0.75, step=0.5)
+    with pytest.raises(ValueError, match=r"window is 4\.0 s, but .* last only 3 s"):
+        predict_windows(model, truth, window=4.0)
+    alone = Trajectory(truth.t, truth.q[0], truth.v[0], truth.u[0])
+    with pytest.raises(ValueError, match=r"expected \(K, T, N\)"):
+        predict_trajectories(model, alone)
+    uneven = Trajectory(truth.t**2, truth.q, truth.v, truth.u)
+    with pytest.raises(ValueError, match="sample time varies"):
+        predict_trajectories(model, uneven, step=0.25)
+
+
+def test_uneven_sample_times_are_fine_without_a_step():
+    t = torch.tensor([0.0, 0.1, 0.4, 1.0], dtype=torch.float64)
+    one = torch.ones(1, 4, 1, dtype=torch.float64)
+    truth = Trajectory(t, 0.5 * t[None, :, None] ** 2, t[None, :, None], one)
+    prediction = predict_trajectories(PointMass(), truth)
+    torch.testing.assert_close(prediction.q_hat, prediction.q)
+
+
+@pytest.fixture(scope="module")
+def arm_motion():
+    """Two motions of the soft arm, simulated at 1 ms."""
+    t = 1e-3 * torch.arange(101, dtype=torch.float64)
+    phase = torch.tensor([0.0, 1.0], dtype=torch.float64)[:, None]
+    u = torch.stack(
+        [torch.sin(9 * t + phase), torch.cos(7 * t + phase), -1.3 + 0 * t + 0 * phase], dim=-1
+    )
+    x0 = torch.tensor([[0.2, -0.1, 0.2, 0, 0, 0], [0.0, 0.0, 0.15, 0, 0, 0]], dtype=torch.float64)
+    x = SoftArm().predict(x0, t, u)
+    return Trajectory(t, x[..., :3], x[..., 3:], u)
+
+
+def test_the_truth_predicts_itself(arm_motion):
+    prediction = predict_trajectories(SoftArm(), arm_motion, step=0.002)
+    assert prediction.q.std() > 0.01
+    assert prediction.error().max() < 1e-6
+
+
+def test_another_plant_does_not_predict_the_truth(arm_motion):
+    prediction = predict_trajectories(SoftArm(damping=0.12), arm_motion, step=0.002)
+    assert prediction.error().max() > 1e-3

@@ -1,0 +1,110 @@
+import json
+import math
+
+import pandas as pd
+import pytest
+
+from pinn_dyn.evaluation import (
+    RunResult,
+    format_table,
+    grouped_table,
+    summary_table,
+    write_table,
+)
+
+
+def result(model, seed, error, *, diverged=0, valid=1.0):
+    metrics = {
+        "error_mean": error,
+        "error_std": error / 2,
+        "diverged": diverged,
+        "valid_time_near": valid,
+    }
+    return RunResult(f"{model}-{seed}", model, seed, metrics, {"training_pairs": 8000})
+
+
+@pytest.fixture
+def results():
+    return [
+        result("lagrangian", 0, 0.25, valid=3.0),
+        result("lagrangian", 1, 0.75, valid=2.0),
+        # The mean of what is left is small, but trajectories are missing from it.
+        result("black_box", 0, 0.125, diverged=4),
+        result("black_box", 1, math.inf, diverged=9, valid=0.0),
+    ]
+
+
+def row_of(text, name):
+    return next(line for line in text.splitlines() if line.startswith(name))
+
+
+def test_one_row_per_run(results):
+    frame = summary_table(results)
+    assert list(frame.columns[:4]) == ["run", "model", "seed", "training_pairs"]
+    assert list(frame.run) == ["lagrangian-0", "lagrangian-1", "black_box-0", "black_box-1"]
+    assert list(frame.error_mean) == [0.25, 0.75, 0.125, math.inf]
+
+
+def test_the_best_is_marked_among_those_that_did_not_diverge(results):
+    text = format_table(summary_table(results))
+    assert "0.25 ± 0.125*" in row_of(text, "lagrangian-0")
+    assert "3*" in row_of(text, "lagrangian-0")
+    assert "0*" in row_of(text, "lagrangian-1")  # no trajectory diverged
+    assert "*" not in row_of(text, "black_box-0")
+    assert "8000*" not in text
+    assert "nan" not in text.lower()
+
+
+def test_columns_are_aligned(results):
+    lines = format_table(summary_table(results)).splitlines()
+    ends = lines[0].index("seed") + len("seed")
+    assert [line[ends - 1] for line in lines[2:]] == ["0", "1", "0", "1"]
+
+
+def test_a_column_without_a_difference_has_no_best():
+    text = format_table(summary_table([result("a", 0, 0.5), result("a", 1, 0.5)]))
+    assert "*" not in text
+
+
+def test_mean_and_worst_over_seeds(results):
+    frame = grouped_table(summary_table(results)).set_index("model")
+    assert list(frame.index) == ["lagrangian", "black_box"]
+    assert list(frame.seeds) == [2, 2]
+    assert frame.loc["lagrangian", "mean_error_mean"] == pytest.approx(0.5)
+    assert frame.loc["lagrangian", "worst_error_mean"] == pytest.approx(0.75)
+    assert frame.loc["lagrangian", "worst_valid_time_near"] == pytest.approx(2.0)
+    assert frame.loc["lagrangian", "mean_training_pairs"] == 8000
+    assert frame.loc["black_box", "mean_error_mean"] == math.inf
+    assert frame.loc["black_box", "worst_diverged"] == 9
+    assert "worst_training_pairs" not in frame.columns
+
+
+def test_files_round_trip(results, tmp_path):
+    frame = summary_table(results)
+    csv, records = write_table(frame, tmp_path / "new", "runs")
+    assert (csv.name, records.name) == ("runs.csv", "runs.json")
+    pd.testing.assert_frame_equal(pd.read_csv(csv), frame)
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    rows = json.loads(records.read_text(), parse_constant=refuse)
+    assert rows[0]["error_mean"] == 0.25
+    assert rows[0]["seed"] == 0
+    assert float(rows[3]["error_mean"]) == math.inf
+
+
+def test_a_run_without_a_metric_has_a_gap(tmp_path):
+    runs = [result("a", 0, 0.5), RunResult("b-0", "b", 0, {"error_mean": 0.25})]
+    frame = summary_table(runs)
+    row = row_of(format_table(frame), "b-0")
+    assert row.split()[-1] == "-"
+    _, records = write_table(frame, tmp_path, "runs")
+    assert json.loads(records.read_text())[1]["training_pairs"] is None
+
+
+def test_errors_name_the_run():
+    with pytest.raises(ValueError, match="results is empty"):
+        summary_table([])
+    with pytest.raises(ValueError, match=r"run 'r' names \['seed', 'x'\] twice"):
+        summary_table([RunResult("r", "m", 0, {"x": 1.0, "seed": 2}, {"x": 2.0})])

@@ -1,0 +1,19 @@
+"""The base class's automatic differentiation, on systems that give only the four terms."""
+
+import pytest
+
+from tests.contracts.mechanical_system import MechanicalSystemContract
+from tests.support.cart_pole import CartPole
+from tests.support.linear import damped_oscillators
+
+
+class TestLinearSystem(MechanicalSystemContract):
+    @pytest.fixture
+    def system(self):
+        return damped_oscillators()
+
+
+class TestCartPole(MechanicalSystemContract):
+    @pytest.fixture(params=["velocity", "momentum"])
+    def system(self, request):
+        return CartPole(coordinates=request.param)

@@ -1,0 +1,326 @@
+"""Roll-outs against exact solutions: order, input interpolation, precision, gradients."""
+
+import copy
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.mechanics import rollout
+from pinn_dyn.mechanics.integration import rollout_increments
+from pinn_dyn.systems import SoftArm
+from tests.support.cart_pole import CartPole
+from tests.support.finite_differences import slope
+from tests.support.linear import (
+    damped_oscillators,
+    exact_solution,
+    exact_solution_under_sine,
+)
+
+START = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
+
+
+@pytest.fixture
+def system():
+    return damped_oscillators().requires_grad_(False)
+
+
+def samples(count, step, seed=0):
+    """Times and an input that jumps to an independent value at every sample."""
+    generator = torch.Generator().manual_seed(seed)
+    t = step * torch.arange(count, dtype=torch.float64)
+    return t, torch.randn(count, 1, generator=generator, dtype=torch.float64)
+
+
+# Against matrix exponentials. RK4 errs by 1e-7 with steps of 0.01 s, a wrong input by 1e-3.
+
+
+def test_free_motion_matches_the_matrix_exponential(system):
+    t = torch.linspace(0, 1, 11, dtype=torch.float64)
+    u = torch.zeros(11, 1, dtype=torch.float64)
+    x = rollout(system.velocity_derivative, START, t, u, substeps=10)
+    expected = exact_solution(system, START, t, u, "hold")
+    torch.testing.assert_close(x, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("interpolation", ["hold", "linear"])
+def test_sampled_input_matches_its_exact_discretization(system, interpolation):
+    """Zero-order or first-order hold; the input jumps by its own size at every sample."""
+    t, u = samples(count=16, step=0.1)
+    x = rollout(system.velocity_derivative, START, t, u, interpolation=interpolation, substeps=10)
+    expected = exact_solution(system, START, t, u, interpolation)
+    torch.testing.assert_close(x, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_held_input_in_float32_uses_each_intervals_own_sample(system, substeps):
+    """0.01 s is no binary fraction: the solver's and the input's times must still agree."""
+    t, u = samples(count=51, step=0.01)
+    single = copy.deepcopy(system).float()
+    x = rollout(
+        single.velocity_derivative,
+        START.float(),
+        t.float(),
+        u.float(),
+        interpolation="hold",
+        substeps=substeps,
+    )
+    expected = exact_solution(system, START, t, u, "hold")
+    # One stage with a neighbour's input would be off by du h / 8, about 1e-3.
+    torch.testing.assert_close(x.double(), expected, rtol=0, atol=1e-5)
+
+
+def test_a_step_of_the_input_acts_from_its_sample_when_held_and_before_it_when_linear(system):
+    t = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
+    u = torch.tensor([[0.0], [1.0], [1.0]], dtype=torch.float64)
+    rest = torch.zeros(4, dtype=torch.float64)
+    held = rollout(system.velocity_derivative, rest, t, u, interpolation="hold")
+    linear = rollout(system.velocity_derivative, rest, t, u, interpolation="linear")
+    assert torch.equal(held[1], rest)
+    assert held[2].abs().max() > 0.05
+    assert linear[1].abs().max() > 0.02
+
+
+def test_held_and_linear_agree_for_a_constant_input(system):
+    t, u = samples(count=11, step=0.1)
+    u = u[:1].expand(11, 1)
+    held, linear = (
+        rollout(system.velocity_derivative, START, t, u, interpolation=name)
+        for name in ("hold", "linear")
+    )
+    torch.testing.assert_close(held, linear, rtol=0, atol=1e-14)
+
+
+DECIMAL_STEP = pytest.param(
+    "hold",
+    0.025,
+    marks=pytest.mark.xfail(
+        strict=True, reason="substeps miss a decimal sample time by one rounding error"
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    ("interpolation", "step"),
+    [("linear", 0.025), ("linear", 1 / 32), ("hold", 1 / 32), DECIMAL_STEP],
+)
+def test_input_may_be_sampled_more_finely_than_the_solution(system, interpolation, step):
+    t_input, u = samples(count=41, step=step)
+    t = t_input[::4]
+    x = rollout(
+        system.velocity_derivative,
+        START,
+        t,
+        u,
+        t_input=t_input,
+        interpolation=interpolation,
+        substeps=12,
+    )
+    expected = exact_solution(system, START, t_input, u, interpolation)[::4]
+    torch.testing.assert_close(x, expected, rtol=0, atol=1e-6)
+
+
+def test_input_holds_its_end_samples_outside_its_own_times(system):
+    t, u = samples(count=2, step=0.1)
+    longer = torch.linspace(-0.1, 0.2, 4, dtype=torch.float64)
+    x = rollout(system.velocity_derivative, START, longer, u, t_input=t, substeps=10)
+    padded = torch.stack([u[0], u[0], u[1], u[1]])
+    expected = exact_solution(system, START, longer, padded, "linear")
+    torch.testing.assert_close(x, expected, rtol=0, atol=1e-6)
+
+
+def test_every_trajectory_of_a_batch_has_its_own_input_and_start(system):
+    t, first = samples(count=6, step=0.1, seed=0)
+    _, second = samples(count=6, step=0.1, seed=1)
+    starts, inputs = torch.stack([START, -2 * START]), torch.stack([first, second])
+    x = rollout(system.velocity_derivative, starts, t, inputs, substeps=10)
+    assert x.shape == (2, 6, 4)
+    for row in range(2):
+        expected = exact_solution(system, starts[row], t, inputs[row], "linear")
+        torch.testing.assert_close(x[row], expected, rtol=0, atol=1e-6)
+
+
+# Order of the method.
+
+
+def test_rollout_is_of_fourth_order_for_a_driven_linear_system(system):
+    """The input is sampled at every stage (thirds of a step), so that only RK4 errs."""
+    end, frequency = 2.0, 3.0
+    expected = exact_solution_under_sine(system, START, torch.tensor([end]), frequency)[0]
+    t_input = torch.linspace(0, end, 12 * 20 + 1, dtype=torch.float64)
+    errors = []
+    for steps in (20, 40, 80):
+        t = torch.linspace(0, end, steps + 1, dtype=torch.float64)
+        u = torch.sin(frequency * t_input)[:, None]
+        x = rollout(system.velocity_derivative, START, t, u, t_input=t_input)
+        errors.append(float((x[-1] - expected).norm()))
+    ratios = np.divide(errors[:-1], errors[1:])
+    assert ((ratios > 12) & (ratios < 20)).all(), (errors, ratios)
+
+
+@pytest.mark.parametrize("form", ["velocity_derivative", "momentum_derivative"])
+def test_rollout_is_of_fourth_order_for_the_soft_arm(form):
+    arm = SoftArm()
+    q = torch.tensor([0.6, -0.3, 0.2], dtype=torch.float64)
+    v = torch.tensor([0.5, 1.0, -0.2], dtype=torch.float64)
+    second = v if form == "velocity_derivative" else arm.momentum(q, v)
+    x0 = torch.cat([q, second])
+    # A straight line over the whole time is exact at every stage.
+    t_input = torch.tensor([0.0, 0.05], dtype=torch.float64)
+    u = torch.tensor([[0.1, -0.2, -1.3], [-0.2, 0.1, -1.0]], dtype=torch.float64)
+    ends = []
+    for steps in (8, 16, 32, 64):
+        t = torch.linspace(0, 0.05, steps + 1, dtype=torch.float64)
+        ends.append(rollout(getattr(arm, form), x0, t, u, t_input=t_input)[-1])
+    changes = torch.stack([(b - a).norm() for a, b in itertools.pairwise(ends)])
+    ratios = changes[:-1] / changes[1:]
+    assert ((ratios > 12) & (ratios < 20)).all(), (changes, ratios)
+
+
+@pytest.mark.parametrize("interpolation", ["hold", "linear"])
+def test_substeps_are_shorter_steps(system, interpolation):
+    t, u = samples(count=6, step=0.1)
+    fine = torch.linspace(0, 0.5, 21, dtype=torch.float64)
+    divided, short = (
+        rollout(
+            system.velocity_derivative,
+            START,
+            grid,
+            u,
+            t_input=t,
+            interpolation=interpolation,
+            substeps=substeps,
+        )
+        for grid, substeps in ((t, 4), (fine, 1))
+    )
+    assert divided.shape == (6, 4)
+    torch.testing.assert_close(divided, short[::4], rtol=0, atol=1e-13)
+
+
+# Precision of the increments.
+
+
+def one_step(system, x0, t, u):
+    """Increments of one step in float64 and in float32, from the same float32 state."""
+    single = copy.deepcopy(system).float()
+    exact = rollout_increments(system.velocity_derivative, x0.double(), t, u)[-1]
+    rounded = rollout_increments(single.velocity_derivative, x0, t, u.float())[-1]
+    return exact, rounded
+
+
+def test_increments_keep_float32_precision_where_the_state_swallows_them(system):
+    x0 = torch.tensor([1000.3, -1000.7, 1.5, -2.5])
+    t = torch.tensor([0.0, 1e-5], dtype=torch.float64)
+    u = torch.ones(2, 1, dtype=torch.float64)
+    exact, rounded = one_step(system, x0, t, u)
+    assert ((rounded - exact) / exact).abs().max() < 1e-5
+    # The same increment as a difference of float32 states has no correct digit left.
+    from_states = (x0 + rounded) - x0
+    assert ((from_states - exact) / exact)[:2].abs().max() > 0.5
+
+
+@pytest.mark.xfail(strict=True, reason="rollout_increments casts t before subtracting t[0]")
+@pytest.mark.parametrize("start", [10.0, 1000.0])
+def test_increments_keep_float32_precision_late_in_a_recording(system, start):
+    """A float32 time of 1000 s resolves 6e-5 s: the step has to be taken in float64."""
+    t = start + torch.tensor([0.0, 1e-3], dtype=torch.float64)
+    u = torch.ones(2, 1, dtype=torch.float64)
+    exact, rounded = one_step(system, torch.tensor([1.0, -1.0, 0.5, 0.2]), t, u)
+    assert ((rounded - exact) / exact).abs().max() < 1e-5
+
+
+def test_increments_start_at_zero_and_add_up_to_the_states(system):
+    t, u = samples(count=6, step=0.1)
+    increments = rollout_increments(system.velocity_derivative, START, t, u)
+    assert torch.equal(increments[0], torch.zeros(4, dtype=torch.float64))
+    states = rollout(system.velocity_derivative, START, t, u)
+    torch.testing.assert_close(states, START + increments, rtol=0, atol=0)
+
+
+def test_prediction_is_the_rollout_in_the_systems_own_coordinates():
+    t, u = samples(count=6, step=0.05)
+    for coordinates in ("velocity", "momentum"):
+        system = CartPole(coordinates).requires_grad_(False)
+        derivative = getattr(system, f"{coordinates}_derivative")
+        expected = rollout(derivative, START, t, u, interpolation="hold")
+        actual = system.predict(START, t, u, interpolation="hold")
+        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-14)
+
+
+def test_compiled_derivative_is_used_in_training_mode_only(monkeypatch):
+    calls = []
+
+    def counting(function):
+        def compiled(*args):
+            calls.append(function)
+            return function(*args)
+
+        return compiled
+
+    monkeypatch.setattr(torch, "compile", counting)
+    system = damped_oscillators()
+    system.compile_derivative()
+    t, u = samples(count=2, step=0.1)
+    system.train().predict(START, t, u)
+    assert len(calls) == 4  # stages of one step
+    system.eval().predict(START, t, u)
+    assert len(calls) == 4
+
+
+# Gradients.
+
+
+@pytest.mark.parametrize("coordinates", ["velocity", "momentum"])
+@pytest.mark.parametrize("leaf", ["x0", "u", "cart", "bob", "rod", "friction"])
+def test_each_gradient_through_one_rk4_step_matches_finite_differences(coordinates, leaf):
+    system = CartPole(coordinates)
+    t = torch.tensor([0.0, 0.02], dtype=torch.float64)
+    weights = torch.tensor([30.0, -20.0, 1.0, 2.0], dtype=torch.float64)
+    values = {"x0": START.clone(), "u": torch.tensor([[1.0], [-2.0]], dtype=torch.float64)}
+    values.update(system.named_parameters())
+    value = values[leaf]
+
+    def loss():
+        end = system.predict(values["x0"], t, values["u"])[-1]
+        return (weights * end).sum() + end.square().sum()
+
+    value.requires_grad_(True)
+    (gradient,) = torch.autograd.grad(loss(), value)
+    assert gradient.shape == value.shape
+    with torch.no_grad():
+        for index in np.ndindex(*value.shape):
+            start = value[index].clone()
+
+            def moved(e, index=index, start=start):
+                value[index] = start + e
+                result = loss()
+                value[index] = start
+                return result
+
+            expected = float(slope(moved))
+            assert float(gradient[index]) == pytest.approx(expected, rel=1e-8, abs=1e-9), index
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x0": torch.tensor([0.0, torch.nan, 0.0, 0.0])}, r"x0 has 1 non-finite.*index \(1,\)"),
+        ({"x0": torch.tensor([0.0, 0.0, torch.inf, 0.0])}, r"x0 has 1 non-finite.*inf"),
+        ({"substeps": 0}, "substeps is 0"),
+        ({"t": torch.zeros(1)}, r"t has shape \(1,\)"),
+        ({"t": torch.tensor(0.0)}, r"t has shape \(\)"),
+        ({"u": torch.zeros(3, 1)}, r"u has shape \(3, 1\), expected \(\*batch, 4, M\)"),
+        ({"t_input": torch.zeros(5)}, r"u has shape \(4, 1\), expected \(\*batch, 5, M\)"),
+        ({"u": torch.zeros(2, 4, 1)}, r"u has batch shape \(2,\), x0 has \(\)"),
+        ({"interpolation": "cubic"}, "interpolation is 'cubic'"),
+    ],
+)
+def test_bad_input_is_refused_by_name(change, message):
+    values = {"x0": torch.zeros(4), "t": torch.arange(4.0), "u": torch.zeros(4, 1)} | change
+    derivative = copy.deepcopy(damped_oscillators()).float().velocity_derivative
+    with pytest.raises(ValueError, match=message):
+        rollout(derivative, values.pop("x0"), values.pop("t"), values.pop("u"), **values)

@@ -1,0 +1,138 @@
+"""Trajectories: what they accept, and how they are cut and stacked."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from pinn_dyn.mechanics import Trajectory, stack
+
+
+def trajectory(samples=11, step=0.1, start=0.0, batch=(), momentum=True, **changes):
+    generator = torch.Generator().manual_seed(0)
+
+    def values(size):
+        return torch.randn(*batch, samples, size, generator=generator, dtype=torch.float64)
+
+    fields = {
+        "t": start + step * torch.arange(samples, dtype=torch.float64),
+        "q": values(3),
+        "v": values(3),
+        "u": values(2),
+        "p": values(3) if momentum else None,
+    }
+    return Trajectory(**(fields | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"t": torch.zeros(1)}, r"^t has shape \(1,\).*at least 2"),
+        ({"t": torch.zeros(11, 1)}, r"^t has shape \(11, 1\)"),
+        ({"t": torch.tensor([0.0, 1.0, 1.0])}, r"t\[1\] = 1.0 is followed by t\[2\] = 1.0"),
+        ({"t": torch.arange(10.0)}, r"^q has shape \(11, 3\), expected \(\*batch, 10, 3\)"),
+        ({"v": torch.zeros(11, 2)}, r"^v has shape \(11, 2\), expected \(\*batch, 11, 3\)"),
+        ({"u": torch.zeros(10, 2)}, r"^u has shape \(10, 2\), expected \(\*batch, 11, 2\)"),
+        ({"u": torch.zeros(11)}, r"^u has shape \(11,\)"),
+        ({"p": torch.zeros(11, 4)}, r"^p has shape \(11, 4\)"),
+        ({"interpolation": "cubic"}, "interpolation is 'cubic'"),
+    ],
+)
+def test_fields_that_do_not_match_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        trajectory(**changes)
+
+
+@pytest.mark.xfail(strict=True, reason="Trajectory does not check these yet")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"t": torch.tensor([0.0, torch.nan, 2.0])}, "^t "),
+        ({"v": torch.zeros(4, 11, 3)}, "^v "),
+        ({"q": torch.tensor(0.0)}, "^q "),
+        ({"u": torch.tensor(0.0)}, "^u "),
+    ],
+    ids=["NaN in t", "batch of v", "scalar q", "scalar u"],
+)
+def test_other_bad_fields_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        trajectory(**changes)
+
+
+def test_a_trajectory_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        trajectory().interpolation = "hold"
+
+
+def test_duration_runs_from_the_first_to_the_last_sample():
+    assert trajectory(samples=11, step=0.1, start=5.0).duration == pytest.approx(1.0)
+
+
+def test_state_stacks_configuration_and_velocity_or_momentum():
+    item = trajectory(batch=(2,))
+    for coordinates, second in (("velocity", item.v), ("momentum", item.p)):
+        state = item.state(coordinates)
+        assert torch.equal(state[..., :3], item.q)
+        assert torch.equal(state[..., 3:], second)
+
+
+def test_state_in_momentum_says_that_none_was_recorded():
+    with pytest.raises(ValueError, match="no momentum p"):
+        trajectory(momentum=False).state("momentum")
+
+
+@pytest.mark.parametrize(("horizon", "samples"), [(1.0, 11), (0.5, 6), (0.3, 4), (0.1, 2)])
+@pytest.mark.parametrize("start", [0.0, 7.3])
+def test_until_keeps_the_sample_at_the_horizon(horizon, samples, start):
+    """0.3 is not 3 * 0.1 in floating point; half a step of tolerance settles it."""
+    whole = trajectory(start=start, batch=(2,), interpolation="hold")
+    part = whole.until(horizon)
+    assert part.duration == pytest.approx(horizon)
+    assert part.interpolation == "hold"
+    assert torch.equal(part.t, whole.t[:samples])
+    for name in ("q", "v", "u", "p"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)[:, :samples]), name
+
+
+def test_until_works_without_momentum():
+    assert trajectory(momentum=False).until(0.5).p is None
+
+
+def test_until_refuses_a_horizon_beyond_the_end():
+    with pytest.raises(ValueError, match=r"horizon is 1.2 s, but the trajectory lasts only 1 s"):
+        trajectory().until(1.2)
+
+
+def test_stack_adds_a_batch_dimension_and_starts_at_zero():
+    early, late = trajectory(), trajectory(start=100.0)
+    both = stack([early, late])
+    assert both.q.shape == (2, 11, 3)
+    assert both.t[0] == 0
+    torch.testing.assert_close(both.t, early.t)
+    assert torch.equal(both.u[1], late.u)
+    assert torch.equal(both.p[1], late.p)
+
+
+def test_stack_keeps_the_interpolation():
+    assert stack([trajectory(interpolation="hold")] * 2).interpolation == "hold"
+
+
+def test_stack_has_momentum_only_if_every_trajectory_has():
+    assert stack([trajectory(), trajectory(momentum=False)]).p is None
+
+
+@pytest.mark.parametrize("other", [{"samples": 10}, {"step": 0.2}], ids=["samples", "step"])
+def test_stack_refuses_other_sample_times_by_index(other):
+    with pytest.raises(ValueError, match="trajectory 1 has other sample times"):
+        stack([trajectory(), trajectory(**other)])
+
+
+@pytest.mark.xfail(strict=True, reason="stack takes the first trajectory's interpolation")
+def test_stack_refuses_mixed_interpolations():
+    with pytest.raises(ValueError, match="interpolation"):
+        stack([trajectory(), trajectory(interpolation="hold")])
+
+
+def test_stack_refuses_an_empty_list():
+    with pytest.raises(ValueError, match="trajectories is empty"):
+        stack([])

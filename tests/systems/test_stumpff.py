@@ -1,0 +1,66 @@
+"""The Stumpff functions against closed forms, exact series and finite differences."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
+from tests.support.finite_differences import slope
+
+FULL_CIRCLE = pytest.param(
+    4 * math.pi**2,
+    marks=pytest.mark.xfail(strict=True, reason="14 terms leave an error of 1e-13 at 2 pi"),
+)
+
+
+def exact(k, x):
+    """c_k(x) by its series in rational arithmetic, without rounding."""
+    x = Fraction(x)
+    terms = ((-x) ** j / math.factorial(k + 2 * j) for j in range(60))
+    return float(sum(terms))
+
+
+@pytest.mark.parametrize("x", [0.0, 1e-16, 1e-8, 1e-4, 0.01, 1.0, 10.0, FULL_CIRCLE])
+def test_values_match_the_exact_series(x):
+    values = stumpff(torch.tensor(x, dtype=torch.float64))
+    for k, value in enumerate(values):
+        assert float(value) == pytest.approx(exact(k, x), rel=1e-12, abs=4e-15), k
+
+
+def test_values_match_sine_and_cosine_up_to_a_full_circle():
+    theta = np.linspace(0.1, 2 * np.pi, 200)
+    c0, c1, c2, c3, *_ = (c.numpy() for c in stumpff(torch.from_numpy(theta**2)))
+    np.testing.assert_allclose(c0, np.cos(theta), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(c1, np.sin(theta) / theta, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(c2, (1 - np.cos(theta)) / theta**2, rtol=0, atol=1e-12)
+    # theta - sin(theta) has lost three digits at theta = 0.1.
+    np.testing.assert_allclose(c3, (theta - np.sin(theta)) / theta**3, rtol=0, atol=1e-12)
+
+
+def test_float32_values_are_exact_to_float32():
+    x = torch.linspace(0, 9.0, 50)
+    for single, double in zip(stumpff(x), stumpff(x.double()), strict=True):
+        assert single.dtype == torch.float32
+        torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("x", [0.0, 1e-6, 0.5, 4.0, 30.0])
+def test_slopes_match_finite_differences(x):
+    x = torch.tensor(x, dtype=torch.float64)
+    first = first_slopes(stumpff(x))
+    for k, value in zip((1, 2, 3), first, strict=True):
+        expected = slope(lambda e, k=k: stumpff(x + e)[k], 1e-2)
+        torch.testing.assert_close(value, expected, rtol=0, atol=1e-11)
+    for k, value in enumerate(second_slopes(stumpff(x))):
+        expected = slope(lambda e, k=k: first_slopes(stumpff(x + e))[k], 1e-2)
+        torch.testing.assert_close(value, expected, rtol=0, atol=1e-11)
+
+
+def test_derivative_at_zero_is_finite_and_exact():
+    x = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    for k, value in enumerate(stumpff(x)):
+        (gradient,) = torch.autograd.grad(value, x, retain_graph=True)
+        assert float(gradient) == pytest.approx(-1 / math.factorial(k + 2), rel=1e-14)
