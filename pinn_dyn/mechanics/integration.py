@@ -94,22 +94,30 @@ def rollout_increments(
             "expected the same batch"
         )
     require_finite("the initial state x0", x0)
-    signal = SampledInput(t if t_input is None else t_input, u, interpolation)
+    # Times count from the start, in the recording's own precision, and are cast only then.
+    t_samples = (t if t_input is None else t_input) - t[0]
+    t = t - t[0]
 
     def increment_rate(time: Tensor, increment: Tensor) -> Tensor:
         return derivative(x0 + increment, signal(time))
 
-    # One dtype throughout, so that the solver's times and the input's times compare exactly.
-    t = t.to(x0.dtype)
     grid = t
     if substeps > 1:
         fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
         inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
         grid = torch.cat([inner.flatten(), t[-1:]])
+        # A step that ends at a sample ends at that very number: "hold" tells the sides apart.
+        right = torch.searchsorted(t_samples, grid).clamp(1, t_samples.shape[0] - 1)
+        before, after = t_samples[right - 1], t_samples[right]
+        nearest = torch.where(grid - before < after - grid, before, after)
+        close = (grid - nearest).abs() < 1e-6 * (t[1:] - t[:-1]).min() / substeps
+        grid = torch.where(close, nearest, grid)
+    # One dtype throughout, so that the solver's times and the input's times compare exactly.
+    signal = SampledInput(t_samples.to(x0.dtype), u.to(x0.dtype), interpolation)
     solution = odeint(
         increment_rate,
         torch.zeros_like(x0),
-        grid,
+        grid.to(x0.dtype),
         method="rk4",
         options={"perturb": interpolation == "hold"},
     )

@@ -81,6 +81,10 @@ class ContinuousPredictor(Predictor):
         """
         self._compiled = torch.compile(self.state_derivative)
 
+    def __getstate__(self) -> dict[str, object]:
+        # A compiled function belongs to this object: copies and pickles go without it.
+        return {**self.__dict__, "_compiled": None}
+
     @final
     def increments(
         self,

@@ -85,6 +85,17 @@ class Trajectory:
             )
         return torch.cat([self.q, self.p], dim=-1)
 
+    def to(self, device: torch.device | str) -> Trajectory:
+        """The trajectory on another device."""
+        return Trajectory(
+            t=self.t.to(device),
+            q=self.q.to(device),
+            v=self.v.to(device),
+            u=self.u.to(device),
+            p=None if self.p is None else self.p.to(device),
+            interpolation=self.interpolation,
+        )
+
     def until(self, horizon: float) -> Trajectory:
         """The part of the trajectory up to ``horizon`` seconds after its start.
 

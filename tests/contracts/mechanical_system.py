@@ -68,12 +68,12 @@ class MechanicalSystemContract:
     difference_step = 1e-3
     float32_tolerance = 1e-3
     """Between float32 and float64; the accelerations lose the condition number of M."""
-    steps = 12
+    steps = 10
     """Even number of integrator steps in a roll-out."""
-    step_times_rate = 0.03
+    step_times_rate = 0.02
     """Step of a roll-out times the largest eigenvalue of the dynamics at its start."""
     rollout_tolerance = 1e-5
-    """Between roll-outs: fourth order in the step, at most (2 0.03)^4 for the energies."""
+    """Between roll-outs: fourth order in the step, measured at most 5e-6 for the energies."""
 
     @pytest.fixture
     def system(self) -> MechanicalSystem:

@@ -115,7 +115,7 @@ def test_input_may_be_sampled_more_finely_than_the_solution(system, interpolatio
         u,
         t_input=t_input,
         interpolation=interpolation,
-        substeps=12,
+        substeps=8,
     )
     expected = exact_solution(system, START, t_input, u, interpolation)[::4]
     torch.testing.assert_close(x, expected, rtol=0, atol=1e-6)
@@ -170,7 +170,7 @@ def test_rollout_is_of_fourth_order_for_the_soft_arm(form):
     t_input = torch.tensor([0.0, 0.05], dtype=torch.float64)
     u = torch.tensor([[0.1, -0.2, -1.3], [-0.2, 0.1, -1.0]], dtype=torch.float64)
     ends = []
-    for steps in (8, 16, 32, 64):
+    for steps in (8, 16, 32):
         t = torch.linspace(0, 0.05, steps + 1, dtype=torch.float64)
         ends.append(rollout(getattr(arm, form), x0, t, u, t_input=t_input)[-1])
     changes = torch.stack([(b - a).norm() for a, b in itertools.pairwise(ends)])
