@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -82,6 +82,7 @@ class SimulatedSource(DataSource):
         cache: folder of the cache; ``~`` is the home folder.
         labels: name and unit of each coordinate, N of them.
         input_labels: name and unit of each input, M of them.
+        configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
 
     Raises:
         ValueError: on a step longer than the duration, a count below 1, or sizes that do not
@@ -107,6 +108,7 @@ class SimulatedSource(DataSource):
         cache: str,
         labels: Sequence[str],
         input_labels: Sequence[str],
+        configurations: Mapping[str, Sequence[float]],
     ):
         if not 0 < step <= duration:
             raise ValueError(
@@ -124,11 +126,16 @@ class SimulatedSource(DataSource):
             ("initial_states", len(initial_states.q_low), system.num_coordinates),
             ("labels", len(labels), system.num_coordinates),
             ("input_labels", len(input_labels), system.num_inputs),
+            *(
+                (f"configurations.{key}", len(q), system.num_coordinates)
+                for key, q in configurations.items()
+            ),
         ):
             if found != expected:
                 raise ValueError(f"{name}: {key} has {found} entries, the system needs {expected}")
         self.name = name
-        self.system = system
+        self.system: MechanicalSystem = system
+        self.configurations = {key: list(q) for key, q in configurations.items()}
         self.excitation = excitation
         self.initial_states = initial_states
         self.duration = duration
@@ -168,8 +175,8 @@ class SimulatedSource(DataSource):
         return {
             "version": _VERSION,
             "system": {"class": type(self.system).__name__, **public},
-            "excitation": _describe_excitation(self.excitation),
-            "initial_states": _plain(asdict(self.initial_states)),
+            "excitation": _describe(self.excitation),
+            "initial_states": _describe(asdict(self.initial_states)),
             "duration": self.duration,
             "step": self.step,
             "counts": self.counts,
@@ -234,22 +241,16 @@ class SimulatedSource(DataSource):
         return torch.from_numpy(arrays[key][k]) if key in arrays else None
 
 
-def _describe_excitation(excitation: Excitation) -> dict[str, object]:
-    parts: Callable[[object], object] = lambda value: (  # noqa: E731
-        [_describe_excitation(part) for part in value]  # type: ignore[attr-defined]
-        if isinstance(value, Sequence) and value and isinstance(value[0], Excitation)
-        else _plain(value)
-    )
-    return {
-        "class": type(excitation).__name__,
-        **{key: parts(value) for key, value in vars(excitation).items()},
-    }
-
-
-def _plain(value: object) -> object:
-    """Lists and dicts of plain values, from whatever sequence type a config gave."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+def _describe(value: object) -> object:
+    """Plain lists, dicts and values that say what an excitation is made of."""
+    if isinstance(value, Excitation):
+        return {"class": type(value).__name__, **_described_items(vars(value))}
+    if isinstance(value, Mapping):
+        return _described_items(value)
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(v) for v in value]
+        return [_describe(item) for item in value]
     return value
+
+
+def _described_items(values: Mapping[str, object]) -> dict[str, object]:
+    return {str(key): _describe(value) for key, value in values.items()}

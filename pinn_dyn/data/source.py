@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,15 @@ class DataSource(abc.ABC):
         name: short name, for tables and titles.
         labels: name and unit of each coordinate.
         input_labels: name and unit of each input.
+        system: the truth, or None for measured data.
+        configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
     """
 
     name: str
     labels: list[str]
     input_labels: list[str]
+    system: MechanicalSystem | None
+    configurations: dict[str, list[float]]
 
     @abc.abstractmethod
     def load(self) -> Splits:

@@ -11,10 +11,13 @@ from pinn_dyn.evaluation.tables import (
     summary_table,
     write_table,
 )
+from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
 
 __all__ = [
     "Prediction",
+    "RolloutFigures",
     "RolloutMetrics",
+    "RolloutValidator",
     "RunResult",
     "TermComparison",
     "compare_terms",

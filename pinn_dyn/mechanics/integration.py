@@ -86,6 +86,9 @@ def rollout_increments(
     """
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"t has shape {tuple(t.shape)}, expected (T,) with at least 2 times")
+    for name, grid_times in (("t", t), ("t_input", t if t_input is None else t_input)):
+        if not bool((grid_times.diff() > 0).all()):
+            raise ValueError(f"{name} must increase strictly; sort it and drop repeated times")
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, expected at least 1")
     if u.shape[:-2] != x0.shape[:-1]:

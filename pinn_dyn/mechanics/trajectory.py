@@ -44,8 +44,9 @@ class Trajectory:
             raise ValueError(
                 f"t has shape {tuple(self.t.shape)}, expected (T,) with at least 2 samples"
             )
-        if not bool((self.t[1:] > self.t[:-1]).all()):
-            k = int((self.t[1:] <= self.t[:-1]).nonzero()[0])
+        backward = ~(self.t[1:] > self.t[:-1])
+        if backward.any():
+            k = int(backward.nonzero()[0])
             raise ValueError(
                 f"t must increase strictly, but t[{k}] = {float(self.t[k])} "
                 f"is followed by t[{k + 1}] = {float(self.t[k + 1])}"
@@ -54,11 +55,12 @@ class Trajectory:
             value = getattr(self, name)
             if value is None:
                 continue
-            expected = (samples, value.shape[-1]) if name == "u" else (samples, self.q.shape[-1])
-            if value.ndim < 2 or tuple(value.shape[-2:]) != expected:
+            width = (value if name == "u" else self.q).shape[-1:]
+            expected = (*self.q.shape[:-2], samples, *width)
+            if value.ndim < 2 or tuple(value.shape) != expected:
                 raise ValueError(
-                    f"{name} has shape {tuple(value.shape)}, expected (*batch, {expected[0]}, "
-                    f"{expected[1]}) to match t and q"
+                    f"{name} has shape {tuple(value.shape)}, expected (*batch, T, "
+                    f"{'M' if name == 'u' else 'N'}) = {expected} to match t and q"
                 )
         if self.interpolation not in ("linear", "hold"):
             raise ValueError(
@@ -128,9 +130,15 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         raise ValueError("trajectories is empty: expected at least one")
     first = trajectories[0]
     for index, other in enumerate(trajectories):
+        if other.interpolation != first.interpolation:
+            raise ValueError(
+                f"trajectory {index} has interpolation {other.interpolation!r}, trajectory 0 "
+                f"{first.interpolation!r}: expected the same"
+            )
         # Sample times are compared from each trajectory's own start.
+        resolution = 4 * torch.finfo(other.t.dtype).eps * float(other.t.abs().max())
         same = other.t.shape == first.t.shape and torch.allclose(
-            other.t - other.t[0], first.t - first.t[0], rtol=0, atol=1e-9
+            other.t - other.t[0], first.t - first.t[0], rtol=0, atol=max(1e-9, resolution)
         )
         if not same:
             raise ValueError(

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-_TERMS = 14
+_TERMS = 16
 
 
 def stumpff(x: Tensor) -> tuple[Tensor, ...]:

@@ -71,7 +71,7 @@ class DynamicsLearner(L.LightningModule):
             t_input=batch.t_input,
             interpolation=batch.interpolation,
         )
-        loss = self.loss(predicted, batch.increments(self.model.coordinates))
+        loss = self.loss(predicted[..., 1:, :], batch.increments(self.model.coordinates))
         if not torch.isfinite(loss):
             raise NonFiniteLossError(
                 f"the training loss became {float(loss)} at step {self.global_step} (epoch "

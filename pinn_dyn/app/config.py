@@ -1,0 +1,113 @@
+"""Configurations: found, checked before anything runs, and turned into plain values."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import ConfigCompositionException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+class ConfigError(ValueError):
+    """The configuration cannot be used as it is; the message says what to change."""
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as nested dicts, lists and values, all interpolations resolved.
+
+    Raises:
+        ConfigError: naming every value that is still missing.
+    """
+    missing = sorted(OmegaConf.missing_keys(cfg))
+    if missing:
+        raise ConfigError(
+            f"no value for {', '.join(missing)}: give it on the command line, as in "
+            f"'{missing[0]}=...'"
+        )
+    values = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+def main(task: Callable[[DictConfig], object], config_name: str) -> None:
+    """Run a task on the configuration that the command line asks for.
+
+    A misspelt key ends the program before anything is written, with the keys that were probably
+    meant; so does a :class:`ConfigError` or ValueError of the task, without a traceback.
+    """
+    problem = misspelt_key(config_name, sys.argv[1:])
+    if problem:
+        raise SystemExit(f"Error: {problem}")
+
+    def run(cfg: DictConfig) -> object:
+        try:
+            return task(cfg)
+        except (ConfigError, FileNotFoundError) as error:
+            raise SystemExit(f"Error: {error}") from error
+
+    # Warnings about loggers and hardware that a user cannot act on.
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+
+
+def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
+    """What is wrong with a key among command-line overrides, and what was probably meant.
+
+    None if every key exists, or if Hydra itself will explain the error (a group's wrong option,
+    say, for which it lists the right ones).
+    """
+    flags = [index for index, word in enumerate(arguments) if word.startswith("-")]
+    words = [w for k, w in enumerate(arguments) if k not in flags and "=" in w]
+    try:
+        overrides = [
+            # Of a sweep the first choice stands for all.
+            f"{o.input_line.split('=')[0]}={next(o.sweep_string_iterator())}"
+            if o.is_sweep_override()
+            else o.input_line
+            for o in OverridesParser.create().parse_overrides(words)
+        ]
+    except OverrideParseException:
+        return None
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        try:
+            hydra.compose(config_name, overrides=overrides)
+        except ConfigCompositionException as error:
+            key = getattr(error.__cause__, "full_key", None)
+            if not key or "is not in struct" not in str(error.__cause__):
+                return None
+            groups = [o for o in overrides if "." not in o.split("=")[0] and _is_group(o)]
+            known = _keys(hydra.compose(config_name, overrides=groups))
+            close = difflib.get_close_matches(key, known, n=3, cutoff=0.6) or [
+                name for name in known if name.split(".")[-1] == key.split(".")[-1]
+            ]
+            hint = f"did you mean {' or '.join(close[:3])}?" if close else "no key is like it."
+            return (
+                f"the configuration has no key '{key}': {hint} See all keys with "
+                f"'python {config_name}.py --cfg job'."
+            )
+    return None
+
+
+def _is_group(override: str) -> bool:
+    return (CONF / override.split("=")[0].lstrip("+~")).is_dir()
+
+
+def _keys(cfg: DictConfig, prefix: str = "") -> list[str]:
+    names = []
+    for key in cfg:
+        name = f"{prefix}{key}"
+        names.append(name)
+        if not OmegaConf.is_missing(cfg, key) and not OmegaConf.is_interpolation(cfg, key):
+            value = cfg[key]
+            if isinstance(value, DictConfig):
+                names += _keys(value, f"{name}.")
+    return names

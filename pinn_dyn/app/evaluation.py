@@ -1,0 +1,187 @@
+"""Compare trained models on unseen test trajectories, as evaluate.py does."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from pinn_dyn.app.build import build_source
+from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.runs import Run, find_runs, load_run, provenance
+from pinn_dyn.data import DataSource
+from pinn_dyn.evaluation import (
+    Prediction,
+    RunResult,
+    compare_terms,
+    error_figure,
+    format_table,
+    grouped_table,
+    predict_trajectories,
+    predict_windows,
+    rollout_metrics,
+    save,
+    summary_table,
+    terms_figure,
+    trajectory_figure,
+    write_table,
+)
+from pinn_dyn.mechanics import MechanicalSystem, Trajectory, stack
+
+log = logging.getLogger(__name__)
+
+# Columns of the terminal's table; the files hold all of them.
+_SHOWN = ("error_mean", "error_std", "error_median", "error_worst", "squared_error_mean")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One run's roll-outs and its row of the table."""
+
+    run: Run
+    label: str
+    prediction: Prediction
+    result: RunResult
+
+
+def evaluate(cfg: DictConfig) -> float:
+    """Evaluate runs side by side; returns the smallest mean error.
+
+    Raises:
+        ConfigError: on runs that cannot be loaded, or that were trained on different data.
+    """
+    config = plain(cfg)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    torch.set_num_threads(config["threads"])
+    runs = [load_run(path, config["checkpoint"]) for path in find_runs(config["runs"])]
+    source = build_source(_shared_dataset(runs))
+    truth = stack(source.load().test)
+    log.info("%d runs on %d test trajectories of %s", len(runs), truth.q.shape[0], source.name)
+
+    labels = _labels(runs)
+    evaluations = []
+    for run, label in zip(tqdm(runs, desc="evaluating runs"), labels, strict=True):
+        evaluations.append(_evaluate(run, label, truth, config))
+    summary = summary_table([item.result for item in evaluations])
+    write_table(summary, folder, "summary")
+    grouped = grouped_table(summary)
+    write_table(grouped, folder, "by_model")
+    (folder / "provenance.json").write_text(
+        json.dumps({"config": config, "dataset": runs[0].config["dataset"], **provenance()}, indent=2)
+    )
+    _draw(evaluations, truth.until(config["horizon"]), source, config, folder)
+    text = _compare_with_truth(evaluations, source, folder)
+
+    horizon = f"{config['horizon']:g} s"
+    shown = ["run", "seed", "pairs", *_SHOWN, *[c for c in summary if c.startswith("window_")]]
+    print(f"\n{text}" if text else "")
+    print(f"{source.name}: {truth.q.shape[0]} unseen test trajectories, {horizon} open loop")
+    print(format_table(summary[[name for name in shown if name in summary]]))
+    if len(grouped) < len(summary):
+        best = ["model", "runs", *[c for c in grouped if c.endswith(("_error_mean", "_error_worst"))]]
+        print(f"\nover seeds:\n{format_table(grouped[[c for c in best if c in grouped]])}")
+    print(f"\nfigures and tables are in {folder}")
+    return float(summary["error_mean"].min())
+
+
+def _shared_dataset(runs: list[Run]) -> dict[str, Any]:
+    """The part of the configuration that says which data all runs were trained on."""
+    first = runs[0]
+    for run in runs[1:]:
+        if _without_cache(run.config) != _without_cache(first.config):
+            raise ConfigError(
+                f"runs: {run.folder} was trained on another data set than {first.folder} "
+                "(compare 'dataset' in their config.yaml): evaluate them separately"
+            )
+    return first.config
+
+
+def _without_cache(config: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in config["dataset"].items() if key != "cache"}
+
+
+def _labels(runs: list[Run]) -> list[str]:
+    """Short names of runs: the model, with its seed and folder only where they tell apart."""
+    models = [run.config["model_name"] for run in runs]
+    seeds = [f"{m} seed {run.config['seed']}" for m, run in zip(models, runs, strict=True)]
+    for names in (models, seeds):
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name} {run.folder.name}" for name, run in zip(seeds, runs, strict=True)]
+
+
+def _evaluate(run: Run, label: str, truth: Trajectory, config: dict[str, Any]) -> Evaluation:
+    step = run.statistics.step if config["step"] is None else config["step"]
+    horizon = truth.until(config["horizon"])
+    prediction = predict_trajectories(run.model, horizon, step=step)
+    metrics = rollout_metrics(
+        prediction.q_hat, prediction.q, prediction.t, thresholds=config["thresholds"]
+    ).to_dict()
+    for window in config["windows"]:
+        windowed = predict_windows(run.model, horizon, window=window, step=step)
+        figures = rollout_metrics(windowed.q_hat, windowed.q, windowed.t, thresholds={})
+        metrics[f"window_{window:g}s_error_mean"] = figures.error_mean
+    recorded = ("pairs", "parameters", "training_seconds")
+    extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
+    result = RunResult(
+        label, run.config["model_name"], run.config["seed"], metrics, {**extra, "step": step}
+    )
+    return Evaluation(run, label, prediction, result)
+
+
+def _draw(
+    evaluations: list[Evaluation],
+    truth: Trajectory,
+    source: DataSource,
+    config: dict[str, Any],
+    folder: Path,
+) -> None:
+    predictions = {item.label: item.prediction for item in evaluations}
+    title = f"{source.name}, unseen test trajectories, {config['horizon']:g} s open loop"
+    figure = trajectory_figure(
+        truth,
+        predictions,
+        trajectory=config["trajectory"],
+        title=f"{source.name}, test trajectory {config['trajectory']}, open loop",
+        labels=source.labels,
+        input_labels=source.input_labels,
+    )
+    save(figure, folder / "trajectory.png")
+    save(error_figure(predictions, title=title), folder / "error.png")
+
+
+def _compare_with_truth(
+    evaluations: list[Evaluation], source: DataSource, folder: Path
+) -> str:
+    """Write learned against true terms of each structured model; returns the text of it."""
+    if source.system is None or not source.configurations:
+        return ""
+    names = list(source.configurations)
+    q = torch.tensor([source.configurations[name] for name in names], dtype=torch.float64)
+    texts = []
+    for item in evaluations:
+        model = item.run.model
+        if not isinstance(model, MechanicalSystem):
+            continue
+        comparison = compare_terms(model, source.system, q, names=names)
+        stem = item.label.replace(" ", "_")
+        write_table(comparison.to_frame(), folder, f"terms_{stem}")
+        texts.append(f"{item.label}: learned and true terms\n{comparison.to_text()}")
+        for index, name in enumerate(names):
+            figure = terms_figure(
+                comparison,
+                configuration=index,
+                title=f"{item.label}: learned and true terms, {name}",
+                inverse_mass=model.coordinates == "momentum",
+            )
+            save(figure, folder / f"terms_{stem}_{name}.png")
+    text = "\n\n".join(texts)
+    (folder / "terms.txt").write_text(text + "\n")
+    return text

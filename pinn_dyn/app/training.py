@@ -1,0 +1,101 @@
+"""Train a model, as train.py does."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from pathlib import Path
+
+import lightning as L
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from pinn_dyn.app.build import (
+    build_data,
+    build_learner,
+    build_model,
+    build_trainer,
+    build_validator,
+)
+from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.runs import CHECKPOINTS, METRICS, provenance, read_config, write_config
+
+log = logging.getLogger(__name__)
+
+
+def train(cfg: DictConfig) -> float:
+    """Train one model; returns the last validation error, the figure that a sweep minimizes.
+
+    Raises:
+        ConfigError: on a configuration that cannot be used, or nothing to resume from.
+        NonFiniteLossError: if the loss becomes NaN or infinite.
+    """
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    last = None
+    if cfg.resume is not None:
+        folder = Path(cfg.resume)
+        config = read_config(folder)
+        last = folder / CHECKPOINTS / "last.ckpt"
+        if not last.is_file():
+            raise ConfigError(f"nothing to resume from: {last} does not exist")
+    else:
+        config = plain(cfg)
+        write_config(folder, config)
+    torch.set_num_threads(config["threads"])
+    L.seed_everything(config["seed"], verbose=False)
+
+    data = build_data(config)
+    log.info("%s: loading data", config["name"])
+    statistics = data.statistics
+    model = build_model(config, statistics)
+    validator = build_validator(config, statistics.step)
+    learner = build_learner(config, model, statistics, validator)
+    trainer = build_trainer(config, folder, data.source, validator)
+
+    start = time.perf_counter()
+    trainer.fit(learner, data, ckpt_path=last, weights_only=True)
+    seconds = time.perf_counter() - start
+
+    metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
+    error = metrics.get("val/error_mean", float("nan"))
+    parameters = sum(p.numel() for p in model.parameters())
+    record = {
+        "name": config["name"],
+        "seed": config["seed"],
+        "pairs": len(data.windows),
+        "parameters": parameters,
+        "training_seconds": seconds,
+        "steps": trainer.global_step,
+        "validation": metrics,
+        **provenance(),
+    }
+    (folder / METRICS).write_text(json.dumps(record, indent=2))
+    for logger in trainer.loggers:
+        logger.log_hyperparams(
+            _flat(config),  # type: ignore[arg-type]
+            {"val/error_mean": error, "training_seconds": seconds},  # type: ignore[call-arg]
+        )
+        logger.finalize("success")
+    log.info(
+        "%s seed %d: validation error %.5f over %g s after %.0f s of training, in %s",
+        config["name"],
+        config["seed"],
+        error,
+        validator.horizon,
+        seconds,
+        folder,
+    )
+    return error
+
+
+def _flat(values: dict, prefix: str = "") -> dict[str, object]:
+    flat: dict[str, object] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{name}.")
+        else:
+            flat[name] = value if isinstance(value, (int, float, bool, str)) else str(value)
+    return flat
