@@ -87,9 +87,7 @@ def build_trainer(
                 configurations=source.configurations,
             )
         callbacks.append(callback)
-    logger = TensorBoardLogger(
-        str(folder), name="tensorboard", version="", default_hp_metric=False
-    )
+    logger = TensorBoardLogger(str(folder), name="tensorboard", version="", default_hp_metric=False)
     return _build(
         "trainer",
         {**config["trainer"], "_partial_": True},

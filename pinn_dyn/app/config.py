@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -65,16 +65,15 @@ def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
     None if every key exists, or if Hydra itself will explain the error (a group's wrong option,
     say, for which it lists the right ones).
     """
-    flags = [index for index, word in enumerate(arguments) if word.startswith("-")]
-    words = [w for k, w in enumerate(arguments) if k not in flags and "=" in w]
+    words = [word for word in arguments if "=" in word and not word.startswith("-")]
     try:
-        overrides = [
+        overrides = []
+        for word, parsed in zip(
+            words, OverridesParser.create().parse_overrides(words), strict=True
+        ):
             # Of a sweep the first choice stands for all.
-            f"{o.input_line.split('=')[0]}={next(o.sweep_string_iterator())}"
-            if o.is_sweep_override()
-            else o.input_line
-            for o in OverridesParser.create().parse_overrides(words)
-        ]
+            first = next(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else None
+            overrides.append(word if first is None else f"{word.split('=')[0]}={first}")
     except OverrideParseException:
         return None
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
@@ -101,13 +100,13 @@ def _is_group(override: str) -> bool:
     return (CONF / override.split("=")[0].lstrip("+~")).is_dir()
 
 
-def _keys(cfg: DictConfig, prefix: str = "") -> list[str]:
-    names = []
-    for key in cfg:
-        name = f"{prefix}{key}"
-        names.append(name)
-        if not OmegaConf.is_missing(cfg, key) and not OmegaConf.is_interpolation(cfg, key):
-            value = cfg[key]
-            if isinstance(value, DictConfig):
-                names += _keys(value, f"{name}.")
-    return names
+def _keys(cfg: DictConfig) -> list[str]:
+    def walk(values: dict[Any, Any], prefix: str) -> Iterator[str]:
+        for key, value in values.items():
+            yield f"{prefix}{key}"
+            if isinstance(value, dict):
+                yield from walk(value, f"{prefix}{key}.")
+
+    values = OmegaConf.to_container(cfg)
+    assert isinstance(values, dict)
+    return list(walk(values, ""))

@@ -74,7 +74,9 @@ def evaluate(cfg: DictConfig) -> float:
     grouped = grouped_table(summary)
     write_table(grouped, folder, "by_model")
     (folder / "provenance.json").write_text(
-        json.dumps({"config": config, "dataset": runs[0].config["dataset"], **provenance()}, indent=2)
+        json.dumps(
+            {"config": config, "dataset": runs[0].config["dataset"], **provenance()}, indent=2
+        )
     )
     _draw(evaluations, truth.until(config["horizon"]), source, config, folder)
     text = _compare_with_truth(evaluations, source, folder)
@@ -85,7 +87,11 @@ def evaluate(cfg: DictConfig) -> float:
     print(f"{source.name}: {truth.q.shape[0]} unseen test trajectories, {horizon} open loop")
     print(format_table(summary[[name for name in shown if name in summary]]))
     if len(grouped) < len(summary):
-        best = ["model", "runs", *[c for c in grouped if c.endswith(("_error_mean", "_error_worst"))]]
+        best = [
+            "model",
+            "runs",
+            *[c for c in grouped if c.endswith(("_error_mean", "_error_worst"))],
+        ]
         print(f"\nover seeds:\n{format_table(grouped[[c for c in best if c in grouped]])}")
     print(f"\nfigures and tables are in {folder}")
     return float(summary["error_mean"].min())
@@ -118,7 +124,7 @@ def _labels(runs: list[Run]) -> list[str]:
 
 
 def _evaluate(run: Run, label: str, truth: Trajectory, config: dict[str, Any]) -> Evaluation:
-    step = run.statistics.step if config["step"] is None else config["step"]
+    step = run.model.fixed_step or config["step"] or run.statistics.step
     horizon = truth.until(config["horizon"])
     prediction = predict_trajectories(run.model, horizon, step=step)
     metrics = rollout_metrics(
@@ -157,9 +163,7 @@ def _draw(
     save(error_figure(predictions, title=title), folder / "error.png")
 
 
-def _compare_with_truth(
-    evaluations: list[Evaluation], source: DataSource, folder: Path
-) -> str:
+def _compare_with_truth(evaluations: list[Evaluation], source: DataSource, folder: Path) -> str:
     """Write learned against true terms of each structured model; returns the text of it."""
     if source.system is None or not source.configurations:
         return ""

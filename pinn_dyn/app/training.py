@@ -74,8 +74,8 @@ def train(cfg: DictConfig) -> float:
     (folder / METRICS).write_text(json.dumps(record, indent=2))
     for logger in trainer.loggers:
         logger.log_hyperparams(
-            _flat(config),  # type: ignore[arg-type]
-            {"val/error_mean": error, "training_seconds": seconds},  # type: ignore[call-arg]
+            _flat(config),
+            {"val/error_mean": error, "training_seconds": seconds},
         )
         logger.finalize("success")
     log.info(

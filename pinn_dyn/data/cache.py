@@ -24,7 +24,9 @@ def cache_key(description: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def load_or_make(folder: Path, name: str, description: object, make: Callable[[], Arrays]) -> Arrays:
+def load_or_make(
+    folder: Path, name: str, description: object, make: Callable[[], Arrays]
+) -> Arrays:
     """Load the arrays of a description from the cache, or make and store them.
 
     A file is ``<name>-<key>.npz``: plain arrays without pickle, with the description beside them.
@@ -68,7 +70,8 @@ def _write(path: Path, arrays: Arrays, description: object) -> None:
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with partial.open("wb") as file:
-            np.savez(file, description=np.array(json.dumps(description)), **dict(arrays))
+            members = {"description": np.array(json.dumps(description)), **arrays}
+            np.savez(file, allow_pickle=False, **members)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -89,7 +89,8 @@ class MultiSine(_Bounded):
         """Draw ``count`` multi-sines; they do not depend on the duration."""
         peak = self._peaks(count, rng)
         shape = (*peak.shape, self.harmonics)
-        frequency = np.exp(rng.uniform(*np.log(np.asarray(self.frequency)), shape))
+        low, high = np.log(self.frequency)
+        frequency = np.exp(rng.uniform(low, high, shape))
         phase = rng.uniform(0, 2 * np.pi, shape)
         weight = rng.dirichlet(np.ones(self.harmonics), peak.shape)
 
@@ -162,7 +163,7 @@ class Steps(_Bounded):
         number = int(np.ceil(duration / self.hold[0])) + 1
         shape = (*peak.shape, number)
         level = rng.uniform(-1, 1, shape)
-        start = np.cumsum(rng.uniform(*self.hold, shape), axis=-1)
+        start = np.cumsum(rng.uniform(self.hold[0], self.hold[1], shape), axis=-1)
         jump = np.diff(level, axis=-1)
 
         def signal(t: np.ndarray) -> np.ndarray:

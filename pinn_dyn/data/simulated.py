@@ -45,7 +45,9 @@ class InitialStates:
             )
         bounds = np.array([self.q_low, self.q_high, self.v_max], dtype=float)
         if not np.isfinite(bounds).all():
-            raise ValueError(f"InitialStates: bounds are {bounds.tolist()}, expected finite numbers")
+            raise ValueError(
+                f"InitialStates: bounds are {bounds.tolist()}, expected finite numbers"
+            )
         if (bounds[0] > bounds[1]).any() or (bounds[2] < 0).any():
             raise ValueError(
                 f"InitialStates: q_low = {list(self.q_low)}, q_high = {list(self.q_high)}, v_max = "

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,25 +52,13 @@ class Windows:
     def to(self, device: torch.device, dtype: torch.dtype | None = None) -> Windows:
         """All tensors on a device and, where given, in a dtype."""
         moved = self._map(lambda value: value.to(device, dtype))
-        return Windows(
-            **{
-                item.name: getattr(moved, item.name).to(device, dtype)
-                if item.name in ("t", "t_input")
-                else getattr(moved, item.name)
-                for item in fields(self)
-            }
-        )
+        return replace(moved, t=self.t.to(device, dtype), t_input=self.t_input.to(device, dtype))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Windows:
-        kept = ("t", "t_input", "interpolation")
-        return Windows(
-            **{
-                item.name: getattr(self, item.name)
-                if item.name in kept
-                else change(getattr(self, item.name))
-                for item in fields(self)
-            }
-        )
+        """Apply a change to every tensor that has one row per window."""
+        rows = ("q", "v", "p", "dq", "dv", "dp", "u")
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in rows}
+        return replace(self, **changed)
 
     def start(self, coordinates: Coordinates) -> Tensor:
         """State at the start, ``(B, 2N)``: (q, v) or (q, p)."""
@@ -167,9 +156,7 @@ def draw_windows(
     if momentum is not None:
         p = momentum(q, v)
     elif all(item.p is not None for item in trajectories):
-        p = torch.stack(
-            [trajectories[i].p[k + knots] for i, k in zip(which, offset, strict=True)]  # type: ignore[index]
-        )
+        p = torch.stack([trajectories[i].p[k + knots] for i, k in zip(which, offset, strict=True)])
     else:
         p = q.new_zeros((count, steps + 1, 0))
     return Windows(

@@ -38,7 +38,8 @@ class RolloutValidator:
 
     def predict(self, model: Predictor, truth: Trajectory) -> Prediction:
         """Roll out the model along the first ``horizon`` seconds of the truth."""
-        return predict_trajectories(model, truth.until(self.horizon), step=self.step)
+        step = model.fixed_step or self.step
+        return predict_trajectories(model, truth.until(self.horizon), step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
         """Error mean, median and worst, diverged count, and the seconds that it took."""

@@ -21,7 +21,10 @@ class Predictor(nn.Module, abc.ABC):
         num_coordinates: N, the dimension of q.
         num_inputs: M, the dimension of u.
         coordinates: ``"velocity"`` if the state is (q, v), ``"momentum"`` if it is (q, p).
+        fixed_step: the one step in s that the model predicts in, or None if it takes any.
     """
+
+    fixed_step: float | None = None
 
     def __init__(self, num_coordinates: int, num_inputs: int, coordinates: Coordinates):
         super().__init__()

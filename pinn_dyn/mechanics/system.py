@@ -69,13 +69,11 @@ class MechanicalSystem(ContinuousPredictor):
     # What a subclass may replace by closed formulas.
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        _, pullback = torch.func.vjp(lambda x: self.potential_energy(x).sum(), q)
-        (force,) = pullback(torch.ones((), dtype=q.dtype, device=q.device))
-        return force
+        return torch.func.grad(lambda x: self.potential_energy(x).sum())(q)
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """M(q) a + C(q, v) v, with C(q, v) v = (dM/dt) v - d(v^T M v / 2)/dq."""
-        mass, mass_rate = torch.func.jvp(self.mass_matrix, (q,), (v,))
+        mass, mass_rate = torch.func.jvp(self.mass_matrix, (q,), (v,))  # type: ignore[misc]
         return matvec(mass, a) + matvec(mass_rate, v) - self._kinetic_gradient(q, v)
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
@@ -96,9 +94,7 @@ class MechanicalSystem(ContinuousPredictor):
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
         """d(v^T M(q) v / 2)/dq at fixed v, one reverse pass through the mass matrix."""
-        _, pullback = torch.func.vjp(self.mass_matrix, q)
-        (gradient,) = pullback(0.5 * v.unsqueeze(-1) * v.unsqueeze(-2))
-        return gradient
+        return torch.func.grad(lambda x: 0.5 * (v * matvec(self.mass_matrix(x), v)).sum())(q)
 
     # What every mechanical system can then do.
 

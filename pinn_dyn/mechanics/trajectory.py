@@ -56,11 +56,12 @@ class Trajectory:
             if value is None:
                 continue
             width = (value if name == "u" else self.q).shape[-1:]
-            expected = (*self.q.shape[:-2], samples, *width)
-            if value.ndim < 2 or tuple(value.shape) != expected:
+            batch = self.q.shape[:-2]
+            if value.ndim < 2 or value.shape != (*batch, samples, *width):
+                sizes = ", ".join(str(size) for size in (samples, *width))
                 raise ValueError(
-                    f"{name} has shape {tuple(value.shape)}, expected (*batch, T, "
-                    f"{'M' if name == 'u' else 'N'}) = {expected} to match t and q"
+                    f"{name} has shape {tuple(value.shape)}, expected (*batch, {sizes}) with the "
+                    f"batch {tuple(batch)} of q"
                 )
         if self.interpolation not in ("linear", "hold"):
             raise ValueError(

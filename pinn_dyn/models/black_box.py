@@ -25,15 +25,21 @@ class NextStateMLP(Predictor):
         activation: activation of the hidden layers.
     """
 
-    def __init__(
-        self, statistics: Statistics, hidden: Sequence[int], activation: str = "softplus"
-    ):
+    scale: Tensor
+    step: Tensor
+
+    def __init__(self, statistics: Statistics, hidden: Sequence[int], activation: str = "softplus"):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, "velocity")
         mean, std = statistics.network_input(repeat_input=2)
         self.network = MLP(2 * size + 2 * inputs, 2 * size, hidden, activation, mean, std)
         self.register_buffer("scale", statistics.velocity_increment_std[0].float())
         self.register_buffer("step", torch.tensor(statistics.step, dtype=torch.float64))
+
+    @property
+    def fixed_step(self) -> float:  # type: ignore[override]
+        """The step of the windows that it was trained on, s."""
+        return float(self.step)
 
     def increments(
         self,
@@ -51,7 +57,7 @@ class NextStateMLP(Predictor):
                 times are not among the sample times of the input.
         """
         grid = t if t_input is None else t_input
-        step = float(self.step)
+        step = self.fixed_step
         spacing = (t[1:] - t[:-1]).double()
         if (spacing - step).abs().max() > 1e-3 * step:
             raise ValueError(
@@ -85,9 +91,9 @@ class AccelerationMLP(ContinuousPredictor):
         activation: activation of the hidden layers.
     """
 
-    def __init__(
-        self, statistics: Statistics, hidden: Sequence[int], activation: str = "softplus"
-    ):
+    scale: Tensor
+
+    def __init__(self, statistics: Statistics, hidden: Sequence[int], activation: str = "softplus"):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, "velocity")
         mean, std = statistics.network_input(repeat_input=1)

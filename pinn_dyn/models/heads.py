@@ -69,6 +69,8 @@ class NetworkCholesky(CholeskyFactor):
         ValueError: on an unknown diagonal, a negative epsilon or a bound that is not positive.
     """
 
+    placement: Tensor
+
     def __init__(
         self,
         *,
@@ -97,11 +99,11 @@ class NetworkCholesky(CholeskyFactor):
         self.network = MLP(size, outputs, hidden, activation, mean, std)
         with torch.no_grad():
             # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
-            last = self.network.layers[-1]
-            assert isinstance(last, nn.Linear)
+            last = self.network.linears[-1]
             last.weight.mul_(0.1)
             last.bias[:size] = 0.54 if diagonal == "softplus" else 1.0
-        # vec(L) = y S, S holds the scales: a product with a mostly zero S is faster than indexing, above all backwards.
+        # vec(L) = y S, where S holds the scales: a product with a mostly zero matrix is faster
+        # than indexing, above all backwards.
         rows, columns = torch.tril_indices(size, size, offset=-1)
         order = torch.cat([torch.arange(size) * (size + 1), rows * size + columns])
         placement = torch.zeros(outputs, size * size)
@@ -153,6 +155,8 @@ class ConstantCholesky(CholeskyFactor):
         epsilon: smallest diagonal entry in units of the scale.
     """
 
+    scale: Tensor
+
     def __init__(
         self, *, size: int, scale: Tensor, mean: Tensor, std: Tensor, epsilon: float = 1e-3
     ):
@@ -189,6 +193,8 @@ class FixedCholesky(CholeskyFactor):
     Raises:
         ValueError: if the matrix is not N x N, not symmetric or not positive semi-definite.
     """
+
+    factor: Tensor
 
     def __init__(
         self,
@@ -246,6 +252,8 @@ class NetworkPotential(nn.Module):
         activation: activation of the hidden layers.
         quadratic: whether the K term is there; false is the paper's plain network.
     """
+
+    scale: Tensor
 
     def __init__(
         self,
@@ -306,6 +314,8 @@ class NetworkInput(InputMatrix):
         ValueError: on a bound that is not positive.
     """
 
+    scale: Tensor
+
     def __init__(
         self,
         *,
@@ -344,6 +354,8 @@ class ConstantInput(InputMatrix):
         mean, std: not used by a constant; every head takes the same arguments from the model.
     """
 
+    scale: Tensor
+
     def __init__(self, *, size: int, inputs: int, scale: Tensor, mean: Tensor, std: Tensor):
         super().__init__()
         self.raw = nn.Parameter(torch.eye(size, inputs))
@@ -367,6 +379,8 @@ class FixedInput(InputMatrix):
     Raises:
         ValueError: if the matrix is not N x M.
     """
+
+    value: Tensor
 
     def __init__(
         self,

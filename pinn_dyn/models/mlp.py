@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -52,6 +54,9 @@ class MLP(nn.Module):
         ValueError: on an unknown activation, or widths below 1.
     """
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(
         self,
         inputs: int,
@@ -70,15 +75,17 @@ class MLP(nn.Module):
             raise ValueError(f"hidden is {list(hidden)}, expected widths of at least 1")
         self._activation = ACTIVATIONS[activation]
         sizes = [inputs, *hidden, outputs]
-        self.layers = nn.ModuleList(
-            nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)
-        )
-        for layer in self.layers:
-            assert isinstance(layer, nn.Linear)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        for layer in self.linears:
             nn.init.xavier_normal_(layer.weight)
             nn.init.zeros_(layer.bias)
         self.register_buffer("mean", torch.zeros(inputs) if mean is None else mean.float())
         self.register_buffer("std", torch.ones(inputs) if std is None else std.float())
+
+    @property
+    def linears(self) -> list[nn.Linear]:
+        """The layers, from input to output."""
+        return cast("list[nn.Linear]", list(self.layers))
 
     def forward(self, x: Tensor) -> Tensor:
         """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
@@ -87,22 +94,25 @@ class MLP(nn.Module):
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
         """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
         h = (x - self.mean) / self.std
+        *hidden, last = self.linears
         tape = []
-        for layer in self.layers[:-1]:
+        for layer in hidden:
             h, slope = self._activation(layer(h))
             tape.append(slope)
-        return self.layers[-1](h), tuple(tape)
+        return last(h), tuple(tape)
 
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
         h = dx / self.std
-        for layer, slope in zip(self.layers[:-1], tape, strict=True):
+        *hidden, last = self.linears
+        for layer, slope in zip(hidden, tape, strict=True):
             h = F.linear(h, layer.weight) * slope
-        return F.linear(h, self.layers[-1].weight)
+        return F.linear(h, last.weight)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
-        h = dy @ self.layers[-1].weight
-        for layer, slope in zip(reversed(self.layers[:-1]), reversed(tape), strict=True):
+        *hidden, last = self.linears
+        h = dy @ last.weight
+        for layer, slope in zip(reversed(hidden), reversed(tape), strict=True):
             h = (h * slope) @ layer.weight
         return h / self.std

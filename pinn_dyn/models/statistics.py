@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,17 +60,13 @@ class Statistics:
         std = torch.cat([self.q_std, self.v_std, *[self.u_std] * repeat_input])
         return mean, std
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, Any]:
         """Plain lists and floats, as a checkpoint stores them."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in values.items()}
 
     @classmethod
-    def from_dict(cls, values: dict[str, object]) -> Statistics:
+    def from_dict(cls, values: dict[str, Any]) -> Statistics:
         """The inverse of :meth:`to_dict`."""
-        return cls(
-            **{
-                k: torch.tensor(v, dtype=torch.float64) if isinstance(v, list) else v
-                for k, v in values.items()
-            }
-        )
+        read = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items() if k != "step"}
+        return cls(**read, step=values["step"])

@@ -68,6 +68,9 @@ class SoftArm(MechanicalSystem):
             stiffness or damping.
     """
 
+    _s: Tensor
+    _weights: Tensor
+
     def __init__(
         self,
         segments: int = 1,
@@ -79,9 +82,9 @@ class SoftArm(MechanicalSystem):
         damping: float = 0.1,
         nodes: int = 10,
     ):
-        for name, value in (("segments", segments), ("nodes", nodes)):
-            if value < 1:
-                raise ValueError(f"SoftArm: {name} is {value}, expected at least 1")
+        for name, count in (("segments", segments), ("nodes", nodes)):
+            if count < 1:
+                raise ValueError(f"SoftArm: {name} is {count}, expected at least 1")
         for name, value in (("mass", mass), ("length", length)):
             if not value > 0:
                 raise ValueError(f"SoftArm: {name} is {value}, expected a positive number")
@@ -204,9 +207,7 @@ class SoftArm(MechanicalSystem):
                 )
             jacobians.append(jac[..., :-1, :, :])
             biases.append(bias[..., :-1, :])
-            base = _Tip(
-                r[..., -1, :], turn, jac[..., -1, :, :], spin, bias[..., -1, :], spin_bias
-            )
+            base = _Tip(r[..., -1, :], turn, jac[..., -1, :, :], spin, bias[..., -1, :], spin_bias)
             tips.append(base)
         points = _Points(torch.cat(jacobians, -3), None if v is None else torch.cat(biases, -2))
         return points, tips

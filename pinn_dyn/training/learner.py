@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data.windows import Windows
-from pinn_dyn.mechanics import Predictor, Trajectory
+from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
 from pinn_dyn.models.statistics import Statistics
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
@@ -59,7 +59,7 @@ class DynamicsLearner(L.LightningModule):
         self.validator = validator
         self._optimizer = optimizer
         self._scheduler = scheduler
-        if compile and hasattr(model, "compile_derivative"):
+        if compile and isinstance(model, ContinuousPredictor):
             model.compile_derivative()
 
     def training_step(self, batch: Windows, batch_idx: int) -> Tensor:

@@ -29,6 +29,8 @@ class IncrementLoss(nn.Module):
         model: the model that will be trained.
     """
 
+    scale: Tensor
+
     def __init__(self, statistics: Statistics, model: Predictor):
         super().__init__()
         momentum = model.coordinates == "momentum"

@@ -43,7 +43,6 @@ def test_fields_that_do_not_match_are_refused_by_name(changes, message):
         trajectory(**changes)
 
 
-@pytest.mark.xfail(strict=True, reason="Trajectory does not check these yet")
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -127,7 +126,6 @@ def test_stack_refuses_other_sample_times_by_index(other):
         stack([trajectory(), trajectory(**other)])
 
 
-@pytest.mark.xfail(strict=True, reason="stack takes the first trajectory's interpolation")
 def test_stack_refuses_mixed_interpolations():
     with pytest.raises(ValueError, match="interpolation"):
         stack([trajectory(), trajectory(interpolation="hold")])

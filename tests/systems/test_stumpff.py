@@ -10,10 +10,7 @@ import torch
 from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
 from tests.support.finite_differences import slope
 
-FULL_CIRCLE = pytest.param(
-    4 * math.pi**2,
-    marks=pytest.mark.xfail(strict=True, reason="14 terms leave an error of 1e-13 at 2 pi"),
-)
+FULL_CIRCLE = 4 * math.pi**2
 
 
 def exact(k, x):

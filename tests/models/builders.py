@@ -1,0 +1,145 @@
+"""Small models with non-trivial weights, and the data scales that they are built from."""
+
+from functools import partial
+
+import torch
+
+from pinn_dyn.models import (
+    AccelerationMLP,
+    ConstantCholesky,
+    ConstantInput,
+    FixedCholesky,
+    FixedInput,
+    HamiltonianNetwork,
+    LagrangianNetwork,
+    NetworkCholesky,
+    NetworkInput,
+    NetworkPotential,
+    NextStateMLP,
+    Statistics,
+)
+
+STEP = 0.02
+
+
+def make_statistics(n, m, step=STEP):
+    """Scales that are all different from one and from each other."""
+    rows = torch.arange(1, n + 1, dtype=torch.float64)
+    columns = torch.arange(1, m + 1, dtype=torch.float64)
+    increment = torch.cat([0.02 * rows.sqrt(), 0.03 * rows.rsqrt()])
+    return Statistics(
+        q_mean=0.1 * rows - 0.3,
+        q_std=0.6 + 0.1 * rows,
+        v_std=1.5 - 0.2 * rows,
+        p_std=0.7 + 0.1 * rows,
+        u_mean=0.2 * columns - 0.5,
+        u_std=0.8 + 0.15 * columns,
+        velocity_increment_std=torch.stack([increment, 2 * increment]),
+        momentum_increment_std=torch.stack([0.7 * increment, 1.4 * increment]),
+        step=step,
+    )
+
+
+def perturb(model, seed=0, spread=0.3):
+    """Move every parameter off its start: that start is near a diagonal, constant matrix."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += spread * torch.randn(
+                parameter.shape, generator=generator, dtype=torch.float64
+            ).to(parameter)
+    return model
+
+
+def positive_matrix(n):
+    """A symmetric positive definite matrix with entries off the diagonal."""
+    values = torch.full((n, n), 0.1, dtype=torch.float64) + torch.diag(torch.arange(1.0, n + 1))
+    return values.tolist()
+
+
+def input_values(n, m):
+    """A full N x M matrix."""
+    return (0.2 * torch.arange(n * m).reshape(n, m) - 0.5).tolist()
+
+
+def make_structured(
+    kind,
+    n=3,
+    m=3,
+    *,
+    mass=None,
+    potential=None,
+    damping=None,
+    input=None,
+    statistics=None,
+    dtype=torch.float64,
+):
+    """A Lagrangian or Hamiltonian network; a head that is left out is a small network."""
+    torch.manual_seed(7)
+    mass = mass or partial(NetworkCholesky, hidden=[6, 5])
+    heads = {
+        "potential": potential or partial(NetworkPotential, hidden=[6, 5]),
+        "damping": damping or partial(NetworkCholesky, hidden=[5], epsilon=0.0),
+        "input": input or partial(NetworkInput, hidden=[5]),
+    }
+    statistics = statistics or make_statistics(n, m)
+    if kind == "lnn":
+        model = LagrangianNetwork(statistics, mass, **heads)
+    else:
+        model = HamiltonianNetwork(statistics, mass, **heads)
+    return perturb(model.to(dtype))
+
+
+def make_model(kind, n=2, m=2, dtype=torch.float64):
+    """One of the four models."""
+    if kind in ("lnn", "hnn"):
+        return make_structured(kind, n, m, dtype=dtype)
+    torch.manual_seed(7)
+    black_box = {"next_state": NextStateMLP, "acceleration": AccelerationMLP}[kind]
+    return perturb(black_box(make_statistics(n, m), hidden=[6, 5]).to(dtype))
+
+
+VARIANTS = {
+    "networks-softplus-3x3": dict(n=3, m=3),
+    "bounded-tanh-mass-constant-damping-2x1": dict(
+        n=2,
+        m=1,
+        mass=partial(NetworkCholesky, hidden=[6], activation="tanh", bound=2.0),
+        damping=partial(ConstantCholesky, epsilon=1e-3),
+        input=partial(NetworkInput, hidden=[4], activation="tanh", bound=1.5),
+    ),
+    "relu-silu-fixed-input-2x4": dict(
+        n=2,
+        m=4,
+        # A large epsilon keeps the matrix regular where the relu is zero.
+        mass=partial(NetworkCholesky, hidden=[6], activation="silu", diagonal="relu", epsilon=0.3),
+        potential=partial(NetworkPotential, hidden=[6], activation="silu", quadratic=False),
+        damping=partial(NetworkCholesky, hidden=[4], diagonal="relu", epsilon=0.0),
+        input=partial(FixedInput, value=input_values(2, 4)),
+    ),
+    "constant-mass-fixed-damping-constant-input-3x3": dict(
+        n=3,
+        m=3,
+        mass=ConstantCholesky,
+        potential=partial(NetworkPotential, hidden=[6], activation="tanh"),
+        damping=partial(FixedCholesky, value=positive_matrix(3)),
+        input=ConstantInput,
+    ),
+    "fixed-mass-no-damping-identity-input-2x2": dict(
+        n=2,
+        m=2,
+        mass=partial(FixedCholesky, value=positive_matrix(2)),
+        damping=partial(FixedCholesky, value=[[0.0, 0.0], [0.0, 0.0]]),
+        input=FixedInput,
+    ),
+}
+"""Every kind of head once, with square, wide and tall input matrices."""
+
+
+def random_batch(n, m, batch=6, seed=3, dtype=torch.float64):
+    """q, v (or p), a and u, uniform in [-1, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    return tuple(
+        (2 * torch.rand(batch, size, generator=generator, dtype=torch.float64) - 1).to(dtype)
+        for size in (n, n, n, m)
+    )

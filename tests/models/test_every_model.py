@@ -1,0 +1,168 @@
+"""What all four models share: batch shapes, precision, saving, copying, compiling."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+
+from pinn_dyn.mechanics import ContinuousPredictor
+from tests.models.builders import STEP, make_model, perturb, random_batch
+from tests.support.finite_differences import assert_near
+
+KINDS = ["lnn", "hnn", "next_state", "acceleration"]
+CONTINUOUS = ["lnn", "hnn", "acceleration"]
+T = STEP * torch.arange(4, dtype=torch.float64)
+
+
+def windows(batch=(6,), dtype=torch.float64):
+    """Initial states and inputs at the four times T."""
+    q, v, _, u = random_batch(2, 2, batch=6, dtype=dtype)
+    x0 = torch.cat([q, v], -1)
+    u = torch.stack([u, 0.5 * u, -u, 0.2 * u], -2)
+    return x0.reshape(*batch, 4), u.reshape(*batch, 4, 2)
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.mark.parametrize("batch", [(), (6,), (2, 3)], ids=["unbatched", "B", "B1xB2"])
+def test_any_batch_shape_gives_the_same_prediction(kind, batch):
+    model = make_model(kind)
+    x0, u = windows()
+    expected = model.predict(x0, T, u)
+    assert expected.shape == (6, 4, 4)
+    if batch == ():
+        actual, expected = model.predict(x0[2], T, u[2]), expected[2]
+    else:
+        actual, expected = model.predict(*windows(batch)[:1], T, windows(batch)[1]), expected
+        expected = expected.reshape(*batch, 4, 4)
+    assert_near(actual, expected, 1e-12)
+
+
+def test_a_prediction_starts_at_the_initial_state_and_moves(kind):
+    x0, u = windows()
+    model = make_model(kind)
+    path = model.predict(x0, T, u)
+    assert torch.equal(path[:, 0], x0)
+    assert float((path[:, 1:] - path[:, :-1]).abs().amax((0, 1)).min()) > 1e-3
+    assert_near(model.increments(x0, T, u), path - x0[:, None], 1e-12)
+
+
+def test_float32_is_close_to_float64(kind):
+    double, single = make_model(kind), make_model(kind).float()
+    expected = double.increments(*windows()[:1], T, windows()[1])
+    x0, u = windows(dtype=torch.float32)
+    actual = single.increments(x0, T, u)
+    assert actual.dtype == torch.float32
+    assert_near(actual.double(), expected, 2e-5)
+
+
+def test_saved_weights_give_identical_predictions(kind):
+    model = make_model(kind, dtype=torch.float32)
+    file = io.BytesIO()
+    torch.save(model.state_dict(), file)
+    file.seek(0)
+    other = perturb(make_model(kind, dtype=torch.float32), seed=1)
+    x0, u = windows(dtype=torch.float32)
+    assert not torch.equal(other.predict(x0, T, u), model.predict(x0, T, u))
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(other.predict(x0, T, u), model.predict(x0, T, u))
+
+
+def test_a_saved_model_carries_its_scales(kind):
+    """Normalization is part of the state: a model built from other data loads it back."""
+    model = make_model(kind)
+    with torch.no_grad():
+        for buffer in model.buffers():
+            buffer *= 1.25
+    model_of_other_data = make_model(kind)
+    x0, u = windows()
+    # A step is one of these scales: the saved black box has learned another one.
+    t = 1.25 * T if kind == "next_state" else T
+    model_of_other_data.load_state_dict(model.state_dict())
+    assert torch.equal(model_of_other_data.predict(x0, t, u), model.predict(x0, t, u))
+    if kind != "next_state":
+        assert not torch.allclose(make_model(kind).predict(x0, t, u), model.predict(x0, t, u))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+def test_a_copy_predicts_alike_and_is_independent(kind, copied):
+    model = make_model(kind)
+    x0, u = windows()
+    other = copied(model)
+    before = model.predict(x0, T, u)
+    assert torch.equal(other.predict(x0, T, u), before)
+    perturb(other, seed=2)
+    assert torch.equal(model.predict(x0, T, u), before)
+    assert not torch.equal(other.predict(x0, T, u), before)
+
+
+def test_every_parameter_that_moves_the_state_has_a_gradient(kind):
+    model = make_model(kind)
+    x0, u = windows()
+    model.increments(x0, T, u).square().sum().backward()
+    still = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()}
+    # A constant added to V moves nothing.
+    assert still == ({"potential.network.layers.2.bias"} if kind in ("lnn", "hnn") else set())
+
+
+# Compiled derivatives.
+
+
+def loss_and_gradients(model, x0, t, u):
+    increments = model.increments(x0, t, u)
+    parameters = list(model.parameters())
+    gradients = torch.autograd.grad(
+        (increments / STEP).square().mean(), parameters, allow_unused=True, materialize_grads=True
+    )
+    return increments.detach(), gradients
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CONTINUOUS)
+def test_a_compiled_model_has_the_same_increments_and_gradients(kind):
+    model = make_model(kind, dtype=torch.float32)
+    x0, u = windows(dtype=torch.float32)
+    expected, expected_gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
+    model.compile_derivative()
+    calls = []
+    compiled = model._compiled
+    model._compiled = lambda x, u: calls.append(x.shape) or compiled(x, u)
+    model.train()
+    actual, gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
+    assert len(calls) == 4  # the stages of one step
+    assert_near(actual, expected, 1e-4)
+    overall = max(float(g.abs().max()) for g in expected_gradients)
+    assert overall > 1e-3
+    for (name, _), a, e in zip(
+        model.named_parameters(), gradients, expected_gradients, strict=True
+    ):
+        difference = float((a - e).abs().max())
+        assert difference <= 1e-4 * max(float(e.abs().max()), 1e-2 * overall), name
+    model.eval()
+    loss_and_gradients(model, x0, T[:2], u[:, :2])
+    assert len(calls) == 4  # validation runs eagerly
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+@pytest.mark.parametrize("kind", CONTINUOUS)
+def test_a_copy_goes_without_the_compiled_function(kind, copied):
+    model = make_model(kind)
+    model.compile_derivative()
+    assert model._compiled is not None
+    other = copied(model)
+    assert other._compiled is None
+    assert model._compiled is not None
+    x0, u = windows()
+    assert torch.equal(other.predict(x0, T, u), model.eval().predict(x0, T, u))
+    assert "_compiled" not in model.state_dict()
+
+
+def test_only_a_model_with_a_derivative_can_compile_it(kind):
+    model = make_model(kind)
+    assert hasattr(model, "compile_derivative") == isinstance(model, ContinuousPredictor)
+    assert isinstance(model, ContinuousPredictor) == (kind in CONTINUOUS)

@@ -1,0 +1,88 @@
+"""The networks' explicit formulas against automatic differentiation of L(q, v) and H(q, p)."""
+
+import pytest
+import torch
+
+from tests.models.autodiff import autodiff_derivative, rk4_increment
+from tests.models.builders import VARIANTS, make_structured, random_batch
+from tests.support.finite_differences import assert_near, slope
+
+MODELS = pytest.mark.parametrize("kind", ["lnn", "hnn"])
+STEP = 0.05
+
+
+@pytest.fixture(params=VARIANTS)
+def variant(request):
+    return VARIANTS[request.param]
+
+
+def batch_of(model):
+    q, second, a, u = random_batch(model.num_coordinates, model.num_inputs)
+    return torch.cat([q, second], -1), u, torch.cat([a, q], -1)
+
+
+@MODELS
+def test_state_derivative_is_that_of_the_scalar_function(kind, variant):
+    model = make_structured(kind, **variant)
+    x, u, _ = batch_of(model)
+    assert_near(model.state_derivative(x, u), autodiff_derivative(model, x, u), 1e-9)
+
+
+@MODELS
+def test_a_step_and_its_gradients_are_those_of_the_scalar_function(kind, variant):
+    """Second derivatives of the heads: the loss is a function of first derivatives."""
+    model = make_structured(kind, **variant)
+    x, u, target = batch_of(model)
+    leaves = [*model.parameters(), x.requires_grad_(True), u.requires_grad_(True)]
+    t = torch.tensor([0.0, STEP], dtype=torch.float64)
+    own = model.increments(x, t, torch.stack([u, 0.5 * u], -2))[..., -1, :]
+    plain = rk4_increment(lambda x, u: autodiff_derivative(model, x, u), x, u, 0.5 * u, STEP)
+    assert_near(own, plain, 1e-9)
+    gradients = [
+        torch.autograd.grad(
+            (value / STEP - target).square().mean(),
+            leaves,
+            allow_unused=True,
+            materialize_grads=True,
+        )
+        for value in (own, plain)
+    ]
+    overall = max(float(gradient.abs().max()) for gradient in gradients[1])
+    assert overall > 1e-3
+    for actual, expected in zip(*gradients, strict=True):
+        # A gradient that is zero (the last bias of V) is zero beside all others.
+        assert_near(actual, expected, 1e-8, max(float(expected.abs().max()), 1e-6 * overall))
+
+
+@MODELS
+def test_gradients_of_single_weights_are_finite_differences(kind):
+    model = make_structured(kind)
+    x, u, target = batch_of(model)
+    t = torch.tensor([0.0, STEP], dtype=torch.float64)
+
+    def loss():
+        increments = model.increments(x, t, torch.stack([u, 0.5 * u], -2))[..., -1, :]
+        return (increments / STEP - target).square().mean()
+
+    loss().backward()
+    parameters = dict(model.named_parameters())
+    largest = max(float(p.grad.abs().max()) for p in parameters.values() if p.grad is not None)
+    generator = torch.Generator().manual_seed(5)
+    checked = 0
+    for name, parameter in parameters.items():
+        flat = parameter.detach().view(-1)
+        index = int(torch.randint(flat.numel(), (), generator=generator))
+        start = float(flat[index])
+
+        def shifted(e, flat=flat, index=index, start=start):
+            flat[index] = start + e
+            with torch.no_grad():
+                value = loss()
+            flat[index] = start
+            return value
+
+        expected = float(slope(shifted))
+        actual = 0.0 if parameter.grad is None else float(parameter.grad.view(-1)[index])
+        assert abs(actual - expected) < 1e-9 * largest + 1e-7 * abs(expected), name
+        checked += abs(expected) > 1e-4 * largest
+    assert checked > len(parameters) / 2

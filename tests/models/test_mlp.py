@@ -1,0 +1,111 @@
+"""The MLP's explicit tangent and reverse passes against torch.func."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from pinn_dyn.models import MLP
+from tests.models.builders import perturb
+from tests.support.finite_differences import assert_near
+
+PLAIN = {"softplus": F.softplus, "tanh": torch.tanh, "silu": F.silu}
+
+
+def make_mlp(activation, hidden=(5, 4), normalized=True):
+    torch.manual_seed(1)
+    mean = torch.tensor([0.5, -0.3, 0.2]) if normalized else None
+    std = torch.tensor([0.7, 1.4, 2.0]) if normalized else None
+    return perturb(MLP(3, 2, hidden, activation, mean, std).double())
+
+
+@pytest.fixture(params=list(PLAIN))
+def activation(request):
+    return request.param
+
+
+@pytest.fixture(params=[(), (7,), (2, 3)], ids=["unbatched", "B", "B1xB2"])
+def x(request):
+    generator = torch.Generator().manual_seed(2)
+    return 2 * torch.randn(*request.param, 3, generator=generator, dtype=torch.float64)
+
+
+def test_value_is_that_of_a_plain_loop(activation, x):
+    network = make_mlp(activation)
+    mean, std = torch.tensor([0.5, -0.3, 0.2]).double(), torch.tensor([0.7, 1.4, 2.0]).double()
+    h = (x - mean) / std
+    for k, layer in enumerate(network.layers):
+        h = h @ layer.weight.T + layer.bias
+        h = PLAIN[activation](h) if k < 2 else h
+    assert network(x).shape == (*x.shape[:-1], 2)
+    assert_near(network(x), h, 1e-12)
+    assert_near(network.linearize(x)[0], h, 1e-12)
+
+
+def test_pushforward_is_the_jvp(activation, x):
+    network = make_mlp(activation)
+    dx = torch.flip(x, (-1,)) + 0.3
+    _, tape = network.linearize(x)
+    _, expected = torch.func.jvp(network, (x,), (dx,))
+    assert_near(network.pushforward(tape, dx), expected, 1e-12)
+
+
+def test_pullback_is_the_vjp(activation, x):
+    network = make_mlp(activation)
+    dy = x[..., :2] - 0.4
+    _, tape = network.linearize(x)
+    _, vjp = torch.func.vjp(network, x)
+    assert_near(network.pullback(tape, dy), vjp(dy)[0], 1e-12)
+
+
+def test_the_passes_can_be_differentiated_again(activation):
+    network = make_mlp(activation)
+    x = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    dx, dy = torch.randn_like(x), torch.randn(4, 2, dtype=torch.float64)
+    _, tape = network.linearize(x)
+    leaves = [x, *network.parameters()]
+    plain_tangent = torch.func.jvp(network, (x,), (dx,))[1]
+    plain_reverse = torch.func.vjp(network, x)[1](dy)[0]
+    for own, plain in (
+        (network.pushforward(tape, dx), plain_tangent),
+        (network.pullback(tape, dy), plain_reverse),
+    ):
+        gradients = [
+            torch.autograd.grad(
+                y.square().sum(),
+                leaves,
+                retain_graph=True,
+                allow_unused=True,
+                materialize_grads=True,
+            )
+            for y in (own, plain)
+        ]
+        assert all(float(g.abs().max()) > 1e-6 for g in gradients[1][:-1])
+        for actual, expected in zip(*gradients, strict=True):
+            assert_near(actual, expected, 1e-11, 1e-12 + float(expected.abs().max()))
+
+
+def test_tangent_and_reverse_pass_are_adjoint(activation):
+    network = make_mlp(activation, normalized=False)
+    x, dx = torch.randn(2, 5, 3, dtype=torch.float64)
+    dy = torch.randn(5, 2, dtype=torch.float64)
+    _, tape = network.linearize(x)
+    left = (network.pushforward(tape, dx) * dy).sum()
+    assert_near(left, (network.pullback(tape, dy) * dx).sum(), 1e-12)
+
+
+def test_without_hidden_layers_it_is_linear():
+    network = make_mlp("tanh", hidden=())
+    x, dx = torch.randn(2, 5, 3, dtype=torch.float64)
+    value, tape = network.linearize(x)
+    assert tape == ()
+    assert_near(network(x + dx), value + network.pushforward(tape, dx), 1e-12)
+
+
+def test_an_unknown_activation_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match="'relu', expected one of softplus, tanh, silu"):
+        MLP(2, 1, [3], "relu")
+
+
+def test_a_width_below_one_is_refused():
+    with pytest.raises(ValueError, match=r"hidden is \[4, 0\]"):
+        MLP(2, 1, [4, 0])

@@ -1,0 +1,60 @@
+"""The scales of the data."""
+
+import json
+import math
+from dataclasses import FrozenInstanceError, fields
+
+import pytest
+import torch
+
+from pinn_dyn.models import Statistics
+from tests.models.builders import make_statistics
+
+
+def test_a_dictionary_gives_the_same_statistics_back():
+    statistics = make_statistics(3, 2)
+    # Through JSON: plain lists and numbers only, every digit kept.
+    back = Statistics.from_dict(json.loads(json.dumps(statistics.to_dict())))
+    for item in fields(Statistics):
+        before, after = getattr(statistics, item.name), getattr(back, item.name)
+        assert type(after) is type(before), item.name
+        if isinstance(before, torch.Tensor):
+            assert after.dtype == before.dtype, item.name
+            assert torch.equal(after, before), item.name
+        else:
+            assert after == before, item.name
+
+
+def test_sizes_are_those_of_the_data():
+    statistics = make_statistics(3, 2)
+    assert (statistics.num_coordinates, statistics.num_inputs) == (3, 2)
+
+
+def test_typical_force_is_the_root_mean_square_of_the_inputs():
+    generator = torch.Generator().manual_seed(0)
+    u = torch.tensor([1.0, -2.0]) + torch.tensor([0.5, 3.0]) * torch.randn(
+        1000, 2, generator=generator, dtype=torch.float64
+    )
+    values = make_statistics(3, 2).to_dict()
+    values["u_mean"] = u.mean(0).tolist()
+    values["u_std"] = u.std(0, correction=0).tolist()
+    statistics = Statistics.from_dict(values)
+    torch.testing.assert_close(statistics.u_rms, u.square().mean(0).sqrt())
+    assert math.isclose(statistics.force, float(u.square().mean().sqrt()), rel_tol=1e-9)
+
+
+@pytest.mark.parametrize("repeat", [1, 2])
+def test_network_input_is_state_and_inputs(repeat):
+    statistics = make_statistics(3, 2)
+    mean, std = statistics.network_input(repeat_input=repeat)
+    assert mean.tolist() == [
+        *statistics.q_mean.tolist(), 0, 0, 0, *statistics.u_mean.tolist() * repeat
+    ]  # fmt: skip
+    assert std.tolist() == [
+        *statistics.q_std.tolist(), *statistics.v_std.tolist(), *statistics.u_std.tolist() * repeat
+    ]  # fmt: skip
+
+
+def test_statistics_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError):
+        make_statistics(2, 1).step = 1.0
