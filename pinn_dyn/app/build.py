@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,16 @@ def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
 def build_learner(
     config: dict[str, Any], model: Predictor, statistics: Statistics, validator: RolloutValidator
 ) -> DynamicsLearner:
-    """The LightningModule: model, loss, optimizer and schedule."""
+    """The LightningModule: model, loss, optimizer and schedule.
+
+    Raises:
+        ConfigError: if compilation is asked for and there is no C++ compiler.
+    """
+    if config["compile"] and not any(map(shutil.which, ("g++", "clang++", "c++"))):
+        raise ConfigError(
+            "compile is true, but there is no C++ compiler (g++ or clang++) on the path: install "
+            "one, or set compile=false"
+        )
     return DynamicsLearner(
         model,
         loss=_build("loss", config["loss"], statistics=statistics, model=model),

@@ -140,9 +140,10 @@ def error_figure(
 def terms_figure(
     comparison: TermComparison, *, configuration: int, title: str, inverse_mass: bool = False
 ) -> Figure:
-    """True (upper row) and learned (lower row) M, D, G and A at one configuration.
+    """M, D, G and A at one configuration: true X, learned X_L, and P X with the best-fit P.
 
-    Each column has one colour scale, from minus to plus its largest true or learned entry. The
+    A model whose terms equal P X moves like the truth: multiplying the equation of motion by P
+    does not change it. Each column has one colour scale, from minus to plus its largest entry; the
     colour follows the square root of an entry, so that small ones are not lost.
 
     Args:
@@ -157,25 +158,32 @@ def terms_figure(
     rows = comparison.q.shape[-1]
     widths = [max(pair[0].shape[-1], 1.6) for pair in matrices.values()]
     cell = 0.72 if rows <= 4 else 0.62
-    figure = Figure(figsize=(cell * sum(widths) + 3.0, 2 * cell * rows + 2.2), layout="constrained")
-    axes = figure.subplots(2, len(matrices), width_ratios=widths)
-    for column, (term, (true, learned, _)) in enumerate(matrices.items()):
-        pair = (true[configuration], learned[configuration])
-        scale = max(float(matrix.abs().max()) for matrix in pair) or 1.0
-        errors = frame.loc[frame["term"] == term, "relative_error_identity"]
-        for row, matrix in enumerate(pair):
+    figure = Figure(figsize=(cell * sum(widths) + 3.0, 3 * cell * rows + 2.6), layout="constrained")
+    axes = figure.subplots(3, len(matrices), width_ratios=widths)
+    for column, (term, three) in enumerate(matrices.items()):
+        shown = [matrix[configuration] for matrix in three]
+        scale = max(float(matrix.abs().max()) for matrix in shown) or 1.0
+        for row, matrix in enumerate(shown):
             ax = axes[row, column]
             colour = matrix.sign() * (matrix.abs() / scale).sqrt()
             # The ends of the colour map are too dark to read a number on.
             ax.imshow(colour, cmap="RdBu_r", vmin=-1.6, vmax=1.6)
             _annotate(ax, matrix, digits=3 if rows <= 4 else 2)
         axes[0, column].set_title(_MATH[term])
-        axes[1, column].set_xlabel(f"error {100 * errors.iloc[configuration]:.2g} %")
-    axes[0, 0].set_ylabel("true")
-    axes[1, 0].set_ylabel("learned")
+        errors = frame[frame["term"] == term].iloc[configuration]
+        axes[1, column].set_xlabel(f"error {_percent(errors['relative_error_identity'])}")
+        axes[2, column].set_xlabel(f"misses {_percent(errors['relative_error_best_P'])}")
+    for row, name in enumerate(("true X", "learned $X_L$", "P X, best P")):
+        axes[row, 0].set_ylabel(name)
     numbers = ", ".join(f"{value:.4g}" for value in comparison.q[configuration].tolist())
-    figure.suptitle(f"{title}\nq = ({numbers}), error = |learned - true| / |true|")
+    figure.suptitle(
+        f"{title}\nq = ({numbers}), error $|X_L - X| / |X|$, P X misses $|X_L - P X| / |X_L|$"
+    )
     return figure
+
+
+def _percent(ratio: float) -> str:
+    return f"{100 * ratio:.0f} %" if ratio > 0.1 else f"{100 * ratio:.2g} %"
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -98,7 +98,7 @@ def test_terms_are_annotated(inverse_mass, shown, tmp_path):
     comparison = compare_terms(SoftArm(damping=0.12), SoftArm(), q)
     figure = terms_figure(comparison, configuration=1, title="fake", inverse_mass=inverse_mass)
     check_picture(figure, tmp_path / "terms.png")
-    assert len(figure.axes) == 8
+    assert len(figure.axes) == 12
     assert shown in [text.get_text() for text in figure.axes[0].texts]
     assert len(figure.axes[2].texts) == 3  # G is one column
     assert figure.axes[5].get_xlabel() == "error 20 %"

@@ -304,8 +304,10 @@ def test_each_gradient_through_one_rk4_step_matches_finite_differences(coordinat
         ({"t": torch.zeros(1)}, r"t has shape \(1,\)"),
         ({"t": torch.tensor(0.0)}, r"t has shape \(\)"),
         ({"u": torch.zeros(3, 1)}, r"u has shape \(3, 1\), expected \(\*batch, 4, M\)"),
-        ({"t_input": torch.zeros(5)}, r"u has shape \(4, 1\), expected \(\*batch, 5, M\)"),
+        ({"t_input": torch.arange(5.0)}, r"u has shape \(4, 1\), expected \(\*batch, 5, M\)"),
         ({"u": torch.zeros(2, 4, 1)}, r"u has batch shape \(2,\), x0 has \(\)"),
+        ({"t": torch.tensor([0.0, 2.0, 1.0, 3.0])}, "t must increase strictly"),
+        ({"t_input": torch.zeros(4)}, "t_input must increase strictly"),
         ({"interpolation": "cubic"}, "interpolation is 'cubic'"),
     ],
 )

@@ -1,0 +1,160 @@
+"""Excitation signals: bounds, order, smoothness, frequencies, seeds and bad arguments."""
+
+import numpy as np
+import pytest
+
+from pinn_dyn.data import Chirp, Mixture, MultiSine, Steps
+
+OFFSET = np.array([0.5, -2.0])
+AMPLITUDE = np.array([1.0, 0.25])
+DURATION = 6.0
+TIME = np.linspace(0, DURATION, 3001)
+
+KINDS = {
+    "sine": MultiSine(OFFSET, AMPLITUDE, frequency=[0.5, 3.0], harmonics=1),
+    "multi-sine": MultiSine(OFFSET, AMPLITUDE, frequency=[0.5, 3.0], harmonics=5),
+    "chirp": Chirp(OFFSET, AMPLITUDE, frequency=[0.5, 3.0]),
+    "steps": Steps(OFFSET, AMPLITUDE, hold=[0.3, 1.0], rise_time=0.1),
+}
+KINDS["mixture"] = Mixture(list(KINDS.values()))
+
+
+def samples(excitation, count=30, seed=0, t=TIME):
+    return excitation.draw(count, DURATION, np.random.default_rng(seed))(t)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_signals_move_within_their_amplitude_about_the_offset(kind):
+    u = samples(KINDS[kind])
+    assert u.shape == (30, TIME.size, 2)
+    excursion = np.abs(u - OFFSET).max(axis=(0, 1))
+    assert (excursion <= AMPLITUDE * (1 + 1e-12)).all()
+    # Not by standing still: the largest of 30 peaks comes near the bound.
+    assert (excursion > 0.6 * AMPLITUDE).all()
+
+
+def test_peaks_of_a_sine_lie_between_a_third_and_the_whole_amplitude():
+    u = samples(KINDS["sine"], count=200)
+    peak = np.abs(u - OFFSET).max(axis=1) / AMPLITUDE
+    assert peak.min() > 0.33
+    assert peak.min() < 0.4
+    assert peak.max() > 0.95
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_gives_the_same_signals_again_and_another_seed_gives_others(kind):
+    first, again, other = (samples(KINDS[kind], seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (np.abs(first - other).max(axis=(1, 2)) > 1e-3).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_signals_drawn_together_differ(kind):
+    u = samples(KINDS[kind], count=6).reshape(6, -1)
+    distance = np.abs(u[:, None] - u[None]).max(-1)
+    assert (distance[~np.eye(6, dtype=bool)] > 1e-3).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_signal_is_a_function_of_time_alone(kind):
+    """The solver asks for single times in any order, the data set for all at once."""
+    signal = KINDS[kind].draw(7, DURATION, np.random.default_rng(4))
+    together = signal(TIME[:50])
+    one_by_one = np.concatenate([signal(TIME[k : k + 1]) for k in reversed(range(50))], axis=1)
+    np.testing.assert_allclose(one_by_one[:, ::-1], together, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 9])
+def test_a_mixture_takes_its_parts_in_turn(count):
+    """Parts with offsets far apart show which part a signal came from."""
+    parts = [MultiSine([10.0 * k], [1.0]) for k in range(3)]
+    u = samples(Mixture(parts), count=count)
+    assert u.shape[0] == count
+    np.testing.assert_array_equal(np.round(u.mean(axis=(1, 2)) / 10), np.arange(count) % 3)
+
+
+def test_steps_are_smooth_ramps_between_held_levels():
+    """A minimum-jerk ramp over r has slopes up to 15/8 jump/r and curvatures up to 5.78 jump/r^2.
+
+    A jump is at most twice the amplitude.
+    """
+    rise = 0.1
+    excitation = Steps(OFFSET, AMPLITUDE, hold=[0.3, 1.0], rise_time=rise)
+    u = samples(excitation, count=40) - OFFSET
+    h = TIME[1] - TIME[0]
+    slope = np.abs(np.diff(u, axis=1)).max(axis=(0, 1)) / h
+    curvature = np.abs(np.diff(u, n=2, axis=1)).max(axis=(0, 1)) / h**2
+    assert (slope <= 15 / 8 * 2 * AMPLITUDE / rise).all()
+    assert (curvature <= 5.78 * 2 * AMPLITUDE / rise**2).all()
+    # It does step, and holds between: ramps fill at most a third of the time.
+    assert (slope > 0.5 * AMPLITUDE / rise).all()
+    held = (np.abs(np.diff(u, axis=1)) < 1e-12).mean()
+    assert 0.6 < held < 0.95
+
+
+def test_steps_go_on_until_the_end_of_the_duration():
+    """Held at most 1 s, a signal has a ramp within any 1.1 s, the last ones included."""
+    u = samples(Steps(OFFSET, AMPLITUDE, hold=[0.3, 1.0], rise_time=0.1), count=40)
+    tail = u[:, TIME >= DURATION - 1.1]
+    assert (np.ptp(tail, axis=1) > 0).all()
+
+
+def test_a_chirp_sweeps_from_one_end_of_its_band_to_the_other():
+    """The phase is quadratic in time, so its zero crossings tell the frequency at both ends."""
+    low, high, duration = 1.0, 4.0, 10.0
+    t = np.linspace(0, duration, 40001)
+    chirp = Chirp([0.0], [1.0], frequency=[low, high])
+    u = chirp.draw(12, duration, np.random.default_rng(0))(t)[..., 0]
+    downward = 0
+    for signal in u:
+        k = np.flatnonzero(np.diff(np.sign(signal)) != 0)
+        crossing = t[k] - signal[k] * (t[k + 1] - t[k]) / (signal[k + 1] - signal[k])
+        half_turns = np.polynomial.Polynomial.fit(crossing, np.arange(len(k)), 2)
+        ends = half_turns.deriv()(np.array([0.0, duration])) / 2
+        np.testing.assert_allclose(np.sort(ends), [low, high], rtol=1e-3)
+        downward += ends[0] > ends[1]
+    assert 0 < downward < 12
+
+
+def test_frequencies_of_a_sine_lie_in_its_band():
+    t = np.linspace(0, 20, 20001)
+    u = MultiSine([0.0], [1.0], frequency=[1.0, 2.0], harmonics=1)
+    u = u.draw(20, 20.0, np.random.default_rng(0))(t)[..., 0]
+    turns = (np.diff(np.sign(u), axis=1) != 0).sum(axis=1) / 2
+    assert (turns >= 1.0 * 20 - 0.5).all()
+    assert (turns <= 2.0 * 20 + 0.5).all()
+    assert np.ptp(turns) > 5
+
+
+BAD = {
+    "lengths": (lambda: MultiSine([0.0], [1.0, 2.0]), "MultiSine", "amplitude"),
+    "negative amplitude": (lambda: Chirp([0.0], [-1.0]), "Chirp", "amplitude"),
+    "zero frequency": (lambda: MultiSine([0.0], [1.0], [0.0, 1.0]), "MultiSine", "frequency"),
+    "reversed frequency": (lambda: Chirp([0.0], [1.0], [2.0, 1.0]), "Chirp", "frequency"),
+    "one frequency": (lambda: Chirp([0.0], [1.0], [2.0]), "Chirp", "frequency"),
+    "no harmonics": (lambda: MultiSine([0.0], [1.0], harmonics=0), "MultiSine", "harmonics"),
+    "reversed hold": (lambda: Steps([0.0], [1.0], hold=[2.0, 1.0]), "Steps", "hold"),
+    "zero rise time": (lambda: Steps([0.0], [1.0], rise_time=0.0), "Steps", "rise_time"),
+    "long rise": (
+        lambda: Steps([0.0], [1.0], hold=[0.1, 1.0], rise_time=0.2),
+        "Steps",
+        "rise_time",
+    ),
+    "empty mixture": (lambda: Mixture([]), "Mixture", "parts"),
+    "nan frequency": (
+        lambda: Chirp([0.0], [1.0], [float("nan"), 1.0]),
+        "Chirp",
+        "frequency",
+    ),
+    "no inputs": (lambda: MultiSine([], []), "MultiSine", "amplitude"),
+    "nan amplitude": (lambda: MultiSine([0.0], [float("nan")]), "MultiSine", "amplitude"),
+    "infinite offset": (lambda: Steps([float("inf")], [1.0]), "Steps", "offset"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_arguments_are_refused_by_name(case):
+    make, owner, argument = BAD[case]
+    with pytest.raises(ValueError, match=rf"{owner}: .*{argument}") as caught:
+        make()
+    assert argument in str(caught.value)

@@ -1,0 +1,258 @@
+"""Simulated data sets: what is combined, what is unseen, what the cache key knows."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.data import InitialStates, Mixture, MultiSine, SimulatedSource, Steps
+from pinn_dyn.systems import SoftArm
+from tests.support.linear import damped_oscillators
+
+SINE = dict(offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.1], frequency=[1.0, 4.0])
+STEPS = dict(offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.1], hold=[0.06, 0.1])
+BOX = dict(q_low=[-1.0, -1.0, 0.1], q_high=[1.0, 1.0, 0.4], v_max=[1.0, 1.0, 0.1])
+
+
+def excitation(sine=None, steps=None):
+    return Mixture(
+        [
+            MultiSine(**{**SINE, **(sine or {})}),
+            Steps(**STEPS, **{"rise_time": 0.05, **(steps or {})}),
+        ]
+    )
+
+
+def make_source(cache, **changes):
+    arguments = dict(
+        name="tiny_arm",
+        system=SoftArm(),
+        excitation=excitation(),
+        initial_states=InitialStates(**BOX),
+        duration=0.2,
+        step=0.01,
+        train_initial_states=3,
+        train_inputs=2,
+        validation=2,
+        test=3,
+        seed=0,
+        rtol=1e-8,
+        atol=1e-9,
+        cache=str(cache),
+        labels=["x", "y", "l"],
+        input_labels=["a", "b", "c"],
+        configurations={"bent": [0.8, 0.2, 0.3]},
+    )
+    return SimulatedSource(**{**arguments, **changes})
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def splits(cache):
+    return make_source(cache).load()
+
+
+def starts(trajectories):
+    return {tuple(torch.cat([x.q[0], x.v[0]]).tolist()) for x in trajectories}
+
+
+def inputs(trajectories):
+    return {tuple(x.u.flatten().tolist()) for x in trajectories}
+
+
+def test_training_combines_every_initial_state_with_every_input(splits):
+    assert len(splits.train) == 6
+    assert len(starts(splits.train)) == 3
+    assert len(inputs(splits.train)) == 2
+    pairs = {(*starts([x]), *inputs([x])) for x in splits.train}
+    assert len(pairs) == 6
+
+
+@pytest.mark.parametrize(("split", "count"), [("validation", 2), ("test", 3)])
+def test_validation_and_test_have_states_and_inputs_of_their_own(splits, split, count):
+    unseen = getattr(splits, split)
+    others = [
+        x
+        for name in ("train", "validation", "test")
+        if name != split
+        for x in getattr(splits, name)
+    ]
+    assert len(unseen) == len(starts(unseen)) == len(inputs(unseen)) == count
+    assert not starts(unseen) & starts(others)
+    assert not inputs(unseen) & inputs(others)
+    # No coordinate of a start and no single input signal is shared either.
+    for x in unseen:
+        for y in others:
+            assert (x.q[0] != y.q[0]).all()
+            assert (x.u != y.u).any(0).all()
+
+
+def test_trajectories_are_sampled_as_asked(splits):
+    t = torch.arange(21, dtype=torch.float64) * 0.01
+    for x in [*splits.train, *splits.validation, *splits.test]:
+        torch.testing.assert_close(x.t, t, rtol=0, atol=1e-12)
+        assert x.q.shape == x.v.shape == x.u.shape == (21, 3)
+        assert x.q.dtype == torch.float64
+        assert x.interpolation == "linear"
+
+
+def test_momenta_are_mass_matrix_times_velocity(splits):
+    arm = SoftArm()
+    for x in [*splits.validation, *splits.test]:
+        expected = (arm.mass_matrix(x.q) @ x.v.unsqueeze(-1)).squeeze(-1)
+        torch.testing.assert_close(x.p, expected, rtol=1e-12, atol=1e-14)
+    x = splits.train[0]
+    expected = (arm.mass_matrix(x.q) @ x.v.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(splits.momentum(x.q, x.v), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_more_test_trajectories_do_not_change_the_others(cache, splits):
+    """Starts and inputs to the bit; motions to the solver's tolerance, as all share its steps."""
+    more = make_source(cache, test=5).load()
+    assert len(more.test) == 5
+    for name in ("train", "validation"):
+        for x, y in zip(getattr(splits, name), getattr(more, name), strict=True):
+            assert torch.equal(x.u, y.u)
+            assert torch.equal(x.q[0], y.q[0])
+            torch.testing.assert_close(x.q, y.q, rtol=0, atol=1e-7)
+
+
+def test_another_seed_gives_other_trajectories(cache, splits):
+    other = make_source(cache, seed=1).load()
+    assert not starts(splits.train) & starts(other.train)
+    assert not inputs(splits.train) & inputs(other.train)
+
+
+def test_initial_states_fill_their_box():
+    box = InitialStates(**BOX)
+    q, v = box.draw(500, np.random.default_rng(0))
+    low, high, v_max = (np.array(BOX[key]) for key in ("q_low", "q_high", "v_max"))
+    assert ((q >= low) & (q <= high)).all()
+    assert (np.abs(v) <= v_max).all()
+    assert (np.ptp(q, axis=0) > 0.95 * (high - low)).all()
+    assert (np.ptp(v, axis=0) > 0.95 * 2 * v_max).all()
+
+
+# The cache.
+
+
+def test_a_second_load_does_not_simulate(cache, splits, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("simulated again")
+
+    monkeypatch.setattr("pinn_dyn.data.simulated.simulate", refuse)
+    again = make_source(cache).load()
+    for name in ("train", "validation", "test"):
+        for x, y in zip(getattr(splits, name), getattr(again, name), strict=True):
+            for key in ("t", "q", "v", "u"):
+                assert torch.equal(getattr(x, key), getattr(y, key))
+
+
+CHANGES = {
+    "mass": lambda: dict(system=SoftArm(mass=0.31)),
+    "damping": lambda: dict(system=SoftArm(damping=0.2)),
+    "nodes": lambda: dict(system=SoftArm(nodes=3)),
+    "seed": lambda: dict(seed=1),
+    "rtol": lambda: dict(rtol=1e-7),
+    "atol": lambda: dict(atol=1e-8),
+    "step": lambda: dict(step=0.02),
+    "duration": lambda: dict(duration=0.3),
+    "train_initial_states": lambda: dict(train_initial_states=2, train_inputs=3),
+    "validation": lambda: dict(validation=3),
+    "test": lambda: dict(test=4),
+    "amplitude": lambda: dict(excitation=excitation(sine={"amplitude": [1.2, 1.3, 0.1]})),
+    "harmonics": lambda: dict(excitation=excitation(sine={"harmonics": 2})),
+    "rise_time": lambda: dict(excitation=excitation(steps={"rise_time": 0.04})),
+    "kind": lambda: dict(excitation=MultiSine(**SINE)),
+    "q_low": lambda: dict(initial_states=InitialStates(**{**BOX, "q_low": [-1.0, -1.0, 0.2]})),
+    "v_max": lambda: dict(initial_states=InitialStates(**{**BOX, "v_max": [1.0, 1.0, 0.2]})),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_of_the_data_is_another_entry_of_the_cache(tmp_path, change):
+    changed = make_source(tmp_path, **CHANGES[change]())
+    assert changed.describe() != make_source(tmp_path).describe()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        dict(cache="elsewhere"),
+        dict(labels=["other", "names", "here"]),
+        dict(configurations={}),
+    ],
+    ids=["cache", "labels", "configurations"],
+)
+def test_what_does_not_touch_the_data_is_the_same_entry(tmp_path, change):
+    assert make_source(tmp_path, **change).describe() == make_source(tmp_path).describe()
+
+
+def test_evaluation_mode_of_the_system_is_the_same_entry(tmp_path):
+    assert (
+        make_source(tmp_path, system=SoftArm().eval()).describe()
+        == make_source(tmp_path).describe()
+    )
+
+
+def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
+    def describe(mass):
+        system = damped_oscillators().requires_grad_(False)
+        system.mass.mul_(mass)
+        return make_source(
+            tmp_path,
+            system=system,
+            excitation=MultiSine([0.0], [1.0]),
+            initial_states=InitialStates([-1.0, -1.0], [1.0, 1.0], [0.1, 0.1]),
+            labels=["a", "b"],
+            input_labels=["u"],
+            configurations={},
+        ).describe()
+
+    assert describe(1.0) == describe(1.0)
+    assert describe(1.0) != describe(2.0)
+
+
+# Bad arguments.
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(step=0.3), "step is 0.3 s and duration 0.2 s"),
+        (dict(step=0.0), "step is 0.0"),
+        (dict(train_initial_states=0), "train_initial_states is 0"),
+        (dict(train_inputs=0), "train_inputs is 0"),
+        (dict(validation=0), "validation is 0"),
+        (dict(test=-1), "test is -1"),
+        (dict(labels=["x", "y"]), "labels has 2 entries, the system needs 3"),
+        (dict(input_labels=["a"]), "input_labels has 1 entries, the system needs 3"),
+        (dict(configurations={"odd": [1.0]}), "configurations.odd has 1 entries"),
+        (dict(system=SoftArm(segments=2)), "initial_states has 3 entries, the system needs 6"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(tmp_path, change, message):
+    with pytest.raises(ValueError, match=rf"tiny_arm: {message}"):
+        make_source(tmp_path, **change)
+
+
+def test_an_excitation_of_another_size_is_refused_by_name(tmp_path):
+    with pytest.raises(ValueError, match="tiny_arm: excitation"):
+        make_source(tmp_path, excitation=MultiSine([0.0], [1.0])).load()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(v_max=[1.0]), "v_max have 3, 3 and 1 entries"),
+        (dict(q_high=[1.0, 1.0, np.nan]), "finite"),
+        (dict(q_low=[2.0, -1.0, 0.1]), "q_low <= q_high"),
+        (dict(v_max=[1.0, -1.0, 0.1]), "v_max >= 0"),
+    ],
+)
+def test_a_bad_box_of_initial_states_is_refused(change, message):
+    with pytest.raises(ValueError, match=f"InitialStates: .*{message}"):
+        InitialStates(**{**BOX, **change})

@@ -1,0 +1,219 @@
+"""The simulator against closed forms, a second solver and the balance of energy."""
+
+import signal as signals
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import cumulative_simpson, solve_ivp
+
+from pinn_dyn.data import Mixture, MultiSine, SimulationError, Steps, simulate
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.systems import SoftArm
+from tests.support.linear import damped_oscillators, exact_solution, exact_solution_under_sine
+
+ARM_INPUTS = Mixture(
+    [
+        MultiSine([0.0, 0.0, -1.15], [1.2, 1.2, 0.1], frequency=[0.5, 2.0], harmonics=3),
+        Steps([0.0, 0.0, -1.15], [1.2, 1.2, 0.1], hold=[0.2, 0.5], rise_time=0.1),
+    ]
+)
+ARM_Q = np.array([[0.6, -0.4, 0.2], [-0.9, 0.3, 0.3], [0.1, 0.05, 0.15]])
+ARM_V = np.array([[0.5, -0.2, 0.05], [0.0, 0.0, 0.0], [-0.8, 0.9, -0.05]])
+ARM_T = np.linspace(0, 1.0, 501)
+
+
+def constant(value, count):
+    return lambda t: np.broadcast_to(np.asarray(value), (count, len(t), len(value)))
+
+
+@pytest.fixture
+def linear():
+    return damped_oscillators().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def arm_run():
+    signal = ARM_INPUTS.draw(3, 1.0, np.random.default_rng(0))
+    q, v = simulate(SoftArm(), ARM_Q, ARM_V, signal, ARM_T)
+    return signal, q, v
+
+
+def test_a_damped_linear_system_under_a_constant_input_follows_the_matrix_exponential(linear):
+    x0 = np.array([[0.5, -0.3, 0.2, 0.8], [1.0, 1.0, 0.0, 0.0]])
+    t = np.linspace(0, 4, 41)
+    q, v = simulate(linear, x0[:, :2], x0[:, 2:], constant([0.7], 2), t)
+    u = torch.full((41, 1), 0.7, dtype=torch.float64)
+    for k in range(2):
+        exact = exact_solution(linear, torch.from_numpy(x0[k]), torch.from_numpy(t), u, "hold")
+        np.testing.assert_allclose(np.hstack([q[k], v[k]]), exact.numpy(), rtol=0, atol=1e-7)
+
+
+def test_a_damped_linear_system_under_a_sine_follows_the_matrix_exponential(linear):
+    x0 = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
+    t = np.linspace(0, 4, 41)
+    q, v = simulate(
+        linear,
+        x0[None, :2].numpy(),
+        x0[None, 2:].numpy(),
+        lambda s: np.sin(3 * s)[None, :, None],
+        t,
+    )
+    exact = exact_solution_under_sine(linear, x0, torch.from_numpy(t), 3.0)
+    np.testing.assert_allclose(np.hstack([q[0], v[0]]), exact.numpy(), rtol=0, atol=1e-7)
+
+
+def test_looser_tolerances_give_larger_errors(linear):
+    """The tolerances reach the solver."""
+    x0 = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
+    t = np.linspace(0, 4, 41)
+    exact = exact_solution_under_sine(linear, x0, torch.from_numpy(t), 3.0).numpy()
+    errors = []
+    for tolerance in (1e-4, 1e-11):
+        q, v = simulate(
+            linear,
+            x0[None, :2].numpy(),
+            x0[None, 2:].numpy(),
+            lambda s: np.sin(3 * s)[None, :, None],
+            t,
+            rtol=tolerance,
+            atol=tolerance,
+        )
+        errors.append(np.abs(np.hstack([q[0], v[0]]) - exact).max())
+    assert errors[1] < 1e-9 < 1e-7 < errors[0]
+
+
+def test_the_soft_arm_agrees_with_a_tighter_solve_of_one_trajectory(arm_run):
+    signal, q, v = arm_run
+    arm = SoftArm()
+
+    def rate(time, x):
+        u = torch.from_numpy(signal(np.array([time]))[0, 0])
+        with torch.inference_mode():
+            return arm.velocity_derivative(torch.from_numpy(np.array(x)), u).numpy()
+
+    every = slice(None, None, 50)
+    tight = solve_ivp(
+        rate,
+        (0, 0.5),
+        np.concatenate([ARM_Q[0], ARM_V[0]]),
+        method="DOP853",
+        t_eval=ARM_T[:251][every],
+        rtol=1e-11,
+        atol=1e-12,
+    )
+    ours = np.hstack([q[0], v[0]])[:251][every]
+    np.testing.assert_allclose(ours, tight.y.T, rtol=0, atol=1e-6)
+
+
+def test_a_batch_equals_single_trajectories(arm_run):
+    signal, q, v = arm_run
+    half = ARM_T[:251]
+    for k in (1, 2):
+        alone_q, alone_v = simulate(
+            SoftArm(),
+            ARM_Q[k : k + 1],
+            ARM_V[k : k + 1],
+            lambda t, k=k: signal(t)[k : k + 1],
+            half,
+        )
+        np.testing.assert_allclose(alone_q[0], q[k, :251], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(alone_v[0], v[k, :251], rtol=0, atol=1e-5)
+
+
+def test_samples_start_at_the_initial_states(arm_run):
+    _, q, v = arm_run
+    assert q.shape == v.shape == (3, 501, 3)
+    np.testing.assert_array_equal(q[:, 0], ARM_Q)
+    np.testing.assert_array_equal(v[:, 0], ARM_V)
+
+
+def test_the_energy_of_the_soft_arm_changes_by_the_power_that_enters_and_is_lost(arm_run):
+    signal, q, v = arm_run
+    arm = SoftArm()
+    q, v, u = (torch.from_numpy(np.ascontiguousarray(x)) for x in (q, v, signal(ARM_T)))
+    energy = arm.total_energy(q, v).numpy()
+    work = cumulative_simpson(arm.power(q, v, u).numpy(), x=ARM_T, initial=0)
+    change = energy - energy[:, :1]
+    np.testing.assert_allclose(change, work, rtol=0, atol=2e-6)
+    assert np.abs(change).max() > 0.05
+
+
+def test_the_velocity_is_the_rate_of_the_configuration(arm_run):
+    _, q, v = arm_run
+    h = ARM_T[1]
+    rate = (8 * (q[:, 3:-1] - q[:, 1:-3]) - (q[:, 4:] - q[:, :-4])) / (12 * h)
+    np.testing.assert_allclose(rate, v[:, 2:-2], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_non_finite_initial_state_is_refused_with_its_number(linear, bad):
+    q0 = np.zeros((3, 2))
+    q0[1, 0] = bad
+    with pytest.raises(ValueError, match="initial state 1"):
+        simulate(linear, q0, np.zeros((3, 2)), constant([0.0], 3), np.linspace(0, 1, 11))
+
+
+class LosesMass(MechanicalSystem):
+    """A mass 1 - q that a constant force drives to q = 1, where it vanishes."""
+
+    def __init__(self):
+        super().__init__(1, 1)
+
+    def mass_matrix(self, q):
+        return (1 - q).unsqueeze(-1)
+
+    def potential_energy(self, q):
+        return torch.zeros_like(q[..., 0])
+
+    def damping_matrix(self, q):
+        return torch.zeros_like(q).unsqueeze(-1)
+
+    def input_matrix(self, q):
+        return torch.ones_like(q).unsqueeze(-1)
+
+
+def time_of(error):
+    return float(str(error).split("t = ")[1].split(" s")[0])
+
+
+def test_a_lost_mass_matrix_ends_the_simulation_and_says_when():
+    """From rest under u = 1 the mass, moving at the rate p/(1 - q), is gone after 0.94 s."""
+    t = np.linspace(0, 5, 51)
+    with pytest.raises(SimulationError) as caught:
+        simulate(LosesMass(), np.zeros((1, 1)), np.zeros((1, 1)), constant([1.0], 1), t)
+    # Kinetic energy p^2 / (2 m) = q and p^2 (1/m)' feed the motion until shortly after.
+    assert 0.5 < time_of(caught.value) < 2.0
+
+
+def test_an_initial_state_without_a_positive_mass_matrix_ends_the_simulation():
+    t = np.linspace(0, 1, 11)
+    with pytest.raises(SimulationError, match="t = 0 s"):
+        simulate(LosesMass(), np.full((1, 1), 2.0), np.zeros((1, 1)), constant([1.0], 1), t)
+
+
+class Deadline:
+    """Turns a computation that hangs into a failure."""
+
+    def __init__(self, seconds):
+        self.seconds = seconds
+
+    def __enter__(self):
+        def stop(*_):
+            raise AssertionError(f"still running after {self.seconds} s")
+
+        self.before = signals.signal(signals.SIGALRM, stop)
+        signals.alarm(self.seconds)
+
+    def __exit__(self, *_):
+        signals.alarm(0)
+        signals.signal(signals.SIGALRM, self.before)
+
+
+@pytest.mark.parametrize("onset", [0.5, 0.0])
+def test_an_input_that_is_not_a_number_ends_the_simulation(linear, onset):
+    def signal(t):
+        return np.where(t < onset, 0.1, np.nan)[None, :, None]
+
+    with Deadline(5), pytest.raises(SimulationError, match="t = "):
+        simulate(linear, np.zeros((1, 2)), np.zeros((1, 2)), signal, np.linspace(0, 1, 11))

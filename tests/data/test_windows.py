@@ -1,0 +1,300 @@
+"""Windows, their order in batches, and the data module that serves them."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.data import DataSource, DynamicsData, Splits, draw_windows
+from pinn_dyn.data.windows import BatchSampler
+from pinn_dyn.mechanics import Trajectory
+from tests.support.cart_pole import CartPole
+
+STEP = 0.01
+
+
+def make_trajectory(seed, samples=40, step=STEP, **extra):
+    """Random samples, so that every one of them is recognized by its value."""
+    generator = torch.Generator().manual_seed(seed)
+    q, v, u = (
+        torch.randn(samples, size, generator=generator, dtype=torch.float64) for size in (2, 2, 1)
+    )
+    return Trajectory(torch.arange(samples, dtype=torch.float64) * step, q, v, u, **extra)
+
+
+def draw(trajectories, **changes):
+    return draw_windows(
+        trajectories, **{"count": 30, "steps": 2, "stride": 3, "seed": 0, **changes}
+    )
+
+
+def origin(trajectories, windows):
+    """Which trajectory and sample each window starts at, found by its configuration."""
+    found = []
+    for q in windows.q:
+        (hit,) = [
+            (number, int(k))
+            for number, item in enumerate(trajectories)
+            for k in (item.q == q).all(-1).nonzero()
+        ]
+        found.append(hit)
+    return found
+
+
+@pytest.fixture
+def trajectories():
+    return [make_trajectory(0), make_trajectory(1, samples=25), make_trajectory(2)]
+
+
+@pytest.mark.parametrize(("steps", "stride"), [(1, 1), (1, 5), (2, 3), (4, 1)])
+def test_a_window_holds_the_slices_of_its_trajectory(trajectories, steps, stride):
+    windows = draw(trajectories, steps=steps, stride=stride)
+    span = steps * stride
+    assert windows.q.shape == windows.v.shape == (30, 2)
+    assert windows.dq.shape == windows.dv.shape == (30, steps, 2)
+    for index, (number, k) in enumerate(origin(trajectories, windows)):
+        item = trajectories[number]
+        knots = slice(k + stride, k + span + 1, stride)
+        assert torch.equal(windows.v[index], item.v[k])
+        assert torch.equal(windows.dq[index], item.q[knots] - item.q[k])
+        assert torch.equal(windows.dv[index], item.v[knots] - item.v[k])
+        assert torch.equal(windows.u[index], item.u[k : k + span + 1])
+    t = torch.arange(span + 1, dtype=torch.float64) * STEP
+    torch.testing.assert_close(windows.t_input, t, rtol=0, atol=1e-15)
+    torch.testing.assert_close(windows.t, t[::stride], rtol=0, atol=1e-15)
+
+
+def test_all_starts_are_drawn_before_any_comes_twice(trajectories):
+    """40 + 25 + 40 samples, less 6 each, are 87 starts: 87 windows are all of them."""
+    windows = draw(trajectories, count=87)
+    expected = [(n, k) for n, item in enumerate(trajectories) for k in range(len(item.t) - 6)]
+    assert sorted(origin(trajectories, windows)) == expected
+
+
+def test_starts_are_drawn_from_all_trajectories_alike(trajectories):
+    windows = draw(trajectories, count=60)
+    found = origin(trajectories, windows)
+    assert len(set(found)) == 60
+    share = np.bincount([number for number, _ in found], minlength=3) / 60
+    np.testing.assert_allclose(share, np.array([34, 19, 34]) / 87, atol=0.12)
+
+
+def test_a_seed_gives_the_same_windows_again_and_another_seed_gives_others(trajectories):
+    first, again, other = (draw(trajectories, seed=seed) for seed in (0, 0, 1))
+    assert torch.equal(first.q, again.q)
+    assert origin(trajectories, first) != origin(trajectories, other)
+
+
+def test_momenta_come_from_the_mass_matrix_at_the_start_and_at_every_step(trajectories):
+    system = CartPole().requires_grad_(False)
+    windows = draw(trajectories, momentum=system.momentum)
+
+    def momentum(q, v):
+        return (system.mass_matrix(q) @ v.unsqueeze(-1)).squeeze(-1)
+
+    start = momentum(windows.q, windows.v)
+    q = windows.q[:, None] + windows.dq
+    v = windows.v[:, None] + windows.dv
+    torch.testing.assert_close(windows.p, start, rtol=0, atol=1e-12)
+    torch.testing.assert_close(windows.dp, momentum(q, v) - start[:, None], rtol=0, atol=1e-12)
+
+
+def test_recorded_momenta_are_used_where_no_truth_is_known():
+    recorded = [make_trajectory(k, p=torch.randn(40, 2, dtype=torch.float64)) for k in range(2)]
+    windows = draw(recorded)
+    for index, (number, k) in enumerate(origin(recorded, windows)):
+        p = recorded[number].p
+        assert torch.equal(windows.p[index], p[k])
+        assert torch.equal(windows.dp[index], p[[k + 3, k + 6]] - p[k])
+
+
+def test_without_momenta_there_are_none(trajectories):
+    windows = draw(trajectories)
+    assert windows.p.shape == (30, 0)
+    assert windows.dp.shape == (30, 2, 0)
+
+
+def test_the_input_keeps_its_interpolation():
+    windows = draw([make_trajectory(0, interpolation="hold")], count=10)
+    assert windows.interpolation == "hold"
+    assert windows[torch.tensor([0, 1])].to(torch.device("cpu")).interpolation == "hold"
+
+
+def test_increments_stay_precise_in_single_precision():
+    """Increments of 1e-6 on states near 1: subtracted in float32 they would be 6 % off."""
+    t = torch.arange(40, dtype=torch.float64) * STEP
+    q = 1 + 1e-6 * torch.sin(t)[:, None].repeat(1, 2)
+    slow = Trajectory(t, q, q, torch.zeros(40, 1, dtype=torch.float64))
+    windows = draw([slow])
+    single = windows.to(torch.device("cpu"), torch.float32)
+    assert single.dq.dtype == single.q.dtype == single.t.dtype == torch.float32
+    torch.testing.assert_close(single.dq.double(), windows.dq, rtol=1e-6, atol=0)
+    torch.testing.assert_close(single.dv.double(), windows.dv, rtol=1e-6, atol=0)
+
+
+def test_statistics_are_those_of_the_windows(trajectories):
+    system = CartPole().requires_grad_(False)
+    windows = draw(trajectories, momentum=system.momentum)
+    statistics = windows.statistics()
+    expected = {
+        "q_mean": windows.q.mean(0),
+        "q_std": windows.q.std(0, correction=0),
+        "v_std": windows.v.std(0, correction=0),
+        "p_std": windows.p.std(0, correction=0),
+        "u_mean": windows.u.reshape(-1, 1).mean(0),
+        "u_std": windows.u.reshape(-1, 1).std(0, correction=0),
+        "velocity_increment_std": torch.cat([windows.dq, windows.dv], -1).std(0, correction=0),
+        "momentum_increment_std": torch.cat([windows.dq, windows.dp], -1).std(0, correction=0),
+    }
+    for name, value in expected.items():
+        torch.testing.assert_close(getattr(statistics, name), value, rtol=1e-12, atol=0)
+    assert statistics.step == pytest.approx(3 * STEP)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(count=0), "count is 0"),
+        (dict(steps=0), "steps is 0"),
+        (dict(stride=-1), "stride is -1"),
+        (dict(count=88), "88 windows of 6 samples .* only 87 starts"),
+        (dict(steps=20, stride=2, count=1), "only 0 starts"),
+    ],
+)
+def test_windows_that_cannot_be_drawn_are_refused(trajectories, changes, message):
+    with pytest.raises(ValueError, match=message):
+        draw(trajectories, **changes)
+
+
+@pytest.mark.parametrize("where", ["within", "between"])
+def test_a_clock_that_is_not_uniform_is_refused(trajectories, where):
+    odd = make_trajectory(3, step=0.02)
+    if where == "within":
+        t = trajectories[1].t.clone()
+        t[7:] += 0.001
+        odd = Trajectory(t, trajectories[1].q, trajectories[1].v, trajectories[1].u)
+    with pytest.raises(ValueError, match="training trajectory 1 has sample times"):
+        draw([trajectories[0], odd])
+
+
+# The order of batches.
+
+
+def batches(epoch=0, seed=0, size=64, batch_size=16, number=4):
+    sampler = BatchSampler(size, batch_size=batch_size, batches=number, seed=seed)
+    sampler.set_epoch(epoch)
+    return torch.stack(list(sampler))
+
+
+def test_batches_depend_on_the_seed_and_the_epoch_alone():
+    assert torch.equal(batches(epoch=3), batches(epoch=3))
+    assert not torch.equal(batches(epoch=3), batches(epoch=4))
+    assert not torch.equal(batches(seed=0), batches(seed=1))
+    # A sampler that has been through earlier epochs gives what a fresh one gives.
+    sampler = BatchSampler(64, batch_size=16, batches=4, seed=0)
+    for epoch in range(4):
+        sampler.set_epoch(epoch)
+        last = torch.stack(list(sampler))
+    assert torch.equal(last, batches(epoch=3))
+
+
+def test_a_pass_covers_every_window_once():
+    order = batches(number=12).reshape(3, 64)
+    for one_pass in order:
+        assert torch.equal(one_pass.sort().values, torch.arange(64))
+    assert not torch.equal(order[0], order[1])
+
+
+def test_no_window_comes_twice_in_a_pass_that_does_not_divide_evenly():
+    order = batches(size=70, number=8)
+    assert order.shape == (8, 16)
+    for one_pass in order.reshape(2, 64):
+        assert len(set(one_pass.tolist())) == 64
+
+
+def test_the_sampler_tells_its_length():
+    assert len(BatchSampler(64, batch_size=16, batches=7, seed=0)) == 7
+
+
+# The data module.
+
+
+class Stored(DataSource):
+    """Trajectories in memory; counts how often they are asked for."""
+
+    name = "stored"
+    labels = ("x", "y")
+    input_labels = ("u",)
+    system = None
+    configurations = {}  # noqa: RUF012
+
+    def __init__(self):
+        self.loads = 0
+        self.splits = Splits(
+            [make_trajectory(k) for k in range(3)],
+            [make_trajectory(k) for k in (10, 11)],
+            [make_trajectory(k) for k in (20, 21)],
+        )
+
+    def load(self):
+        self.loads += 1
+        return self.splits
+
+
+def make_data(**changes):
+    arguments = dict(pairs=90, steps=2, stride=3, batch_size=16, batches_per_epoch=9, seed=0)
+    return DynamicsData(Stored(), **{**arguments, **changes})
+
+
+def test_training_batches_have_the_asked_shapes_in_single_precision():
+    loaded = list(make_data().train_dataloader())
+    assert len(loaded) == 9
+    for batch in loaded:
+        assert batch.q.shape == (16, 2)
+        assert batch.dq.shape == (16, 2, 2)
+        assert batch.u.shape == (16, 7, 1)
+        assert batch.t.shape == (3,)
+        assert {batch.q.dtype, batch.u.dtype, batch.t.dtype} == {torch.float32}
+
+
+def test_windows_come_from_training_trajectories_alone():
+    data = make_data()
+    splits = data.source.splits
+    found = origin([*splits.train, *splits.validation, *splits.test], data.windows)
+    assert {number for number, _ in found} == {0, 1, 2}
+    served = torch.cat([batch.q for batch in data.train_dataloader()])
+    train = torch.cat([x.q for x in splits.train]).float()
+    assert (served[:, None] == train).all(-1).any(-1).all()
+
+
+def test_validation_is_one_batch_of_whole_trajectories():
+    data = make_data()
+    (batch,) = data.val_dataloader()
+    assert torch.equal(batch.q, torch.stack([x.q for x in data.source.splits.validation]))
+    assert batch.q.shape == (2, 40, 2)
+
+
+def test_the_source_is_asked_once():
+    data = make_data()
+    data.prepare_data()
+    list(data.train_dataloader())
+    list(data.val_dataloader())
+    assert data.statistics.step == pytest.approx(3 * STEP)
+    assert data.source.loads == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(batch_size=0), "batch_size is 0"),
+        (dict(batches_per_epoch=0), "batches_per_epoch is 0"),
+        (dict(batch_size=91), "batch_size is 91, expected at most the number of pairs, 90"),
+    ],
+)
+def test_bad_sizes_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_data(**changes)
+
+
+def test_more_pairs_than_the_data_have_are_refused():
+    with pytest.raises(ValueError, match="only 102 starts"):
+        make_data(pairs=1000).windows  # noqa: B018
