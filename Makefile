@@ -20,8 +20,9 @@ INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check $(PIP_FLA
 help:  ## list the targets
 	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-7s %s\n", $$1, $$2 }'
 
-demo: $(VENV)/.installed  ## run the demo (runtime packages only)
-	$(BIN)/python demo.py
+demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, compare them
+	$(BIN)/python train.py -m 'experiment=soft_arm_1/demo/hnn,soft_arm_1/demo/lnn,soft_arm_1/demo/mlp' hydra.sweep.dir=runs/demo
+	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' hydra.run.dir=runs/demo-evaluation
 
 test: $(VENV)/.installed-dev  ## run the tests
 	$(BIN)/python -m pytest
@@ -32,8 +33,9 @@ lint: $(VENV)/.installed-dev  ## check style, types and import order
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.installed-bench  ## time a training step
+bench: $(VENV)/.installed-bench  ## time a training step and the simulation of the data
 	$(BIN)/python benchmarks/training_step.py
+	$(BIN)/python benchmarks/data_generation.py
 
 clean:  ## remove the environment and the caches, keep the runs
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

@@ -156,7 +156,7 @@ class SimulatedSource(DataSource):
 
     def load(self) -> Splits:
         """The trajectories, from the cache or newly simulated."""
-        arrays = load_or_make(self.cache, self.name, self.describe(), self._simulate)
+        arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
         t = torch.from_numpy(arrays["t"])
         splits: dict[str, list[Trajectory]] = {}
         for split in _SPLITS:
@@ -187,7 +187,8 @@ class SimulatedSource(DataSource):
             "atol": self.atol,
         }
 
-    def _simulate(self) -> Arrays:
+    def simulate(self) -> Arrays:
+        """Simulate all trajectories anew: arrays ``<split>_<q, v, u, p>``, each ``(K, T, .)``."""
         samples = round(self.duration / self.step) + 1
         t = np.arange(samples) * self.step
         starts, signals, pick = [], [], []
