@@ -13,10 +13,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.data import DataSource, DynamicsData
-from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
+from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.training import DynamicsLearner
+
+CHECKPOINTS = "checkpoints"
 
 
 def _build(name: str, config: dict[str, Any], **extra: Any) -> Any:
@@ -85,18 +87,21 @@ def build_trainer(
     config: dict[str, Any], folder: Path, source: DataSource, validator: RolloutValidator
 ) -> L.Trainer:
     """The trainer with its callbacks and the TensorBoard logger, all writing to ``folder``."""
-    callbacks = []
-    for name, part in config["callbacks"].items():
-        callback = _build(f"callbacks.{name}", part)
-        if part["_target_"].endswith(RolloutFigures.__name__):
-            callback = callback(
-                validator=validator,
-                labels=source.labels,
-                input_labels=source.input_labels,
-                system=source.system,
-                configurations=source.configurations,
-            )
-        callbacks.append(callback)
+    # What a callback needs beyond its configuration, by its name there.
+    needs: dict[str, dict[str, Any]] = {
+        "checkpoint": {"dirpath": str(folder / CHECKPOINTS)},
+        "figures": {
+            "validator": validator,
+            "labels": source.labels,
+            "input_labels": source.input_labels,
+            "system": source.system,
+            "configurations": source.configurations,
+        },
+    }
+    callbacks = [
+        _build(f"callbacks.{name}", part, **needs.get(name, {}))
+        for name, part in config["callbacks"].items()
+    ]
     logger = TensorBoardLogger(str(folder), name="tensorboard", version="", default_hp_metric=False)
     return _build(
         "trainer",

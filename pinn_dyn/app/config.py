@@ -14,6 +14,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
+from pinn_dyn.data import SimulationError
+from pinn_dyn.training import NonFiniteLossError
+
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
 
@@ -42,7 +45,7 @@ def main(task: Callable[[DictConfig], object], config_name: str) -> None:
     """Run a task on the configuration that the command line asks for.
 
     A misspelt key ends the program before anything is written, with the keys that were probably
-    meant; so does a :class:`ConfigError` or ValueError of the task, without a traceback.
+    meant; so does an error that the user can mend, without a traceback.
     """
     problem = misspelt_key(config_name, sys.argv[1:])
     if problem:
@@ -51,7 +54,7 @@ def main(task: Callable[[DictConfig], object], config_name: str) -> None:
     def run(cfg: DictConfig) -> object:
         try:
             return task(cfg)
-        except (ConfigError, FileNotFoundError) as error:
+        except (ConfigError, NonFiniteLossError, SimulationError) as error:
             raise SystemExit(f"Error: {error}") from error
 
     # Warnings about loggers and hardware that a user cannot act on.

@@ -68,7 +68,10 @@ def evaluate(cfg: DictConfig) -> float:
     labels = _labels(runs)
     evaluations = []
     for run, label in zip(tqdm(runs, desc="evaluating runs"), labels, strict=True):
-        evaluations.append(_evaluate(run, label, truth, config))
+        try:
+            evaluations.append(_evaluate(run, label, truth, config))
+        except ValueError as error:
+            raise ConfigError(f"{run.folder}: {error}") from error
     summary = summary_table([item.result for item in evaluations])
     write_table(summary, folder, "summary")
     grouped = grouped_table(summary)

@@ -14,14 +14,13 @@ from typing import Any
 import torch
 import yaml
 
-from pinn_dyn.app.build import build_model
+from pinn_dyn.app.build import CHECKPOINTS, build_model
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
-CHECKPOINTS = "checkpoints"
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,11 @@ def train(cfg: DictConfig) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     last = None
     if cfg.resume is not None:
+        others = [word for word in HydraConfig.get().overrides.task if word[:7] != "resume="]
+        if others:
+            raise ConfigError(
+                f"resume goes on with the run's own configuration: leave out {', '.join(others)}"
+            )
         folder = Path(cfg.resume)
         config = read_config(folder)
         last = folder / CHECKPOINTS / "last.ckpt"
@@ -48,14 +53,21 @@ def train(cfg: DictConfig) -> float:
 
     data = build_data(config)
     log.info("%s: loading data", config["name"])
-    statistics = data.statistics
+    try:
+        statistics = data.statistics
+    except ValueError as problem:
+        raise ConfigError(f"data: {problem}") from problem
     model = build_model(config, statistics)
     validator = build_validator(config, statistics.step)
     learner = build_learner(config, model, statistics, validator)
     trainer = build_trainer(config, folder, data.source, validator)
 
     start = time.perf_counter()
-    trainer.fit(learner, data, ckpt_path=last, weights_only=True)
+    try:
+        trainer.fit(learner, data, ckpt_path=last, weights_only=True)
+    except SystemExit:  # Lightning's end of an interrupted training
+        log.warning("interrupted; go on with: python train.py resume=%s", folder)
+        raise
     seconds = time.perf_counter() - start
 
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
