@@ -28,7 +28,6 @@ class HessianBaseline:
 
     def __init__(self, model: LagrangianNetwork):
         self.model = model
-        self.derivative = self.state_derivative
 
     def lagrangian(self, q: Tensor, v: Tensor) -> Tensor:
         """L(q, v) of one sample, a scalar."""
@@ -48,12 +47,8 @@ class HessianBaseline:
         q, v = x.chunk(2, dim=-1)
         return torch.cat([v, vmap(self.acceleration)(q, v, u)], dim=-1)
 
-    def compile(self) -> None:
-        """Compile the state derivative, as the paper's code does with ``jax.jit``."""
-        self.derivative = torch.compile(self.state_derivative)
-
     def increments(
         self, x0: Tensor, t: Tensor, u: Tensor, *, interpolation: Interpolation = "linear"
     ) -> Tensor:
         """As ``LagrangianNetwork.increments``, by the same integrator."""
-        return rollout_increments(self.derivative, x0, t, u, interpolation=interpolation)
+        return rollout_increments(self.state_derivative, x0, t, u, interpolation=interpolation)

@@ -89,7 +89,8 @@ def build_trainer(
     """The trainer with its callbacks and the TensorBoard logger, all writing to ``folder``."""
     # What a callback needs beyond its configuration, by its name there.
     needs: dict[str, dict[str, Any]] = {
-        "checkpoint": {"dirpath": str(folder / CHECKPOINTS)},
+        "best": {"dirpath": str(folder / CHECKPOINTS)},
+        "last": {"dirpath": str(folder / CHECKPOINTS)},
         "figures": {
             "validator": validator,
             "labels": source.labels,

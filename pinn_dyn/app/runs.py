@@ -71,7 +71,7 @@ def load_run(folder: Path, checkpoint: str) -> Run:
         )
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, ValueError) as error:
+    except Exception as error:  # a damaged archive or pickle raises nearly anything
         raise ConfigError(f"{path} cannot be read, it may be cut short: {error}") from error
     parameters = saved["hyper_parameters"]
     statistics = Statistics.from_dict(parameters["statistics"])
@@ -81,13 +81,16 @@ def load_run(folder: Path, checkpoint: str) -> Run:
         for key, value in saved["state_dict"].items()
         if key.startswith("model.")
     }
+    written_for = parameters["config"]["model"]
     try:
+        if written_for != config["model"]:
+            raise RuntimeError("their model sections differ")
         model.load_state_dict(weights)
     except RuntimeError as error:
         raise ConfigError(
             f"{path} holds weights of another model than {folder / CONFIG} describes "
             f"({config['model']['_target_']}, the checkpoint was written for "
-            f"{parameters['config']['model']['_target_']}): {error}"
+            f"{written_for['_target_']}): {error}"
         ) from error
     path = folder / METRICS
     metrics = json.loads(path.read_text()) if path.is_file() else {}

@@ -55,10 +55,11 @@ def train(cfg: DictConfig) -> float:
     log.info("%s: loading data", config["name"])
     try:
         statistics = data.statistics
+        validator = build_validator(config, statistics.step)
+        data.splits.validation[0].until(validator.horizon)
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem
     model = build_model(config, statistics)
-    validator = build_validator(config, statistics.step)
     learner = build_learner(config, model, statistics, validator)
     trainer = build_trainer(config, folder, data.source, validator)
 

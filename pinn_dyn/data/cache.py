@@ -46,7 +46,14 @@ def load_or_make(
         if path.exists():
             try:
                 return _read(path)
-            except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            except (
+                OSError,
+                ValueError,
+                EOFError,
+                KeyError,
+                RuntimeError,
+                zipfile.BadZipFile,
+            ) as error:
                 aside = path.with_suffix(".damaged")
                 os.replace(path, aside)
                 log.warning(
@@ -63,14 +70,19 @@ def load_or_make(
 def _read(path: Path) -> Arrays:
     # numpy reads each member to its end, where zipfile compares the checksum.
     with np.load(path, allow_pickle=False) as archive:
-        return {key: archive[key] for key in archive.files if key != "description"}
+        return {str(name): archive[str(name)] for name in archive["names"]}
 
 
 def _write(path: Path, arrays: Arrays, description: object) -> None:
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with partial.open("wb") as file:
-            members = {"description": np.array(json.dumps(description)), **arrays}
+            # The names tell a reader what must be there, should the archive's directory be damaged.
+            members = {
+                "description": np.array(json.dumps(description)),
+                "names": np.array(list(arrays)),
+                **arrays,
+            }
             np.savez(file, allow_pickle=False, **members)
         os.replace(partial, path)
     finally:

@@ -51,6 +51,12 @@ class _Bounded(Excitation):
                 f"{type(self).__name__}: offset has {len(self.offset)} entries and amplitude "
                 f"{len(self.amplitude)}, expected one of each per input"
             )
+        for name, values in (("offset", self.offset), ("amplitude", self.amplitude)):
+            if len(values) == 0 or not np.isfinite(values).all():
+                raise ValueError(
+                    f"{type(self).__name__}: {name} is {list(values)}, expected a finite number "
+                    "for each input"
+                )
         if min(self.amplitude) < 0:
             raise ValueError(
                 f"{type(self).__name__}: amplitude is {list(self.amplitude)}, expected no "

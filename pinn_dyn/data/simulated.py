@@ -17,7 +17,7 @@ from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
-_VERSION = 1
+_VERSION = 2
 _SPLITS = ("train", "validation", "test")
 
 
@@ -169,14 +169,15 @@ class SimulatedSource(DataSource):
 
     def describe(self) -> dict[str, object]:
         """Everything the trajectories depend on: the key of the cache."""
-        public = {
+        settings = {
             key: value
             for key, value in vars(self.system).items()
-            if isinstance(value, (int, float, str, bool)) and not key.startswith("_")
+            if isinstance(value, (int, float, str)) and key != "training"
         }
+        constants = {key: value.tolist() for key, value in self.system.state_dict().items()}
         return {
             "version": _VERSION,
-            "system": {"class": type(self.system).__name__, **public},
+            "system": {"class": type(self.system).__name__, **settings, **constants},
             "excitation": _describe(self.excitation),
             "initial_states": _describe(asdict(self.initial_states)),
             "duration": self.duration,

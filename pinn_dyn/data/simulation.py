@@ -10,6 +10,9 @@ from tqdm import tqdm
 from pinn_dyn.data.excitation import Signal
 from pinn_dyn.mechanics import MechanicalSystem
 
+# In units of the whole duration: far below any step that a smooth motion needs.
+_SMALLEST_STEP = 1e-7
+
 
 class SimulationError(RuntimeError):
     """The solver could not finish a simulation."""
@@ -58,9 +61,23 @@ def simulate(
     def derivative(time: float, flat: np.ndarray) -> np.ndarray:
         x = torch.from_numpy(np.array(flat.reshape(count, size)))
         u = torch.from_numpy(signal(np.array([time]))[:, 0])
-        with torch.inference_mode():
-            return system.velocity_derivative(x, u).numpy().ravel()
+        try:
+            with torch.inference_mode():
+                return system.velocity_derivative(x, u).numpy().ravel()
+        except torch.linalg.LinAlgError:
+            # A trial state beyond the system's limits: the solver takes a smaller step.
+            return np.full(flat.shape, np.nan)
 
+    def give_up(time: float, reason: str) -> SimulationError:
+        return SimulationError(
+            f"the simulation stopped at t = {time:.4g} s of {t[-1]:.4g} s: {reason}; reduce the "
+            f"input or the initial states, or loosen rtol = {rtol:g} and atol = {atol:g}"
+        )
+
+    if not np.isfinite(derivative(t[0], x0.ravel())).all():
+        raise give_up(
+            t[0], "the acceleration is not finite there (M not positive definite, or a bad input)"
+        )
     states = np.empty((count, len(t), size))
     solver = DOP853(derivative, t[0], x0.ravel(), t[-1], rtol=rtol, atol=atol)
     states[:, 0] = x0
@@ -72,19 +89,15 @@ def simulate(
         bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
     ) as bar:
         while solver.status == "running":
-            try:
-                message = solver.step()
-            except torch.linalg.LinAlgError as error:
-                raise SimulationError(
-                    f"the mass matrix lost its positive definiteness near t = {solver.t:.4g} s: "
-                    "the motion left the region where the system is defined; reduce the input or "
-                    "the initial states"
-                ) from error
-            if solver.status == "failed" or not np.isfinite(solver.y).all():
-                raise SimulationError(
-                    f"the solver stopped at t = {solver.t:.4g} s of {t[-1]:.4g} s: "
-                    f"{message or 'the state is no longer finite'}; reduce the input, or loosen "
-                    f"rtol = {rtol:g} and atol = {atol:g}"
+            message = solver.step()
+            if solver.status == "failed":
+                raise give_up(solver.t, message or "the solver failed")
+            # The very last step may be short: it ends where the time does.
+            if solver.status == "running" and solver.step_size < _SMALLEST_STEP * t[-1]:
+                raise give_up(
+                    solver.t,
+                    f"its step shrank to {solver.step_size:.1e} s, as it does where the motion "
+                    "runs into a singularity (an arm of length zero, say)",
                 )
             until = int(np.searchsorted(t, solver.t, side="right"))
             if until > filled:

@@ -65,6 +65,7 @@ class NextStateMLP(Predictor):
                 f"by {float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
             )
         index = torch.searchsorted(grid.double(), t.double() - 0.5 * float(grid[1] - grid[0]))
+        index = index.clamp(max=grid.shape[0] - 1)
         if (grid[index].double() - t.double()).abs().max() > 1e-3 * step:
             raise ValueError("the times t are not among the sample times t_input of the input")
         samples = u[..., index, :]

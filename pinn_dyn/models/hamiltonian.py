@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
@@ -53,7 +54,11 @@ class HamiltonianNetwork(StructuredNetwork):
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q) = W(q)^-1, ``(*batch, N, N)``."""
-        return self.inverse_mass(q).cholesky_inverse()
+        # Not cholesky_inverse: torch 2.13 gets its forward-mode derivative wrong.
+        factor = self.inverse_mass(q)
+        eye = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
+        inverse = torch.stack([lower_solve(factor, row.expand_as(q)) for row in eye], dim=-1)
+        return inverse.transpose(-1, -2) @ inverse
 
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         factor, tape = self.inverse_mass.linearize(q)

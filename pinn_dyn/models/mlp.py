@@ -112,7 +112,9 @@ class MLP(nn.Module):
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
         *hidden, last = self.linears
-        h = dy @ last.weight
+        # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
+        # ones(B, 1) @ W to a wrong gradient at some small sizes.
+        h = dy * last.weight if last.out_features == 1 else dy @ last.weight
         for layer, slope in zip(reversed(hidden), reversed(tape), strict=True):
             h = (h * slope) @ layer.weight
         return h / self.std

@@ -74,8 +74,8 @@ class DynamicsLearner(L.LightningModule):
         loss = self.loss(predicted[..., 1:, :], batch.increments(self.model.coordinates))
         if not torch.isfinite(loss):
             raise NonFiniteLossError(
-                f"the training loss became {float(loss)} at step {self.global_step} (epoch "
-                f"{self.current_epoch}); the checkpoints written before are kept. Lower "
+                f"the training loss became {float(loss.detach())} at step {self.global_step} "
+                f"(epoch {self.current_epoch}); the checkpoints written before are kept. Lower "
                 "optimizer.lr, shorten the window (data.steps, data.stride) or raise the heads' "
                 "epsilon, then start again"
             )

@@ -152,7 +152,10 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize(
+    "case",
+    BAD,
+)
 def test_bad_arguments_are_refused_by_name(case):
     make, owner, argument = BAD[case]
     with pytest.raises(ValueError, match=rf"{owner}: .*{argument}") as caught:

@@ -1,7 +1,5 @@
 """The simulator against closed forms, a second solver and the balance of energy."""
 
-import signal as signals
-
 import numpy as np
 import pytest
 import torch
@@ -24,7 +22,7 @@ ARM_T = np.linspace(0, 1.0, 501)
 
 
 def constant(value, count):
-    return lambda t: np.broadcast_to(np.asarray(value), (count, len(t), len(value)))
+    return lambda t: np.tile(np.asarray(value), (count, len(t), 1))
 
 
 @pytest.fixture
@@ -155,13 +153,14 @@ def test_a_non_finite_initial_state_is_refused_with_its_number(linear, bad):
 
 
 class LosesMass(MechanicalSystem):
-    """A mass 1 - q that a constant force drives to q = 1, where it vanishes."""
+    """A point mass m(q) under a force of 1 N, with m(q) no longer positive beyond q = 1."""
 
-    def __init__(self):
+    def __init__(self, mass):
         super().__init__(1, 1)
+        self.mass = mass
 
     def mass_matrix(self, q):
-        return (1 - q).unsqueeze(-1)
+        return self.mass(q).unsqueeze(-1)
 
     def potential_energy(self, q):
         return torch.zeros_like(q[..., 0])
@@ -173,47 +172,46 @@ class LosesMass(MechanicalSystem):
         return torch.ones_like(q).unsqueeze(-1)
 
 
+def vanishing(q):
+    return 1 - q
+
+
+def jumping(q):
+    return torch.where(q < 1, torch.ones_like(q), -torch.ones_like(q))
+
+
+def push(mass, q0):
+    t = np.linspace(0, 5, 51)
+    simulate(LosesMass(mass), np.full((1, 1), q0), np.zeros((1, 1)), constant([1.0], 1), t)
+
+
 def time_of(error):
     return float(str(error).split("t = ")[1].split(" s")[0])
 
 
-def test_a_lost_mass_matrix_ends_the_simulation_and_says_when():
-    """From rest under u = 1 the mass, moving at the rate p/(1 - q), is gone after 0.94 s."""
-    t = np.linspace(0, 5, 51)
+def test_a_mass_that_vanishes_ends_the_simulation_and_says_when():
+    """By conservation of energy p^2/(2 m) = q, so q = 1 is reached after pi/sqrt(8) s."""
     with pytest.raises(SimulationError) as caught:
-        simulate(LosesMass(), np.zeros((1, 1)), np.zeros((1, 1)), constant([1.0], 1), t)
-    # Kinetic energy p^2 / (2 m) = q and p^2 (1/m)' feed the motion until shortly after.
-    assert 0.5 < time_of(caught.value) < 2.0
+        push(vanishing, 0.0)
+    assert time_of(caught.value) == pytest.approx(np.pi / np.sqrt(8), abs=2e-3)
+
+
+def test_a_mass_matrix_that_is_not_positive_ends_the_simulation_and_says_when():
+    """q = t^2/2 reaches 1 after sqrt(2) s; the time named is that of the last good step."""
+    with pytest.raises(SimulationError, match="mass matrix lost its positive definit") as caught:
+        push(jumping, 0.0)
+    assert 0.1 < time_of(caught.value) <= np.sqrt(2)
 
 
 def test_an_initial_state_without_a_positive_mass_matrix_ends_the_simulation():
-    t = np.linspace(0, 1, 11)
     with pytest.raises(SimulationError, match="t = 0 s"):
-        simulate(LosesMass(), np.full((1, 1), 2.0), np.zeros((1, 1)), constant([1.0], 1), t)
+        push(jumping, 2.0)
 
 
-class Deadline:
-    """Turns a computation that hangs into a failure."""
-
-    def __init__(self, seconds):
-        self.seconds = seconds
-
-    def __enter__(self):
-        def stop(*_):
-            raise AssertionError(f"still running after {self.seconds} s")
-
-        self.before = signals.signal(signals.SIGALRM, stop)
-        signals.alarm(self.seconds)
-
-    def __exit__(self, *_):
-        signals.alarm(0)
-        signals.signal(signals.SIGALRM, self.before)
-
-
-@pytest.mark.parametrize("onset", [0.5, 0.0])
-def test_an_input_that_is_not_a_number_ends_the_simulation(linear, onset):
+def test_an_input_that_stops_being_a_number_ends_the_simulation(linear):
     def signal(t):
-        return np.where(t < onset, 0.1, np.nan)[None, :, None]
+        return np.where(t < 0.5, 0.1, np.nan)[None, :, None]
 
-    with Deadline(5), pytest.raises(SimulationError, match="t = "):
+    with pytest.raises(SimulationError) as caught:
         simulate(linear, np.zeros((1, 2)), np.zeros((1, 2)), signal, np.linspace(0, 1, 11))
+    assert time_of(caught.value) == pytest.approx(0.5, abs=1e-3)

@@ -11,7 +11,7 @@ T = STEP * torch.arange(5, dtype=torch.float64)
 
 @pytest.fixture
 def model():
-    return make_model("next_state")
+    return make_model("next_state").requires_grad_(False)
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_times_that_are_not_sample_times_are_refused(model, start, inputs, t_inp
 
 
 def test_acceleration_is_scaled_by_the_data_and_velocity_is_exact(start):
-    model = make_model("acceleration")
+    model = make_model("acceleration").requires_grad_(False)
     s = make_statistics(2, 2)
     u = torch.full((6, 2), 0.3, dtype=torch.float64)
     features = torch.cat(

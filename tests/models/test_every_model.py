@@ -3,12 +3,15 @@
 import copy
 import io
 import pickle
+from functools import partial
 
 import pytest
 import torch
+from torch._inductor import config as inductor_config
 
 from pinn_dyn.mechanics import ContinuousPredictor
-from tests.models.builders import STEP, make_model, perturb, random_batch
+from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential
+from tests.models.builders import STEP, make_model, make_structured, perturb, random_batch
 from tests.support.finite_differences import assert_near
 
 KINDS = ["lnn", "hnn", "next_state", "acceleration"]
@@ -123,9 +126,20 @@ def loss_and_gradients(model, x0, t, u):
 
 
 @pytest.mark.slow
+@inductor_config.patch({"cpp.simdlen": 1, "compile_threads": 1})  # they build faster
 @pytest.mark.parametrize("kind", CONTINUOUS)
 def test_a_compiled_model_has_the_same_increments_and_gradients(kind):
-    model = make_model(kind, dtype=torch.float32)
+    # Few small layers: compiling takes longer the more there are.
+    heads = {
+        "mass": partial(NetworkCholesky, hidden=[4]),
+        "potential": partial(NetworkPotential, hidden=[6, 5]),
+        "damping": partial(NetworkCholesky, hidden=[], epsilon=0.0),
+        "input": partial(NetworkInput, hidden=[]),
+    }
+    if kind == "acceleration":
+        model = make_model(kind, dtype=torch.float32)
+    else:
+        model = make_structured(kind, 2, 2, dtype=torch.float32, **heads)
     x0, u = windows(dtype=torch.float32)
     expected, expected_gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
     model.compile_derivative()

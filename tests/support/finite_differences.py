@@ -22,5 +22,5 @@ def assert_near(actual, expected, tolerance, scale=None):
     The scale is the largest entry of ``expected`` if None: an entry that is small by
     cancellation is no more exact than the terms it is made of.
     """
-    scale = float(expected.abs().max()) if scale is None else float(scale)
+    scale = float(expected.detach().abs().max()) if scale is None else float(scale)
     torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance * scale)

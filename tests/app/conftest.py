@@ -1,0 +1,33 @@
+"""One cache and a few tiny runs for all tests of the entry points."""
+
+import pytest
+
+from tests.app.entry import NO_FIGURES, train
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory):
+    """All runs share the cached tiny data sets."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PINN_DYN_CACHE", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def hnn_run(tmp_path_factory):
+    """A Hamiltonian network, two epochs, with figures."""
+    folder = tmp_path_factory.mktemp("runs") / "hnn"
+    return train(folder, "model=hnn", "trainer.max_epochs=2")
+
+
+@pytest.fixture(scope="session")
+def lnn_run(tmp_path_factory):
+    """A Lagrangian network."""
+    return train(tmp_path_factory.mktemp("runs") / "lnn", "model=lnn", NO_FIGURES)
+
+
+@pytest.fixture(scope="session")
+def mlp_run(tmp_path_factory):
+    """The paper's black box."""
+    return train(tmp_path_factory.mktemp("runs") / "mlp", "model=mlp", NO_FIGURES)

@@ -1,0 +1,83 @@
+"""Calls of the entry scripts, in this process or another one, on a data set that takes no time."""
+
+import contextlib
+import logging
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+TINY_DATA = [
+    "dataset.duration=0.2",
+    "dataset.step=0.002",
+    "dataset.train_initial_states=2",
+    "dataset.train_inputs=2",
+    "dataset.validation=2",
+    "dataset.test=2",
+]
+TINY = [
+    *TINY_DATA,
+    "data.pairs=64",
+    "data.batch_size=32",
+    "data.stride=5",
+    "data.batches_per_epoch=2",
+    "validator.horizon=0.1",
+    "validator.step=null",
+    "trainer.max_epochs=1",
+    "trainer.check_val_every_n_epoch=1",
+    "trainer.enable_progress_bar=false",
+]
+# Drawing takes longer than the training itself.
+NO_FIGURES = "~callbacks.figures"
+
+
+@contextlib.contextmanager
+def own_logging():
+    """Take away the log handlers that Hydra adds: they would outlive the captured output."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    try:
+        yield
+    finally:
+        for handler in root.handlers:
+            if handler not in handlers:
+                handler.close()
+        root.handlers[:] = handlers
+        root.setLevel(level)
+
+
+def run_script(script, *arguments):
+    """Run an entry script in this process, as ``python <script> <arguments>`` would."""
+    with pytest.MonkeyPatch.context() as patch, own_logging():
+        patch.setattr(sys, "argv", [script, *arguments])
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+
+
+def train(folder, *arguments):
+    """Train on the tiny data set and return the run folder."""
+    run_script("train.py", *TINY, f"hydra.run.dir={folder}", *arguments)
+    return Path(folder)
+
+
+def fails(script, *arguments):
+    """Run an entry script that has to end with an error; returns what was raised."""
+    with pytest.raises(SystemExit) as caught:
+        run_script(script, *arguments)
+    assert caught.value.code not in (0, None)
+    return caught.value
+
+
+def start_process(script, *arguments, folder, output):
+    """Start an entry script in another process, with its output going to a file."""
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / script), *arguments],
+        cwd=folder,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )

@@ -1,0 +1,165 @@
+"""Mistakes on the command line: what is said, and that nothing is left behind."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, run_script
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Where runs would be written."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def said(error, capsys):
+    """All that a failed program said."""
+    captured = capsys.readouterr()
+    return f"{captured.out}\n{captured.err}\n{error.code if isinstance(error.code, str) else ''}"
+
+
+@pytest.mark.parametrize(
+    ("script", "mistake", "meant"),
+    [
+        ("train.py", "data.pair=64", "data.pairs"),
+        ("train.py", "trainer.max_epoch=1", "trainer.max_epochs"),
+        ("train.py", "optimiser.lr=0.1", "optimizer.lr"),
+        ("train.py", "sed=1", "seed"),
+        ("train.py", "max_epochs=1", "trainer.max_epochs"),
+        ("evaluate.py", "run=[runs/here]", "runs"),
+        ("evaluate.py", "horizn=1", "horizon"),
+    ],
+)
+def test_a_misspelt_key_is_answered_with_the_right_one(elsewhere, script, mistake, meant):
+    error = fails(script, mistake)
+    # Of a dotted name the part that does not exist.
+    key = mistake.split("=")[0]
+    assert f"no key '{key}'" in str(error) or f"no key '{key.split('.')[0]}'" in str(error)
+    assert "did you mean" in str(error)
+    assert re.search(rf"[ ]{re.escape(meant)}[ ?]", str(error).split("did you mean")[1])
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_misspelt_key_of_a_chosen_model_is_answered_with_that_models_key(elsewhere):
+    error = fails("train.py", "model=mlp", "model.hiden=[8]")
+    assert "did you mean model.hidden" in str(error)
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_misspelt_key_in_a_sweep_is_answered_before_any_run(elsewhere):
+    error = fails("train.py", "-m", "model=lnn,hnn", "data.pair=64,128")
+    assert "did you mean data.pairs" in str(error)
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_misspelt_key_ends_the_real_program_with_an_error(elsewhere):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), "data.pair=64"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode != 0
+    assert "did you mean data.pairs" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_key_unlike_any_other_is_answered_with_where_to_look(elsewhere):
+    error = fails("train.py", "qqqqqq=1")
+    assert "no key 'qqqqqq'" in str(error)
+    assert "--cfg job" in str(error)
+    assert not list(elsewhere.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("choice", "options"),
+    [("model=lagrange", ["hnn", "lnn", "mlp"]), ("model/damping=none", ["constant", "network"])],
+)
+def test_a_wrong_option_of_a_group_lists_the_right_ones(elsewhere, capsys, choice, options):
+    text = said(fails("train.py", choice), capsys)
+    assert choice.split("=")[1] in text
+    for option in options:
+        assert option in text
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_missing_value_is_asked_for_by_name(elsewhere, capsys):
+    text = said(fails("train.py", *TINY, "model=lnn", "model/damping=fixed"), capsys)
+    assert "no value for model.damping.value" in text
+    assert "'model.damping.value=...'" in text
+    assert "Traceback" not in text
+    assert not list(elsewhere.rglob("*.ckpt"))
+
+
+def test_missing_runs_are_asked_for_by_name(capsys):
+    text = said(fails("evaluate.py"), capsys)
+    assert "no value for runs" in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["dataset.train_inputs=0"], ["dataset", "train_inputs is 0"]),
+        (["dataset.system.mass=-1"], ["dataset", "SoftArm: mass is -1"]),
+        (["data.batch_size=65"], ["data", "batch_size is 65", "64"]),
+        (["model=mlp", "model.activation=gelu"], ["model", "gelu", "softplus"]),
+        (["model=lnn", "model/damping=fixed", "model.damping.value=[[1,2],[3,4]]"], ["model"]),
+        (["validator.step=0.2"], ["validator: step is 0.2 s and horizon 0.1 s"]),
+        (["+data.nonsense=1"], ["data", "nonsense"]),
+        (["dataset.system._target_=pinn_dyn.systems.Nothing"], ["dataset", "Nothing"]),
+    ],
+)
+def test_a_value_that_a_part_refuses_is_reported_in_its_words(elsewhere, capsys, overrides, words):
+    text = said(fails("train.py", *TINY, NO_FIGURES, *overrides), capsys)
+    for word in words:
+        assert word in text
+    assert "Traceback" not in text
+    assert not list(elsewhere.rglob("*.ckpt"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["data.pairs=100000"], ["100000 windows", "starts"]),
+        (["validator.horizon=3"], ["horizon is 3", "lasts only 0.2 s"]),
+    ],
+)
+def test_a_value_that_does_not_fit_the_data_is_reported(elsewhere, capsys, overrides, words):
+    text = said(fails("train.py", *TINY, NO_FIGURES, *overrides), capsys)
+    for word in words:
+        assert word in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_folder_without_a_run_cannot_be_resumed(elsewhere, capsys, exists):
+    if exists:
+        (elsewhere / "empty").mkdir()
+    text = said(fails("train.py", "resume=empty"), capsys)
+    assert "empty is not a run folder" in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("script", "examples"),
+    [
+        ("train.py", ["python train.py experiment=", "python train.py -m ", "resume="]),
+        ("evaluate.py", ["python evaluate.py runs="]),
+    ],
+)
+def test_help_shows_examples_and_the_configuration(elsewhere, capsys, script, examples):
+    with pytest.raises(SystemExit) as caught:
+        run_script(script, "--help")
+    assert caught.value.code in (0, None)
+    text = capsys.readouterr().out
+    for example in examples:
+        assert example in text
+    assert "seed: 0" in text or "runs: ???" in text
+    assert not list(elsewhere.iterdir())

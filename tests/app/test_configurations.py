@@ -1,0 +1,95 @@
+"""Every experiment, every model and every head composes and trains through the entry point."""
+
+import json
+
+import hydra
+import pytest
+from omegaconf import OmegaConf
+
+from pinn_dyn.app.config import CONF
+from tests.app.entry import NO_FIGURES, TINY, run_script, train
+
+MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
+EXPERIMENTS = sorted(
+    str(path.relative_to(CONF / "experiment").with_suffix(""))
+    for path in (CONF / "experiment").rglob("*.yaml")
+)
+HEADS = sorted(
+    str(path.relative_to(CONF / "model").with_suffix(""))
+    for path in (CONF / "model").glob("*/*.yaml")
+)
+# Configurations that leave a value to the user.
+VALUES = {
+    "mass/fixed": "value=[[0.01,0,0],[0,0.01,0],[0,0,0.1]]",
+    "damping/fixed": "value=[[0.1,0,0],[0,0.1,0],[0,0,0.1]]",
+}
+
+
+def compose(*overrides):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return hydra.compose("train", overrides=list(overrides))
+
+
+def assert_trained(folder, steps=2):
+    """Weights have been written, and a finite validation error."""
+    assert (folder / "checkpoints" / "best.ckpt").is_file()
+    assert (folder / "checkpoints" / "last.ckpt").is_file()
+    record = json.loads((folder / "metrics.json").read_text())
+    assert record["steps"] == steps
+    assert 0 < record["validation"]["val/error_mean"] < 10
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_trains(tmp_path, experiment):
+    choice = f"experiment={experiment}"
+    composed = compose(choice)
+    # Only what the experiment's own data set and trainer have can be made tiny.
+    tiny = [x for x in TINY if OmegaConf.select(composed, x.split("=")[0], default="no") != "no"]
+    folder = tmp_path / "run"
+    run_script(
+        "train.py",
+        choice,
+        *tiny,
+        NO_FIGURES,
+        "compile=false",
+        f"hydra.run.dir={folder}",
+    )
+    assert_trained(folder)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_trains(tmp_path, model):
+    assert_trained(train(tmp_path / "run", f"model={model}", NO_FIGURES))
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_every_head_trains(tmp_path, head):
+    group, option = head.split("/")
+    value = [f"model.{group}.{VALUES[head]}"] if head in VALUES else []
+    folder = train(tmp_path / "run", "model=lnn", f"model/{group}={option}", *value, NO_FIGURES)
+    assert_trained(folder)
+
+
+@pytest.mark.parametrize("option", sorted(x.split("/")[1] for x in HEADS if "mass/" in x))
+def test_every_mass_head_trains_as_an_inverse_mass(tmp_path, option):
+    value = ["model.inverse_mass.value=[[100,0,0],[0,100,0],[0,0,10]]"]
+    folder = train(
+        tmp_path / "run",
+        "model=hnn",
+        f"model/mass@model.inverse_mass={option}",
+        *(value if option == "fixed" else []),
+        NO_FIGURES,
+    )
+    assert_trained(folder)
+
+
+def test_windows_of_several_steps_train(tmp_path):
+    folder = train(tmp_path / "run", "model=lnn", "data.steps=3", NO_FIGURES)
+    assert_trained(folder)
+
+
+def test_there_are_models_heads_and_experiments_to_test():
+    """The lists above come from globs: an empty one would test nothing."""
+    assert {"hnn", "lnn", "mlp"} <= set(MODELS)
+    assert {"mass/network", "damping/fixed", "input/network"} <= set(HEADS)
+    assert len(EXPERIMENTS) >= 3

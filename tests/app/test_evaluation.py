@@ -1,0 +1,207 @@
+"""evaluate.py: what it writes, and runs that cannot be evaluated."""
+
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+
+from tests.app.entry import NO_FIGURES, fails, run_script, train
+
+SHORT = ["horizon=0.1", "windows=[0.02,0.05]"]
+
+
+def evaluate(folder, *runs, arguments=()):
+    paths = ",".join(str(run) for run in runs)
+    run_script("evaluate.py", f"runs=[{paths}]", *SHORT, f"hydra.run.dir={folder}", *arguments)
+    return folder
+
+
+def refused(capsys, *runs, arguments=()):
+    """What evaluate.py says about runs that it cannot evaluate."""
+    paths = ",".join(str(run) for run in runs)
+    error = fails("evaluate.py", f"runs=[{paths}]", *SHORT, "hydra.run.dir=out", *arguments)
+    captured = capsys.readouterr()
+    text = f"{captured.out}\n{captured.err}\n{error.code}"
+    assert "Traceback" not in text
+    return text
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Relative folders are made here."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory, hnn_run, mlp_run):
+    """A structured model beside a black box, and what was printed."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    printed = folder / "printed.txt"
+    with pytest.MonkeyPatch.context() as patch, printed.open("w") as file:
+        patch.setattr("sys.stdout", file)
+        evaluate(folder, hnn_run, mlp_run)
+    return folder
+
+
+def test_tables_are_written_as_csv_and_json(evaluation):
+    summary = pd.read_csv(evaluation / "summary.csv")
+    assert summary["model"].tolist() == ["hnn", "mlp"]
+    assert np.isfinite(summary["error_mean"]).all()
+    assert (summary["error_mean"] > 0).all()
+    assert {"window_0.02s_error_mean", "window_0.05s_error_mean"} <= set(summary)
+    assert (summary["pairs"] == 64).all()
+    rows = json.loads((evaluation / "summary.json").read_text())
+    assert [row["error_mean"] for row in rows] == pytest.approx(summary["error_mean"].tolist())
+    by_model = pd.read_csv(evaluation / "by_model.csv")
+    assert by_model["model"].tolist() == ["hnn", "mlp"]
+
+
+def test_a_windowed_error_is_smaller_than_the_open_loop_one(evaluation):
+    """Re-set every 0.02 s of 0.1 s, an untrained model has less time to drift."""
+    summary = pd.read_csv(evaluation / "summary.csv")
+    assert (summary["window_0.02s_error_mean"] < summary["error_mean"]).all()
+
+
+def test_the_table_is_printed(evaluation):
+    text = (evaluation / "printed.txt").read_text()
+    assert "2 unseen test trajectories, 0.1 s open loop" in text
+    for model in ("hnn", "mlp"):
+        assert any(line.startswith(model) for line in text.splitlines())
+    assert "error_mean" in text
+    assert str(evaluation) in text
+
+
+def test_figures_are_drawn(evaluation):
+    for name in ("trajectory.png", "error.png", "terms_hnn_bent.png"):
+        picture = imread(evaluation / name)
+        assert min(picture.shape[:2]) > 200
+        assert picture[..., :3].std() > 0.01
+
+
+def test_terms_are_compared_for_the_structured_model_alone(evaluation):
+    terms = pd.read_csv(evaluation / "terms_hnn.csv")
+    assert len(terms) > 0
+    assert "hnn" in (evaluation / "terms.txt").read_text()
+    assert not list(evaluation.glob("terms_mlp*"))
+
+
+def test_the_records_say_what_was_evaluated(evaluation):
+    record = json.loads((evaluation / "provenance.json").read_text())
+    assert record["config"]["horizon"] == 0.1
+    assert record["dataset"]["name"] == "soft_arm_1"
+    assert {"commit", "torch"} <= record.keys()
+
+
+def test_seeds_of_a_model_are_grouped_and_globs_find_them(tmp_path, hnn_run, mlp_run, capsys):
+    runs = tmp_path / "runs"
+    shutil.copytree(hnn_run, runs / "a")
+    other = train(runs / "b", "model=hnn", "seed=1", NO_FIGURES)
+    shutil.copytree(mlp_run, runs / "c")
+    (runs / "not a run").mkdir()
+    assert (other / "metrics.json").is_file()
+    capsys.readouterr()
+    evaluate(tmp_path / "out", f"{runs}/*")
+    summary = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert summary["model"].tolist() == ["hnn", "hnn", "mlp"]
+    assert summary["run"].is_unique
+    by_model = pd.read_csv(tmp_path / "out" / "by_model.csv").set_index("model")
+    assert by_model.loc["hnn", "mean_error_mean"] == pytest.approx(summary["error_mean"][:2].mean())
+    assert by_model.loc["hnn", "worst_error_mean"] == pytest.approx(summary["error_mean"][:2].max())
+    assert "over seeds" in capsys.readouterr().out
+
+
+def copy(run, folder):
+    shutil.copytree(run, folder)
+    return folder
+
+
+def swap(first, second):
+    """Exchange the checkpoints of two runs."""
+    one, other = (run / "checkpoints" / "best.ckpt" for run in (first, second))
+    contents = one.read_bytes(), other.read_bytes()
+    other.write_bytes(contents[0])
+    one.write_bytes(contents[1])
+
+
+def test_a_checkpoint_of_another_model_is_refused_with_both_named(
+    tmp_path, hnn_run, mlp_run, capsys
+):
+    hnn, mlp = copy(hnn_run, tmp_path / "hnn"), copy(mlp_run, tmp_path / "mlp")
+    swap(hnn, mlp)
+    for run in (hnn, mlp):
+        text = refused(capsys, run)
+        assert "another model" in text
+        assert str(run / "checkpoints" / "best.ckpt") in text
+        assert "HamiltonianNetwork" in text
+        assert "NextStateMLP" in text
+
+
+def test_a_checkpoint_of_a_model_that_differs_in_its_activation_is_refused(
+    tmp_path, mlp_run, capsys
+):
+    tanh = train(tmp_path / "tanh", "model=mlp", "model.activation=tanh", NO_FIGURES)
+    mlp = copy(mlp_run, tmp_path / "mlp")
+    swap(tanh, mlp)
+    assert "another model" in refused(capsys, mlp)
+
+
+@pytest.mark.parametrize("left", [0, 3, 100, 20000, -100])
+def test_a_truncated_checkpoint_is_refused(tmp_path, mlp_run, capsys, left):
+    run = copy(mlp_run, tmp_path / "mlp")
+    path = run / "checkpoints" / "best.ckpt"
+    path.write_bytes(path.read_bytes()[:left])
+    text = refused(capsys, run)
+    assert str(path) in text
+    assert "cut short" in text
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, mlp_run, capsys):
+    run = copy(mlp_run, tmp_path / "mlp")
+    (run / "checkpoints" / "best.ckpt").write_text("something else altogether")
+    assert str(run / "checkpoints" / "best.ckpt") in refused(capsys, run)
+
+
+def test_a_missing_checkpoint_is_refused_with_those_there_are(tmp_path, mlp_run, capsys):
+    run = copy(mlp_run, tmp_path / "mlp")
+    (run / "checkpoints" / "best.ckpt").unlink()
+    text = refused(capsys, run)
+    assert "best.ckpt does not exist" in text
+    assert "has last" in text
+    evaluate(tmp_path / "out", run, arguments=["checkpoint=last"])
+    assert (tmp_path / "out" / "summary.csv").is_file()
+
+
+def test_a_pattern_that_matches_nothing_is_refused(tmp_path, capsys):
+    text = refused(capsys, tmp_path / "nowhere" / "*")
+    assert "nowhere/*' matches nothing" in text
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert "matches no run folder" in refused(capsys, tmp_path / "empty")
+
+
+def test_runs_of_different_data_sets_are_refused(tmp_path, hnn_run, capsys):
+    other = train(tmp_path / "other", "model=mlp", "dataset.seed=1", NO_FIGURES)
+    text = refused(capsys, hnn_run, other)
+    assert "another data set" in text
+    assert str(other) in text
+    assert str(hnn_run) in text
+
+
+def test_runs_with_another_cache_folder_are_of_the_same_data_set(tmp_path, hnn_run, mlp_run, cache):
+    run = copy(mlp_run, tmp_path / "mlp")
+    text = (run / "config.yaml").read_text()
+    assert str(cache) in text
+    (run / "config.yaml").write_text(text.replace(str(cache), str(tmp_path / "cache")))
+    evaluate(tmp_path / "out", hnn_run, run)
+    assert len(pd.read_csv(tmp_path / "out" / "summary.csv")) == 2
+
+
+def test_a_horizon_beyond_the_data_is_refused(hnn_run, capsys):
+    text = refused(capsys, hnn_run, arguments=["horizon=3"])
+    assert "horizon is 3" in text
+    assert "lasts only 0.2 s" in text

@@ -1,0 +1,142 @@
+"""What a training leaves behind, and sweeps."""
+
+import json
+import re
+
+import pytest
+import torch
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from pinn_dyn.app.runs import load_run
+from tests.app.entry import NO_FIGURES, TINY, run_script, train
+
+PLAIN = (str, int, float, bool, type(None))
+
+
+def assert_plain(value, where="hyper_parameters"):
+    """Nested dicts and lists of plain values; exact types, as a subclass needs its own code."""
+    if type(value) in (dict, list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, item in items:
+            assert type(key) in (str, int), f"{where}: key {key!r}"
+            assert_plain(item, f"{where}.{key}")
+    else:
+        assert type(value) in PLAIN, f"{where} is a {type(value)}"
+
+
+def load(run, name="best"):
+    return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+@pytest.mark.parametrize("name", ["best", "last"])
+def test_checkpoints_hold_plain_hyperparameters(hnn_run, name):
+    saved = load(hnn_run, name)
+    assert_plain(saved["hyper_parameters"])
+    assert saved["hyper_parameters"]["config"]["model_name"] == "hnn"
+    assert saved["hyper_parameters"]["statistics"]["step"] == pytest.approx(0.01)
+    assert any(key.startswith("model.") for key in saved["state_dict"])
+
+
+def test_the_configuration_is_written_resolved(hnn_run):
+    text = (hnn_run / "config.yaml").read_text()
+    assert "${" not in text
+    assert "???" not in text
+    config = yaml.safe_load(text)
+    assert config["model_name"] == "hnn"
+    assert config["trainer"]["max_epochs"] == 2
+    assert config["data"]["seed"] == config["seed"] == 0
+    assert config["dataset"]["labels"][0] == "Δx [rad]"
+    assert config == load(hnn_run)["hyper_parameters"]["config"]
+
+
+def test_metrics_are_written_with_their_provenance(hnn_run):
+    record = json.loads((hnn_run / "metrics.json").read_text())
+    assert record["pairs"] == 64
+    assert record["steps"] == 4
+    assert record["seed"] == 0
+    assert record["training_seconds"] > 0
+    assert record["validation"]["val/error_mean"] > 0
+    assert re.fullmatch(r"[0-9a-f]{7,40}|unknown", record["commit"])
+    assert record["torch"] == torch.__version__
+    assert {"python", "hardware"} <= record.keys()
+    parameters = load_run(hnn_run, "best").model.parameters()
+    assert record["parameters"] == sum(x.numel() for x in parameters)
+
+
+def test_tensorboard_has_losses_errors_figures_and_hyperparameters(hnn_run):
+    files = list((hnn_run / "tensorboard").glob("events.out.tfevents.*"))
+    assert files
+    log = EventAccumulator(str(hnn_run / "tensorboard")).Reload()
+    scalars = log.Tags()["scalars"]
+    assert any(tag.startswith("train/loss") for tag in scalars)
+    assert [event.step for event in log.Scalars("val/error_mean")][:2] == [1, 3]
+    images = set(log.Tags()["images"])
+    assert {"rollout/trajectory", "rollout/error", "terms/bent"} <= images
+    assert "_hparams_/session_start_info" in log.summary_metadata
+    hparams = str(log.summary_metadata["_hparams_/session_start_info"].plugin_data.content)
+    assert "optimizer.lr" in hparams
+    assert "data.pairs" in hparams
+
+
+def test_the_last_checkpoint_is_of_the_last_epoch(tmp_path):
+    """Also where the validation error was smaller in between."""
+    run = train(
+        tmp_path / "run",
+        "model=lnn",
+        "data.batches_per_epoch=10",
+        "trainer.max_epochs=6",
+        NO_FIGURES,
+    )
+    assert load(run, "best")["global_step"] < 60
+    assert load(run, "last")["global_step"] == 60
+
+
+def test_a_run_loads_back_with_the_weights_of_its_checkpoint(hnn_run):
+    run = load_run(hnn_run, "last")
+    saved = load(hnn_run, "last")["state_dict"]
+    weights = run.model.state_dict()
+    assert weights
+    for key, value in weights.items():
+        assert torch.equal(value, saved[f"model.{key}"])
+    assert not run.model.training
+    assert run.config["model_name"] == "hnn"
+
+
+def test_a_seed_gives_the_same_weights_again_and_another_seed_gives_others(tmp_path, lnn_run):
+    again = train(tmp_path / "again", "model=lnn", NO_FIGURES)
+    other = train(tmp_path / "other", "model=lnn", "seed=1", NO_FIGURES)
+    first, again, other = (load(run)["state_dict"] for run in (lnn_run, again, other))
+    assert first.keys() == again.keys() == other.keys()
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert any(not torch.equal(first[key], other[key]) for key in first)
+
+
+def test_runs_go_to_a_folder_named_by_data_set_model_and_seed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_script("train.py", *TINY, NO_FIGURES, "model=acceleration", "seed=3")
+    (folder,) = (tmp_path / "runs" / "soft_arm_1" / "acceleration-seed3").iterdir()
+    assert (folder / "metrics.json").is_file()
+    assert (folder / "checkpoints" / "best.ckpt").is_file()
+
+
+def test_a_sweep_writes_a_folder_per_combination(tmp_path):
+    run_script(
+        "train.py",
+        "-m",
+        *TINY,
+        NO_FIGURES,
+        "model=lnn,hnn",
+        "seed=0,1",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}",
+    )
+    found = set()
+    for path in (tmp_path / "sweep").glob("*/config.yaml"):
+        config = yaml.safe_load(path.read_text())
+        record = json.loads((path.parent / "metrics.json").read_text())
+        saved = load(path.parent)["hyper_parameters"]["config"]
+        assert record["seed"] == config["seed"] == saved["seed"]
+        assert config["model"]["_target_"] == saved["model"]["_target_"]
+        found.add((config["model_name"], config["seed"]))
+    assert found == {(model, seed) for model in ("lnn", "hnn") for seed in (0, 1)}
+    assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 4

@@ -1,0 +1,201 @@
+"""The LightningModule: a training lowers the loss, and stops at one that is not a number."""
+
+from functools import partial
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import OneCycleLR
+
+from pinn_dyn.data import DataSource, DynamicsData, Splits, simulate
+from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.models import (
+    AccelerationMLP,
+    ConstantCholesky,
+    ConstantInput,
+    HamiltonianNetwork,
+    LagrangianNetwork,
+    NetworkPotential,
+    NextStateMLP,
+)
+from pinn_dyn.training import DynamicsLearner, IncrementLoss, NonFiniteLossError
+from tests.support.linear import damped_oscillators
+
+HEADS = dict(
+    potential=partial(NetworkPotential, hidden=[8]),
+    damping=partial(ConstantCholesky, epsilon=0.0),
+    input=ConstantInput,
+)
+MODELS = {
+    "lnn": lambda statistics: LagrangianNetwork(statistics, ConstantCholesky, **HEADS),
+    "hnn": lambda statistics: HamiltonianNetwork(statistics, ConstantCholesky, **HEADS),
+    "acceleration": lambda statistics: AccelerationMLP(statistics, [16]),
+    "next state": lambda statistics: NextStateMLP(statistics, [16]),
+}
+
+
+class Oscillators(DataSource):
+    """Trajectories of two coupled damped masses."""
+
+    def __init__(self, splits):
+        self.splits = splits
+
+    def load(self):
+        return self.splits
+
+
+@pytest.fixture(scope="module")
+def splits():
+    system = damped_oscillators().requires_grad_(False)
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 2, 101)
+    phase = rng.uniform(0, 6, (6, 1, 1))
+
+    def signal(s):
+        return np.sin(3 * s[:, None] + phase)
+
+    q, v = simulate(system, *rng.uniform(-1, 1, (2, 6, 2)), signal, t)
+    q, v, u = (torch.from_numpy(np.ascontiguousarray(x)) for x in (q, v, signal(t)))
+    p = system.momentum(q, v)
+    made = [Trajectory(torch.from_numpy(t), q[k], v[k], u[k], p=p[k]) for k in range(6)]
+    return Splits(made[:4], made[4:5], made[5:], system.momentum)
+
+
+@pytest.fixture
+def data(splits):
+    return DynamicsData(
+        Oscillators(splits),
+        pairs=128,
+        steps=1,
+        stride=2,
+        batch_size=32,
+        batches_per_epoch=30,
+        seed=0,
+    )
+
+
+def make_learner(model, data, validator=lambda model, truth: {"error_mean": 1.0}, lr=0.01):
+    return DynamicsLearner(
+        model,
+        loss=IncrementLoss(data.statistics, model),
+        optimizer=partial(AdamW, lr=lr),
+        scheduler=partial(OneCycleLR, max_lr=lr),
+        validator=validator,
+        config={"seed": 0},
+        statistics=data.statistics,
+        compile=False,
+    )
+
+
+def make_trainer(folder, *, max_epochs, **extra):
+    return L.Trainer(
+        accelerator="cpu",
+        max_epochs=max_epochs,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        inference_mode=False,
+        default_root_dir=folder,
+        **extra,
+    )
+
+
+def loss_of(learner, data):
+    windows = data.windows.to(torch.device("cpu"), torch.float32)
+    with torch.no_grad():
+        predicted = learner.model.increments(
+            windows.start(learner.model.coordinates), windows.t, windows.u, t_input=windows.t_input
+        )
+        measured = windows.increments(learner.model.coordinates)
+        return float(learner.loss(predicted[:, 1:], measured))
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_short_training_lowers_the_loss(tmp_path, data, kind):
+    torch.manual_seed(0)
+    learner = make_learner(MODELS[kind](data.statistics), data)
+    before = loss_of(learner, data)
+    make_trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(learner, data)
+    assert loss_of(learner, data) < 0.5 * before
+
+
+def test_the_logged_loss_is_that_of_the_batches(tmp_path, data):
+    """With the learning rate at zero it is the mean over batches of a fixed model's loss."""
+    torch.manual_seed(0)
+    learner = make_learner(AccelerationMLP(data.statistics, [8]), data, lr=0.0)
+    trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
+    trainer.fit(learner, data)
+    loader = data.train_dataloader()
+    expected = []
+    for batch in loader:
+        with torch.no_grad():
+            predicted = learner.model.increments(
+                batch.start("velocity"), batch.t, batch.u, t_input=batch.t_input
+            )
+            expected.append(float(learner.loss(predicted[:, 1:], batch.increments("velocity"))))
+    assert len(expected) == 30
+    assert float(trainer.callback_metrics["train/loss"]) == pytest.approx(
+        np.mean(expected), rel=1e-5
+    )
+
+
+def test_the_learning_rate_moves_with_every_step(tmp_path, data):
+    """One cycle over 60 steps ends at its lowest rate; one over epochs would be at its start."""
+    learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
+    trainer = make_trainer(tmp_path, max_epochs=2, enable_checkpointing=False)
+    trainer.fit(learner, data)
+    (scheduler,) = [item.scheduler for item in trainer.lr_scheduler_configs]
+    assert scheduler.total_steps == 60
+    assert scheduler.get_last_lr()[0] < 1e-2 * 0.01
+
+
+def test_validation_figures_are_logged_by_name(tmp_path, data):
+    seen = []
+
+    def validator(model, truth):
+        seen.append((model, truth.q.shape))
+        return {"error_mean": 0.25, "diverged": 3.0}
+
+    model = AccelerationMLP(data.statistics, [8])
+    learner = make_learner(model, data, validator)
+    trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
+    trainer.fit(learner, data)
+    assert float(trainer.callback_metrics["val/error_mean"]) == 0.25
+    assert float(trainer.callback_metrics["val/diverged"]) == 3.0
+    assert seen == [(model, (1, 101, 2))]
+
+
+class Breaks(AccelerationMLP):
+    """Its predictions are not numbers any more after some training steps."""
+
+    calls = 0
+    good = 70
+
+    def state_derivative(self, x, u):
+        rate = super().state_derivative(x, u)
+        if torch.is_grad_enabled():
+            self.calls += 1
+        # Four evaluations of the derivative in a step.
+        return rate if self.calls <= 4 * self.good else rate * float("nan")
+
+
+def test_a_loss_that_is_not_a_number_stops_the_training_and_keeps_the_checkpoints(tmp_path, data):
+    torch.manual_seed(0)
+    learner = make_learner(Breaks(data.statistics, [8]), data)
+    checkpoint = ModelCheckpoint(
+        dirpath=tmp_path / "checkpoints", filename="best", monitor="val/error_mean", save_last=True
+    )
+    trainer = make_trainer(tmp_path, max_epochs=4, callbacks=[checkpoint])
+    with pytest.raises(NonFiniteLossError, match=r"became nan at step 70 \(epoch 2\)"):
+        trainer.fit(learner, data)
+    for name in ("best", "last"):
+        saved = torch.load(tmp_path / "checkpoints" / f"{name}.ckpt", weights_only=True)
+        assert saved["global_step"] in (30, 60)
+        fresh = make_learner(AccelerationMLP(data.statistics, [8]), data)
+        fresh.load_state_dict(saved["state_dict"])
+        assert np.isfinite(loss_of(fresh, data))
+        assert all(torch.isfinite(value).all() for value in saved["state_dict"].values())

@@ -1,0 +1,63 @@
+"""A training that was killed and resumed ends with the weights of one that ran through."""
+
+import signal
+import time
+
+import pytest
+import torch
+
+from tests.app.entry import NO_FIGURES, TINY, run_script, start_process
+
+EPOCHS, BATCHES = 8, 25
+LONG = [
+    *TINY,
+    NO_FIGURES,
+    "model=lnn",
+    f"data.batches_per_epoch={BATCHES}",
+    f"trainer.max_epochs={EPOCHS}",
+]
+
+
+def epoch_of(path):
+    """The epoch of a checkpoint that is perhaps just being written; -1 where there is none."""
+    try:
+        return torch.load(path, weights_only=True)["epoch"]
+    except Exception:
+        return -1
+
+
+@pytest.mark.slow
+def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monkeypatch):
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "cache"))
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    last = killed / "checkpoints" / "last.ckpt"
+    log = tmp_path / "log.txt"
+    with log.open("w") as output:
+        at = dict(folder=tmp_path, output=output)
+        process = start_process("train.py", *LONG, f"hydra.run.dir={killed}", **at)
+        try:
+            while epoch_of(last) < 1 and process.poll() is None:
+                time.sleep(0.02)
+        finally:
+            process.kill()
+        assert process.wait(timeout=10) == -signal.SIGKILL, log.read_text()
+        assert not (killed / "metrics.json").exists()
+        cut = torch.load(last, weights_only=True)
+        assert 1 <= cut["epoch"] < EPOCHS - 1
+        process = start_process("train.py", f"resume={killed}", **at)
+        try:
+            run_script("train.py", *LONG, f"hydra.run.dir={whole}")
+            assert process.wait(timeout=120) == 0, log.read_text()
+        finally:
+            process.kill()
+    first, second = (
+        torch.load(run / "checkpoints" / "last.ckpt", weights_only=True) for run in (whole, killed)
+    )
+    assert first["global_step"] == second["global_step"] == EPOCHS * BATCHES
+    assert first["state_dict"].keys() == second["state_dict"].keys()
+    moved = False
+    for key, value in first["state_dict"].items():
+        assert torch.equal(value, second["state_dict"][key]), key
+        moved = moved or not torch.equal(value, cut["state_dict"][key])
+    assert moved
+    assert (killed / "metrics.json").is_file()
