@@ -146,16 +146,13 @@ BAD = {
         "Chirp",
         "frequency",
     ),
-    "no inputs": (lambda: MultiSine([], []), "MultiSine", "amplitude"),
+    "no inputs": (lambda: MultiSine([], []), "MultiSine", "offset"),
     "nan amplitude": (lambda: MultiSine([0.0], [float("nan")]), "MultiSine", "amplitude"),
     "infinite offset": (lambda: Steps([float("inf")], [1.0]), "Steps", "offset"),
 }
 
 
-@pytest.mark.parametrize(
-    "case",
-    BAD,
-)
+@pytest.mark.parametrize("case", BAD)
 def test_bad_arguments_are_refused_by_name(case):
     make, owner, argument = BAD[case]
     with pytest.raises(ValueError, match=rf"{owner}: .*{argument}") as caught:

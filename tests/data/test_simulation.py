@@ -198,9 +198,9 @@ def test_a_mass_that_vanishes_ends_the_simulation_and_says_when():
 
 def test_a_mass_matrix_that_is_not_positive_ends_the_simulation_and_says_when():
     """q = t^2/2 reaches 1 after sqrt(2) s; the time named is that of the last good step."""
-    with pytest.raises(SimulationError, match="mass matrix lost its positive definit") as caught:
+    with pytest.raises(SimulationError, match="mass matrix is no longer positive") as caught:
         push(jumping, 0.0)
-    assert 0.1 < time_of(caught.value) <= np.sqrt(2)
+    assert time_of(caught.value) == pytest.approx(np.sqrt(2), abs=2e-3)
 
 
 def test_an_initial_state_without_a_positive_mass_matrix_ends_the_simulation():
