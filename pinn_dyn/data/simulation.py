@@ -96,8 +96,8 @@ def simulate(
             if solver.status == "running" and solver.step_size < _SMALLEST_STEP * t[-1]:
                 raise give_up(
                     solver.t,
-                    f"its step shrank to {solver.step_size:.1e} s, as it does where the mass matrix "
-                    "is no longer positive definite (an arm of length zero, say)",
+                    f"its step shrank to {solver.step_size:.1e} s, as it does where the mass "
+                    "matrix is no longer positive definite (an arm of length zero, say)",
                 )
             until = int(np.searchsorted(t, solver.t, side="right"))
             if until > filled:
