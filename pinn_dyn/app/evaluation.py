@@ -137,7 +137,7 @@ def _evaluate(run: Run, label: str, truth: Trajectory, config: dict[str, Any]) -
         windowed = predict_windows(run.model, horizon, window=window, step=step)
         figures = rollout_metrics(windowed.q_hat, windowed.q, windowed.t, thresholds={})
         metrics[f"window_{window:g}s_error_mean"] = figures.error_mean
-    recorded = ("pairs", "parameters", "training_seconds")
+    recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
     extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
     result = RunResult(
         label, run.config["model_name"], run.config["seed"], metrics, {**extra, "step": step}

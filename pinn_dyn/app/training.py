@@ -63,7 +63,7 @@ def train(cfg: DictConfig) -> float:
     learner = build_learner(config, model, statistics, validator)
     trainer = build_trainer(config, folder, data.source, validator)
 
-    start = time.perf_counter()
+    start, start_cpu = time.perf_counter(), time.process_time()
     try:
         trainer.fit(learner, data, ckpt_path=last, weights_only=True)
     except SystemExit:  # Lightning's end of an interrupted training
@@ -80,6 +80,7 @@ def train(cfg: DictConfig) -> float:
         "pairs": len(data.windows),
         "parameters": parameters,
         "training_seconds": seconds,
+        "training_cpu_seconds": time.process_time() - start_cpu,
         "steps": trainer.global_step,
         "validation": metrics,
         **provenance(),
