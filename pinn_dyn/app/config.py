@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pinn_dyn.data import SimulationError
@@ -55,6 +57,8 @@ def main(task: Callable[[DictConfig], object], config_name: str) -> None:
         try:
             return task(cfg)
         except (ConfigError, NonFiniteLossError, SimulationError) as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # Hydra then goes on with the other jobs of the sweep
             raise SystemExit(f"Error: {error}") from error
 
     # Warnings about loggers and hardware that a user cannot act on.
