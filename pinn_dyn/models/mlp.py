@@ -114,7 +114,7 @@ class MLP(nn.Module):
         *hidden, last = self.linears
         # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
         # ones(B, 1) @ W to a wrong gradient at some small sizes.
-        h = dy * last.weight if last.out_features == 1 else dy @ last.weight
+        h = dy * last.weight[0] if last.out_features == 1 else dy @ last.weight
         for layer, slope in zip(reversed(hidden), reversed(tape), strict=True):
             h = (h * slope) @ layer.weight
         return h / self.std
