@@ -1,20 +1,17 @@
 """Learned dynamics: Lagrangian and Hamiltonian networks, their heads, and black boxes."""
 
 from pinn_dyn.models.black_box import AccelerationMLP, NextStateMLP
-from pinn_dyn.models.hamiltonian import HamiltonianNetwork
-from pinn_dyn.models.heads import (
+from pinn_dyn.models.cholesky import (
     CholeskyFactor,
     ConstantCholesky,
-    ConstantInput,
     FixedCholesky,
-    FixedInput,
-    InputMatrix,
     NetworkCholesky,
-    NetworkInput,
-    NetworkPotential,
 )
+from pinn_dyn.models.hamiltonian import HamiltonianNetwork
+from pinn_dyn.models.input_matrix import ConstantInput, FixedInput, InputMatrix, NetworkInput
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.potential import NetworkPotential
 from pinn_dyn.models.statistics import Statistics
 
 __all__ = [

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Coordinates, MechanicalSystem
-from pinn_dyn.models.heads import CholeskyFactor, InputMatrix, NetworkPotential
+from pinn_dyn.models.cholesky import CholeskyFactor
+from pinn_dyn.models.input_matrix import InputMatrix
+from pinn_dyn.models.potential import NetworkPotential
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[..., CholeskyFactor]

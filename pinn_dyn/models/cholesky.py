@@ -1,4 +1,4 @@
-"""Heads: the learned terms, each a network, a learned constant or a fixed value."""
+"""Heads for the mass and damping matrices: Cholesky factors, learned or fixed."""
 
 from __future__ import annotations
 
@@ -145,7 +145,20 @@ class NetworkCholesky(CholeskyFactor):
         return (values @ self.placement).unflatten(-1, (self.size, self.size))
 
 
-class ConstantCholesky(CholeskyFactor):
+class _ConstantFactor(CholeskyFactor):
+    """An L that is the same at every q."""
+
+    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
+        """Zero: L does not depend on q."""
+        size = dq.shape[-1]
+        return dq.new_zeros((*dq.shape[:-1], size, size))
+
+    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
+        """Zero: L does not depend on q."""
+        return torch.zeros_like(cotangent[..., 0])
+
+
+class ConstantCholesky(_ConstantFactor):
     """L = diag(scale) * tril(parameters), the same at every q.
 
     Args:
@@ -172,17 +185,8 @@ class ConstantCholesky(CholeskyFactor):
         factor = (diagonal + self.lower.tril(-1)) * self.scale.unsqueeze(-1)
         return factor.expand(*q.shape[:-1], *factor.shape), ()
 
-    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """Zero: L does not depend on q."""
-        size = dq.shape[-1]
-        return dq.new_zeros((*dq.shape[:-1], size, size))
 
-    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Zero: L does not depend on q."""
-        return torch.zeros_like(cotangent[..., 0])
-
-
-class FixedCholesky(CholeskyFactor):
+class FixedCholesky(_ConstantFactor):
     """L = the Cholesky factor of a given constant matrix, not learned.
 
     Args:
@@ -227,179 +231,3 @@ class FixedCholesky(CholeskyFactor):
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
         """L and an empty tape."""
         return self.factor.expand(*q.shape[:-1], *self.factor.shape), ()
-
-    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """Zero: L does not depend on q."""
-        size = dq.shape[-1]
-        return dq.new_zeros((*dq.shape[:-1], size, size))
-
-    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Zero: L does not depend on q."""
-        return torch.zeros_like(cotangent[..., 0])
-
-
-class NetworkPotential(nn.Module):
-    """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
-
-    K = S S^T is a learned constant: an elastic or gravity well is mostly quadratic, and the
-    network then only has to learn what is left.
-
-    Args:
-        size: N.
-        scale: typical energy, J; from the data.
-        mean, std: normalization of q, ``(N,)``; from the data.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
-        quadratic: whether the K term is there; false is the paper's plain network.
-    """
-
-    scale: Tensor
-
-    def __init__(
-        self,
-        *,
-        size: int,
-        scale: float,
-        mean: Tensor,
-        std: Tensor,
-        hidden: Sequence[int],
-        activation: str = "softplus",
-        quadratic: bool = True,
-    ):
-        super().__init__()
-        self.network = MLP(size, 1, hidden, activation, mean, std)
-        self.register_buffer("scale", torch.tensor(float(scale)))
-        self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None
-
-    def forward(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
-        value = self.network(q).squeeze(-1)
-        if self.stiffness_root is not None:
-            z = (q - self.network.mean) / self.network.std
-            value = value + 0.5 * (z @ self.stiffness_root).square().sum(-1)
-        return self.scale * value
-
-    def gradient(self, q: Tensor) -> Tensor:
-        """G(q) = dV/dq, ``(*batch, N)``, by one reverse pass."""
-        y, tape = self.network.linearize(q)
-        force = self.network.pullback(tape, torch.ones_like(y))
-        if self.stiffness_root is not None:
-            z = (q - self.network.mean) / self.network.std
-            root = self.stiffness_root
-            force = force + (z @ root) @ root.T / self.network.std
-        return self.scale * force
-
-
-class InputMatrix(nn.Module, abc.ABC):
-    """A(q) ``(*batch, N, M)``."""
-
-    @abc.abstractmethod
-    def forward(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
-
-
-class NetworkInput(InputMatrix):
-    """A(q) = scale_i * network(q), reshaped to N x M (paper, figure A-NN).
-
-    Args:
-        size: N.
-        inputs: M.
-        scale: typical size of the entries of each column, ``(M,)``; from the data.
-        mean, std: normalization of q, ``(N,)``; from the data.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
-        bound: largest entry in units of the scale (scaled sigmoid), or None for no bound.
-
-    Raises:
-        ValueError: on a bound that is not positive.
-    """
-
-    scale: Tensor
-
-    def __init__(
-        self,
-        *,
-        size: int,
-        inputs: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        hidden: Sequence[int],
-        activation: str = "softplus",
-        bound: float | None = None,
-    ):
-        super().__init__()
-        if bound is not None and not bound > 0:
-            raise ValueError(f"bound is {bound}, expected a positive number or none")
-        self.shape = (size, inputs)
-        self.bound = bound
-        self.network = MLP(size, size * inputs, hidden, activation, mean, std)
-        self.register_buffer("scale", scale.float())
-
-    def forward(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
-        y = self.network(q).unflatten(-1, self.shape)
-        if self.bound is not None:
-            y = self.bound * (2 * torch.sigmoid(y) - 1)
-        return self.scale * y
-
-
-class ConstantInput(InputMatrix):
-    """A = scale * parameters, the same at every q.
-
-    Args:
-        size: N.
-        inputs: M.
-        scale: typical size of the entries of each column, ``(M,)``; from the data.
-        mean, std: not used by a constant; every head takes the same arguments from the model.
-    """
-
-    scale: Tensor
-
-    def __init__(self, *, size: int, inputs: int, scale: Tensor, mean: Tensor, std: Tensor):
-        super().__init__()
-        self.raw = nn.Parameter(torch.eye(size, inputs))
-        self.register_buffer("scale", scale.float())
-
-    def forward(self, q: Tensor) -> Tensor:
-        """A, ``(*batch, N, M)``."""
-        value = self.scale * self.raw
-        return value.expand(*q.shape[:-1], *value.shape)
-
-
-class FixedInput(InputMatrix):
-    """A = a given constant matrix, not learned.
-
-    Args:
-        size: N.
-        inputs: M.
-        scale, mean, std: not used; every head takes the same arguments from the model.
-        value: the matrix, ``(N, M)``; the identity if None, which needs N = M.
-
-    Raises:
-        ValueError: if the matrix is not N x M.
-    """
-
-    value: Tensor
-
-    def __init__(
-        self,
-        *,
-        size: int,
-        inputs: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        value: Sequence[Sequence[float]] | None = None,
-    ):
-        super().__init__()
-        matrix = torch.eye(inputs) if value is None else torch.tensor(value, dtype=torch.float32)
-        if matrix.shape != (size, inputs):
-            raise ValueError(
-                f"FixedInput: value has shape {tuple(matrix.shape)}, expected ({size}, {inputs})"
-            )
-        self.register_buffer("value", matrix)
-
-    def forward(self, q: Tensor) -> Tensor:
-        """A, ``(*batch, N, M)``."""
-        return self.value.expand(*q.shape[:-1], *self.value.shape)
