@@ -55,10 +55,13 @@ def train(cfg: DictConfig) -> float:
     log.info("%s: loading data", config["name"])
     try:
         statistics = data.statistics
-        validator = build_validator(config, statistics.step)
-        data.splits.validation[0].until(validator.horizon)
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem
+    validator = build_validator(config, statistics.step)
+    try:
+        data.splits.validation[0].until(validator.horizon)
+    except ValueError as problem:
+        raise ConfigError(f"validator: {problem}") from problem
     model = build_model(config, statistics)
     learner = build_learner(config, model, statistics, validator)
     trainer = build_trainer(config, folder, data.source, validator)
