@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.data import DataSource, DynamicsData
+from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
@@ -61,7 +61,7 @@ def build_learner(
     Raises:
         ConfigError: if compilation is asked for and there is no C++ compiler.
     """
-    if config["compile"] and not any(map(shutil.which, ("g++", "clang++", "c++"))):
+    if config["compile"] and not has_cpp_compiler():
         raise ConfigError(
             "compile is true, but there is no C++ compiler (g++ or clang++) on the path: install "
             "one, or set compile=false"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -64,31 +65,36 @@ class InitialStates:
 class SimulatedSource(DataSource):
     """Trajectories of a known system, simulated once and cached on disk.
 
-    Training trajectories combine every initial state with every input; validation and test
-    trajectories each have an initial state and an input of their own, which no training
-    trajectory has.
+    Training trajectories combine every initial state with every input, or pair them one to one;
+    validation and test trajectories each have an initial state and an input of their own, which
+    no training trajectory has.
 
     Args:
         name: short name of the data set.
         system: the truth.
         excitation: family of input signals.
         initial_states: box of initial states.
-        duration: length of each trajectory, s.
-        step: sample time, s.
+        duration: length of each training trajectory, s.
+        test_duration: length of each validation and test trajectory, s; ``duration`` if None.
+        step: sample time of the simulation, s.
+        keep_every: keep every n-th sample, for a lower rate from the same simulation.
         train_initial_states: number of initial states for training.
         train_inputs: number of inputs for training.
+        pairing: ``"product"`` trains on every combination of these, ``"matched"`` gives each
+            initial state an input of its own.
         validation: number of validation trajectories.
         test: number of test trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
+        compile: compile the equation of motion for the simulation.
         cache: folder of the cache; ``~`` is the home folder.
         labels: name and unit of each coordinate, N of them.
         input_labels: name and unit of each input, M of them.
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
 
     Raises:
-        ValueError: on a step longer than the duration, a count below 1, or sizes that do not
-            match the system.
+        ValueError: on a step longer than the duration, a count below 1, an unknown pairing or one
+            of unequal counts, or sizes that do not match the system.
     """
 
     def __init__(
@@ -99,14 +105,18 @@ class SimulatedSource(DataSource):
         excitation: Excitation,
         initial_states: InitialStates,
         duration: float,
+        test_duration: float | None = None,
         step: float,
+        keep_every: int = 1,
         train_initial_states: int,
         train_inputs: int,
+        pairing: Literal["product", "matched"] = "product",
         validation: int,
         test: int,
         seed: int,
         rtol: float,
         atol: float,
+        compile: bool = False,
         cache: str,
         labels: Sequence[str],
         input_labels: Sequence[str],
@@ -116,7 +126,14 @@ class SimulatedSource(DataSource):
             raise ValueError(
                 f"{name}: step is {step} s and duration {duration} s, expected 0 < step <= duration"
             )
+        self.test_duration = duration if test_duration is None else test_duration
+        if not step <= self.test_duration <= duration:
+            raise ValueError(
+                f"{name}: test_duration is {test_duration} s, expected from step = {step} to "
+                f"duration = {duration} s"
+            )
         for key, value in (
+            ("keep_every", keep_every),
             ("train_initial_states", train_initial_states),
             ("train_inputs", train_inputs),
             ("validation", validation),
@@ -124,6 +141,13 @@ class SimulatedSource(DataSource):
         ):
             if value < 1:
                 raise ValueError(f"{name}: {key} is {value}, expected at least 1")
+        if pairing not in ("product", "matched"):
+            raise ValueError(f"{name}: pairing is {pairing!r}, expected 'product' or 'matched'")
+        if pairing == "matched" and train_initial_states != train_inputs:
+            raise ValueError(
+                f"{name}: pairing is 'matched' with {train_initial_states} initial states and "
+                f"{train_inputs} inputs for training, expected as many of each"
+            )
         for key, found, expected in (
             ("initial_states", len(initial_states.q_low), system.num_coordinates),
             ("labels", len(labels), system.num_coordinates),
@@ -142,6 +166,9 @@ class SimulatedSource(DataSource):
         self.initial_states = initial_states
         self.duration = duration
         self.step = step
+        self.keep_every = keep_every
+        self.pairing = pairing
+        self.compile = compile
         self.counts = {
             "train": (train_initial_states, train_inputs),
             "validation": (validation, validation),
@@ -157,12 +184,14 @@ class SimulatedSource(DataSource):
     def load(self) -> Splits:
         """The trajectories, from the cache or newly simulated."""
         arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
-        t = torch.from_numpy(arrays["t"])
+        t = torch.from_numpy(arrays["t"][:: self.keep_every])
         splits: dict[str, list[Trajectory]] = {}
         for split in _SPLITS:
-            q, v, u = (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
+            q, v, u = (
+                torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
+            )
             splits[split] = [
-                Trajectory(t, q[k], v[k], u[k], p=self._momenta(arrays, split, k))
+                Trajectory(t[: q.shape[1]], q[k], v[k], u[k], p=self._momenta(arrays, split, k))
                 for k in range(q.shape[0])
             ]
         return Splits(splits["train"], splits["validation"], splits["test"], self._momentum)
@@ -181,8 +210,10 @@ class SimulatedSource(DataSource):
             "excitation": _describe(self.excitation),
             "initial_states": _describe(asdict(self.initial_states)),
             "duration": self.duration,
+            "test_duration": self.test_duration,
             "step": self.step,
             "counts": self.counts,
+            "pairing": self.pairing,
             "seed": self.seed,
             "rtol": self.rtol,
             "atol": self.atol,
@@ -199,7 +230,7 @@ class SimulatedSource(DataSource):
             states, inputs = self.counts[split]
             starts.append(self.initial_states.draw(states, rng))
             signals.append(self.excitation.draw(inputs, self.duration, rng))
-            if split == "train":
+            if split == "train" and self.pairing == "product":
                 pick.append(np.array([(a, b) for a in range(states) for b in range(inputs)]))
             else:
                 pick.append(np.array([(a, a) for a in range(states)]))
@@ -218,17 +249,20 @@ class SimulatedSource(DataSource):
             t,
             rtol=self.rtol,
             atol=self.atol,
+            compile=self.compile,
             progress=f"simulating {len(q0)} trajectories of {self.name}",
         )
         ends = np.cumsum([0, *(len(p) for p in pick)])
         arrays = {"t": t}
         for index, split in enumerate(_SPLITS):
             part = slice(ends[index], ends[index + 1])
-            arrays[f"{split}_q"], arrays[f"{split}_v"] = q[part], v[part]
-            arrays[f"{split}_u"] = signals[index](t)[pick[index][:, 1]]
+            last = round((self.duration if split == "train" else self.test_duration) / self.step)
+            q_part, v_part = q[part, : last + 1], v[part, : last + 1]
+            arrays[f"{split}_q"], arrays[f"{split}_v"] = q_part, v_part
+            arrays[f"{split}_u"] = signals[index](t[: last + 1])[pick[index][:, 1]]
             if split != "train":
                 arrays[f"{split}_p"] = self._momentum(
-                    torch.from_numpy(q[part]), torch.from_numpy(v[part])
+                    torch.from_numpy(q_part), torch.from_numpy(v_part)
                 ).numpy()
         return arrays
 
@@ -239,10 +273,9 @@ class SimulatedSource(DataSource):
         with torch.no_grad():
             return torch.cat([self.system.momentum(a, b) for a, b in pieces]).reshape(q.shape)
 
-    @staticmethod
-    def _momenta(arrays: Arrays, split: str, k: int) -> Tensor | None:
+    def _momenta(self, arrays: Arrays, split: str, k: int) -> Tensor | None:
         key = f"{split}_p"
-        return torch.from_numpy(arrays[key][k]) if key in arrays else None
+        return torch.from_numpy(arrays[key][k, :: self.keep_every]) if key in arrays else None
 
 
 def _describe(value: object) -> object:

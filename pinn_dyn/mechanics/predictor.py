@@ -68,8 +68,14 @@ class Predictor(nn.Module, abc.ABC):
 
 
 class ContinuousPredictor(Predictor):
-    """A predictor given by a state derivative dx/dt = f(x, u), integrated by RK4."""
+    """A predictor given by a state derivative dx/dt = f(x, u), integrated by RK4.
 
+    Attributes:
+        substeps: RK4 steps within a step of the data. One is enough while the data resolve the
+            fastest motion; data of a low rate need more.
+    """
+
+    substeps: int = 1
     _compiled: Callable[[Tensor, Tensor], Tensor] | None = None
 
     @abc.abstractmethod
@@ -98,7 +104,7 @@ class ContinuousPredictor(Predictor):
         t_input: Tensor | None = None,
         interpolation: Interpolation = "linear",
     ) -> Tensor:
-        """Integrate the state derivative, one RK4 step per interval of ``t``."""
+        """Integrate the state derivative, ``substeps`` RK4 steps per interval of ``t``."""
         compiled = self._compiled if self.training else None
         return rollout_increments(
             compiled or self.state_derivative,
@@ -107,4 +113,5 @@ class ContinuousPredictor(Predictor):
             u,
             t_input=t_input,
             interpolation=interpolation,
+            substeps=self.substeps,
         )

@@ -31,11 +31,13 @@ class MechanicalSystem(ContinuousPredictor):
 
     Lagrangian form, paper eq. (armdynamics)::
 
-        M(q) dv/dt + C(q, v) v + G(q) + D(q) v = A(q) u,      G = dV/dq
+        M(q) dv/dt + C(q, v) v + G(q) + D(q) v + F(v) = A(q) u,      G = dV/dq
 
     Hamiltonian form, paper eq. (hamiltonian_dyn), with p = M(q) v::
 
-        dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) dH/dp + A(q) u
+        dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) v - F(v) + A(q) u,  v = dH/dp
+
+    F(v) is dry friction, with v^T F(v) >= 0; it is zero, as in the paper, unless a subclass has it.
 
     Symbols: q configuration ``(*batch, N)``, v velocity ``(*batch, N)``, a acceleration
     ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
@@ -81,6 +83,9 @@ class MechanicalSystem(ContinuousPredictor):
         bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
         return spd_solve(self.mass_matrix(q), force - bias)
 
+    def _friction_force(self, v: Tensor) -> Tensor:
+        return torch.zeros_like(v)
+
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """(dH/dq, dH/dp): dH/dp = M^-1 p = v and dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v."""
         v = self._velocity(q, p)
@@ -116,6 +121,12 @@ class MechanicalSystem(ContinuousPredictor):
         return self._potential_force(q)
 
     @final
+    def dissipative_force(self, q: Tensor, v: Tensor) -> Tensor:
+        """D(q) v + F(v), ``(*batch, N)``; its power v^T D v + v^T F(v) is never negative."""
+        self._check(q=q, v=v)
+        return matvec(self.damping_matrix(q), v) + self._friction_force(v)
+
+    @final
     def coriolis_matrix(self, q: Tensor, v: Tensor) -> Tensor:
         """C(q, v), ``(*batch, N, N)``, from the Christoffel symbols of the first kind::
 
@@ -139,15 +150,15 @@ class MechanicalSystem(ContinuousPredictor):
     def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """a = M^-1 (A u - C v - G - D v), ``(*batch, N)``; paper eq. (armdynamics)."""
         self._check(q=q, v=v, u=u)
-        force = matvec(self.input_matrix(q), u) - matvec(self.damping_matrix(q), v)
+        force = matvec(self.input_matrix(q), u) - self.dissipative_force(q, v)
         return self._acceleration(q, v, force)
 
     @final
     def inverse_dynamics(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """tau = M a + C v + G + D v, ``(*batch, N)``, the generalized force that gives ``a``."""
+        """tau = M a + C v + G + D v + F, ``(*batch, N)``, the force that gives ``a``."""
         self._check(q=q, v=v, a=a)
         conservative = self._inertial_force(q, v, a) + self._potential_force(q)
-        return conservative + matvec(self.damping_matrix(q), v)
+        return conservative + self.dissipative_force(q, v)
 
     @final
     def momentum(self, q: Tensor, v: Tensor) -> Tensor:
@@ -173,9 +184,9 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """dE/dt = v^T A(q) u - v^T D(q) v, ``(*batch,)``, W: what enters less what is lost."""
+        """dE/dt = v^T A u - v^T (D v + F), ``(*batch,)``, W: what enters less what is lost."""
         self._check(q=q, v=v, u=u)
-        supplied = matvec(self.input_matrix(q), u) - matvec(self.damping_matrix(q), v)
+        supplied = matvec(self.input_matrix(q), u) - self.dissipative_force(q, v)
         return (v * supplied).sum(-1)
 
     @final
@@ -190,7 +201,7 @@ class MechanicalSystem(ContinuousPredictor):
         q, p = x.chunk(2, dim=-1)
         self._check(q=q, p=p, u=u)
         grad_q, v = self._hamiltonian_gradient(q, p)
-        force = matvec(self.input_matrix(q), u) - matvec(self.damping_matrix(q), v)
+        force = matvec(self.input_matrix(q), u) - self.dissipative_force(q, v)
         return torch.cat([v, force - grad_q], dim=-1)
 
     @final

@@ -7,6 +7,7 @@ from pinn_dyn.models.cholesky import (
     FixedCholesky,
     NetworkCholesky,
 )
+from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
 from pinn_dyn.models.input_matrix import ConstantInput, FixedInput, InputMatrix, NetworkInput
 from pinn_dyn.models.lagrangian import LagrangianNetwork
@@ -20,8 +21,10 @@ __all__ = [
     "CholeskyFactor",
     "ConstantCholesky",
     "ConstantInput",
+    "CoulombFriction",
     "FixedCholesky",
     "FixedInput",
+    "Friction",
     "HamiltonianNetwork",
     "InputMatrix",
     "LagrangianNetwork",
@@ -29,5 +32,6 @@ __all__ = [
     "NetworkInput",
     "NetworkPotential",
     "NextStateMLP",
+    "NoFriction",
     "Statistics",
 ]

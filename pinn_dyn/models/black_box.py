@@ -23,16 +23,23 @@ class NextStateMLP(Predictor):
         statistics: scales of the data.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
+        angles: which coordinates are angles; the network sees their sine and cosine.
     """
 
     scale: Tensor
     step: Tensor
 
-    def __init__(self, statistics: Statistics, hidden: Sequence[int], activation: str = "softplus"):
+    def __init__(
+        self,
+        statistics: Statistics,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+        angles: Sequence[int] = (),
+    ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, "velocity")
         mean, std = statistics.network_input(repeat_input=2)
-        self.network = MLP(2 * size + 2 * inputs, 2 * size, hidden, activation, mean, std)
+        self.network = MLP(2 * size + 2 * inputs, 2 * size, hidden, activation, mean, std, angles)
         self.register_buffer("scale", statistics.velocity_increment_std[0].float())
         self.register_buffer("step", torch.tensor(statistics.step, dtype=torch.float64))
 
@@ -90,15 +97,25 @@ class AccelerationMLP(ContinuousPredictor):
         statistics: scales of the data.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
+        angles: which coordinates are angles; the network sees their sine and cosine.
+        substeps: RK4 steps within a step of the data.
     """
 
     scale: Tensor
 
-    def __init__(self, statistics: Statistics, hidden: Sequence[int], activation: str = "softplus"):
+    def __init__(
+        self,
+        statistics: Statistics,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+        angles: Sequence[int] = (),
+        substeps: int = 1,
+    ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, "velocity")
+        self.substeps = substeps
         mean, std = statistics.network_input(repeat_input=1)
-        self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std)
+        self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
         self.register_buffer("scale", acceleration.float())
 

@@ -59,6 +59,7 @@ class NetworkCholesky(CholeskyFactor):
         size: N.
         scale: typical size of the rows of L, ``(N,)``; from the data.
         mean, std: normalization of q, ``(N,)``; from the data.
+        angles: which coordinates are angles, and enter the network as sine and cosine.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         diagonal: what keeps the diagonal non-negative, softplus or relu.
@@ -78,6 +79,7 @@ class NetworkCholesky(CholeskyFactor):
         scale: Tensor,
         mean: Tensor,
         std: Tensor,
+        angles: Sequence[int] = (),
         hidden: Sequence[int],
         activation: str = "softplus",
         diagonal: Literal["softplus", "relu"] = "softplus",
@@ -96,7 +98,7 @@ class NetworkCholesky(CholeskyFactor):
         self.epsilon = epsilon
         self.bound = bound
         outputs = size * (size + 1) // 2
-        self.network = MLP(size, outputs, hidden, activation, mean, std)
+        self.network = MLP(size, outputs, hidden, activation, mean, std, angles)
         with torch.no_grad():
             # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
             last = self.network.linears[-1]
@@ -164,14 +166,21 @@ class ConstantCholesky(_ConstantFactor):
     Args:
         size: N.
         scale: typical size of the rows of L, ``(N,)``; from the data.
-        mean, std: not used by a constant; every head takes the same arguments from the model.
+        mean, std, angles: not used by a constant; every head takes the same arguments.
         epsilon: smallest diagonal entry in units of the scale.
     """
 
     scale: Tensor
 
     def __init__(
-        self, *, size: int, scale: Tensor, mean: Tensor, std: Tensor, epsilon: float = 1e-3
+        self,
+        *,
+        size: int,
+        scale: Tensor,
+        mean: Tensor,
+        std: Tensor,
+        angles: Sequence[int] = (),
+        epsilon: float = 1e-3,
     ):
         super().__init__()
         self.epsilon = epsilon
@@ -191,7 +200,7 @@ class FixedCholesky(_ConstantFactor):
 
     Args:
         size: N.
-        scale, mean, std: not used; every head takes the same arguments from the model.
+        scale, mean, std, angles: not used; every head takes the same arguments from the model.
         value: the symmetric positive semi-definite matrix, ``(N, N)``.
 
     Raises:
@@ -207,6 +216,7 @@ class FixedCholesky(_ConstantFactor):
         scale: Tensor,
         mean: Tensor,
         std: Tensor,
+        angles: Sequence[int] = (),
         value: Sequence[Sequence[float]],
     ):
         super().__init__()

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
+    FrictionHead,
     InputHead,
     PotentialHead,
     StructuredNetwork,
@@ -29,7 +33,9 @@ class HamiltonianNetwork(StructuredNetwork):
 
     Args:
         statistics: scales of the data; needs momenta.
-        inverse_mass, potential, damping, input: builders of the heads.
+        inverse_mass, potential, damping, input, friction: builders of the heads.
+        angles: which coordinates are angles; the heads see their sine and cosine.
+        substeps: RK4 steps within a step of the data.
     """
 
     def __init__(
@@ -39,13 +45,19 @@ class HamiltonianNetwork(StructuredNetwork):
         potential: PotentialHead,
         damping: CholeskyHead,
         input: InputHead,
+        friction: FrictionHead = NoFriction,
+        angles: Sequence[int] = (),
+        substeps: int = 1,
     ):
-        super().__init__(statistics, "momentum", potential, damping, input)
+        super().__init__(
+            statistics, "momentum", potential, damping, friction, input, angles, substeps
+        )
         self.inverse_mass = inverse_mass(
             size=self.num_coordinates,
             scale=(statistics.v_std / statistics.p_std).sqrt(),
             mean=statistics.q_mean,
             std=statistics.q_std,
+            angles=angles,
         )
 
     def inverse_mass_matrix(self, q: Tensor) -> Tensor:

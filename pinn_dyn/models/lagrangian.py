@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
+    FrictionHead,
     InputHead,
     PotentialHead,
     StructuredNetwork,
@@ -19,10 +23,10 @@ from pinn_dyn.models.structured import (
 class LagrangianNetwork(StructuredNetwork):
     """Lagrangian network with dissipation and a learned input matrix.
 
-    Heads give M = L L^T, V, D = L_D L_D^T and A; the acceleration follows from paper eq.
-    (armdynamics), which for L(q, v) = v^T M v / 2 - V reads::
+    Heads give M = L L^T, V, D = L_D L_D^T, A and a friction F; the acceleration follows from paper
+    eq. (armdynamics), which for L(q, v) = v^T M v / 2 - V reads::
 
-        M a = A u - D v - G - (dM/dt) v + d(v^T M v / 2)/dq
+        M a = A u - D v - F(v) - G - (dM/dt) v + d(v^T M v / 2)/dq
 
     One tangent pass (dL/dt) and one reverse pass (the last term, through |L^T v|^2 / 2) through the
     mass head take the place of the Hessian of the Lagrangian, and two triangular solves with the
@@ -30,7 +34,9 @@ class LagrangianNetwork(StructuredNetwork):
 
     Args:
         statistics: scales of the data.
-        mass, potential, damping, input: builders of the heads.
+        mass, potential, damping, input, friction: builders of the heads.
+        angles: which coordinates are angles; the heads see their sine and cosine.
+        substeps: RK4 steps within a step of the data.
     """
 
     def __init__(
@@ -40,15 +46,21 @@ class LagrangianNetwork(StructuredNetwork):
         potential: PotentialHead,
         damping: CholeskyHead,
         input: InputHead,
+        friction: FrictionHead = NoFriction,
+        angles: Sequence[int] = (),
+        substeps: int = 1,
     ):
-        super().__init__(statistics, "velocity", potential, damping, input)
+        super().__init__(
+            statistics, "velocity", potential, damping, friction, input, angles, substeps
+        )
         size = self.num_coordinates
         acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
         self.mass = mass(
             size=size,
-            scale=(statistics.force / acceleration).sqrt(),
+            scale=(self.input.typical_force(statistics.u_rms) / acceleration).sqrt(),
             mean=statistics.q_mean,
             std=statistics.q_std,
+            angles=angles,
         )
 
     def mass_matrix(self, q: Tensor) -> Tensor:

@@ -37,7 +37,10 @@ ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 
 
 class MLP(nn.Module):
-    """y = W_n s(... s(W_1 (x - mean)/std + b_1) ...) + b_n.
+    """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
+
+    An entry x_i that is an angle goes in as sin(x_i) and cos(x_i) instead, so that y has its
+    period of 2 pi.
 
     :meth:`linearize` runs the network once and keeps the slopes of its activations; from these
     :meth:`pushforward` gives J dx (tangent pass) and :meth:`pullback` J^T dy (reverse pass), as
@@ -49,13 +52,15 @@ class MLP(nn.Module):
         hidden: widths of the hidden layers.
         activation: one of softplus, tanh, silu.
         mean, std: normalization of x, ``(inputs,)``; none if left out.
+        angles: positions of the angles in x.
 
     Raises:
-        ValueError: on an unknown activation, or widths below 1.
+        ValueError: on an unknown activation, widths below 1, or a position that x does not have.
     """
 
     mean: Tensor
     std: Tensor
+    is_angle: Tensor
 
     def __init__(
         self,
@@ -65,6 +70,7 @@ class MLP(nn.Module):
         activation: str = "softplus",
         mean: Tensor | None = None,
         std: Tensor | None = None,
+        angles: Sequence[int] = (),
     ):
         super().__init__()
         if activation not in ACTIVATIONS:
@@ -73,8 +79,14 @@ class MLP(nn.Module):
             )
         if any(width < 1 for width in hidden):
             raise ValueError(f"hidden is {list(hidden)}, expected widths of at least 1")
+        if any(not 0 <= index < inputs for index in angles):
+            raise ValueError(f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}")
         self._activation = ACTIVATIONS[activation]
-        sizes = [inputs, *hidden, outputs]
+        self._has_angles = len(angles) > 0
+        is_angle = torch.zeros(inputs, dtype=torch.bool)
+        is_angle[list(angles)] = True
+        self.register_buffer("is_angle", is_angle, persistent=False)
+        sizes = [2 * inputs if angles else inputs, *hidden, outputs]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
         for layer in self.linears:
             nn.init.xavier_normal_(layer.weight)
@@ -96,6 +108,21 @@ class MLP(nn.Module):
         h = (x - self.mean) / self.std
         *hidden, last = self.linears
         tape = []
+        if self._has_angles:
+            # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
+            sine, cosine, zero = torch.sin(x), torch.cos(x), torch.zeros_like(x)
+            h = torch.cat(
+                [
+                    torch.where(self.is_angle, sine, h),
+                    torch.where(self.is_angle, cosine, zero),
+                ],
+                dim=-1,
+            )
+            slopes = [
+                torch.where(self.is_angle, cosine, (1 / self.std).expand_as(x)),
+                torch.where(self.is_angle, -sine, zero),
+            ]
+            tape.append(torch.cat(slopes, dim=-1))
         for layer in hidden:
             h, slope = self._activation(layer(h))
             tape.append(slope)
@@ -103,8 +130,10 @@ class MLP(nn.Module):
 
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
-        h = dx / self.std
         *hidden, last = self.linears
+        h = dx / self.std
+        if self._has_angles:
+            h, tape = torch.cat([dx, dx], dim=-1) * tape[0], tape[1:]
         for layer, slope in zip(hidden, tape, strict=True):
             h = F.linear(h, layer.weight) * slope
         return F.linear(h, last.weight)
@@ -112,9 +141,13 @@ class MLP(nn.Module):
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
         *hidden, last = self.linears
+        first, rest = (tape[0], tape[1:]) if self._has_angles else (None, tape)
         # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
         # ones(B, 1) @ W to a wrong gradient at some small sizes.
         h = dy * last.weight[0] if last.out_features == 1 else dy @ last.weight
-        for layer, slope in zip(reversed(hidden), reversed(tape), strict=True):
+        for layer, slope in zip(reversed(hidden), reversed(rest), strict=True):
             h = (h * slope) @ layer.weight
-        return h / self.std
+        if first is None:
+            return h / self.std
+        sine_or_linear, cosine = (h * first).chunk(2, dim=-1)
+        return sine_or_linear + cosine

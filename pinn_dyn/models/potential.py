@@ -14,12 +14,13 @@ class NetworkPotential(nn.Module):
     """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
 
     K = S S^T is a learned constant: an elastic or gravity well is mostly quadratic, and the
-    network then only has to learn what is left.
+    network then only has to learn what is left. Angles are left out of z, as V is periodic in them.
 
     Args:
         size: N.
         scale: typical energy, J; from the data.
         mean, std: normalization of q, ``(N,)``; from the data.
+        angles: which coordinates are angles, and enter the network as sine and cosine.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         quadratic: whether the K term is there; false is the paper's plain network.
@@ -34,21 +35,22 @@ class NetworkPotential(nn.Module):
         scale: float,
         mean: Tensor,
         std: Tensor,
+        angles: Sequence[int] = (),
         hidden: Sequence[int],
         activation: str = "softplus",
         quadratic: bool = True,
     ):
         super().__init__()
-        self.network = MLP(size, 1, hidden, activation, mean, std)
+        self.network = MLP(size, 1, hidden, activation, mean, std, angles)
         self.register_buffer("scale", torch.tensor(float(scale)))
+        quadratic = quadratic and len(set(angles)) < size
         self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None
 
     def forward(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""
         value = self.network(q).squeeze(-1)
         if self.stiffness_root is not None:
-            z = (q - self.network.mean) / self.network.std
-            value = value + 0.5 * (z @ self.stiffness_root).square().sum(-1)
+            value = value + 0.5 * (self._lengths(q) @ self.stiffness_root).square().sum(-1)
         return self.scale * value
 
     def gradient(self, q: Tensor) -> Tensor:
@@ -56,7 +58,12 @@ class NetworkPotential(nn.Module):
         y, tape = self.network.linearize(q)
         force = self.network.pullback(tape, torch.ones_like(y))
         if self.stiffness_root is not None:
-            z = (q - self.network.mean) / self.network.std
             root = self.stiffness_root
-            force = force + (z @ root) @ root.T / self.network.std
+            well = (self._lengths(q) @ root) @ root.T / self.network.std
+            force = force + well.masked_fill(self.network.is_angle, 0.0)
         return self.scale * force
+
+    def _lengths(self, q: Tensor) -> Tensor:
+        """z, with zero in the place of angles."""
+        z = (q - self.network.mean) / self.network.std
+        return z.masked_fill(self.network.is_angle, 0.0)

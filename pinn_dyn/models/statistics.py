@@ -48,11 +48,6 @@ class Statistics:
         """Root mean square of each input, ``(M,)``."""
         return (self.u_mean.square() + self.u_std.square()).sqrt()
 
-    @property
-    def force(self) -> float:
-        """Typical generalized force: root mean square over all inputs."""
-        return float(self.u_rms.square().mean().sqrt())
-
     def network_input(self, repeat_input: int) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of (q, v, u, ... u), for a black box."""
         zero = torch.zeros_like(self.v_std)

@@ -1,31 +1,35 @@
-"""What the Lagrangian and the Hamiltonian network share: heads for V, D and A."""
+"""What the Lagrangian and the Hamiltonian network share: heads for V, D, F and A."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Coordinates, MechanicalSystem
 from pinn_dyn.models.cholesky import CholeskyFactor
+from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import NetworkPotential
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[..., CholeskyFactor]
-"""Builds a Cholesky head from ``size``, ``scale``, ``mean`` and ``std``."""
+"""Builds a Cholesky head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
 PotentialHead = Callable[..., NetworkPotential]
-"""Builds a potential head from ``size``, ``scale``, ``mean`` and ``std``."""
+"""Builds a potential head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
 InputHead = Callable[..., InputMatrix]
-"""Builds an input head from ``size``, ``inputs``, ``scale``, ``mean`` and ``std``."""
+"""Builds an input head from ``size``, ``inputs``, ``scale``, ``mean``, ``std`` and ``angles``."""
+FrictionHead = Callable[..., Friction]
+"""Builds a friction head from ``size``, ``force`` and ``v_std``."""
 
 
 class StructuredNetwork(MechanicalSystem):
-    """A mechanical system with learned V(q), D(q) and A(q); subclasses add the mass.
+    """A mechanical system with learned V(q), D(q), F(v) and A(q); subclasses add the mass.
 
     The scales of the heads come from the data, so that every network works on numbers near one:
-    with f the root mean square of the input, D ~ f/v, V ~ f q, A ~ f/u.
+    with f the root mean square of the input, A ~ f/u, and with f_i the typical force that this
+    gives on coordinate i, D ~ f_i/v_i, F ~ f_i, V ~ f q.
     """
 
     def __init__(
@@ -34,19 +38,36 @@ class StructuredNetwork(MechanicalSystem):
         coordinates: Coordinates,
         potential: PotentialHead,
         damping: CholeskyHead,
+        friction: FrictionHead,
         input: InputHead,
+        angles: Sequence[int],
+        substeps: int,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, coordinates)
-        mean, std = statistics.q_mean, statistics.q_std
-        force = statistics.force
-        self.potential = potential(size=size, scale=force * float(std.mean()), mean=mean, std=std)
-        self.damping = damping(
-            size=size, scale=(force / statistics.v_std).sqrt(), mean=mean, std=std
-        )
+        self.substeps = substeps
+        self.angles = tuple(angles)
+        mean, std, u_rms = statistics.q_mean, statistics.q_std, statistics.u_rms
         self.input = input(
-            size=size, inputs=inputs, scale=force / statistics.u_rms, mean=mean, std=std
+            size=size,
+            inputs=inputs,
+            scale=u_rms.square().mean().sqrt() / u_rms,
+            mean=mean,
+            std=std,
+            angles=angles,
         )
+        force = self.input.typical_force(u_rms)
+        self.potential = potential(
+            size=size,
+            scale=float(force.square().mean().sqrt() * std.mean()),
+            mean=mean,
+            std=std,
+            angles=angles,
+        )
+        self.damping = damping(
+            size=size, scale=(force / statistics.v_std).sqrt(), mean=mean, std=std, angles=angles
+        )
+        self.friction = friction(size=size, force=force, v_std=statistics.v_std)
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""
@@ -59,6 +80,9 @@ class StructuredNetwork(MechanicalSystem):
     def input_matrix(self, q: Tensor) -> Tensor:
         """A(q), ``(*batch, N, M)``."""
         return self.input(q)
+
+    def _friction_force(self, v: Tensor) -> Tensor:
+        return self.friction(v)
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.potential.gradient(q)

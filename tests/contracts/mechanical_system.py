@@ -202,6 +202,13 @@ class MechanicalSystemContract:
 
     # The Coriolis terms.
 
+    def test_dissipation_is_viscous_damping_and_a_passive_friction(self, system, configurations):
+        q, v, _, _ = configurations
+        friction = system.dissipative_force(q, v) - product(system.damping_matrix(q), v)
+        power = (friction * v).sum(-1)
+        assert (power >= -self.exact_tolerance * (1 + power.abs().max())).all()
+        assert_near(system.dissipative_force(q, 0 * v), 0 * v, self.exact_tolerance, scale=1)
+
     def test_mass_rate_minus_twice_coriolis_is_skew_symmetric(self, system, configurations):
         q, v, _, _ = configurations
         mass_rate = slope(lambda e: system.mass_matrix(q + e * v), self.difference_step)
@@ -218,7 +225,7 @@ class MechanicalSystemContract:
         scale = self._coriolis_scale(system, configurations)
         force = product(system.coriolis_matrix(q, v), v)
         assert_near(force, expected, self.difference_tolerance, scale)
-        lost = product(system.damping_matrix(q), v)
+        lost = system.dissipative_force(q, v)
         rest = system.inverse_dynamics(q, v, 0 * v) - system.potential_force(q) - lost
         assert_near(rest, expected, self.difference_tolerance, scale + lost.abs().max())
 
@@ -295,7 +302,7 @@ class MechanicalSystemContract:
         assert_near(system.power(q, v, u), expected, self.difference_tolerance)
 
     def test_rollout_keeps_the_balance_of_energy(self, system, configurations):
-        """E(T) - E(0) is the integral of v^T A u - v^T D v.
+        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F).
 
         The input is one straight line over the whole roll-out, so the power is smooth, and both
         the integrator and Simpson's rule are of fourth order in the step.
@@ -304,7 +311,7 @@ class MechanicalSystemContract:
         q, v = x.chunk(2, -1)
         u = self._input(configurations, t)
         supplied = (product(system.input_matrix(q), u) * v).sum(-1)
-        lost = (product(system.damping_matrix(q), v) * v).sum(-1)
+        lost = (system.dissipative_force(q, v) * v).sum(-1)
         work = torch.from_numpy(simpson((supplied - lost).numpy(), x=t.numpy(), axis=-1))
         energy = system.total_energy(q, v)
         turnover = simpson((supplied.abs() + lost.abs()).numpy(), x=t.numpy(), axis=-1).max()

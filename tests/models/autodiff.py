@@ -6,6 +6,19 @@ These share with the models only the values of the terms, none of their derivati
 import torch
 from torch.func import grad, hessian, jacrev, vmap
 
+from pinn_dyn.models import CoulombFriction
+
+
+def dissipation(model, q, v):
+    """D v, and where the model has it the Coulomb law, written out anew."""
+    force = model.damping_matrix(q) @ v
+    head = model.friction
+    if not isinstance(head, CoulombFriction):
+        return force
+    level = head.force * torch.log(1 + torch.exp(head.raw_force))
+    width = head.v_std * (torch.log(1 + torch.exp(head.raw_width)) + 0.01)
+    return force + level * (1 - 2 / (torch.exp(2 * v / width) + 1))
+
 
 def lagrangian_derivative(model, x, u):
     """d(q, v)/dt from the Hessian of L(q, v) = v^T M v / 2 - V, paper eq. (armdynamics)."""
@@ -14,7 +27,7 @@ def lagrangian_derivative(model, x, u):
         return 0.5 * v @ model.mass_matrix(q) @ v - model.potential_energy(q)
 
     def acceleration(q, v, u):
-        force = model.input_matrix(q) @ u - model.damping_matrix(q) @ v
+        force = model.input_matrix(q) @ u - dissipation(model, q, v)
         mixed = jacrev(grad(lagrangian, 1), 0)(q, v)
         return torch.linalg.solve(
             hessian(lagrangian, 1)(q, v), force + grad(lagrangian, 0)(q, v) - mixed @ v
@@ -32,7 +45,7 @@ def hamiltonian_derivative(model, x, u):
 
     def rates(q, p, u):
         v = grad(hamiltonian, 1)(q, p)
-        force = model.input_matrix(q) @ u - model.damping_matrix(q) @ v
+        force = model.input_matrix(q) @ u - dissipation(model, q, v)
         return torch.cat([v, force - grad(hamiltonian, 0)(q, p)])
 
     return vmap(rates)(*x.chunk(2, -1), u)

@@ -8,6 +8,7 @@ from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
     ConstantInput,
+    CoulombFriction,
     FixedCholesky,
     FixedInput,
     HamiltonianNetwork,
@@ -16,6 +17,7 @@ from pinn_dyn.models import (
     NetworkInput,
     NetworkPotential,
     NextStateMLP,
+    NoFriction,
     Statistics,
 )
 
@@ -71,6 +73,8 @@ def make_structured(
     potential=None,
     damping=None,
     input=None,
+    friction=None,
+    angles=(),
     statistics=None,
     dtype=torch.float64,
 ):
@@ -81,6 +85,8 @@ def make_structured(
         "potential": potential or partial(NetworkPotential, hidden=[6, 5]),
         "damping": damping or partial(NetworkCholesky, hidden=[5], epsilon=0.0),
         "input": input or partial(NetworkInput, hidden=[5]),
+        "friction": friction or NoFriction,
+        "angles": angles,
     }
     statistics = statistics or make_statistics(n, m)
     if kind == "lnn":
@@ -132,6 +138,8 @@ VARIANTS = {
         damping=partial(FixedCholesky, value=[[0.0, 0.0], [0.0, 0.0]]),
         input=FixedInput,
     ),
+    "friction-angle-and-length-3x3": dict(n=3, m=3, friction=CoulombFriction, angles=[0, 2]),
+    "friction-all-angles-2x1": dict(n=2, m=1, friction=CoulombFriction, angles=[0, 1]),
 }
 """Every kind of head once, with square, wide and tall input matrices."""
 

@@ -1,0 +1,65 @@
+"""Heads for dry friction: none, or a smooth Coulomb law for each coordinate."""
+
+from __future__ import annotations
+
+import abc
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Friction(nn.Module, abc.ABC):
+    """A dissipative force F(v) ``(*batch, N)`` beside D(q) v, with v^T F(v) >= 0."""
+
+    @abc.abstractmethod
+    def forward(self, v: Tensor) -> Tensor:
+        """F(v), ``(*batch, N)``, at v ``(*batch, N)``."""
+
+
+class NoFriction(Friction):
+    """F = 0: dissipation is viscous, as in the paper.
+
+    Args:
+        size, force, v_std: not used; every head takes the same arguments from the model.
+    """
+
+    def __init__(self, *, size: int, force: Tensor, v_std: Tensor):
+        super().__init__()
+
+    def forward(self, v: Tensor) -> Tensor:
+        """Zero."""
+        return torch.zeros_like(v)
+
+
+class CoulombFriction(Friction):
+    """F_i(v) = c_i tanh(v_i / w_i), a smooth Coulomb law with learned c_i > 0 and w_i > 0.
+
+    c_i is the friction force of coordinate i (N or Nm), w_i the speed at which it has mostly set
+    in. Passive by construction: v_i F_i(v) >= 0 for every v. See Armstrong-Helouvry, Dupont and
+    Canudas de Wit (1994), "A survey of models, analysis tools and compensation methods for the
+    control of machines with friction", for the law and what it leaves out (stiction).
+
+    Args:
+        size: N.
+        force: typical generalized forces, ``(N,)``; c starts at a tenth of them.
+        v_std: typical speeds, ``(N,)``; w starts at a tenth of them and stays above a hundredth,
+            as a jump in the force could not be integrated.
+    """
+
+    force: Tensor
+    v_std: Tensor
+
+    def __init__(self, *, size: int, force: Tensor, v_std: Tensor):
+        super().__init__()
+        start = torch.full((size,), 0.1).expm1().log()
+        self.raw_force = nn.Parameter(start.clone())
+        self.raw_width = nn.Parameter(start.clone())
+        self.register_buffer("force", force.float().clone())
+        self.register_buffer("v_std", v_std.float().clone())
+
+    def forward(self, v: Tensor) -> Tensor:
+        """F(v)."""
+        force = self.force * F.softplus(self.raw_force)
+        width = self.v_std * (F.softplus(self.raw_width) + 0.01)
+        return force * torch.tanh(v / width)

@@ -1,0 +1,296 @@
+"""PyBullet arms: against the contract, closed forms, Bullet's own steps, and bad input."""
+
+import copy
+import pickle
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+import torch
+
+pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+import pybullet_data  # noqa: E402
+
+from pinn_dyn.evaluation.learned_terms import compare_terms  # noqa: E402
+from pinn_dyn.systems import BulletArm  # noqa: E402
+from tests.contracts.mechanical_system import Configurations, MechanicalSystemContract  # noqa: E402
+from tests.support.finite_differences import assert_near  # noqa: E402
+
+pytestmark = pytest.mark.panda
+
+PANDA = "franka_panda/panda.urdf"
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+
+# Two rods in the vertical x-z plane that turn about y, hanging at q = 0; an unequal inertia, walls,
+# friction and a tool frame without <inertial>, none of which may matter.
+PENDULUM = """<robot name="pendulum">
+  <link name="base"/>
+  <link name="upper"><inertial><origin xyz="0 0 -0.3"/><mass value="1.5"/>
+    <inertia ixx="0.4" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.1"/></inertial></link>
+  <link name="lower"><inertial><origin xyz="0 0 -0.2"/><mass value="0.8"/>
+    <inertia ixx="0.2" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.3"/></inertial></link>
+  <link name="tool"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/><limit lower="-0.1" upper="0.1" velocity="0.5" effort="30"/>
+    <dynamics damping="7" friction="3"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0 0 -0.5"/><axis xyz="0 1 0"/><limit velocity="4" effort="10"/></joint>
+  <joint name="flange" type="fixed"><parent link="lower"/><child link="tool"/></joint>
+</robot>"""
+
+
+def pendulum_terms(q, v, g=9.81):
+    """M, C v and G of the double pendulum above, from its Lagrangian by hand."""
+    m1, m2, c1, c2, l1, i1, i2 = 1.5, 0.8, 0.3, 0.2, 0.5, 0.05, 0.02
+    k = m2 * l1 * c2
+    m22 = m2 * c2**2 + i2
+    m12 = m22 + k * np.cos(q[1])
+    m11 = m1 * c1**2 + i1 + m2 * l1**2 + m22 + 2 * k * np.cos(q[1])
+    coriolis = k * np.sin(q[1]) * np.array([-(2 * v[0] + v[1]) * v[1], v[0] ** 2])
+    g2 = m2 * g * c2 * np.sin(q[0] + q[1])
+    gravity = np.array([(m1 * c1 + m2 * l1) * g * np.sin(q[0]) + g2, g2])
+    return np.array([[m11, m12], [m12, m22]]), coriolis, gravity
+
+
+@pytest.fixture
+def pendulum(tmp_path):
+    """Writes the pendulum's URDF, changed by (old, new) pairs, and gives its path."""
+
+    def write(*changes):
+        text = PENDULUM
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / "pendulum.urdf"
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return BulletArm(PANDA, locked_joints=FINGERS, damping=0.5)
+
+
+def states(arm, count=4):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(arm.q_low, arm.q_high, (count, arm.num_coordinates))
+    return q, *(rng.uniform(-2, 2, (2, *q.shape)))
+
+
+class TestPanda(MechanicalSystemContract):
+    @pytest.fixture
+    def system(self, panda):
+        return panda
+
+    @pytest.fixture
+    def configurations(self, panda):
+        q, v, a = states(panda, 8)
+        return Configurations(*(torch.from_numpy(x) for x in (q, v, a, 10 * a)))
+
+    def test_gradients_through_an_rk4_step_match_finite_differences(self, panda, configurations):
+        """Bullet gives no derivatives of the dynamics: they are refused, not silently zero."""
+        q, v, _, u = configurations
+        with torch.enable_grad(), pytest.raises(RuntimeError, match="have no derivatives"):
+            panda.forward_dynamics(q.clone().requires_grad_(), v, u)
+
+
+# Against independent answers.
+
+
+@pytest.mark.parametrize("gravity", [9.81, 0.0])
+def test_double_pendulum_has_the_terms_of_its_closed_form(pendulum, gravity):
+    arm = BulletArm(pendulum(), gravity=(0, 0, -gravity), damping=(0.3, 0.2))
+    assert arm.joint_names == ["shoulder", "elbow"]
+    q, v, a = states(arm)
+    for k in range(len(q)):
+        M, Cv, G = pendulum_terms(q[k], v[k], gravity)
+        at = [torch.from_numpy(x[k]) for x in (q, v, a)]
+        np.testing.assert_allclose(arm.mass_matrix(at[0]), M, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(arm.potential_force(at[0]), G, rtol=0, atol=1e-11)
+        expected = M @ a[k] + Cv + G + np.array([0.3, 0.2]) * v[k]
+        np.testing.assert_allclose(arm.inverse_dynamics(*at), expected, rtol=0, atol=1e-11)
+        force = arm.coriolis_matrix(*at[:2]) @ at[1]
+        np.testing.assert_allclose(force, Cv, rtol=0, atol=1e-11)
+
+
+def rotation(axis, angle):
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def panda_mass_matrix(q):
+    """sum m J^T J + Jw^T I Jw over all links, straight from the URDF, fingers at zero."""
+    robot = ET.parse(f"{pybullet_data.getDataPath()}/{PANDA}").getroot()
+    links = {link.get("name"): link for link in robot.findall("link")}
+    numbers = lambda element, key: np.array([float(x) for x in element.get(key).split()])  # noqa: E731
+    frames = {"panda_link0": (np.eye(3), np.zeros(3), [])}
+    angles, mass_matrix = list(q), np.zeros((7, 7))
+    # The file names a parent before its children, as this loop needs.
+    pending = robot.findall("joint")
+    for joint in pending:
+        R, r, axes = frames[joint.find("parent").get("link")]
+        origin = joint.find("origin")
+        roll, pitch, yaw = numbers(origin, "rpy")
+        r = r + R @ numbers(origin, "xyz")
+        R = R @ rotation((0, 0, 1), yaw) @ rotation((0, 1, 0), pitch) @ rotation((1, 0, 0), roll)
+        if joint.get("type") == "revolute":
+            axis = numbers(joint.find("axis"), "xyz")
+            axes = [*axes, (R @ axis, r)]
+            R = R @ rotation(axis, angles.pop(0))
+        name = joint.find("child").get("link")
+        frames[name] = (R, r, axes)
+        inertial = links[name].find("inertial")
+        centre = r + R @ numbers(inertial.find("origin"), "xyz")
+        mass = float(inertial.find("mass").get("value"))
+        linear, angular = np.zeros((3, 7)), np.zeros((3, 7))
+        for index, (axis, point) in enumerate(axes):
+            linear[:, index], angular[:, index] = np.cross(axis, centre - point), axis
+        # All inertias of this file are 0.1 kg m^2 about every axis.
+        inertia = float(inertial.find("inertia").get("ixx"))
+        mass_matrix += mass * linear.T @ linear + inertia * angular.T @ angular
+    assert not angles
+    return mass_matrix
+
+
+def test_panda_has_the_mass_matrix_of_its_urdf_with_the_fingers_locked(panda):
+    assert panda.num_coordinates == 7
+    q = states(panda)[0]
+    M = panda.mass_matrix(torch.from_numpy(q))
+    for k in range(len(q)):
+        np.testing.assert_allclose(M[k], panda_mass_matrix(q[k]), rtol=0, atol=1e-9)
+
+
+def test_inertia_from_collision_shapes_differs_in_inertia_alone(panda):
+    arm = BulletArm(PANDA, locked_joints=FINGERS, inertia="collision")
+    q = torch.from_numpy(states(panda)[0])
+    assert_near(arm.potential_energy(q), panda.potential_energy(q), 1e-12)
+    assert arm.describe()["urdf"] != panda.describe()["urdf"]  # the meshes are part of it
+    smallest = [torch.linalg.eigvalsh(x.mass_matrix(q))[:, 0] for x in (arm, panda)]
+    assert (smallest[0] > 0).all()
+    assert (smallest[0] < 0.1 * smallest[1]).all()
+
+
+# Bullet's own motion.
+
+
+@pytest.mark.parametrize("damping", [0.0, 2.0])
+@pytest.mark.parametrize("inertia", ["file", "collision"])
+def test_recorded_steps_are_those_of_the_equation_of_motion(inertia, damping):
+    """Also far beyond the joint and velocity limits of the URDF, where nothing may stop it."""
+    arm = BulletArm(PANDA, locked_joints=FINGERS, inertia=inertia, damping=damping)
+    rng = np.random.default_rng(1)
+    torques = rng.uniform(-5, 5, (61, 7)) * np.array([4, 4, 4, 4, 1, 1, 1])
+    q, v, u = arm.simulate(
+        arm.q_high + 0.5, 2 * arm.v_max, lambda k, q, v: torques[k], steps=60, step=1e-3
+    )
+    np.testing.assert_array_equal(u, torques)
+    a = arm.forward_dynamics(*(torch.from_numpy(x[:-1]) for x in (q, v, u))).numpy()
+    assert np.abs(a).max() > 5  # so 1e-8 is a statement about the motion
+    np.testing.assert_allclose(v[1:], v[:-1] + 1e-3 * a, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(q[1:], q[:-1] + 1e-3 * v[1:], rtol=0, atol=1e-12)
+
+
+def test_pendulum_swings_without_walls_and_friction_and_keeps_its_energy(pendulum):
+    """Released at 1.2 rad between walls at 0.1 rad and with friction in the URDF."""
+    arm = BulletArm(pendulum(), damping=0)
+    zero = np.zeros(2)
+    q, v, _ = arm.simulate(
+        np.array([1.2, 0.4]), zero, lambda k, q, v: zero, steps=20000, step=1e-4
+    )
+    assert q[:, 0].min() < -0.5
+    assert np.abs(v).max() > 2
+    energy = arm.total_energy(torch.from_numpy(q[::100]), torch.from_numpy(v[::100])).numpy()
+    # Semi-implicit Euler: the error is of first order in the step and does not accumulate.
+    assert np.abs(energy - energy[0]).max() < 2e-3 * (energy.max() - energy.min() + 10)
+    lossy = BulletArm(pendulum(), damping=0.5)
+    q, v, _ = lossy.simulate(q[0], zero, lambda k, q, v: zero, steps=20000, step=1e-4)
+    lost = 0.5 * (v**2).sum(-1).mean() * 2.0
+    change = lossy.total_energy(torch.from_numpy(q[[0, -1]]), torch.from_numpy(v[[0, -1]])).diff()
+    assert lost > 1
+    assert float(change) == pytest.approx(-lost, rel=2e-3)
+
+
+def test_no_motor_resists_and_bodies_do_not_touch(panda):
+    """Without gravity, torque and damping the velocity at rest stays zero, folded up as well."""
+    arm = BulletArm(PANDA, locked_joints=FINGERS, inertia="collision", damping=0, gravity=(0, 0, 0))
+    folded = np.array([0, 1.8, 0, -3.1, 0, 3.8, 0])
+    _, v, _ = arm.simulate(folded, 0 * folded, lambda k, q, v: 0 * q, steps=50, step=1e-3)
+    assert np.abs(v).max() < 1e-12
+
+
+# As an object among others.
+
+
+def test_copies_and_pickles_give_the_same_numbers(panda):
+    q = torch.from_numpy(states(panda)[0])
+    for twin in (copy.deepcopy(panda), pickle.loads(pickle.dumps(panda))):
+        assert torch.equal(twin.mass_matrix(q), panda.mass_matrix(q))
+        assert torch.equal(twin.damping_matrix(q), panda.damping_matrix(q))
+
+
+def test_two_arms_in_one_process_keep_their_own_gravity(panda):
+    heavy = BulletArm(PANDA, locked_joints=FINGERS, gravity=(0, 0, -19.62))
+    q = torch.from_numpy(states(panda)[0])
+    assert_near(heavy.potential_force(q), 2 * panda.potential_force(q), 1e-12)
+    assert_near(heavy.potential_energy(q), 2 * panda.potential_energy(q), 1e-12)
+
+
+def test_terms_are_compared_with_the_arm_as_the_truth(panda):
+    stiff = BulletArm(PANDA, locked_joints=FINGERS, damping=1.0)
+    comparison = compare_terms(stiff, panda, torch.from_numpy(states(panda, 2)[0]).float())
+    errors = comparison.to_frame().set_index("term").relative_error_identity
+    assert errors["D"].to_list() == pytest.approx([1, 1])
+    assert errors.drop("D").abs().max() < 1e-12
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("changes", "arguments", "message"),
+    [
+        ([], {"damping": [0.1, 0.2, 0.3]}, r"damping has 3 entries, but .*pendulum.urdf has 2"),
+        ([], {"damping": -0.1}, r"damping is -0.1, expected finite numbers of at least 0"),
+        ([], {"locked_joints": ["wrist"]}, r"no joint 'wrist' to lock: .* shoulder, elbow, flange"),
+        ([], {"locked_joints": ["shoulder", "elbow"]}, r"no revolute joint that is free"),
+        ([], {"inertia": "guess"}, r"inertia is 'guess', expected 'file' or 'collision'"),
+        ([], {"inertia": "collision"}, r"link 'upper' moves and has no <collision>"),
+        ([], {"gravity": [0, -9.81]}, r"gravity is \[0, -9.81\], expected 3"),
+        ([('"continuous"', '"floating"')], {}, r"joint 'elbow' is of type 'floating', but an arm"),
+        ([('"continuous"', '"prismatic"')], {}, r"'elbow' is of type 'prismatic'.*locked_joints"),
+        ([('value="0.8"', 'value="0"')], {}, r"link 'lower' moves with joint 'elbow' and has no m"),
+        ([('value="0.8"', 'value="-1"')], {}, r"link 'lower' has mass -1.0 kg"),
+        ([('value="0.8"', 'value="heavy"')], {}, r"'lower' has <mass value='heavy'>, expected a"),
+        ([("inertia ", "nothing ")], {}, r"link 'upper' moves and has no <inertia>"),
+        ([('lower="-0.1"', 'lower="0.1"')], {}, r"joint 'shoulder' has limits lower = 0.1 and upp"),
+        ([('child link="lower"', 'child link="low"')], {}, r"joint 'elbow' has the child 'low'"),
+        ([("</robot>", "")], {}, r"pendulum.urdf is not valid XML"),
+        ([("robot", "sdf")], {}, r"holds <sdf> with 3 joints, expected <robot>"),
+    ],
+)
+def test_bad_input_is_refused_with_what_to_do(pendulum, changes, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        BulletArm(pendulum(*changes), **arguments)
+
+
+def test_a_missing_urdf_is_named_with_a_close_one():
+    with pytest.raises(FileNotFoundError, match=r"'franka_panda/pnda.urdf' not found.*panda.urdf"):
+        BulletArm("franka_panda/pnda.urdf")
+
+
+def test_a_missing_mesh_is_named(pendulum):
+    shape = '<collision><geometry><mesh filename="package://arm.obj"/></geometry></collision>'
+    path = pendulum(("</inertial>", f"</inertial>{shape}"))
+    with pytest.raises(FileNotFoundError, match=r"mesh 'package://arm.obj' not found"):
+        BulletArm(path, inertia="collision")
+    assert BulletArm(path, inertia="file").num_coordinates == 2
+
+
+def test_without_pybullet_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(ImportError, match=r"pip install 'pinn_dyn\[panda\]'.*3\.10 and 3\.11"):
+        BulletArm(PANDA)
