@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +57,8 @@ class SoftArm(MechanicalSystem):
 
     Args:
         segments: n, number of segments; N = M = 3 n.
-        mass: mass of each segment, kg.
+        mass: mass of each segment, kg; one for all, or n of them. A segment without mass leaves
+            M singular in its coordinates.
         length: rest length of each segment, m.
         gravity: gravitational acceleration along +z, m/s^2.
         stiffness: elastic stiffness of each coordinate, Nm/rad for bending, N/m for elongation.
@@ -64,18 +66,19 @@ class SoftArm(MechanicalSystem):
         nodes: Gauss-Legendre nodes per segment; 10 are exact to 1e-12 for theta <= 3.
 
     Raises:
-        ValueError: on segments < 1, nodes < 1, mass or length not positive, or negative gravity,
-            stiffness or damping.
+        ValueError: on segments < 1, nodes < 1, length not positive, masses that are negative, all
+            zero or not n, or negative gravity, stiffness or damping.
     """
 
     _s: Tensor
+    _masses: Tensor
     _weights: Tensor
 
     def __init__(
         self,
         segments: int = 1,
         *,
-        mass: float = 0.3,
+        mass: float | Sequence[float] = 0.3,
         length: float = 0.2,
         gravity: float = 9.81,
         stiffness: float = 1.0,
@@ -85,19 +88,25 @@ class SoftArm(MechanicalSystem):
         for name, count in (("segments", segments), ("nodes", nodes)):
             if count < 1:
                 raise ValueError(f"SoftArm: {name} is {count}, expected at least 1")
-        for name, value in (("mass", mass), ("length", length)):
-            if not value > 0:
-                raise ValueError(f"SoftArm: {name} is {value}, expected a positive number")
+        masses = [float(mass)] * segments if isinstance(mass, (int, float)) else list(mass)
+        if len(masses) != segments:
+            raise ValueError(
+                f"SoftArm: mass has {len(masses)} entries, expected one number or {segments}"
+            )
+        if not all(m >= 0 for m in masses) or not sum(masses) > 0:
+            raise ValueError(f"SoftArm: mass is {mass}, expected a positive number")
+        if not length > 0:
+            raise ValueError(f"SoftArm: length is {length}, expected a positive number")
         for name, value in (("gravity", gravity), ("stiffness", stiffness), ("damping", damping)):
             if not value >= 0:
                 raise ValueError(f"SoftArm: {name} is {value}, expected zero or a positive number")
         super().__init__(num_coordinates=3 * segments, num_inputs=3 * segments)
         self.segments = segments
-        self.mass = mass
         self.length = length
         self.gravity = gravity
         self.stiffness = stiffness
         self.damping = damping
+        self.register_buffer("_masses", torch.tensor(masses, dtype=torch.float64))
         points, weights = np.polynomial.legendre.leggauss(nodes)
         self.register_buffer("_s", torch.tensor((points + 1) / 2, dtype=torch.float64))
         self.register_buffer("_weights", torch.tensor(weights / 2, dtype=torch.float64))
@@ -109,17 +118,17 @@ class SoftArm(MechanicalSystem):
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q) = stiffness |q|^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
-        height = q.new_zeros(q.shape[:-1])
+        weight = q.new_zeros(q.shape[:-1])
         position = q.new_zeros((*q.shape[:-1], 3))
         rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
         weights = self._weights.to(q)
         for index in range(self.segments):
             local = self._local_points(q[..., 3 * index : 3 * index + 3], self._s.to(q))
             world = position.unsqueeze(-2) + local @ rotation.transpose(-1, -2)
-            height = height + world[..., 2] @ weights
+            weight = weight + self._masses[index].to(q) * (world[..., 2] @ weights)
             position, rotation = self._tip_frame(q, index, position, rotation)
         elastic = 0.5 * self.stiffness * (q * q).sum(-1)
-        return elastic - self.mass * self.gravity * height
+        return elastic - self.gravity * weight
 
     def damping_matrix(self, q: Tensor) -> Tensor:
         """D = damping I, ``(*batch, N, N)``."""
@@ -164,7 +173,7 @@ class SoftArm(MechanicalSystem):
         return spd_solve(self._gram(points.jacobian), force - bias)
 
     def _point_masses(self, like: Tensor) -> Tensor:
-        return self.mass * self._weights.to(like).repeat(self.segments)
+        return torch.outer(self._masses, self._weights).flatten().to(like)
 
     def _gram(self, jacobian: Tensor) -> Tensor:
         weighted = jacobian * self._point_masses(jacobian)[:, None, None]

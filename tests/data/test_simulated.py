@@ -71,6 +71,31 @@ def test_training_combines_every_initial_state_with_every_input(splits):
     assert len(pairs) == 6
 
 
+def test_matched_training_gives_each_state_an_input_of_its_own(cache):
+    source = make_source(cache, train_initial_states=3, train_inputs=3, pairing="matched")
+    train = source.load().train
+    assert len(train) == len(starts(train)) == len(inputs(train)) == 3
+
+
+def test_a_lower_rate_keeps_every_nth_sample_of_one_simulation(cache, splits, monkeypatch):
+    monkeypatch.setattr(SimulatedSource, "simulate", None)  # the cache has it
+    slow = make_source(cache, keep_every=4).load()
+    for name in ("train", "validation", "test"):
+        for fast_one, slow_one in zip(getattr(splits, name), getattr(slow, name), strict=True):
+            for key in ("t", "q", "v", "u"):
+                assert torch.equal(getattr(slow_one, key), getattr(fast_one, key)[::4])
+    assert torch.equal(slow.test[0].p, splits.test[0].p[::4])
+
+
+def test_unseen_trajectories_may_be_shorter(cache, splits):
+    short = make_source(cache, test_duration=0.1).load()
+    assert torch.equal(short.train[0].q, splits.train[0].q)
+    for name in ("validation", "test"):
+        for long, cut in zip(getattr(splits, name), getattr(short, name), strict=True):
+            assert float(cut.t[-1]) == pytest.approx(0.1)
+            assert torch.equal(cut.q, long.q[:11])
+
+
 @pytest.mark.parametrize(("split", "count"), [("validation", 2), ("test", 3)])
 def test_validation_and_test_have_states_and_inputs_of_their_own(splits, split, count):
     unseen = getattr(splits, split)
@@ -232,6 +257,11 @@ def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
         (dict(train_initial_states=0), "train_initial_states is 0"),
         (dict(train_inputs=0), "train_inputs is 0"),
         (dict(validation=0), "validation is 0"),
+        (dict(keep_every=0), "keep_every is 0"),
+        (dict(test_duration=0.3), "test_duration is 0.3 s"),
+        (dict(test_duration=0.001), "test_duration is 0.001 s"),
+        (dict(pairing="paired"), "pairing is 'paired'"),
+        (dict(pairing="matched"), "pairing is 'matched' with 3 initial states and 2 inputs"),
         (dict(test=-1), "test is -1"),
         (dict(labels=["x", "y"]), "labels has 2 entries, the system needs 3"),
         (dict(input_labels=["a"]), "input_labels has 1 entries, the system needs 3"),

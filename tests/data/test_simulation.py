@@ -6,6 +6,7 @@ import torch
 from scipy.integrate import cumulative_simpson, solve_ivp
 
 from pinn_dyn.data import Mixture, MultiSine, SimulationError, Steps, simulate
+from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from tests.support.linear import damped_oscillators, exact_solution, exact_solution_under_sine
@@ -59,6 +60,24 @@ def test_a_damped_linear_system_under_a_sine_follows_the_matrix_exponential(line
     )
     exact = exact_solution_under_sine(linear, x0, torch.from_numpy(t), 3.0)
     np.testing.assert_allclose(np.hstack([q[0], v[0]]), exact.numpy(), rtol=0, atol=1e-7)
+
+
+@pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
+def test_a_compiled_simulation_is_the_same(linear):
+    q0, v0, t = np.ones((2, 2)), np.zeros((2, 2)), np.linspace(0, 1, 5)
+    plain = simulate(linear, q0, v0, constant([1.0], 2), t)
+    compiled = simulate(linear, q0, v0, constant([1.0], 2), t, compile=True)
+    np.testing.assert_allclose(compiled, plain, rtol=0, atol=1e-10)
+
+
+def test_without_a_compiler_the_simulation_runs_and_says_so(linear, monkeypatch, caplog):
+    monkeypatch.setenv("PATH", "")
+    q0, v0, t = np.ones((2, 2)), np.zeros((2, 2)), np.linspace(0, 1, 5)
+    plain = simulate(linear, q0, v0, constant([1.0], 2), t)
+    np.testing.assert_array_equal(
+        simulate(linear, q0, v0, constant([1.0], 2), t, compile=True), plain
+    )
+    assert "no C++ compiler" in caplog.text
 
 
 def test_looser_tolerances_give_larger_errors(linear):

@@ -1,6 +1,7 @@
 """The soft arm against the paper's tables, hand calculations and independent kinematics."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -219,6 +220,24 @@ def test_lower_segment_on_a_resting_upper_one_is_a_single_arm(motion):
     torch.testing.assert_close(block, SoftArm(1).mass_matrix(q[3:]), rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.parametrize("lower", [1, 2])
+def test_lower_segments_straight_and_massless_leave_a_single_arm(motion, lower):
+    """What hangs below without mass and without bending adds nothing to the upper segment."""
+    q = torch.from_numpy(motion[0][:3])
+    straight = torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64).repeat(lower)
+    arm = SoftArm(1 + lower, mass=[MASS] + [0.0] * lower)
+    mass, damping, force, inputs = arm.terms(torch.cat([q, straight]))
+    expected = SoftArm(1, mass=MASS).terms(q)
+    torch.testing.assert_close(mass[:3, :3], expected.M, rtol=1e-13, atol=1e-15)
+    torch.testing.assert_close(damping[:3, :3], expected.D)
+    torch.testing.assert_close(force[:3], expected.G, rtol=1e-13, atol=1e-15)
+    torch.testing.assert_close(inputs[:3, :3], expected.A, rtol=1e-13, atol=1e-15)
+    # No inertia of their own, and only their springs pull on them.
+    assert mass[3:].abs().max() == 0 == mass[:, 3:].abs().max()
+    torch.testing.assert_close(force[3:], straight)
+    assert inputs[3:, :3].abs().max() == 0
+
+
 def test_default_quadrature_is_exact_to_twelve_digits_up_to_three_radians():
     generator = torch.Generator().manual_seed(0)
     angle = 2 * math.pi * torch.rand(6, 2, generator=generator, dtype=torch.float64)
@@ -243,6 +262,7 @@ def test_default_quadrature_is_exact_to_twelve_digits_up_to_three_radians():
         ("mass", 0.0),
         ("mass", -0.3),
         ("mass", math.nan),
+        ("mass", [-0.3]),
         ("length", -1.0),
         ("length", 0.0),
         ("gravity", -9.81),
@@ -251,5 +271,10 @@ def test_default_quadrature_is_exact_to_twelve_digits_up_to_three_radians():
     ],
 )
 def test_a_bad_parameter_is_refused_by_name(name, value):
-    with pytest.raises(ValueError, match=rf"SoftArm: {name} is {value}"):
+    with pytest.raises(ValueError, match=re.escape(f"SoftArm: {name} is {value}")):
         SoftArm(**{name: value})
+
+
+def test_one_mass_or_one_for_each_segment():
+    with pytest.raises(ValueError, match="mass has 3 entries, expected one number or 2"):
+        SoftArm(2, mass=[0.3, 0.3, 0.3])
