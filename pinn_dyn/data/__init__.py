@@ -1,7 +1,15 @@
-"""Data: excitation signals, simulated data sets, windows and the LightningDataModule."""
+"""Data: excitation signals, simulated data sets, logs, windows and the LightningDataModule."""
 
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
+from pinn_dyn.data.logs import Cleaned, LogError, LogSource
+from pinn_dyn.data.robot import RobotSource
+from pinn_dyn.data.robot_excitation import (
+    Robot,
+    RobotExcitation,
+    TorqueMultiSine,
+    TrackedMultiSine,
+)
 from pinn_dyn.data.simulated import InitialStates, SimulatedSource
 from pinn_dyn.data.simulation import SimulationError, simulate
 from pinn_dyn.data.source import DataSource, Splits
@@ -9,16 +17,24 @@ from pinn_dyn.data.windows import Windows, draw_windows
 
 __all__ = [
     "Chirp",
+    "Cleaned",
     "DataSource",
     "DynamicsData",
     "Excitation",
     "InitialStates",
+    "LogError",
+    "LogSource",
     "Mixture",
     "MultiSine",
+    "Robot",
+    "RobotExcitation",
+    "RobotSource",
     "SimulatedSource",
     "SimulationError",
     "Splits",
     "Steps",
+    "TorqueMultiSine",
+    "TrackedMultiSine",
     "Windows",
     "draw_windows",
     "simulate",

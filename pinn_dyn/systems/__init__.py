@@ -1,5 +1,6 @@
 """Analytic and simulated robots, the truth that models are compared with."""
 
+from pinn_dyn.systems.bullet_arm import BulletArm
 from pinn_dyn.systems.soft_arm import SoftArm
 
-__all__ = ["SoftArm"]
+__all__ = ["BulletArm", "SoftArm"]

@@ -20,9 +20,10 @@ class IncrementLoss(nn.Module):
     standard deviation over the training windows. With one step this is the paper's loss
     ||x_{k+1} - x^_{k+1}||^2, normalized; with more it is the multi-step loss.
 
-    The weight w of the configuration half is 1, as in the paper's Hamiltonian loss; it is 0 where
-    dq/dt = v holds by construction, as in the paper's Lagrangian loss. A window costs four
-    evaluations of the dynamics per step.
+    The weight w of the configuration half is 1, as in the paper's Hamiltonian loss; it is 0 for
+    windows of one step where dq/dt = v holds by construction, as in the paper's Lagrangian loss.
+    Over several steps it is 1 again: a measured q is better than a velocity derived from it. A
+    window costs four evaluations of the dynamics per step.
 
     Args:
         statistics: scales of the data.
@@ -36,7 +37,7 @@ class IncrementLoss(nn.Module):
         momentum = model.coordinates == "momentum"
         std = statistics.momentum_increment_std if momentum else statistics.velocity_increment_std
         self.register_buffer("scale", std.float(), persistent=False)
-        exact_rate = isinstance(model, ContinuousPredictor) and not momentum
+        exact_rate = isinstance(model, ContinuousPredictor) and not momentum and std.shape[0] == 1
         self.first = model.num_coordinates if exact_rate else 0
 
     def forward(self, predicted: Tensor, measured: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ import copy
 import pickle
 import sys
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,9 +28,9 @@ FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 PENDULUM = """<robot name="pendulum">
   <link name="base"/>
   <link name="upper"><inertial><origin xyz="0 0 -0.3"/><mass value="1.5"/>
-    <inertia ixx="0.4" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.1"/></inertial></link>
+    <inertia ixx="0.09" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.1"/></inertial></link>
   <link name="lower"><inertial><origin xyz="0 0 -0.2"/><mass value="0.8"/>
-    <inertia ixx="0.2" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.3"/></inertial></link>
+    <inertia ixx="0.2" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.21"/></inertial></link>
   <link name="tool"/>
   <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
     <axis xyz="0 1 0"/><limit lower="-0.1" upper="0.1" velocity="0.5" effort="30"/>
@@ -37,6 +38,20 @@ PENDULUM = """<robot name="pendulum">
   <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
     <origin xyz="0 0 -0.5"/><axis xyz="0 1 0"/><limit velocity="4" effort="10"/></joint>
   <joint name="flange" type="fixed"><parent link="lower"/><child link="tool"/></joint>
+</robot>"""
+
+# Skew axes, turned frames and products of inertia.
+SPATIAL = """<robot name="spatial">
+  <link name="base"/>
+  <link name="one"><inertial><origin xyz="0.1 0.02 -0.3" rpy="0.3 -0.5 1.1"/><mass value="1.5"/>
+    <inertia ixx="0.09" ixy="0.01" ixz="-0.015" iyy="0.07" iyz="0.02" izz="0.1"/></inertial></link>
+  <link name="two"><inertial><origin xyz="0 0.1 -0.2" rpy="-0.7 0.2 0.4"/><mass value="0.8"/>
+    <inertia ixx="0.05" ixy="-0.01" ixz="0.005" iyy="0.04" iyz="0.01" izz="0.06"/></inertial></link>
+  <joint name="a" type="revolute"><parent link="base"/><child link="one"/>
+    <origin rpy="0.4 0.1 -0.3"/><axis xyz="0 0 1"/><limit lower="-2" upper="2"/></joint>
+  <joint name="b" type="revolute"><parent link="one"/><child link="two"/>
+    <origin xyz="0.1 0.2 -0.5" rpy="-1.2 0.5 0.2"/><axis xyz="0.6 0 0.8"/>
+    <limit lower="-2" upper="2"/></joint>
 </robot>"""
 
 
@@ -122,36 +137,48 @@ def rotation(axis, angle):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def panda_mass_matrix(q):
-    """sum m J^T J + Jw^T I Jw over all links, straight from the URDF, fingers at zero."""
-    robot = ET.parse(f"{pybullet_data.getDataPath()}/{PANDA}").getroot()
-    links = {link.get("name"): link for link in robot.findall("link")}
-    numbers = lambda element, key: np.array([float(x) for x in element.get(key).split()])  # noqa: E731
-    frames = {"panda_link0": (np.eye(3), np.zeros(3), [])}
-    angles, mass_matrix = list(q), np.zeros((7, 7))
-    # The file names a parent before its children, as this loop needs.
-    pending = robot.findall("joint")
-    for joint in pending:
+def numbers(element, key):
+    text = "0 0 0" if element is None else element.get(key, "0 0 0")
+    return np.array([float(x) for x in text.split()])
+
+
+def placed(R, r, origin):
+    """The frame ``origin`` of a URDF, within the frame (R, r)."""
+    roll, pitch, yaw = numbers(origin, "rpy")
+    turn = rotation((0, 0, 1), yaw) @ rotation((0, 1, 0), pitch) @ rotation((1, 0, 0), roll)
+    return R @ turn, r + R @ numbers(origin, "xyz")
+
+
+def urdf_mass_matrix(text, q):
+    """sum m J^T J + Jw^T I Jw over all links of a URDF that names parents before children.
+
+    Revolute joints take their angles from q in turn, prismatic ones stay at zero.
+    """
+    robot = ET.fromstring(text)
+    links = {link.get("name"): link.find("inertial") for link in robot.findall("link")}
+    joints = robot.findall("joint")
+    frames = {joints[0].find("parent").get("link"): (np.eye(3), np.zeros(3), [])}
+    angles, mass_matrix = list(q), np.zeros((len(q), len(q)))
+    for joint in joints:
         R, r, axes = frames[joint.find("parent").get("link")]
-        origin = joint.find("origin")
-        roll, pitch, yaw = numbers(origin, "rpy")
-        r = r + R @ numbers(origin, "xyz")
-        R = R @ rotation((0, 0, 1), yaw) @ rotation((0, 1, 0), pitch) @ rotation((1, 0, 0), roll)
+        R, r = placed(R, r, joint.find("origin"))
         if joint.get("type") == "revolute":
             axis = numbers(joint.find("axis"), "xyz")
             axes = [*axes, (R @ axis, r)]
             R = R @ rotation(axis, angles.pop(0))
         name = joint.find("child").get("link")
         frames[name] = (R, r, axes)
-        inertial = links[name].find("inertial")
-        centre = r + R @ numbers(inertial.find("origin"), "xyz")
-        mass = float(inertial.find("mass").get("value"))
-        linear, angular = np.zeros((3, 7)), np.zeros((3, 7))
+        Rc, centre = placed(R, r, links[name].find("origin"))
+        xx, xy, xz, yy, yz, zz = (
+            float(links[name].find("inertia").get(f"i{key}"))
+            for key in ("xx", "xy", "xz", "yy", "yz", "zz")
+        )
+        inertia = Rc @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ Rc.T
+        linear, angular = np.zeros((2, 3, len(q)))
         for index, (axis, point) in enumerate(axes):
             linear[:, index], angular[:, index] = np.cross(axis, centre - point), axis
-        # All inertias of this file are 0.1 kg m^2 about every axis.
-        inertia = float(inertial.find("inertia").get("ixx"))
-        mass_matrix += mass * linear.T @ linear + inertia * angular.T @ angular
+        mass = float(links[name].find("mass").get("value"))
+        mass_matrix += mass * linear.T @ linear + angular.T @ inertia @ angular
     assert not angles
     return mass_matrix
 
@@ -160,8 +187,23 @@ def test_panda_has_the_mass_matrix_of_its_urdf_with_the_fingers_locked(panda):
     assert panda.num_coordinates == 7
     q = states(panda)[0]
     M = panda.mass_matrix(torch.from_numpy(q))
+    text = Path(pybullet_data.getDataPath(), PANDA).read_text()
     for k in range(len(q)):
-        np.testing.assert_allclose(M[k], panda_mass_matrix(q[k]), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(M[k], urdf_mass_matrix(text, q[k]), rtol=0, atol=1e-9)
+
+
+def test_products_of_inertia_and_turned_frames_count_in_full(tmp_path):
+    path = tmp_path / "spatial.urdf"
+    path.write_text(SPATIAL)
+    arm = BulletArm(str(path), damping=0)
+    q, v, _ = states(arm)
+    M = arm.mass_matrix(torch.from_numpy(q))
+    for k in range(len(q)):
+        np.testing.assert_allclose(M[k], urdf_mass_matrix(SPATIAL, q[k]), rtol=0, atol=1e-9)
+    # Bullet's stepping uses another algorithm than its M: the two have to agree as well.
+    q, v, u = arm.simulate(q[0], v[0], lambda k, q, v: np.array([0.3, -0.2]), steps=20, step=1e-3)
+    a = arm.forward_dynamics(*(torch.from_numpy(x[:-1]) for x in (q, v, u))).numpy()
+    np.testing.assert_allclose(v[1:], v[:-1] + 1e-3 * a, rtol=0, atol=1e-8)
 
 
 def test_inertia_from_collision_shapes_differs_in_inertia_alone(panda):
@@ -198,9 +240,7 @@ def test_pendulum_swings_without_walls_and_friction_and_keeps_its_energy(pendulu
     """Released at 1.2 rad between walls at 0.1 rad and with friction in the URDF."""
     arm = BulletArm(pendulum(), damping=0)
     zero = np.zeros(2)
-    q, v, _ = arm.simulate(
-        np.array([1.2, 0.4]), zero, lambda k, q, v: zero, steps=20000, step=1e-4
-    )
+    q, v, _ = arm.simulate(np.array([1.2, 0.4]), zero, lambda k, q, v: zero, steps=20000, step=1e-4)
     assert q[:, 0].min() < -0.5
     assert np.abs(v).max() > 2
     energy = arm.total_energy(torch.from_numpy(q[::100]), torch.from_numpy(v[::100])).numpy()
@@ -266,6 +306,7 @@ def test_terms_are_compared_with_the_arm_as_the_truth(panda):
         ([('value="0.8"', 'value="-1"')], {}, r"link 'lower' has mass -1.0 kg"),
         ([('value="0.8"', 'value="heavy"')], {}, r"'lower' has <mass value='heavy'>, expected a"),
         ([("inertia ", "nothing ")], {}, r"link 'upper' moves and has no <inertia>"),
+        ([('iyy="0.02"', 'iyy="0.002"')], {}, r"Bullet refuses the inertia of link 'lower'"),
         ([('lower="-0.1"', 'lower="0.1"')], {}, r"joint 'shoulder' has limits lower = 0.1 and upp"),
         ([('child link="lower"', 'child link="low"')], {}, r"joint 'elbow' has the child 'low'"),
         ([("</robot>", "")], {}, r"pendulum.urdf is not valid XML"),

@@ -1,0 +1,39 @@
+"""Logs of robots: columns, units, cleaning steps, checks and the data source."""
+
+from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
+from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.filters import (
+    Butterworth,
+    MovingAverage,
+    PolynomialFit,
+    SavitzkyGolayVelocity,
+)
+from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.repairs import InputDelay, InterpolateHeld, RemoveJumps, SubtractStart
+from pinn_dyn.data.logs.source import Cleaned, LogSource
+from pinn_dyn.data.logs.splits import Part
+from pinn_dyn.data.logs.step import Step
+from pinn_dyn.data.logs.units import UNITS
+
+__all__ = [
+    "UNITS",
+    "Butterworth",
+    "Cleaned",
+    "Columns",
+    "Deduplicate",
+    "InputDelay",
+    "InterpolateHeld",
+    "LogError",
+    "LogSource",
+    "MovingAverage",
+    "Part",
+    "PolynomialFit",
+    "Recording",
+    "RemoveJumps",
+    "Resample",
+    "SavitzkyGolayVelocity",
+    "SplitGaps",
+    "Step",
+    "SubtractStart",
+]

@@ -1,0 +1,185 @@
+"""What looks wrong in a log: errors where it cannot be used, warnings where it may be right."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from pinn_dyn.data.logs.clock import GAP_FACTOR, Deduplicate, Resample, SplitGaps
+from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.step import Step
+
+# Logs of robots are written between 2 Hz and 100 kHz.
+_SAMPLE_TIMES = (1e-5, 0.5)
+# What the factor between dq/dt and v may be without a warning, and how well it must be determined.
+_FACTORS = (0.8, 1.25)
+_CLEAR = 0.8
+# A partial correlation of force and acceleration below this is clear.
+_REVERSED = -0.5
+
+
+def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: list[Step]) -> None:
+    """The times of one run, in s.
+
+    Raises:
+        LogError: on an implausible sample time, and on times that go back, repeat or jump where no
+            step takes care of it; names the line and the step.
+    """
+    if len(t) < 2:
+        raise LogError(f"{path}, line {lines[0]}: a run of one row, expected at least two")
+    spacing = np.diff(t)
+    kinds = {type(step) for step in steps}
+    back = spacing < 0
+    if back.any() and SplitGaps not in kinds:
+        k = int(back.argmax())
+        raise LogError(
+            f"{path}, line {lines[k + 1]}, column {name!r}: the time goes back from {t[k]:.9g} to "
+            f"{t[k + 1]:.9g} s: if a new run starts there, name its column in 'trajectory' or add "
+            "a SplitGaps step; otherwise repair the file"
+        )
+    repeated = spacing == 0
+    if repeated.any() and Deduplicate not in kinds:
+        k = int(repeated.argmax())
+        raise LogError(
+            f"{path}, line {lines[k + 1]}, column {name!r}: the time {t[k]:.9g} s repeats "
+            f"({int(repeated.sum())} rows do): add a Deduplicate step, which keeps the first"
+        )
+    forward = spacing[spacing > 0]
+    if not len(forward):
+        raise LogError(f"{path}, column {name!r}: the time never increases, expected a clock")
+    typical = float(np.median(forward))
+    low, high = _SAMPLE_TIMES
+    if not low <= typical <= high:
+        raise LogError(
+            f"{path}, column {name!r}: the sample time would be {typical:.6g} s, expected {low:g} "
+            f"to {high:g} s: is the unit of the time wrong ({'ms' if typical > high else 's'}?)"
+        )
+    gaps = spacing > GAP_FACTOR * typical
+    if gaps.any() and not kinds & {SplitGaps, Resample}:
+        k = int(gaps.argmax())
+        raise LogError(
+            f"{path}, line {lines[k + 1]}, column {name!r}: the time jumps from {t[k]:.9g} to "
+            f"{t[k + 1]:.9g} s, where {typical:.6g} s is usual ({int(gaps.sum())} such gaps): add "
+            "a SplitGaps step to split the run there, or Resample to interpolate over short gaps"
+        )
+
+
+def check_second_clock(
+    t: np.ndarray, other: np.ndarray, lines: np.ndarray, path: Path, names: tuple[str, str]
+) -> None:
+    """Two time columns of one run, in s, which must elapse alike.
+
+    Raises:
+        LogError: where they are more than a typical sample time apart; names the line.
+    """
+    typical = float(np.median(np.abs(np.diff(t))))
+    apart = np.abs((t - t[0]) - (other - other[0]))
+    if (apart > typical).any():
+        k = int((apart > typical).argmax())
+        raise LogError(
+            f"{path}, line {lines[k]}: the clocks {names[0]!r} and {names[1]!r} disagree: "
+            f"{t[k] - t[0]:.9g} and {other[k] - other[0]:.9g} s have passed since the start of the "
+            f"run, and {apart.max():.4g} s is the most they are apart: check their units, and "
+            "keep the clock of the robot alone"
+        )
+
+
+def check_inputs(recordings: list[Recording], u: Columns, report: Report) -> None:
+    """Warns of inputs that never change.
+
+    Raises:
+        LogError: if no input ever changes.
+    """
+    first = recordings[0].u[0]
+    moved = np.any([(recording.u != first).any(axis=0) for recording in recordings], axis=0)
+    still = [name for name, moves in zip(u.columns, moved, strict=True) if not moves]
+    if len(still) == len(u.columns):
+        raise LogError(
+            f"u: every input ({', '.join(still)}) is constant in all runs, so nothing can be "
+            "learned about the input matrix: are these the right columns?"
+        )
+    for name in still:
+        report.warn(f"input {name!r} is constant in all runs: its column of A cannot be learned")
+
+
+def check_angles(recordings: list[Recording], q: Columns, report: Report) -> None:
+    """Warns of angles beyond 4 pi rad, which are probably in degrees."""
+    for k, name in enumerate(q.columns):
+        if q.units[k] != "rad":
+            continue
+        for recording in recordings:
+            largest = float(np.abs(recording.q[:, k]).max())
+            if largest > 4 * math.pi:
+                row = int(np.abs(recording.q[:, k]).argmax())
+                report.warn(
+                    f"{recording.run}, column {name!r}: {largest:.4g} rad at t = "
+                    f"{recording.t[row]:.6g} s is more than two turns: is it in degrees? Its unit "
+                    f"is given as {q.file_units[k]!r}"
+                )
+                break
+
+
+def check_velocities(
+    training: list[Recording], q: Columns, v: Columns, step: float, report: Report
+) -> None:
+    """Warns where q and v disagree by a factor k, by least squares over stretches of 10 samples.
+
+    Δq_j = k ∫ v dt over stretch j; integrals are less noisy than derivatives.
+    """
+    dq, dv = [], []
+    for recording in training:
+        assert recording.v is not None
+        integral = np.cumsum(0.5 * (recording.v[1:] + recording.v[:-1]) * step, axis=0)
+        dq.append(np.diff(recording.q[1::10], axis=0))
+        dv.append(np.diff(integral[::10], axis=0))
+    moved, integrated = np.vstack(dq), np.vstack(dv)
+    for k, (name, velocity) in enumerate(zip(q.columns, v.columns, strict=True)):
+        norm = np.linalg.norm(moved[:, k]) * np.linalg.norm(integrated[:, k])
+        if norm == 0:
+            continue
+        product = float(moved[:, k] @ integrated[:, k])
+        factor = product / float(integrated[:, k] @ integrated[:, k])
+        if abs(product) / norm < _CLEAR or _FACTORS[0] <= factor <= _FACTORS[1]:
+            continue
+        degrees = math.isclose(abs(factor), 180 / math.pi, rel_tol=0.2) or math.isclose(
+            abs(factor), math.pi / 180, rel_tol=0.2
+        )
+        cause = "one of them is in degrees" if degrees else "check unit, scale and sign of both"
+        report.warn(
+            f"columns {name!r} and {velocity!r}: the derivative of q is {factor:.4g} times v, "
+            f"expected 1: {cause}"
+        )
+
+
+def check_force_signs(training: list[Recording], u: Columns, step: float, report: Report) -> None:
+    """Warns where a force seems to push backwards; for forces and torques, one per coordinate.
+
+    The acceleration and input i are both freed of what 1, q, q², sin q, cos q, v and the other
+    inputs explain (least squares); a correlation of the rests below -0.5 is clear.
+    """
+    if training[0].q.shape[1] != len(u.columns) or not set(u.units) <= {"Nm", "N"}:
+        return
+    q = np.vstack([item.q for item in training])
+    v = np.vstack([item.v for item in training if item.v is not None])
+    forces = np.vstack([item.u for item in training])
+    acceleration = np.vstack(
+        [np.gradient(item.v, step, axis=0) for item in training if item.v is not None]
+    )
+    ones = np.ones((len(q), 1))
+    for k, name in enumerate(u.columns):
+        others = np.delete(forces, k, axis=1)
+        known = np.hstack([ones, q, q**2, np.sin(q), np.cos(q), v, others])
+        both = np.column_stack([acceleration[:, k], forces[:, k]])
+        rest = both - known @ np.linalg.lstsq(known, both, rcond=None)[0]
+        norm = np.linalg.norm(rest, axis=0).prod()
+        correlation = float(rest[:, 0] @ rest[:, 1]) / norm if norm > 0 else 0.0
+        if correlation < _REVERSED:
+            report.warn(
+                f"input {name!r} seems to push backwards: it correlates with the acceleration of "
+                f"coordinate {k + 1} by {correlation:.2f} once position, velocity and other inputs "
+                "are accounted for: is its sign reversed?"
+            )

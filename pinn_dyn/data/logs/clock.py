@@ -1,0 +1,127 @@
+"""Steps that mend the clock of a log."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.step import Step
+
+# A row may be this much late, as a multiple of the median sample time, before it counts as a gap.
+GAP_FACTOR = 3.0
+
+
+@dataclass(frozen=True)
+class Deduplicate(Step):
+    """Drops rows with the time of the row before, and rows that repeat all its values.
+
+    Some loggers write faster than the robot answers: the row is then stale, though its time is new.
+    More than ``longest`` repeats in a row are a robot at rest, and kept.
+
+    Args:
+        longest: the most repeats in a row that are taken for stale rows.
+    """
+
+    longest: int = 5
+
+    def __post_init__(self) -> None:
+        if self.longest < 1:
+            raise LogError(f"Deduplicate: longest is {self.longest}, expected at least 1")
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        values = recording.values()
+        same_time = np.r_[False, np.diff(recording.t) == 0]
+        stale = np.r_[False, (values[1:] == values[:-1]).all(axis=1)]
+        edges = np.flatnonzero(np.diff(np.r_[False, stale, False]))
+        for first, end in edges.reshape(-1, 2):
+            if end - first > self.longest:
+                stale[first:end] = False
+        drop = same_time | stale
+        share = 100 * drop.mean()
+        text = (
+            f"dropped {drop.sum()} of {len(drop)} rows ({share:.2g} %): {same_time.sum()} with the "
+            f"time of the row before, {(stale & ~same_time).sum()} with its values"
+        )
+        return [recording.rows(~drop)], text
+
+
+@dataclass(frozen=True)
+class SplitGaps(Step):
+    """Splits a run where the time jumps by more than ``longest``, or backwards.
+
+    Args:
+        longest: longest step of the time that is no gap, s.
+    """
+
+    longest: float
+
+    def __post_init__(self) -> None:
+        if not self.longest > 0:
+            raise LogError(f"SplitGaps: longest is {self.longest} s, expected more than 0")
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        spacing = np.diff(recording.t)
+        gaps = np.flatnonzero((spacing > self.longest) | (spacing < 0)) + 1
+        edges = [0, *gaps.tolist(), len(recording)]
+        parts = [recording.rows(slice(a, b)) for a, b in itertools.pairwise(edges)]
+        whole = [part for part in parts if len(part) > 1]
+        where = ", ".join(f"{recording.t[k - 1]:.6g} s" for k in gaps[:5])
+        more = " ..." if len(gaps) > 5 else ""
+        text = f"{len(gaps)} gaps" + (f", after {where}{more}" if len(gaps) else "")
+        if len(whole) < len(parts):
+            text += f"; dropped {len(parts) - len(whole)} stretches of a single row"
+        return whole, text
+
+
+@dataclass(frozen=True)
+class Resample(Step):
+    """A uniform clock t_k = t_0 + k / rate, the signals linear between the rows of the log.
+
+    Args:
+        rate: samples per second, Hz.
+        max_gap: longest time between two rows that is interpolated, s.
+    """
+
+    rate: float
+    max_gap: float
+
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and self.max_gap > 0):
+            raise LogError(
+                f"Resample: rate is {self.rate} Hz and max_gap {self.max_gap} s, expected more "
+                "than 0"
+            )
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        t = recording.t
+        if len(t) < 2 or not (np.diff(t) > 0).all():
+            raise LogError(
+                f"{recording.place}: Resample needs at least two rows, in times that increase: put "
+                "Deduplicate or SplitGaps before it"
+            )
+        spacing = np.diff(t)
+        widest = int(spacing.argmax())
+        if spacing[widest] > self.max_gap:
+            raise LogError(
+                f"{recording.place}: Resample found a gap of {spacing[widest]:.4g} s after t = "
+                f"{t[widest]:.6g} s, longer than max_gap, {self.max_gap} s: put SplitGaps before "
+                "it, or raise max_gap"
+            )
+        # The last sample may round to just beyond the end.
+        count = int(np.floor((t[-1] - t[0]) * self.rate + 1e-6)) + 1
+        clock = t[0] + np.arange(count) / self.rate
+
+        def at(values: np.ndarray) -> np.ndarray:
+            return np.column_stack([np.interp(clock, t, column) for column in values.T])
+
+        v = None if recording.v is None else at(recording.v)
+        resampled = Recording(recording.run, clock, at(recording.q), v, at(recording.u))
+        text = (
+            f"{len(t)} rows, {1e3 * spacing.min():.3g} to {1e3 * spacing.max():.3g} ms apart, to "
+            f"{count} samples at {self.rate:g} Hz"
+        )
+        return [resampled], text

@@ -1,0 +1,109 @@
+"""Which columns hold a signal, and how their numbers become SI."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.units import to_si
+
+_KEYS = ("columns", "unit", "sign", "scale", "offset")
+
+
+class Columns:
+    """The columns of one signal.
+
+        x = sign * scale * factor(unit) * (raw - offset)
+
+    with the offset in the unit of the file. All but ``columns`` is one value, or one per column.
+
+    Args:
+        columns: names of the columns in the file.
+        unit: unit in the file, see :data:`~pinn_dyn.data.logs.UNITS`.
+        sign: 1 or -1.
+        scale: factor beside that of the unit, such as a gear ratio.
+        offset: what the file shows at zero.
+
+    Raises:
+        LogError: on an empty or repeated column, an unknown unit, or lengths that differ.
+    """
+
+    def __init__(
+        self,
+        columns: str | Sequence[str],
+        *,
+        unit: str | Sequence[str],
+        sign: float | Sequence[float] = 1,
+        scale: float | Sequence[float] = 1.0,
+        offset: float | Sequence[float] = 0.0,
+    ):
+        self.columns = [columns] if isinstance(columns, str) else [str(name) for name in columns]
+        if not self.columns:
+            raise LogError("columns is empty: expected at least one name")
+        repeated = sorted({name for name in self.columns if self.columns.count(name) > 1})
+        if repeated:
+            raise LogError(f"columns names {', '.join(repeated)} twice: expected each once")
+        self.file_units = self._each("unit", unit)
+        si = [to_si(name) for name in self.file_units]
+        self.units = [name for name, _ in si]
+        signs = np.array(self._each("sign", sign), dtype=float)
+        if not np.isin(signs, (-1, 1)).all():
+            raise LogError(f"sign is {sign}, expected 1 or -1 (a factor belongs in scale)")
+        scales = np.array(self._each("scale", scale), dtype=float)
+        if not np.isfinite(scales).all() or (scales == 0).any():
+            raise LogError(f"scale is {scale}, expected numbers that are not 0")
+        self.factors = signs * scales * np.array([factor for _, factor in si])
+        self.offsets = np.array(self._each("offset", offset), dtype=float)
+        if not np.isfinite(self.offsets).all():
+            raise LogError(f"offset is {offset}, expected finite numbers")
+
+    @classmethod
+    def from_config(cls, name: str, given: Columns | Mapping[str, Any]) -> Columns:
+        """Columns from the short form of a config, ``{columns: [q1, q2], unit: rad}``.
+
+        Raises:
+            LogError: naming the signal and the key that is missing or misspelt.
+        """
+        if isinstance(given, Columns):
+            return given
+        if not isinstance(given, Mapping):
+            raise LogError(f"{name} is {given!r}, expected {{columns: [...], unit: ...}}")
+        for key in given:
+            if key not in _KEYS:
+                close = difflib.get_close_matches(str(key), _KEYS, n=1)
+                hint = f": did you mean {close[0]!r}?" if close else ""
+                raise LogError(f"{name} has the key {key!r}, expected {', '.join(_KEYS)}{hint}")
+        for key in ("columns", "unit"):
+            if given.get(key) is None:
+                raise LogError(f"{name}.{key} is missing: expected {{columns: [...], unit: ...}}")
+        try:
+            return cls(**given)
+        except LogError as error:
+            raise LogError(f"{name}: {error}") from error
+
+    @property
+    def labels(self) -> list[str]:
+        """Name and SI unit of each column, as in ``q1 [rad]``."""
+        return [
+            name if unit == "1" else f"{name} [{unit}]"
+            for name, unit in zip(self.columns, self.units, strict=True)
+        ]
+
+    def to_si(self, raw: np.ndarray) -> np.ndarray:
+        """Raw columns ``(T, K)`` in SI units."""
+        return (raw - self.offsets) * self.factors
+
+    def _each(self, name: str, value: Any) -> list[Any]:
+        """One value per column."""
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            if len(value) != len(self.columns):
+                raise LogError(
+                    f"{name} has {len(value)} entries, expected one, or one for each of the "
+                    f"{len(self.columns)} columns"
+                )
+            return list(value)
+        return [value] * len(self.columns)

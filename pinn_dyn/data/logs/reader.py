@@ -1,0 +1,158 @@
+"""Reads the columns of log files: CSV, and MATLAB through SciPy."""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.io import loadmat
+
+from pinn_dyn.data.logs.errors import LogError
+
+
+def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
+    """The files of names or glob patterns in a folder, in order of their names.
+
+    Raises:
+        LogError: if the folder does not exist, or a pattern finds nothing there.
+    """
+    folder = Path(root).expanduser()
+    if not folder.is_dir():
+        raise LogError(f"root is {str(folder.absolute())!r}, which is no folder")
+    found: set[Path] = set()
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        if Path(pattern).is_absolute():
+            raise LogError(f"files has {pattern!r}, expected paths from the folder root")
+        matches = [path for path in folder.glob(pattern) if path.is_file()]
+        if not matches:
+            raise LogError(f"files: nothing matches {pattern!r} in the folder {folder.absolute()}")
+        found.update(matches)
+    return sorted(found)
+
+
+def read_table(path: Path, time: str) -> pd.DataFrame:
+    """All columns of a file; the index is the line in the file (the row, in a ``.mat`` file).
+
+    Raises:
+        LogError: if the file cannot be read or is empty.
+    """
+    return _read_mat(path, time) if path.suffix == ".mat" else _read_csv(path)
+
+
+def numbers(table: pd.DataFrame, path: Path, columns: Sequence[str], signal: str) -> np.ndarray:
+    """Columns as finite numbers, ``(T, K)``.
+
+    Raises:
+        LogError: on a missing, non-numeric or NaN column; names the closest column, or the line.
+    """
+    return np.column_stack([_number(table, path, name, signal) for name in columns])
+
+
+def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series:
+    """One column as it is.
+
+    Raises:
+        LogError: if there is none; names the closest one.
+    """
+    if name not in table.columns:
+        names = [str(known) for known in table.columns]
+        close = difflib.get_close_matches(name, names, n=1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        raise LogError(
+            f"{path}: no column {name!r}, which {signal} asks for: {hint}"
+            f"the file has {', '.join(names)}"
+        )
+    return table[name]
+
+
+def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarray:
+    raw = column(table, path, name, signal)
+    values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        k = int(bad.argmax())
+        what = "is empty or NaN" if pd.isna(raw.iloc[k]) else f"is {str(raw.iloc[k])!r}"
+        raise LogError(
+            f"{path}, line {table.index[k]}, column {name!r} ({signal}): the value {what}, "
+            f"expected a number ({int(bad.sum())} such rows in this column): repair or remove "
+            "these rows"
+        )
+    return values
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            header = file.readline()
+        separator = max(",;\t", key=header.count)
+        with warnings.catch_warnings():
+            # Pandas would cut rows that are longer than the header, and only warn.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            table = pd.read_csv(
+                path,
+                sep=separator,
+                encoding="utf-8-sig",
+                skipinitialspace=True,
+                skip_blank_lines=False,
+                low_memory=False,
+                index_col=False,
+            )
+    except (
+        pd.errors.ParserError,
+        pd.errors.ParserWarning,
+        pd.errors.EmptyDataError,
+        UnicodeDecodeError,
+    ) as error:
+        raise LogError(f"{path}: cannot be read as CSV with a header line: {error}") from error
+    table.columns = [str(name).strip() for name in table.columns]
+    table.index = pd.RangeIndex(2, len(table) + 2)
+    # Blank lines are counted, so that lines keep their numbers, but at the end they do no harm.
+    filled = np.flatnonzero(table.notna().any(axis=1))
+    if not len(filled):
+        raise LogError(f"{path}: has no rows, expected a header line and rows of numbers")
+    return table.iloc[: filled[-1] + 1]
+
+
+def _read_mat(path: Path, time: str) -> pd.DataFrame:
+    try:
+        content = loadmat(path, squeeze_me=False, struct_as_record=True)
+    except NotImplementedError as error:
+        raise LogError(
+            f"{path}: is a MATLAB 7.3 file, which SciPy cannot read: save it with '-v7'"
+        ) from error
+    except (ValueError, TypeError, OSError) as error:
+        raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
+    arrays: dict[str, np.ndarray] = {}
+    for name, value in content.items():
+        if not name.startswith("__"):
+            _flatten(name, value, arrays)
+    if time not in arrays:
+        names = ", ".join(f"{name} {value.shape}" for name, value in arrays.items())
+        close = difflib.get_close_matches(time, arrays, n=1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        raise LogError(f"{path}: no variable {time!r} for the time: {hint}the file has {names}")
+    samples = arrays[time].size
+    columns: dict[str, np.ndarray] = {}
+    for name, value in arrays.items():
+        rows = value if value.shape[0] == samples else value.T
+        if rows.shape[0] != samples:
+            continue  # parameters and the like
+        if rows.shape[1] == 1:
+            columns[name] = rows[:, 0]
+        else:
+            columns |= {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
+    return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+
+
+def _flatten(name: str, value: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
+    """Numeric matrices of a variable and of the fields of its structs, as ``log.q``."""
+    if value.dtype.names:
+        for field in value.dtype.names:
+            if value.size == 1:
+                _flatten(f"{name}.{field}", value.flat[0][field], arrays)
+    elif value.ndim == 2 and value.dtype.kind in "fiub":
+        arrays[name] = value

@@ -1,0 +1,219 @@
+"""Steps that repair what sensors and drives do to the signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.step import Step, change, check_signals, sample_time
+
+
+@dataclass(frozen=True)
+class RemoveJumps(Step):
+    """Replaces samples far from the median of their neighbours, such as jumps of a marker.
+
+    A sample is bad where |x_k - median(x_{k-h}, ..., x_{k+h})| > threshold, h = (window - 1)/2. It
+    takes the value of the straight line between the good samples around it, and the report says
+    when and how far it was off. A jump that lasts longer than h samples is not found, and the first
+    and last h samples are not judged, as a one-sided median lags behind a motion.
+
+    Args:
+        threshold: largest distance from the median that is no jump, SI units; one value, or one
+            per column.
+        window: number of samples, odd.
+        signals: which of q, v and u.
+    """
+
+    threshold: float | Sequence[float]
+    window: int = 25
+    signals: Sequence[str] = ("q",)
+
+    def __post_init__(self) -> None:
+        check_signals(self.signals)
+        if self.window < 3 or self.window % 2 == 0 or not np.all(np.asarray(self.threshold) > 0):
+            raise LogError(
+                f"RemoveJumps: threshold is {self.threshold} and window {self.window}, expected a "
+                "threshold above 0 and an odd window of at least 3"
+            )
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        found: list[str] = []
+
+        def repair(x: np.ndarray) -> np.ndarray:
+            if np.ndim(self.threshold) and len(np.atleast_1d(self.threshold)) != x.shape[1]:
+                raise LogError(
+                    f"RemoveJumps: threshold has {np.size(self.threshold)} entries, expected one, "
+                    f"or one for each of {x.shape[1]} columns"
+                )
+            frame = pd.DataFrame(x)
+            median = frame.rolling(self.window, center=True).median()
+            off = (frame - median).abs()
+            bad = off > np.asarray(self.threshold)
+            rows = np.flatnonzero(bad.any(axis=1))
+            found.extend(f"{recording.t[k]:.6g} s ({off.iloc[k].max():.2g})" for k in rows)
+            good = frame.mask(bad)
+            if good.isna().all().any():
+                raise LogError(f"{recording.place}: RemoveJumps found no good sample in a column")
+            return good.interpolate(limit_direction="both").to_numpy()
+
+        repaired = change(recording, self.signals, repair)
+        if not found:
+            return [repaired], "no jumps"
+        more = " ..." if len(found) > 20 else ""
+        text = f"{len(found)} samples replaced, at (off by): {', '.join(found[:20])}{more}"
+        return [repaired], text
+
+
+@dataclass(frozen=True)
+class InterpolateHeld(Step):
+    """Straight lines between updates of a sensor that is read more slowly than the log is written.
+
+    A value that repeats the one before is stale, up to ``longest`` repeats in a row; a longer
+    stand-still is kept as it is. Each column is treated alone.
+
+    Args:
+        longest: the most repeats in a row that are taken for stale values.
+        signals: which of q, v and u.
+    """
+
+    longest: int
+    signals: Sequence[str] = ("u",)
+
+    def __post_init__(self) -> None:
+        check_signals(self.signals)
+        if self.longest < 1:
+            raise LogError(f"InterpolateHeld: longest is {self.longest}, expected at least 1")
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        shares: list[float] = []
+
+        def draw(x: np.ndarray) -> np.ndarray:
+            columns = []
+            for column in x.T:
+                held = np.r_[False, column[1:] == column[:-1]]
+                edges = np.flatnonzero(np.diff(np.r_[False, held, False])).reshape(-1, 2)
+                for first, end in edges:
+                    # At the end of the log no update follows that a line could lead to.
+                    if end - first > self.longest or end == len(column):
+                        held[first:end] = False
+                shares.append(float(held.mean()))
+                columns.append(np.interp(recording.t, recording.t[~held], column[~held]))
+            return np.column_stack(columns)
+
+        drawn = change(recording, self.signals, draw)
+        text = (
+            f"{100 * min(shares):.0f} to {100 * max(shares):.0f} % of the values of "
+            f"{', '.join(self.signals)} were held and are interpolated"
+        )
+        return [drawn], text
+
+
+@dataclass(frozen=True)
+class SubtractStart(Step):
+    """q minus its mean over the first ``samples`` samples, for sensors that drift between runs.
+
+    Right only where every run starts at rest in the same pose.
+
+    Args:
+        samples: number of samples at rest.
+    """
+
+    samples: int
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise LogError(f"SubtractStart: samples is {self.samples}, expected at least 1")
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        start = recording.q[: self.samples].mean(axis=0)
+        shown = ", ".join(f"{value:.4g}" for value in start)
+        return [replace(recording, q=recording.q - start)], f"subtracted ({shown}) from q"
+
+
+@dataclass(frozen=True)
+class InputDelay(Step):
+    """Shifts the input to where it acts: u(t) becomes u(t - d), on a uniform clock.
+
+    A delay that is not given is the lag at which the input explains q best on the training runs:
+    the largest squared correlation of q(t) with the best affine function of u(t - d), averaged over
+    the coordinates. With one input and one coordinate that is the peak of the cross-correlation. It
+    suits inputs that q follows, such as motor angles of a tendon drive; the lag of the robot itself
+    is in it.
+
+    Args:
+        delay: d, s, rounded to whole samples; None estimates it.
+        longest: longest delay that is tried, s.
+    """
+
+    delay: float | None = None
+    longest: float = 0.5
+
+    def __post_init__(self) -> None:
+        if (self.delay is not None and self.delay < 0) or not self.longest > 0:
+            raise LogError(
+                f"InputDelay: delay is {self.delay} s and longest {self.longest} s, expected 0 or "
+                "more, and more than 0"
+            )
+
+    def fit(self, training: list[Recording]) -> Step:
+        if self.delay is not None:
+            return self
+        step = sample_time(training[0], "InputDelay")
+        most = round(self.longest / step)
+        long = [recording for recording in training if len(recording) > 2 * most]
+        if not long:
+            raise LogError(
+                f"InputDelay: no training run is longer than twice {self.longest} s, the longest "
+                "delay to be tried: lower longest, or give delay"
+            )
+        scores = [self._explained(long, lag, most) for lag in range(most + 1)]
+        return _EstimatedDelay(int(np.argmax(scores)) * step, self.longest, max(scores), scores[0])
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        assert self.delay is not None
+        step = sample_time(recording, "InputDelay")
+        lag = round(self.delay / step)
+        if len(recording) - lag < 2:
+            raise LogError(
+                f"{recording.place}: shorter than the input delay, {self.delay:.4g} s: drop the run"
+            )
+        later = recording.rows(slice(lag, None))
+        shifted = replace(later, u=recording.u[: len(recording) - lag])
+        return [shifted], f"u delayed by {lag} samples ({lag * step:.4g} s), {self._origin()}"
+
+    def _origin(self) -> str:
+        return "as given"
+
+    @staticmethod
+    def _explained(recordings: list[Recording], lag: int, most: int) -> float:
+        """Mean squared multiple correlation of q(t) with u(t - lag)."""
+        # Every lag is judged on the same samples of q.
+        q = np.vstack([item.q[most:] - item.q[most:].mean(0) for item in recordings])
+        u = np.vstack([item.u[most - lag : len(item) - lag] for item in recordings])
+        affine = np.column_stack([u, np.ones(len(u))])
+        rest = q - affine @ np.linalg.lstsq(affine, q, rcond=None)[0]
+        spread = q.var(axis=0)
+        moving = spread > 0
+        return float((1 - rest.var(axis=0)[moving] / spread[moving]).mean()) if moving.any() else 0
+
+
+@dataclass(frozen=True)
+class _EstimatedDelay(InputDelay):
+    """A delay that was estimated, with how well the input explains q with and without it."""
+
+    explained: float = 0.0
+    explained_before: float = 0.0
+
+    def _origin(self) -> str:
+        text = (
+            f"estimated on the training runs: u explains {100 * self.explained:.1f} % of q, "
+            f"without it {100 * self.explained_before:.1f} %"
+        )
+        if self.delay is not None and self.delay >= self.longest - 1e-9:
+            text += "; this is the longest that was tried, so raise longest"
+        return text

@@ -1,0 +1,332 @@
+"""Logs of a robot as a data source: read, checked, split, cleaned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pinn_dyn.data.logs.checks import (
+    check_angles,
+    check_clock,
+    check_force_signs,
+    check_inputs,
+    check_second_clock,
+    check_velocities,
+)
+from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
+from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table
+from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.splits import Part, split
+from pinn_dyn.data.logs.step import Step, sample_time
+from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.mechanics import Interpolation, Trajectory
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """A stretch of a run before and after the cleaning, for a figure.
+
+    Attributes:
+        split: train, validation or test.
+        raw: the stretch as it was read, in SI units.
+        clean: what the steps made of it, on the same clock.
+    """
+
+    split: str
+    raw: Recording
+    clean: list[Recording]
+
+
+class LogSource(DataSource):
+    """Trajectories from CSV or MATLAB logs.
+
+    Runs are split, or cut with a guard, before the steps: no filter sees both sides of a border.
+    Then the steps are applied in order, validation and test are cut into pieces of one length, and
+    every trajectory starts at t = 0. A missing velocity that no step derives is derived by
+    :class:`SavitzkyGolayVelocity` at its defaults.
+
+    Args:
+        name: short name, for tables and titles.
+        root: folder of the files.
+        files: names or glob patterns in that folder.
+        time: column of the time; a second column is a clock that must agree with the first.
+        q: columns of the configuration, N.
+        u: columns of the input, M.
+        v: columns of the velocity, N, or None.
+        trajectory: column that tells the runs of a file apart, or None where a file is one run.
+        steps: names and steps of the cleaning, in order; None entries are left out.
+        validation, test: whole runs, ``{runs: 2, piece: 5.0}``, or the ends of runs,
+            ``{seconds: 3.0, piece: 3.0}``; pieces in s.
+        guard: time left out between training, validation and test of one run, s.
+        shortest: training stretches shorter than this are dropped, s; at least one window.
+        seed: draws the runs where their number is given.
+        interpolation: how the input moves between samples.
+        labels, input_labels: name and unit of each coordinate and input; None takes the columns.
+        configurations: named configurations for learned terms.
+
+    Raises:
+        LogError: on a description that cannot be right; of the files, by :meth:`load`.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        root: str,
+        files: str | Sequence[str],
+        time: Columns | Mapping[str, Any],
+        q: Columns | Mapping[str, Any],
+        u: Columns | Mapping[str, Any],
+        v: Columns | Mapping[str, Any] | None = None,
+        trajectory: str | None = None,
+        steps: Mapping[str, Step | None] | None = None,
+        validation: Part | Mapping[str, Any],
+        test: Part | Mapping[str, Any],
+        guard: float = 0.5,
+        shortest: float = 0.1,
+        seed: int = 0,
+        interpolation: Interpolation = "linear",
+        labels: list[str] | None = None,
+        input_labels: list[str] | None = None,
+        configurations: Mapping[str, list[float]] | None = None,
+    ):
+        self.name = name
+        self.root = root
+        self.files = files
+        self.time = Columns.from_config("time", time)
+        self.q = Columns.from_config("q", q)
+        self.u = Columns.from_config("u", u)
+        self.v = None if v is None else Columns.from_config("v", v)
+        if set(self.time.units) != {"s"}:
+            raise LogError(f"time has the unit {self.time.file_units[0]!r}, expected one of time")
+        if self.v is not None and self.v.units != [f"{unit}/s" for unit in self.q.units]:
+            raise LogError(
+                f"v has the SI units {', '.join(self.v.units)}, expected those of q, "
+                f"{', '.join(self.q.units)}, per second, in the same order"
+            )
+        self.trajectory = trajectory
+        self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
+        self.validation = Part.from_config("validation", validation)
+        self.test = Part.from_config("test", test)
+        if guard < 0 or shortest < 0:
+            raise LogError(f"guard is {guard} and shortest {shortest} s, expected 0 or more")
+        self.guard = guard
+        self.shortest = shortest
+        self.seed = seed
+        self.interpolation = interpolation
+        self.labels = labels or self.q.labels
+        self.input_labels = input_labels or self.u.labels
+        for key, given, columns in (
+            ("labels", self.labels, self.q.columns),
+            ("input_labels", self.input_labels, self.u.columns),
+        ):
+            if len(given) != len(columns):
+                raise LogError(f"{key} has {len(given)} entries, expected {len(columns)}")
+        self.system = None
+        self.configurations = dict(configurations or {})
+        self._loaded: tuple[Splits, Report, list[Cleaned]] | None = None
+
+    def load(self) -> Splits:
+        """The cleaned trajectories.
+
+        Raises:
+            LogError: on a file that cannot be used; names the file, the place and what to do.
+        """
+        return self._load()[0]
+
+    @property
+    def report(self) -> str:
+        """What each step did, and all warnings, as Markdown."""
+        return str(self._load()[1])
+
+    @property
+    def cleaned(self) -> list[Cleaned]:
+        """Every stretch before and after the cleaning: training first, then validation, test."""
+        return self._load()[2]
+
+    def _load(self) -> tuple[Splits, Report, list[Cleaned]]:
+        if self._loaded is None:
+            report = Report(self.name)
+            recordings = self._read(report)
+            check_inputs(recordings, self.u, report)
+            check_angles(recordings, self.q, report)
+            parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
+            cleaned = self._clean(parts, report)
+            step = self._one_sample_time(cleaned)
+            training = [item for part in cleaned if part.split == "train" for item in part.clean]
+            if self.v is not None:
+                check_velocities(training, self.q, self.v, step, report)
+            check_force_signs(training, self.u, step, report)
+            report.add("Splits", "train", _summary(training, step))
+            splits = Splits(
+                train=[self._trajectory(recording, step) for recording in training],
+                validation=self._pieces("validation", self.validation, cleaned, step, report),
+                test=self._pieces("test", self.test, cleaned, step, report),
+            )
+            self._loaded = splits, report, cleaned
+        return self._loaded
+
+    def _read(self, report: Report) -> list[Recording]:
+        paths = find_files(self.root, self.files)
+        recordings = []
+        for path in paths:
+            table = read_table(path, self.time.columns[0])
+            stem = path.relative_to(Path(self.root).expanduser()).with_suffix("").as_posix()
+            groups = [(stem, slice(None))]
+            if self.trajectory is not None:
+                ids = column(table, path, self.trajectory, "trajectory")
+                if ids.isna().any():
+                    raise LogError(
+                        f"{path}, line {table.index[ids.isna()][0]}, column {self.trajectory!r} "
+                        "(trajectory): is empty, expected the name of a run"
+                    )
+                ids = ids.astype(str)
+                prefix = f"{stem}:" if len(paths) > 1 else ""
+                groups = [(f"{prefix}{run}", (ids == run).to_numpy()) for run in ids.unique()]
+            lines = table.index.to_numpy()
+            values = {
+                signal: columns.to_si(numbers(table, path, columns.columns, signal))
+                for signal, columns in (
+                    ("time", self.time),
+                    ("q", self.q),
+                    ("v", self.v),
+                    ("u", self.u),
+                )
+                if columns is not None
+            }
+            for run, rows in groups:
+                t, *others = values["time"][rows].T
+                steps = list(self.steps.values())
+                check_clock(t, lines[rows], path, self.time.columns[0], steps)
+                for name, other in zip(self.time.columns[1:], others, strict=True):
+                    names = (self.time.columns[0], name)
+                    check_second_clock(t, other, lines[rows], path, names)
+                v = values["v"][rows] if "v" in values else None
+                recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
+                report.add(
+                    "Read",
+                    run,
+                    f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}",
+                )
+        return recordings
+
+    def _clean(self, parts: dict[str, list[Recording]], report: Report) -> list[Cleaned]:
+        whole = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
+        cleaned = self._long_enough("splitting", whole, report)
+        for name, step in self.steps.items():
+            fitted = step.fit([x for part in cleaned if part.split == "train" for x in part.clean])
+            cleaned = self._apply(name, fitted, cleaned, report)
+        if any(item.v is None for part in cleaned for item in part.clean):
+            cleaned = self._apply("velocity", SavitzkyGolayVelocity(), cleaned, report)
+        return cleaned
+
+    def _apply(
+        self, name: str, step: Step, cleaned: list[Cleaned], report: Report
+    ) -> list[Cleaned]:
+        result = []
+        for part in cleaned:
+            done = []
+            for recording in part.clean:
+                changed, text = step.apply(recording)
+                report.add(f"{name}: {step}", f"{part.split} {recording.place}", text)
+                done += changed
+            result.append(replace(part, clean=done))
+        return self._long_enough(name, result, report)
+
+    def _long_enough(self, name: str, cleaned: list[Cleaned], report: Report) -> list[Cleaned]:
+        """Without the stretches that a step left too short to be of use."""
+        least = {
+            "train": ("shortest", self.shortest),
+            "validation": ("its piece", self.validation.piece),
+            "test": ("its piece", self.test.piece),
+        }
+        result = []
+        for part in cleaned:
+            key, shortest = least[part.split]
+            kept = []
+            for item in part.clean:
+                # Half a sample: times are rounded.
+                if len(item) > 1 and item.duration >= shortest - 0.5 * (item.t[1] - item.t[0]):
+                    kept.append(item)
+                else:
+                    report.warn(
+                        f"{part.split} {item.place} after {name}: {item.duration:.4g} s, less "
+                        f"than {key}, {shortest:g} s: dropped"
+                    )
+            result.append(replace(part, clean=kept))
+        for split_name, (key, shortest) in least.items():
+            if not any(part.clean for part in result if part.split == split_name):
+                raise LogError(
+                    f"{split_name}: after {name} no stretch is as long as {key}, {shortest:g} s: "
+                    "lower it, or loosen the steps (the warnings name the stretches)"
+                )
+        return result
+
+    def _one_sample_time(self, cleaned: list[Cleaned]) -> float:
+        """The sample time that all stretches share."""
+        every = [item for part in cleaned for item in part.clean]
+        times = [sample_time(item, "a data set") for item in every]
+        shared = float(np.median(times))
+        for item, step in zip(every, times, strict=True):
+            # Rounded times leave the sample time of a short stretch uncertain.
+            if abs(step / shared - 1) > max(1e-3, 0.05 / (len(item) - 1)):
+                raise LogError(
+                    f"{item.place}: its sample time is {step:.9g} s, that of the others "
+                    f"{shared:.9g} s: add a Resample step"
+                )
+        return shared
+
+    def _pieces(
+        self, name: str, part: Part, cleaned: list[Cleaned], step: float, report: Report
+    ) -> list[Trajectory]:
+        """Roll-outs of one length; neighbours share the sample between them."""
+        stretches = [item for one in cleaned if one.split == name for item in one.clean]
+        span = round(part.piece / step)
+        if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
+            raise LogError(
+                f"{name}.piece is {part.piece} s, expected a multiple of the sample time, "
+                f"{step:g} s"
+            )
+        pieces = [
+            item.rows(slice(first, first + span + 1))
+            for item in stretches
+            for first in range(0, len(item) - span, span)
+        ]
+        if not pieces:
+            longest = max(item.duration for item in stretches)
+            raise LogError(
+                f"{name}: no stretch is as long as a piece of {part.piece} s, the longest has "
+                f"{longest:.6g} s: use a shorter piece"
+            )
+        rest = sum(item.duration for item in stretches) - len(pieces) * span * step
+        report.add(
+            "Splits",
+            name,
+            f"{_summary(pieces, step)}, each a roll-out of its own; {max(rest, 0):.4g} s are left "
+            "over and dropped",
+        )
+        return [self._trajectory(piece, step) for piece in pieces]
+
+    def _trajectory(self, recording: Recording, step: float) -> Trajectory:
+        return Trajectory(
+            t=torch.arange(len(recording), dtype=torch.float64) * step,
+            q=torch.from_numpy(np.ascontiguousarray(recording.q)),
+            v=torch.from_numpy(np.ascontiguousarray(recording.v)),
+            u=torch.from_numpy(np.ascontiguousarray(recording.u)),
+            interpolation=self.interpolation,
+        )
+
+
+def _summary(recordings: list[Recording], step: float) -> str:
+    lengths = [recording.duration for recording in recordings]
+    return (
+        f"{len(recordings)} trajectories of {min(lengths):.6g} to {max(lengths):.6g} s, "
+        f"{sum(lengths):.6g} s in all, sample time {step:.6g} s"
+    )

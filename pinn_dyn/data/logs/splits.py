@@ -1,0 +1,156 @@
+"""Which runs, or which end of a run, are for training, validation and test."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import Recording
+
+SPLITS = ("train", "validation", "test")
+_KEYS = ("runs", "seconds", "piece")
+
+
+class Part:
+    """What is kept from training: whole runs, or the last seconds of the others.
+
+    Args:
+        piece: length of the roll-outs that it is cut into, s.
+        runs: number of runs, drawn by the seed, or the names of the runs.
+        seconds: the last so many seconds of every run that is not named elsewhere.
+
+    Raises:
+        LogError: unless just one of ``runs`` and ``seconds`` is given, and all are above 0.
+    """
+
+    def __init__(
+        self,
+        piece: float,
+        *,
+        runs: int | Sequence[str | int] | None = None,
+        seconds: float | None = None,
+    ):
+        if (runs is None) == (seconds is None):
+            raise LogError(
+                f"runs is {runs} and seconds is {seconds}, expected one of them: a number or list "
+                "of whole runs, or the seconds at the end of each run"
+            )
+        self.names = None if runs is None or isinstance(runs, int) else [str(run) for run in runs]
+        self.count = runs if isinstance(runs, int) else len(self.names or [])
+        self.seconds = seconds
+        self.piece = piece
+        if (runs is not None and self.count < 1) or not (seconds is None or seconds > 0):
+            raise LogError(f"runs is {runs} and seconds is {seconds}, expected more than 0")
+        if not piece > 0 or (seconds is not None and piece > seconds):
+            raise LogError(f"piece is {piece} s, expected more than 0 and at most seconds")
+
+    @classmethod
+    def from_config(cls, name: str, given: Part | Mapping[str, Any]) -> Part:
+        """A part from the short form of a config, ``{runs: 2, piece: 5.0}``.
+
+        Raises:
+            LogError: naming the part and the key that is missing or misspelt.
+        """
+        if isinstance(given, Part):
+            return given
+        if not isinstance(given, Mapping) or given.get("piece") is None:
+            raise LogError(
+                f"{name} is {given!r}, expected {{runs: ... or seconds: ..., piece: ...}}"
+            )
+        for key in given:
+            if key not in _KEYS:
+                close = difflib.get_close_matches(str(key), _KEYS, n=1)
+                hint = f": did you mean {close[0]!r}?" if close else ""
+                raise LogError(f"{name} has the key {key!r}, expected {', '.join(_KEYS)}{hint}")
+        try:
+            return cls(**given)
+        except LogError as error:
+            raise LogError(f"{name}: {error}") from error
+
+
+def split(
+    recordings: list[Recording], validation: Part, test: Part, *, guard: float, seed: int
+) -> dict[str, list[Recording]]:
+    """Assign whole runs, and cut the ends of the others, before any filter sees them.
+
+    Along a run that is cut: training, guard, validation, guard, test.
+
+    Raises:
+        LogError: on unknown or doubly used runs, or too few or too short ones.
+    """
+    by_name = {recording.run: recording for recording in recordings}
+    taken: dict[str, str] = {}
+    for name, part in (("validation", validation), ("test", test)):
+        for run in part.names or []:
+            if run not in by_name:
+                close = difflib.get_close_matches(run, by_name, n=1)
+                hint = f"did you mean {close[0]!r}? " if close else ""
+                known = [*by_name][:20]
+                more = " ..." if len(by_name) > 20 else ""
+                raise LogError(
+                    f"{name}.runs: there is no run {run!r}: {hint}"
+                    f"the runs are {', '.join(known)}{more}"
+                )
+            if run in taken:
+                raise LogError(f"run {run!r} is in {taken[run]} and in {name}, expected in one")
+            taken[run] = name
+    counted = {
+        name: part.count
+        for name, part in (("test", test), ("validation", validation))
+        if part.names is None and part.seconds is None
+    }
+    free = [run for run in by_name if run not in taken]
+    if sum(counted.values()) >= len(free):
+        wanted = " and ".join(f"{count} for {name}" for name, count in counted.items())
+        raise LogError(
+            f"there are {len(free)} runs to choose from, but {wanted or 'none'} were asked for, "
+            "and one must be left for training: with a single run, split by 'seconds'"
+        )
+    order = np.random.default_rng(seed).permutation(len(free))
+    for name, count in counted.items():
+        taken |= {free[k]: name for k in order[:count]}
+        order = order[count:]
+
+    parts: dict[str, list[Recording]] = {name: [] for name in SPLITS}
+    for recording in recordings:
+        if recording.run in taken:
+            parts[taken[recording.run]].append(recording)
+        else:
+            for name, stretch in _cut(recording, validation, test, guard).items():
+                parts[name].append(stretch)
+    return parts
+
+
+def _cut(recording: Recording, validation: Part, test: Part, guard: float) -> dict[str, Recording]:
+    """Training, validation and test stretches of one run."""
+    if validation.seconds is None and test.seconds is None:
+        return {"train": recording}
+    t = recording.t
+    if not (np.diff(t) >= 0).all():
+        raise LogError(
+            f"{recording.run}: the time goes backwards, so its last seconds cannot be cut off: "
+            "give a trajectory column, or split by 'runs'"
+        )
+    stretches = {}
+    end, last = t[-1], len(t)
+    for name, part in (("test", test), ("validation", validation)):
+        if part.seconds is None:
+            continue
+        # From the row at or before the border, so that the stretch is not a row too short.
+        first = int(np.searchsorted(t, end - part.seconds, side="right")) - 1
+        border = end - part.seconds - guard
+        left = int(np.searchsorted(t, border, side="right")) + 1
+        if first < 0 or left < 2 or border <= t[0]:
+            raise LogError(
+                f"{recording.place}: too short to keep {part.seconds} s for {name} and a guard of "
+                f"{guard} s from training"
+            )
+        stretches[name] = recording.rows(slice(first, last))
+        end, last = border, min(left, first)
+    # The row after the border only completes a stretch that is measured from its end.
+    stretches["train"] = recording.rows(slice(0, max(last - 1, 1)))
+    return stretches

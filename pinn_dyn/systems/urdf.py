@@ -1,0 +1,232 @@
+"""Reads a URDF and prepares it for Bullet: locked joints, no limits, no hidden friction."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+Inertia = Literal["file", "collision"]
+"""Whether inertias are those of the URDF, or those that Bullet computes from collision shapes."""
+
+_TURNING = ("revolute", "continuous")
+
+
+class JointLimits(NamedTuple):
+    """Limits of a revolute joint: rad, rad, rad/s, Nm; 0 where the URDF gives none."""
+
+    low: float
+    high: float
+    speed: float
+    effort: float
+
+
+class Urdf(NamedTuple):
+    """A URDF that Bullet may load.
+
+    Attributes:
+        path: the file it was read from.
+        text: the URDF for Bullet, mesh paths absolute.
+        digest: SHA-256 of the file and of the meshes that its inertias come from.
+        limits: by the name of each joint that moves.
+        moments: by the name of each link, the sum of its principal moments of inertia, kg m^2.
+    """
+
+    path: Path
+    text: str
+    digest: str
+    limits: dict[str, JointLimits]
+    moments: dict[str, float]
+
+
+def read_urdf(path: Path, locked_joints: Sequence[str], inertia: Inertia) -> Urdf:
+    """Read a URDF and change what would make Bullet's motion differ from M, G and C.
+
+    Locked joints become fixed at zero, so their links' masses stay; all others become continuous,
+    as Bullet's joint limits are walls. Visual shapes go, and collision shapes stay only where
+    inertias come from them.
+
+    Raises:
+        ValueError: on text that is no URDF, an unknown locked joint, a joint that moves and is not
+            revolute, no revolute joint, or a moving link without mass, inertia or shape.
+        FileNotFoundError: if a mesh that is needed is missing.
+    """
+    content = path.read_bytes()
+    try:
+        robot = ET.fromstring(content)
+    except ET.ParseError as error:
+        raise ValueError(f"{path} is not valid XML: {error}; expected a URDF file") from error
+    joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
+    if robot.tag != "robot" or not joints:
+        raise ValueError(
+            f"{path} holds <{robot.tag}> with {len(joints)} joints, expected <robot> with at least "
+            "one: is it a URDF?"
+        )
+    for name in locked_joints:
+        if name not in joints:
+            raise ValueError(
+                f"{path} has no joint {name!r} to lock: its joints are {', '.join(joints)}"
+            )
+    moving = {
+        name: joint
+        for name, joint in joints.items()
+        if joint.get("type") != "fixed" and name not in locked_joints
+    }
+    for name, joint in moving.items():
+        if joint.get("type") not in _TURNING:
+            raise ValueError(
+                f"{path}: joint {name!r} is of type {joint.get('type')!r}, but an arm has a fixed "
+                "base and revolute joints: add it to locked_joints, or use another URDF"
+            )
+    if not moving:
+        raise ValueError(
+            f"{path} has no revolute joint that is free (locked: {list(locked_joints)}), expected "
+            "at least one"
+        )
+    limits = {name: _limits(path, name, joint) for name, joint in moving.items()}
+    _check_masses(path, robot, set(moving), inertia)
+    digest = hashlib.sha256(content)
+    for name, joint in joints.items():
+        joint.set("type", "continuous" if name in moving else "fixed")
+    for link in robot.findall("link"):
+        _remove(link, "visual", *(["collision"] if inertia == "file" else []))
+        for mesh in link.iter("mesh"):
+            file = _find_mesh(path, mesh.get("filename", ""))
+            digest.update(file.read_bytes())
+            mesh.set("filename", str(file))
+    moments = {link.get("name", ""): _moments(path, link) for link in robot.findall("link")}
+    return Urdf(path, ET.tostring(robot, encoding="unicode"), digest.hexdigest(), limits, moments)
+
+
+def find_urdf(urdf: str, folder: Path) -> Path:
+    """The file ``urdf``, or the one of that name in ``folder``, the robots that ship with Bullet.
+
+    Raises:
+        FileNotFoundError: saying where it was looked for, and which names are close.
+    """
+    given = Path(urdf).expanduser()
+    for path in (given, folder / given):
+        if path.is_file():
+            return path.resolve()
+    near = [str(path) for path in given.parent.glob("*.urdf")]
+    near += [str(path.relative_to(folder)) for path in folder.rglob("*.urdf")]
+    guesses = difflib.get_close_matches(urdf, near, n=3, cutoff=0.5)
+    hint = f"; did you mean {' or '.join(guesses)}?" if guesses else "; give the path of a URDF"
+    raise FileNotFoundError(
+        f"URDF {urdf!r} not found, neither from {Path.cwd()} nor in {folder}{hint}"
+    )
+
+
+def _limits(path: Path, name: str, joint: ET.Element) -> JointLimits:
+    """A continuous joint may turn without end; what is then explored is one turn."""
+    limit = joint.find("limit")
+    values = {} if limit is None else {key: _number(path, name, limit, key) for key in limit.attrib}
+    low, high = values.get("lower", 0.0), values.get("upper", 0.0)
+    if joint.get("type") == "continuous":
+        low, high = -math.pi, math.pi
+    elif not low < high:
+        raise ValueError(
+            f"{path}: joint {name!r} has limits lower = {low} and upper = {high}, expected lower < "
+            "upper: set them, lock the joint, or make it continuous"
+        )
+    return JointLimits(low, high, values.get("velocity", 0.0), values.get("effort", 0.0))
+
+
+def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Inertia) -> None:
+    """Every body that moves, a link with all that is fixed to it, needs a mass and an inertia."""
+    links = {link.get("name", ""): link for link in robot.findall("link")}
+    joints = robot.findall("joint")
+    starts = {joint.get("name", ""): _end(path, joint, "child", links) for joint in joints}
+    rigid: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.get("name") not in moving:
+            parent = _end(path, joint, "parent", links)
+            rigid.setdefault(parent, []).append(_end(path, joint, "child", links))
+    for joint_name, start in starts.items():
+        if joint_name not in moving:
+            continue
+        body, mass = [start], 0.0
+        for name in body:
+            body += rigid.get(name, [])
+            mass += (own := _mass(path, links[name]))
+            shape = "inertial/inertia" if inertia == "file" else "collision"
+            if own > 0 and links[name].find(shape) is None:
+                raise ValueError(
+                    f"{path}: link {name!r} moves and has no <{shape.split('/')[-1]}>, which "
+                    f"inertia = {inertia!r} needs: add it, or use the other inertia"
+                )
+        if mass == 0:
+            raise ValueError(
+                f"{path}: link {start!r} moves with joint {joint_name!r} and has no mass: expected "
+                "<inertial> with a positive mass, in it or in a link fixed to it"
+            )
+    for link in links.values():
+        # Bullet takes 1 kg for a link without <inertial>; a mere frame weighs nothing.
+        if link.find("inertial") is None:
+            inertial = ET.SubElement(link, "inertial")
+            ET.SubElement(inertial, "mass", value="0")
+            zero = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+            ET.SubElement(inertial, "inertia", zero)
+
+
+def _end(path: Path, joint: ET.Element, end: str, links: dict[str, ET.Element]) -> str:
+    element = joint.find(end)
+    name = "" if element is None else element.get("link", "")
+    if name not in links:
+        raise ValueError(
+            f"{path}: joint {joint.get('name')!r} has the {end} {name!r}, which is no link: "
+            f"expected one of {', '.join(links)}"
+        )
+    return name
+
+
+def _mass(path: Path, link: ET.Element) -> float:
+    mass = link.find("inertial/mass")
+    value = 0.0 if mass is None else _number(path, link.get("name", ""), mass, "value")
+    if value < 0:
+        raise ValueError(
+            f"{path}: link {link.get('name')!r} has mass {value} kg, expected at least 0"
+        )
+    return value
+
+
+def _moments(path: Path, link: ET.Element) -> float:
+    inertia = link.find("inertial/inertia")
+    if inertia is None:
+        return 0.0
+    return sum(_number(path, link.get("name", ""), inertia, key) for key in ("ixx", "iyy", "izz"))
+
+
+def _number(path: Path, owner: str, element: ET.Element, key: str) -> float:
+    text = element.get(key, "")
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(
+            f"{path}: {owner!r} has <{element.tag} {key}={text!r}>, expected a finite number"
+        )
+    return value
+
+
+def _find_mesh(path: Path, filename: str) -> Path:
+    """A mesh path is relative to the URDF or, as package://, to one of the folders above it."""
+    relative = filename.removeprefix("package://").removeprefix("file://")
+    for folder in path.parents:
+        if (folder / relative).is_file():
+            return folder / relative
+    raise FileNotFoundError(
+        f"{path}: mesh {filename!r} not found in {path.parent} or above: put it there, or use "
+        "inertia = 'file', which needs no mesh"
+    )
+
+
+def _remove(parent: ET.Element, *tags: str) -> None:
+    for tag in tags:
+        for element in parent.findall(tag):
+            parent.remove(element)

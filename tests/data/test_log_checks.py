@@ -1,0 +1,157 @@
+"""Bad logs: each is refused or reported with its place and what to do."""
+
+import numpy as np
+import pytest
+
+from pinn_dyn.data.logs import Deduplicate, LogError, Resample, SplitGaps
+from tests.data.logs_files import motion, source, write
+
+
+def refused(folder, table, message, **changes):
+    write(folder, table)
+    with pytest.raises(LogError, match=message):
+        source(folder, **changes).load()
+
+
+def warned(folder, table, **changes):
+    write(folder, table)
+    report = source(folder, **changes).report
+    return report.split("## Warnings\n")[1].split("\n## ")[0].strip()
+
+
+def put(row, column, value):
+    table = motion().astype(object)
+    table.loc[row, column] = value
+    return table
+
+
+def clock(change):
+    table = motion()
+    table["t"] = change(table["t"].to_numpy().copy())
+    return table
+
+
+def repeat(t):
+    t[400] = t[399]
+    return t
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (motion().rename(columns={"q2": "q_2"}), r"run.csv: no column 'q2'.*mean 'q_2'.*has t, q1"),
+        (put(41, "q2", "broken"), r"run.csv, line 43, column 'q2' \(q\): the value is 'broken'"),
+        (
+            put(17, "u1", np.nan),
+            r"line 19, column 'u1' \(u\): the value is empty or NaN.*1 such row",
+        ),
+        (put(17, "v1", np.inf), r"line 19, column 'v1' \(v\): the value is 'inf'"),
+        (
+            clock(lambda t: np.where(t > 3, t - 3, t)),
+            r"line 303.*goes back from 3 to 0.01.*SplitGaps",
+        ),
+        (clock(repeat), r"line 402, column 't': the time 3.99 s repeats.*Deduplicate"),
+        (clock(lambda t: np.where(t > 3, t + 1, t)), r"line 303.*jumps from 3 to 4.01.*SplitGaps"),
+        (clock(lambda t: 1000 * t), r"sample time would be 10 s.*unit of the time wrong \(ms\?\)"),
+        (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
+        (motion().assign(u1=1.0, u2=0.0), r"every input \(u1, u2\) is constant"),
+        (motion()[:0], r"has no rows"),
+        (motion(2.0), r"too short to keep 2.0 s for test"),
+    ],
+    ids=str,
+)
+def test_bad_files_are_refused_with_place_and_cure(tmp_path, table, message):
+    refused(tmp_path, table, message)
+
+
+def test_the_named_step_is_the_cure(tmp_path):
+    write(tmp_path, clock(repeat))
+    steps = {"deduplicate": Deduplicate(), "resample": Resample(rate=100.0, max_gap=0.05)}
+    assert len(source(tmp_path, steps=steps).load().train[0].t) == 601
+    write(tmp_path, clock(lambda t: np.where(t > 3, t + 1, t)))
+    assert len(source(tmp_path, steps={"gaps": SplitGaps(longest=0.05)}).load().train) == 2
+    write(tmp_path, clock(lambda t: t + 0.004 * np.sin(40 * t)))
+    steps = {"resample": Resample(rate=100.0, max_gap=0.05)}
+    assert source(tmp_path, steps=steps).load().train[0].t.diff().std() < 1e-12
+
+
+def test_two_clocks(tmp_path):
+    table = motion()
+    table["t_robot"] = 5.0 + table["t"]
+    both = dict(columns=["t", "t_robot"], unit="s")
+    write(tmp_path, table)
+    assert len(source(tmp_path, time=both).load().train) == 1
+    table["t_robot"] += 0.01 * table["t"]
+    refused(tmp_path, table, r"line 10\d.*clocks 't' and 't_robot' disagree", time=both)
+
+
+def test_an_empty_pattern_names_itself_and_the_folder(tmp_path):
+    with pytest.raises(LogError, match=rf"nothing matches '\*.txt' in the folder {tmp_path}"):
+        source(tmp_path, files="*.txt").load()
+    with pytest.raises(LogError, match="absent', which is no folder"):
+        source(tmp_path / "absent").load()
+
+
+def test_runs_that_do_not_exist_or_do_not_suffice(tmp_path):
+    write(tmp_path, motion())
+    piece = dict(piece=1.0)
+    with pytest.raises(LogError, match=r"no run 'runs': did you mean 'run'"):
+        source(tmp_path, test=dict(runs=["runs"], **piece)).load()
+    with pytest.raises(LogError, match=r"1 runs to choose from.*split by 'seconds'"):
+        source(tmp_path, test=dict(runs=1, **piece)).load()
+    both = dict(runs=["run"], **piece)
+    with pytest.raises(LogError, match=r"'run' is in validation and in test"):
+        source(tmp_path, test=both, validation=both).load()
+    with pytest.raises(LogError, match=r"train: after splitting no stretch.*shortest, 20 s"):
+        source(tmp_path, shortest=20.0).load()
+
+
+def test_rows_longer_than_the_header(tmp_path):
+    text = motion().to_csv(index=False).splitlines()
+    (tmp_path / "run.csv").write_text("\n".join([text[0], *(f"{row},1" for row in text[1:])]))
+    with pytest.raises(LogError, match=r"run.csv: cannot be read as CSV"):
+        source(tmp_path).load()
+
+
+def test_a_good_log_has_no_warning(tmp_path, caplog):
+    assert warned(tmp_path, motion()) == "- none"
+    assert not caplog.records
+
+
+def test_warnings_are_logged_once(tmp_path, caplog):
+    write(tmp_path, motion().assign(u2=0.0))
+    log = source(tmp_path)
+    log.load()
+    assert "input 'u2' is constant" in log.report
+    assert [record.getMessage() for record in caplog.records] == [
+        "oscillator: input 'u2' is constant in all runs: its column of A cannot be learned"
+    ]
+
+
+def test_angles_in_degrees(tmp_path):
+    table = motion()
+    table[["q2", "v2"]] = np.degrees(table[["q2", "v2"]])
+    text = warned(tmp_path, table)
+    assert text.startswith("- run, column 'q2': ")
+    assert "is it in degrees? Its unit is given as 'rad'" in text
+    assert "derivative" not in text
+
+
+@pytest.mark.parametrize(("factor", "said"), [(180 / np.pi, 0.01745), (-1.0, -1.0), (0.5, 2.0)])
+def test_velocity_that_disagrees_by_a_factor(tmp_path, factor, said):
+    text = warned(tmp_path, motion().assign(v2=factor * motion()["v2"]))
+    assert text.startswith("- columns 'q2' and 'v2': the derivative of q is ")
+    measured = float(text.split("derivative of q is ")[1].split(" ")[0])
+    assert measured == pytest.approx(said, rel=1e-2)
+    assert ("degrees" in text) == (factor > 50)
+
+
+def test_a_reversed_torque(tmp_path):
+    table = motion()
+    rng = np.random.default_rng(0)
+    # A force that the position does not explain, with the motion that follows from it.
+    force = np.interp(table["t"], np.arange(0, 11, 0.25), rng.normal(size=44))
+    v = np.cumsum(force) * 0.01
+    table["v1"], table["q1"], table["u1"] = v, np.cumsum(v) * 0.01, force
+    assert warned(tmp_path, table) == "- none"
+    assert "input 'u1' seems to push backwards" in warned(tmp_path, table.assign(u1=-force))

@@ -1,0 +1,142 @@
+"""The presets: four recorded data sets where they are at hand, and the templates."""
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from pinn_dyn.data import draw_windows, logs
+from pinn_dyn.mechanics import stack
+from tests.data.logs_files import motion, write
+
+ROOT = Path(__file__).resolve().parents[2]
+LOGS = Path(os.environ.get("PINN_DYN_LOGS", ROOT.parent / "shared" / "data"))
+
+needs_logs = pytest.mark.skipif(
+    not LOGS.is_dir(),
+    reason=f"no recorded logs: set PINN_DYN_LOGS to their folder ({LOGS} does not exist)",
+)
+
+
+def preset(name, *overrides):
+    with initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "conf")):
+        config = compose("train", overrides=[f"dataset={name}", *overrides]).dataset
+    return instantiate(OmegaConf.to_container(config, resolve=True), _convert_="all")
+
+
+@needs_logs
+@pytest.mark.parametrize(
+    ("name", "train", "validation", "test", "step", "coordinates", "inputs"),
+    [
+        ("panda_gaz", 1, 1, 1, 0.002, 7, 7),
+        ("double_pendulum", 7, 4, 8, 0.002, 2, 2),
+        ("soft_neck", 103, 6, 12, 0.02, 2, 3),
+        ("trunk", 1, 4, 15, 0.01, 4, 6),
+    ],
+)
+def test_recorded_data_sets(name, train, validation, test, step, coordinates, inputs, monkeypatch):
+    monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))
+    source = preset(name)
+    splits = source.load()
+    assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [
+        train,
+        validation,
+        test,
+    ]
+    windows = draw_windows(splits.train, count=1000, steps=4, stride=1, seed=0)
+    assert windows.t[1] == pytest.approx(step)
+    assert windows.q.shape[1] == coordinates == len(source.labels)
+    assert windows.u.shape[2] == inputs == len(source.input_labels)
+    # v belongs to q: the trapezoidal rule over four steps leaves little of each increment.
+    for item in (stack(splits.validation), stack(splits.test)):
+        dq = item.q[:, 4:] - item.q[:, :-4]
+        weights = torch.tensor([0.5, 1, 1, 1, 0.5], dtype=torch.float64) * step
+        integral = (item.v.unfold(1, 5, 1) * weights).sum(-1)
+        assert (dq - integral).std() < 0.1 * dq.std()
+    assert "## Warnings\n\n- none" in source.report
+
+
+def test_template_in_ten_lines(tmp_path):
+    write(tmp_path, motion())
+    source = preset(
+        "csv_log",
+        f"dataset.root='{tmp_path}'",
+        "dataset.files=run.csv",
+        "dataset.q.columns=[q1,q2]",
+        "dataset.q.unit=rad",
+        "dataset.u.columns=[u1,u2]",
+        "dataset.u.unit=Nm",
+        "dataset.validation.seconds=1.0",
+        "dataset.validation.piece=1.0",
+        "dataset.test.seconds=2.0",
+        "dataset.test.piece=1.0",
+    )
+    splits = source.load()
+    assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [1, 1, 2]
+
+
+@pytest.fixture
+def neck(tmp_path):
+    """A stand-in for the paper's neck: 10 Hz, degrees, four motors, 300 s."""
+    table = motion(300.0, rate=10.0)
+    table["u3"], table["u4"] = -table["u1"], -table["u2"]
+    write(tmp_path, table, "neck.csv")
+    return [f"dataset.root='{tmp_path}'", "dataset.files=neck.csv"]
+
+
+def test_neck_with_its_moving_average(neck):
+    source = preset("neck", *neck)
+    splits = source.load()
+    assert len(splits.test) == 10
+    assert splits.test[0].t[-1] == pytest.approx(5.0)
+    assert splits.train[0].u.shape[1] == 4
+    assert "mean of 50 samples (5 s) of q, v, u" in source.report
+
+
+def test_neck_with_polynomials_instead(neck):
+    fit = "{_target_: pinn_dyn.data.logs.PolynomialFit, degree: 7, segment: 5.0}"
+    source = preset("neck", *neck, "dataset.steps.smooth=null", f"dataset.steps.fit={fit}")
+    splits = source.load()
+    assert {len(item.t) for item in splits.train} == {51}
+    assert "degree 7" in source.report
+    assert "MovingAverage" not in source.report
+
+
+def test_panda_real(tmp_path):
+    table = motion(15.0, rate=500.0)
+    for k in range(1, 8):
+        table[f"q{k}"], table[f"qd{k}"] = table["q1"], table["v1"]
+        table[f"tau{k}"] = table["u1"]
+    write(tmp_path, table, "panda.csv")
+    splits = preset("panda_real", f"dataset.root='{tmp_path}'", "dataset.files=panda.csv").load()
+    assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [1, 1, 2]
+    assert float(splits.train[0].t[1]) == pytest.approx(0.002)
+
+
+def test_the_code_of_the_documentation_runs():
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "csv_logs.md").read_text(), re.S)
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert len(names["splits"].test) == 1
+    assert names["splits"].train[0].q.std() == pytest.approx(0.7, abs=0.1)
+    assert "low-pass of 20 Hz" in names["source"].report
+
+
+def test_the_documentation_names_every_unit_and_step():
+    text = (ROOT / "docs" / "csv_logs.md").read_text()
+    assert [unit for unit in logs.UNITS if f"`{unit}`" not in text] == []
+    steps = [
+        name
+        for name in logs.__all__
+        if name != "Step"
+        and isinstance(getattr(logs, name), type)
+        and issubclass(getattr(logs, name), logs.Step)
+    ]
+    assert len(steps) == 11
+    assert [name for name in steps if f"| `{name}(" not in text] == []

@@ -1,0 +1,257 @@
+"""Logs as a data source: columns, units, splits without leakage, pieces, report."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import torch
+
+from pinn_dyn.data import draw_windows
+from pinn_dyn.data.logs import UNITS, Butterworth, Columns, LogError, SplitGaps
+from pinn_dyn.evaluation.log_figures import cleaning_figure
+from pinn_dyn.mechanics import stack
+from tests.data.logs_files import motion, source, write
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write(tmp_path, motion())
+    return tmp_path
+
+
+def test_a_clean_log_arrives_as_it_is(folder):
+    table, splits = motion(), source(folder).load()
+    (train,) = splits.train
+    assert train.q.dtype == torch.float64
+    assert len(train.t) == 601  # 10 s less 2 + 0.5 + 1 + 0.5 s
+    np.testing.assert_allclose(train.t, table["t"][:601], atol=1e-12)
+    for signal in "qvu":
+        wanted = table[[f"{signal}1", f"{signal}2"]].to_numpy()
+        np.testing.assert_allclose(getattr(train, signal), wanted[:601], atol=1e-11)
+        np.testing.assert_allclose(getattr(splits.test[1], signal), wanted[900:1001], atol=1e-11)
+    assert draw_windows(splits.train, count=50, steps=2, stride=5, seed=0).q.shape == (50, 2)
+    assert stack(splits.validation).q.shape == (2, 51, 2)
+    assert stack(splits.test).t[-1] == pytest.approx(1.0)
+
+
+def test_units_signs_scales_and_offsets(folder):
+    table = motion()
+    table["q1"] = np.degrees(table["q1"]) * -1 + 30
+    table["v1"] = np.degrees(table["v1"]) * -1
+    table["u2"] = 1000 * table["u2"] / 5
+    table["t"] *= 1000
+    write(folder, table)
+    changed = source(
+        folder,
+        time=dict(columns="t", unit="ms"),
+        q=dict(columns=["q1", "q2"], unit=["deg", "rad"], sign=[-1, 1], offset=[30, 0]),
+        v=dict(columns=["v1", "v2"], unit=["deg/s", "rad/s"], sign=[-1, 1]),
+        u=dict(columns=["u1", "u2"], unit=["Nm", "mNm"], scale=[1.0, 5.0]),
+    )
+    (train,) = changed.load().train
+    plain = motion()
+    np.testing.assert_allclose(train.q, plain[["q1", "q2"]][:601], atol=1e-9)
+    np.testing.assert_allclose(train.v, plain[["v1", "v2"]][:601], atol=1e-9)
+    np.testing.assert_allclose(train.u, plain[["u1", "u2"]][:601], atol=1e-9)
+    assert changed.labels == ["q1 [rad]", "q2 [rad]"]
+    assert changed.input_labels == ["u1 [Nm]", "u2 [Nm]"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "value", "si"),
+    [
+        ("rpm", 60.0, 2 * math.pi),
+        ("rev", 0.5, math.pi),
+        ("psi", 14.503773773, 1e5),
+        ("bar", 1.0, 1e5),
+        ("mA", 250.0, 0.25),
+        ("mm", 12.0, 0.012),
+        ("min", 2.0, 120.0),
+    ],
+)
+def test_factors_of_units(unit, value, si):
+    assert UNITS[unit][1] * value == pytest.approx(si)
+
+
+def test_missing_velocity_is_derived(folder):
+    derived = source(folder, v=None)
+    (train,) = derived.load().train
+    np.testing.assert_allclose(train.v, motion()[["v1", "v2"]][:601], atol=2e-3)
+    assert "velocity: SavitzkyGolayVelocity(window=11, order=3)" in derived.report
+
+
+def test_borders_are_cut_before_filters_see_them(folder):
+    """Whatever stands in the test rows and in the guard, training does not change."""
+    steps = {"filter": Butterworth(cutoff=5.0)}
+    before = source(folder, steps=steps).load()
+    table = motion()
+    changed = ["q1", "q2", "v1", "v2", "u1", "u2"]
+    table.loc[752:, changed] = np.random.default_rng(0).normal(size=(249, 6))
+    table.loc[601:649, changed] = 5.0
+    write(folder, table)
+    after = source(folder, steps=steps).load()
+    for name in ("train", "validation"):
+        for one, other in zip(getattr(before, name), getattr(after, name), strict=True):
+            assert torch.equal(one.q, other.q)
+            assert torch.equal(one.v, other.v)
+    assert not torch.equal(before.test[0].q, after.test[0].q)
+
+
+def test_no_row_is_in_two_splits_even_without_a_guard(folder):
+    parts = source(folder, guard=0.0).cleaned
+    times = np.concatenate([part.raw.t for part in parts])
+    assert len(times) == len(np.unique(times))
+    assert [part.split for part in parts] == ["train", "validation", "test"]
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for k in range(8):
+        write(tmp_path, motion(3.0, phase=0.3 * k), f"run_{k}.csv")
+    return tmp_path
+
+
+def names(parts, split):
+    return {part.raw.run for part in parts if part.split == split}
+
+
+def test_whole_runs_are_drawn_by_the_seed(runs):
+    def drawn(seed):
+        return source(
+            runs, validation=dict(runs=1, piece=1.0), test=dict(runs=2, piece=1.0), seed=seed
+        )
+
+    first = drawn(0).cleaned
+    sets = [names(first, split) for split in ("train", "validation", "test")]
+    assert [len(found) for found in sets] == [5, 1, 2]
+    assert len(set.union(*sets)) == 8
+    assert names(drawn(0).cleaned, "test") == sets[2]
+    assert any(names(drawn(seed).cleaned, "test") != sets[2] for seed in (1, 2, 3))
+    splits = drawn(0).load()
+    assert len(splits.test) == 6
+    starts = [tuple(x.q[0].tolist()) for x in splits.train + splits.validation + splits.test]
+    assert len(set(starts)) == len(starts)
+
+
+def test_named_runs_and_the_end_of_the_others(runs):
+    mixed = source(
+        runs, validation=dict(seconds=0.5, piece=0.5), test=dict(runs=["run_3"], piece=2)
+    )
+    parts = mixed.cleaned
+    assert names(parts, "test") == {"run_3"}
+    assert (
+        names(parts, "validation")
+        == names(parts, "train")
+        == {f"run_{k}" for k in range(8)} - {"run_3"}
+    )
+    assert "1 s are left over and dropped" in mixed.report
+
+
+def test_a_column_tells_runs_apart(tmp_path):
+    tables = [motion(2.0, phase=k).assign(id=k) for k in range(4)]
+    write(tmp_path, pd.concat(tables))
+    split = source(
+        tmp_path,
+        trajectory="id",
+        validation=dict(runs=[1], piece=2.0),
+        test=dict(runs=[3], piece=2.0),
+    )
+    splits = split.load()
+    np.testing.assert_allclose(splits.validation[0].q, tables[1][["q1", "q2"]], atol=1e-11)
+    np.testing.assert_allclose(splits.test[0].u, tables[3][["u1", "u2"]], atol=1e-11)
+    assert len(splits.train) == 2
+
+
+def test_matlab_matrices_and_structs(tmp_path):
+    table = motion()
+    log = {"q": table[["q1", "q2"]].to_numpy(), "v": table[["v1", "v2"]].to_numpy().T}
+    content = {"time": table["t"].to_numpy(), "log": log, "u": table[["u1", "u2"]].to_numpy()}
+    scipy.io.savemat(tmp_path / "run.mat", content | {"gain": 3.0})
+    matlab = source(
+        tmp_path,
+        files="run.mat",
+        time=dict(columns="time", unit="s"),
+        q=dict(columns=["log.q_1", "log.q_2"], unit="rad"),
+        v=dict(columns=["log.v_1", "log.v_2"], unit="rad/s"),
+        u=dict(columns=["u_1", "u_2"], unit="Nm"),
+    )
+    (train,) = matlab.load().train
+    for signal in "qvu":
+        wanted = table[[f"{signal}1", f"{signal}2"]].to_numpy()
+        np.testing.assert_allclose(getattr(train, signal), wanted[:601], atol=1e-12)
+
+
+def test_semicolons_and_a_byte_order_mark(tmp_path):
+    text = motion().to_csv(index=False, sep=";", float_format="%.12g")
+    (tmp_path / "run.csv").write_text(text + "\n\n", encoding="utf-8-sig")
+    (train,) = source(tmp_path).load().train
+    np.testing.assert_allclose(train.q, motion()[["q1", "q2"]][:601], atol=1e-11)
+
+
+def test_short_stretches_are_dropped_and_named(folder):
+    table = motion()
+    table.loc[300:, "t"] += 0.4
+    table.loc[305:, "t"] += 0.4
+    write(folder, table)
+    split = source(folder, steps={"gaps": SplitGaps(longest=0.1)})
+    assert [len(item.t) for item in split.load().train] == [300, 296]
+    assert "train run (3.4 to 3.44 s) after gaps: 0.04 s, less than shortest, 0.1 s" in split.report
+    assert "2 gaps, after 2.99 s, 3.44 s" in split.report
+
+
+def test_the_figure_holds_raw_and_cleaned_values(folder):
+    filtered = source(folder, v=None, steps={"filter": Butterworth(cutoff=5.0)})
+    part = filtered.cleaned[0]
+    figure = cleaning_figure(
+        part,
+        title="oscillator",
+        labels=filtered.labels,
+        input_labels=filtered.input_labels,
+        times=(1.0, 2.0),
+    )
+    panels = {ax.get_ylabel(): ax for ax in figure.axes}
+    assert set(panels) == {
+        *filtered.labels,
+        "d/dt q1 [rad/s]",
+        "d/dt q2 [rad/s]",
+        "u1 [Nm]",
+        "u2 [Nm]",
+    }
+    raw, clean = panels["q2 [rad]"].get_lines()
+    np.testing.assert_array_equal(raw.get_ydata(), part.raw.q[100:201, 1])
+    np.testing.assert_array_equal(clean.get_ydata(), part.clean[0].q[100:201, 1])
+    assert len(panels["d/dt q1 [rad/s]"].get_lines()) == 1
+    assert "oscillator: run, train" in figure.get_suptitle()
+    with pytest.raises(ValueError, match="labels has 1 entries, expected 2"):
+        cleaning_figure(part, title="", labels=["q"], input_labels=["u1", "u2"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(q=dict(columns=["q1"], unit="degree")), r"q: unit is 'degree': did you mean 'deg'.*"),
+        (dict(q=dict(columns=["q1"], units="rad")), r"'units'.*did you mean 'unit'"),
+        (dict(q=dict(columns=["q1"])), r"q.unit is missing"),
+        (dict(q=dict(columns=["q1", "q1"], unit="rad")), r"q1 twice"),
+        (dict(q=dict(columns=["q1", "q2"], unit="rad", sign=[1])), r"sign has 1 entries"),
+        (dict(q=dict(columns=["q1", "q2"], unit="rad", sign=2)), r"sign is 2, expected 1 or -1"),
+        (dict(v=dict(columns=["v1", "v2"], unit="m/s")), r"v has the SI units m/s.*per second"),
+        (dict(time=dict(columns="t", unit="m")), r"time has the unit 'm'"),
+        (dict(test=dict(piece=1.0)), r"test: runs is None and seconds is None"),
+        (dict(test=dict(seconds=1.0, runs=1, piece=1.0)), r"expected one of them"),
+        (dict(test=dict(seconds=1.0, piece=2.0)), r"piece is 2.0 s.*at most seconds"),
+        (dict(test=dict(run=1, piece=2.0)), r"'run'.*did you mean 'runs'"),
+        (dict(labels=["a"]), r"labels has 1 entries, expected 2"),
+        (dict(guard=-1.0), r"guard is -1.0"),
+    ],
+)
+def test_wrong_descriptions_are_refused(tmp_path, changes, message):
+    with pytest.raises(LogError, match=message):
+        source(tmp_path, **changes)
+
+
+def test_unknown_units_list_the_known_ones():
+    with pytest.raises(LogError, match=r"rad, mrad, deg.*Nm, mNm.*psi"):
+        Columns("q", unit="furlong")

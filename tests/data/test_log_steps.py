@@ -1,0 +1,251 @@
+"""Each cleaning step against an implementation that shares nothing with it."""
+
+import numpy as np
+import pytest
+import scipy.ndimage
+from scipy.signal import correlate, filtfilt
+
+from pinn_dyn.data.logs import (
+    Butterworth,
+    Deduplicate,
+    InputDelay,
+    InterpolateHeld,
+    LogError,
+    MovingAverage,
+    PolynomialFit,
+    RemoveJumps,
+    Resample,
+    SavitzkyGolayVelocity,
+    SplitGaps,
+    SubtractStart,
+)
+from tests.data.logs_files import RATE, recording
+
+RNG = np.random.default_rng(0)
+NOISE = RNG.normal(size=(300, 2))
+
+
+def only(step, item):
+    parts, text = step.apply(item)
+    assert len(parts) == 1
+    return parts[0], text
+
+
+@pytest.mark.parametrize("window", [1, 4, 5, 50, 1000])
+def test_moving_average_is_matlabs_movmean(window):
+    back, ahead = window // 2, (window - 1) // 2
+    expected = [NOISE[max(k - back, 0) : k + ahead + 1].mean(axis=0) for k in range(len(NOISE))]
+    smooth, _ = only(MovingAverage(window=window), recording(NOISE, v=2 * NOISE))
+    np.testing.assert_allclose(smooth.q, expected, atol=1e-12)
+    np.testing.assert_allclose(smooth.v, 2 * np.array(expected), atol=1e-12)
+
+
+def test_moving_average_of_four_printed_in_the_manual_of_matlab():
+    """``movmean([4 8 6 -1 -2 -3 -1 3 4 5], 3)``, the example of its documentation."""
+    given = [4, 8, 6, -1, -2, -3, -1, 3, 4, 5]
+    printed = [6.0, 6.0, 4.3333, 1.0, -2.0, -2.0, -0.3333, 2.0, 4.0, 4.5]
+    smooth, _ = only(MovingAverage(window=3, signals=["q"]), recording(given))
+    np.testing.assert_allclose(smooth.q[:, 0], printed, atol=1e-4)
+
+
+def test_polynomial_fit_is_that_of_the_normal_equations_and_gives_the_derivative():
+    t = 5000.0 + np.arange(101) / RATE  # far from 0, where powers of t itself would fail
+    q = np.column_stack([np.sin(4 * t), np.cos(3 * t)])
+    parts, text = PolynomialFit(degree=5, segment=0.49).apply(recording(q, t=t))
+    assert [len(part) for part in parts] == [50, 50]
+    assert "last 1 samples" in text
+    for part in parts:
+        rows = slice(*np.searchsorted(t, [part.t[0] - 1e-6, part.t[-1] + 1e-6]))
+        z = (t[rows] - t[rows].mean()) / np.std(t[rows], ddof=1)
+        basis = np.vander(z, 6)
+        weights = np.linalg.solve(basis.T @ basis, basis.T @ q[rows])
+        np.testing.assert_allclose(part.q, basis @ weights, atol=1e-10)
+        # A degree of 5 over half a second is close to the sines themselves.
+        slope = np.column_stack([4 * np.cos(4 * part.t), -3 * np.sin(3 * part.t)])
+        np.testing.assert_allclose(part.v, slope, atol=2e-2)
+
+
+def test_butterworth_is_zero_phase_and_halves_the_amplitude_at_the_cutoff():
+    t = np.arange(4001) / RATE
+    q = np.column_stack([np.sin(2 * np.pi * 5 * t), np.sin(2 * np.pi * 0.5 * t)])
+    smooth, _ = only(Butterworth(cutoff=5.0, signals=["q"]), recording(q))
+    middle = slice(1000, 3000)
+    # Two passes of 1/sqrt(2) each, at no lag; far below the cut-off nothing changes.
+    np.testing.assert_allclose(smooth.q[middle, 0], 0.5 * q[middle, 0], atol=1e-6)
+    np.testing.assert_allclose(smooth.q[middle, 1], q[middle, 1], atol=1e-6)
+
+
+def test_butterworth_agrees_with_its_transfer_function_form():
+    # b and a of the bilinear transform of 1/(s² + √2 s + 1), written out by hand.
+    w = np.tan(np.pi * 10 / RATE)
+    a0 = 1 + np.sqrt(2) * w + w**2
+    b = np.array([1, 2, 1]) * w**2 / a0
+    a = np.array([1, 2 * (w**2 - 1) / a0, (1 - np.sqrt(2) * w + w**2) / a0])
+    smooth, _ = only(Butterworth(cutoff=10.0, order=2, signals=["q"]), recording(NOISE))
+    expected = filtfilt(b, a, NOISE, axis=0, padlen=10)
+    np.testing.assert_allclose(smooth.q, expected, atol=1e-10)
+
+
+def test_savitzky_golay_velocity_is_the_slope_of_local_polynomials():
+    item = recording(NOISE)
+    done, _ = only(SavitzkyGolayVelocity(window=7, order=3), item)
+    for k in (3, 50, 296):
+        near = slice(k - 3, k + 4)
+        for column in range(2):
+            fit = np.polyfit(item.t[near] - item.t[k], NOISE[near, column], 3)
+            assert done.v[k, column] == pytest.approx(fit[-2], rel=1e-8)
+    end = np.polyfit(item.t[-7:] - item.t[-1], NOISE[-7:, 0], 3)
+    assert done.v[-1, 0] == pytest.approx(end[-2], rel=1e-8)
+
+
+def test_resample_draws_straight_lines_on_a_uniform_clock():
+    t = np.cumsum(RNG.uniform(0.5, 1.5, size=400)) / RATE
+    q = np.column_stack([3 * t + 1, np.sin(t)])
+    done, text = only(Resample(rate=200.0, max_gap=0.02), recording(q, t=t))
+    np.testing.assert_allclose(np.diff(done.t), 1 / 200, rtol=1e-9)
+    np.testing.assert_allclose(done.q[:, 0], 3 * done.t + 1, atol=1e-12)
+    assert np.abs(done.q[:, 1] - np.sin(done.t)).max() < 0.015**2 / 8
+    assert t[-1] - done.t[-1] < 1 / 200
+    assert "400 rows" in text
+
+
+def test_resample_refuses_a_gap_and_says_what_to_do():
+    t = np.r_[np.arange(50), 80 + np.arange(50)] / RATE
+    with pytest.raises(LogError, match=r"gap of 0.31 s after t = 0.49 s.*SplitGaps"):
+        Resample(rate=100.0, max_gap=0.1).apply(recording(NOISE[:100], t=t))
+
+
+def test_deduplicate_drops_stale_rows_and_keeps_a_robot_at_rest():
+    fresh = NOISE[:60]
+    stale = np.repeat(fresh, [3 if k == 20 else 10 if k == 40 else 1 for k in range(60)], axis=0)
+    done, text = only(Deduplicate(longest=5), recording(stale, u=stale[:, :1]))
+    expected = np.repeat(fresh, [10 if k == 40 else 1 for k in range(60)], axis=0)
+    np.testing.assert_array_equal(done.q, expected)
+    assert "dropped 2 of 71 rows" in text
+
+
+def test_deduplicate_keeps_the_first_of_equal_times():
+    t = [0.0, 0.01, 0.01, 0.02]
+    done, text = only(Deduplicate(), recording([1, 2, 9, 3], t=t))
+    np.testing.assert_array_equal(done.q[:, 0], [1, 2, 3])
+    assert "1 with the time of the row before" in text
+
+
+def test_split_gaps_splits_at_gaps_and_where_the_time_goes_back():
+    t = np.r_[np.arange(30), 60 + np.arange(20), 10 + np.arange(40)] / RATE
+    parts, text = SplitGaps(longest=0.05).apply(recording(np.arange(90), t=t))
+    assert [part.q[0, 0] for part in parts] == [0, 30, 50]
+    assert [len(part) for part in parts] == [30, 20, 40]
+    assert text.startswith("2 gaps, after 0.29 s, 0.79 s")
+
+
+def test_remove_jumps_replaces_just_the_jumps_and_reports_them():
+    t = np.arange(500) / RATE
+    q = np.column_stack([np.sin(2 * t), np.cos(2 * t)])
+    spoilt = q.copy()
+    spoilt[100:103, 0] += 0.5
+    spoilt[300, 1] -= 0.4
+    done, text = only(RemoveJumps(threshold=0.1, window=15), recording(spoilt))
+    # The bad samples, found with a median filter of another package.
+    median = scipy.ndimage.median_filter(spoilt, size=(15, 1))
+    bad = np.abs(spoilt - median) > 0.1
+    assert bad.sum() == 4
+    np.testing.assert_array_equal(done.q[~bad], spoilt[~bad])
+    np.testing.assert_allclose(done.q, q, atol=2e-3)
+    assert "4 samples replaced" in text
+    assert "3 s (0.39)" in text
+
+
+def test_remove_jumps_leaves_a_clean_log_alone():
+    done, text = only(RemoveJumps(threshold=5.0), recording(NOISE))
+    np.testing.assert_array_equal(done.q, NOISE)
+    assert text == "no jumps"
+
+
+def test_interpolate_held_joins_updates_and_keeps_a_stand_still():
+    slow = np.repeat(np.arange(20.0) ** 2, 5)
+    u = np.r_[slow, np.full(50, 400.0), 410.0]
+    done, text = only(InterpolateHeld(longest=8), recording(np.arange(151), u=u))
+    updates = np.arange(0, 100, 5)
+    for k in range(95):
+        left = updates[k // 5]
+        expected = u[left] + (u[left + 5] - u[left]) * (k - left) / 5
+        assert done.u[k, 0] == pytest.approx(expected)
+    np.testing.assert_array_equal(done.u[100:150, 0], 400.0)
+    assert "53 %" in text
+
+
+def test_subtract_start_starts_at_zero():
+    done, _ = only(SubtractStart(samples=2), recording([3.0, 5.0, 10.0]))
+    np.testing.assert_array_equal(done.q[:, 0], [-1.0, 1.0, 6.0])
+
+
+def test_estimated_delay_is_the_peak_of_the_cross_correlation():
+    u = scipy.ndimage.gaussian_filter1d(RNG.normal(size=2000), 5)
+    q = np.r_[np.zeros(17), 3 * u[:-17]] + 0.02 * RNG.normal(size=2000)
+    item = recording(q, u=u)
+    products = correlate(q - q.mean(), u - u.mean())
+    peak = int(products.argmax()) - (len(u) - 1)
+    assert peak == 17
+    done, text = only(InputDelay(longest=0.5).fit([item]), item)
+    np.testing.assert_array_equal(done.u[:, 0], u[:-peak])
+    np.testing.assert_array_equal(done.q[:, 0], q[peak:])
+    assert "17 samples (0.17 s), estimated" in text
+
+
+def test_delay_is_found_for_a_mixture_of_inputs():
+    u = scipy.ndimage.gaussian_filter1d(RNG.normal(size=(2000, 3)), 5, axis=0)
+    q = np.vstack([np.zeros((9, 2)), (u @ RNG.normal(size=(3, 2)))[:-9]])
+    _, text = only(InputDelay().fit([recording(q, u=u)]), recording(q, u=u))
+    assert "9 samples" in text
+
+
+def test_given_delay_shifts_by_whole_samples():
+    done, text = only(InputDelay(delay=0.021).fit([]), recording(np.arange(10), u=np.arange(10)))
+    np.testing.assert_array_equal(done.q - done.u, 2)
+    assert "as given" in text
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        MovingAverage(),
+        PolynomialFit(degree=2, segment=0.5),
+        Butterworth(cutoff=5.0),
+        SavitzkyGolayVelocity(),
+        InputDelay(delay=0.02),
+    ],
+)
+def test_steps_that_count_samples_refuse_a_jittered_clock(step):
+    t = np.cumsum(RNG.uniform(0.5, 1.5, size=300)) / RATE
+    with pytest.raises(LogError, match=r"uniform clock.*Resample"):
+        step.apply(recording(NOISE, t=t))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: MovingAverage(window=0),
+        lambda: MovingAverage(signals=["x"]),
+        lambda: PolynomialFit(degree=0, segment=1.0),
+        lambda: Butterworth(cutoff=0.0),
+        lambda: Butterworth(cutoff=60.0).apply(recording(NOISE)),
+        lambda: Butterworth(cutoff=1.0).apply(recording(NOISE[:50])),
+        lambda: SavitzkyGolayVelocity(window=10),
+        lambda: SavitzkyGolayVelocity().apply(recording(NOISE, v=NOISE)),
+        lambda: SavitzkyGolayVelocity().apply(recording(NOISE[:9])),
+        lambda: Resample(rate=0.0, max_gap=1.0),
+        lambda: Resample(rate=9.0, max_gap=1.0).apply(recording([1, 2], t=[1.0, 1.0])),
+        lambda: Deduplicate(longest=0),
+        lambda: SplitGaps(longest=0.0),
+        lambda: RemoveJumps(threshold=0.1, window=4),
+        lambda: RemoveJumps(threshold=[0.1] * 3).apply(recording(NOISE)),
+        lambda: InterpolateHeld(longest=0),
+        lambda: SubtractStart(samples=0),
+        lambda: InputDelay(delay=-1.0),
+        lambda: InputDelay(longest=9.0).fit([recording(NOISE)]),
+    ],
+)
+def test_impossible_settings_are_refused(make):
+    with pytest.raises(LogError, match=r"expected|before it|lower longest"):
+        make()

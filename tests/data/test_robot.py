@@ -1,0 +1,349 @@
+"""The recorded data of a PyBullet arm: limits, splits, cache, processes, and bad input."""
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from pinn_dyn.app.config import CONF
+from pinn_dyn.data import (
+    RobotExcitation,
+    RobotSource,
+    SimulationError,
+    TorqueMultiSine,
+    TrackedMultiSine,
+    draw_windows,
+)
+from pinn_dyn.data.cache import load_or_make
+from pinn_dyn.data.robot_excitation import Plan
+from pinn_dyn.evaluation import predict_trajectories
+from pinn_dyn.mechanics import Trajectory, stack
+from pinn_dyn.systems import SoftArm
+
+pytestmark = pytest.mark.panda
+
+TRACKED = {
+    "frequency": [0.05, 0.5],
+    "harmonics": 4,
+    "reach": 0.9,
+    "speed": 0.5,
+    "torque": 0.9,
+    "bandwidth": 10.0,
+}
+TORQUE = {"frequency": [0.1, 1.0], "harmonics": 4, "amplitude": 0.25, "reach": 0.7}
+FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
+SHORT = {"duration": 0.5, "train": 4, "validation": 2, "test": 2, "workers": 1}
+
+
+def build(cache, dataset="panda", **changes):
+    """The data set of conf/dataset with its own excitations, short, built as the app does."""
+    config = OmegaConf.merge(
+        OmegaConf.load(CONF / "dataset" / f"{dataset}.yaml"),
+        {**SHORT, "cache": str(cache)},
+        changes,
+    )
+    config = OmegaConf.to_container(config, resolve=True)
+    return hydra.utils.instantiate(config, _convert_="all")
+
+
+def needs_pybullet():
+    return pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    needs_pybullet()
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def source(cache):
+    return build(cache)
+
+
+@pytest.fixture(scope="module")
+def splits(source):
+    return source.load()
+
+
+def everything(splits):
+    return [*splits.train, *splits.validation, *splits.test]
+
+
+def test_counts_names_and_samples_are_those_asked_for(source, splits):
+    assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [4, 2, 2]
+    assert source.labels[0] == "q1 [rad]"
+    assert source.input_labels[-1] == "τ7 [Nm]"
+    for item in everything(splits):
+        assert item.q.shape == item.v.shape == item.u.shape == (501, 7)
+        assert float(item.t[1]) == pytest.approx(1e-3)
+
+
+def recorded(source, split):
+    """q, v and u as the simulator gave them, from the cache."""
+    arrays = load_or_make(source.cache, source.name, source.describe(), source.simulate)
+    return (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_records_satisfy_the_equation_of_motion_with_the_recorded_torque(source, splits, split):
+    """u is the motor's torque alone: the friction is in D, and is not zero."""
+    assert float(source.system.damping_matrix(torch.zeros(7)).diagonal().min()) > 0
+    q, v, u = recorded(source, split)
+    a = source.system.forward_dynamics(q[:, :-1], v[:, :-1], u[:, :-1])
+    torch.testing.assert_close(v[:, 1:], v[:, :-1] + 1e-3 * a, rtol=0, atol=1e-8)
+    torch.testing.assert_close(q[:, 1:], q[:, :-1] + 1e-3 * v[:, 1:], rtol=0, atol=1e-12)
+
+
+def test_velocities_are_those_at_the_time_of_the_configuration(source, splits):
+    """The true equations, rolled out, stay far closer to the samples than to the record."""
+    centred = stack(splits.test).until(0.4)
+    q, v, u = (x[:, : len(centred.t)] for x in recorded(source, "test"))
+    torch.testing.assert_close(centred.q, q, rtol=0, atol=0)
+    raw = Trajectory(centred.t, q, v, u, interpolation="hold")
+    errors = [
+        predict_trajectories(source.system, item, step=0.01).error().max()
+        for item in (centred, raw)
+    ]
+    assert errors[0] < 0.25 * errors[1]
+
+
+def test_position_velocity_and_torque_limits_hold(source, splits):
+    robot = source.robot
+    for item in everything(splits):
+        q, v, u = (x.numpy() for x in (item.q, item.v, item.u))
+        assert ((q > robot.q_low) & (q < robot.q_high)).all()
+        assert (np.abs(v) <= robot.v_max).all()
+        assert (np.abs(u) <= robot.u_max).all()
+
+
+def test_references_use_the_speed_and_range_allowed(source):
+    """The fraction of the limits is reached by some joint and passed by none."""
+    t = np.arange(10001) * 1e-3
+    peaks, low, high = [], [], []
+    for seed in range(3):
+        plan = TrackedMultiSine(**TRACKED).draw(source.robot, t, np.random.default_rng(seed))
+        q, v, _ = source.robot.simulate(plan.q0, plan.v0, plan.torque, steps=10000, step=1e-3)
+        peaks.append(np.abs(v).max(0) / source.robot.v_max)
+        low.append(q.min(0))
+        high.append(q.max(0))
+    assert np.max(peaks) <= 0.505  # tracked, so not exactly the reference
+    assert np.max(peaks) > 0.49
+    margin = 0.04 * (source.robot.q_high - source.robot.q_low)
+    assert (np.min(low, 0) > source.robot.q_low + margin).all()
+    assert (np.max(high, 0) < source.robot.q_high - margin).all()
+    used = (np.max(high, 0) - np.min(low, 0)) / (source.robot.q_high - source.robot.q_low)
+    assert (used > 0.3).all()
+
+
+def test_a_tight_torque_limit_slows_the_reference_down(source):
+    t = np.arange(2001) * 1e-3
+    fast, slow = (
+        TrackedMultiSine(**{**TRACKED, "frequency": [1, 2], "speed": 1.0, "torque": torque}).draw(
+            source.robot, t, np.random.default_rng(5)
+        )
+        for torque in (1.0, 0.5)
+    )
+    np.testing.assert_array_equal(fast.q0, slow.q0)
+    assert (np.abs(slow.v0) < 0.95 * np.abs(fast.v0)).all()
+    _, _, u = source.robot.simulate(slow.q0, slow.v0, slow.torque, steps=2000, step=1e-3)
+    assert (np.abs(u) <= 0.505 * source.robot.u_max).all()
+
+
+def test_no_two_motions_are_the_same(splits):
+    starts = torch.stack([item.q[0] for item in everything(splits)])
+    assert torch.pdist(starts).min() > 0.1
+
+
+def test_both_kinds_move_every_joint(splits):
+    for item in splits.train:
+        assert (item.v.std(0) > 1e-3).all()
+
+
+def test_more_test_motions_and_more_processes_change_no_other(source, splits, tmp_path):
+    other = build(tmp_path, test=3, workers=2).load()
+    assert len(other.test) == 3
+    for mine, theirs in zip(everything(splits), everything(other), strict=False):
+        assert torch.equal(mine.q, theirs.q)
+        assert torch.equal(mine.u, theirs.u)
+
+
+def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
+    def fail(self):
+        raise AssertionError("recorded again")
+
+    monkeypatch.setattr(RobotSource, "simulate", fail)
+    again = build(cache).load()
+    assert torch.equal(again.test[0].q, splits.test[0].q)
+    assert torch.equal(again.test[0].p, splits.test[0].p)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": 1},
+        {"duration": 0.6},
+        {"step": 0.0005},
+        {"system": {"damping": 0.1}},
+        {"system": {"gravity": [0, 0, 0]}},
+        {"system": {"inertia": "collision"}},
+        {"system": {"locked_joints": [*FINGERS, "panda_joint3"], "damping": 0.5}},
+    ],
+    ids=str,
+)
+def test_what_changes_the_motion_changes_the_key(source, cache, change):
+    assert build(cache, configurations=None, **change).describe() != source.describe()
+
+
+def test_workers_and_names_of_configurations_do_not_change_the_key(source, cache):
+    assert build(cache, workers=3, configurations=None).describe() == source.describe()
+
+
+def test_momenta_are_those_of_the_mass_matrix(source, splits):
+    windows = draw_windows(
+        splits.train, count=50, steps=2, stride=5, seed=0, momentum=splits.momentum
+    )
+    expected = torch.einsum("bij,bj->bi", source.system.mass_matrix(windows.q), windows.v)
+    torch.testing.assert_close(windows.p, expected, rtol=0, atol=1e-12)
+    item = splits.test[0]
+    expected = torch.einsum("bij,bj->bi", source.system.mass_matrix(item.q), item.v)
+    torch.testing.assert_close(item.p, expected, rtol=0, atol=1e-12)
+    assert splits.train[0].p is None
+
+
+def test_any_urdf_by_path(cache):
+    arm = build(
+        cache, "urdf_arm", name="iiwa", system={"urdf": "kuka_iiwa/model.urdf"}, train=2, test=1
+    )
+    assert list(arm.configurations) == ["middle"]
+    q, v, u = recorded(arm, "test")
+    a = arm.system.forward_dynamics(q[:, :-1], v[:, :-1], u[:, :-1])
+    torch.testing.assert_close(v[:, 1:], v[:, :-1] + 1e-3 * a, rtol=0, atol=1e-8)
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"train": 0}, r"panda: train is 0, expected at least 1"),
+        ({"workers": 0}, r"panda: workers is 0"),
+        ({"step": 2.0}, r"panda: step is 2.0 s and duration 0.5 s"),
+        ({"excitations": []}, r"panda: excitations is empty"),
+        ({"configurations": {"short": [0.0]}}, r"configurations.short has 1 entries.* needs 7"),
+        (
+            {"configurations": {"bent": [0, 0, 0, 1.0, 0, 0, 0]}},
+            r"configurations.bent: q of joint 'panda_joint4' is 1 rad at sample 0, expected -3.142",
+        ),
+    ],
+)
+def test_bad_settings_are_refused(cache, changes, message):
+    with pytest.raises(hydra.errors.InstantiationException) as error:
+        build(cache, **changes)
+    with pytest.raises(ValueError, match=message):
+        raise error.value.__cause__
+
+
+def test_a_system_that_is_no_robot_is_refused(cache, source):
+    arguments = {
+        "name": "soft",
+        "excitations": source.excitations,
+        "duration": 1.0,
+        "step": 0.001,
+        "train": 1,
+        "validation": 1,
+        "test": 1,
+        "seed": 0,
+        "workers": 1,
+        "cache": str(cache),
+        "configurations": None,
+    }
+    with pytest.raises(TypeError, match="soft: system is a SoftArm, expected a robot such as Bull"):
+        RobotSource(system=SoftArm(), **arguments)
+
+
+def test_a_urdf_without_torque_limits_is_refused(cache, tmp_path):
+    path = tmp_path / "weak.urdf"
+    path.write_text(
+        """<robot name="weak"><link name="base"/>
+        <link name="rod"><inertial><mass value="1"/>
+          <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+        <joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/>
+          <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="2"/></joint></robot>"""
+    )
+    with pytest.raises(
+        hydra.errors.InstantiationException, match=r"joint 'hinge' has velocity limit 2 .*limit 0 N"
+    ):
+        build(cache, "urdf_arm", system={"urdf": str(path)})
+
+
+@dataclass(frozen=True)
+class Push(RobotExcitation):
+    """Full torque all the time, which no arm survives."""
+
+    def draw(self, robot, t, rng):
+        middle = (robot.q_low + robot.q_high) / 2
+        return Plan(middle, 0 * middle, lambda k, q, v: 1000 * robot.u_max)
+
+
+def test_a_motion_beyond_the_limits_is_given_up_with_its_place(cache):
+    source = build(cache)
+    source.excitations = [*source.excitations, Push()]
+    with pytest.raises(
+        SimulationError, match=r"trajectory 2 of the train split: q of joint .*20 draws: lower"
+    ):
+        source.simulate()
+
+
+def test_torques_are_clipped_to_the_limits(cache):
+    """And recorded as they were applied."""
+    source = build(cache, duration=0.005)
+    source.excitations = [Push()]
+    arrays = source.simulate()
+    np.testing.assert_array_equal(arrays["test_u"][0], np.tile(source.robot.u_max, (7, 1)))
+
+
+def test_a_robot_too_weak_to_hold_itself_is_reported(source):
+    weak = TrackedMultiSine(**{**TRACKED, "torque": 0.1})
+    with pytest.raises(ValueError, match=r"of the torque allowed at joint 'panda_joint6' \(0.1 of"):
+        weak.draw(source.robot, np.arange(101) * 1e-3, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        (TrackedMultiSine, {"reach": 1.2}, r"reach is 1.2, expected more than 0 and at most 1"),
+        (TrackedMultiSine, {"bandwidth": 0.0}, r"bandwidth is 0.0, expected a positive number"),
+        (TrackedMultiSine, {"frequency": [2.0, 1.0]}, r"frequency is \[2.0, 1.0\]"),
+        (TorqueMultiSine, {"amplitude": -1.0}, r"amplitude is -1.0"),
+        (TorqueMultiSine, {"harmonics": 0}, r"harmonics is 0"),
+    ],
+)
+def test_bad_excitations_are_refused(kind, change, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**{**(TRACKED if kind is TrackedMultiSine else TORQUE), **change})
+
+
+def test_everything_else_imports_without_pybullet():
+    """In a process where importing PyBullet fails."""
+    code = (
+        "import sys; sys.modules['pybullet'] = sys.modules['pybullet_data'] = None\n"
+        "import pinn_dyn.app.training, pinn_dyn.data, pinn_dyn.evaluation\n"
+        "from pinn_dyn.systems import BulletArm, SoftArm\n"
+        "SoftArm()\n"
+        "try:\n    BulletArm('franka_panda/panda.urdf')\n"
+        "except ImportError as error:\n    print(error)\n"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert "pip install 'pinn_dyn[panda]'" in done.stdout
