@@ -62,7 +62,10 @@ def evaluate(cfg: DictConfig) -> float:
     torch.set_num_threads(config["threads"])
     runs = [load_run(path, config["checkpoint"]) for path in find_runs(config["runs"])]
     source = build_source(_shared_dataset(runs))
-    truth = stack(source.load().test)
+    try:
+        truth = stack(source.load().test)
+    except ValueError as error:
+        raise ConfigError(f"{source.name}: {error}") from error
     log.info("%d runs on %d test trajectories of %s", len(runs), truth.q.shape[0], source.name)
 
     labels = _labels(runs)

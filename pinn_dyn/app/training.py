@@ -21,6 +21,8 @@ from pinn_dyn.app.build import (
 )
 from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.runs import CHECKPOINTS, METRICS, provenance, read_config, write_config
+from pinn_dyn.data import LogSource
+from pinn_dyn.evaluation import cleaning_figure, save
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +59,8 @@ def train(cfg: DictConfig) -> float:
         statistics = data.statistics
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem
+    if isinstance(data.source, LogSource):
+        _write_report(data.source, folder)
     validator = build_validator(config, statistics.step)
     try:
         data.splits.validation[0].until(validator.horizon)
@@ -105,6 +109,19 @@ def train(cfg: DictConfig) -> float:
         folder,
     )
     return error
+
+
+def _write_report(source: LogSource, folder: Path) -> None:
+    """Write what the cleaning of a log did, and a picture of it."""
+    (folder / "log_report.md").write_text(source.report)
+    figure = cleaning_figure(
+        source.cleaned[0],
+        title=f"{source.name}, raw and cleaned",
+        labels=source.labels,
+        input_labels=source.input_labels,
+    )
+    save(figure, folder / "log_cleaning.png")
+    log.info("what was done to the log is in %s and log_cleaning.png", folder / "log_report.md")
 
 
 def _flat(values: dict, prefix: str = "") -> dict[str, object]:

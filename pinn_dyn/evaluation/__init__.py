@@ -2,6 +2,7 @@
 
 from pinn_dyn.evaluation.figures import error_figure, save, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms, fit_factor
+from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import RolloutMetrics, diverged_trajectories, rollout_metrics
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
 from pinn_dyn.evaluation.tables import (
@@ -20,6 +21,7 @@ __all__ = [
     "RolloutValidator",
     "RunResult",
     "TermComparison",
+    "cleaning_figure",
     "compare_terms",
     "diverged_trajectories",
     "error_figure",
