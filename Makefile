@@ -36,6 +36,7 @@ lint: $(VENV)/.installed-dev  ## check style, types and import order
 bench: $(VENV)/.installed-bench  ## time a training step and the simulation of the data
 	$(BIN)/python benchmarks/training_step.py
 	$(BIN)/python benchmarks/data_generation.py
+	$(BIN)/python benchmarks/data_generation.py --dataset soft_arm_2
 
 clean:  ## remove the environment and the caches, keep the runs
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
