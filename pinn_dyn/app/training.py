@@ -67,6 +67,11 @@ def train(cfg: DictConfig) -> float:
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
     model = build_model(config, statistics)
+    if model.coordinates == "momentum" and data.windows.p.shape[-1] == 0:
+        raise ConfigError(
+            f"model: {config['model_name']} learns from momenta p = M(q) v, and the data set "
+            f"{data.source.name} has none, as they cannot be measured: use model=lnn"
+        )
     learner = build_learner(config, model, statistics, validator)
     trainer = build_trainer(config, folder, data.source, validator)
 

@@ -83,8 +83,8 @@ class Trajectory:
             return torch.cat([self.q, self.v], dim=-1)
         if self.p is None:
             raise ValueError(
-                "this trajectory has no momentum p, which a Hamiltonian model needs: use a data "
-                "set that records it (with_momentum=true), or a Lagrangian model"
+                "this trajectory has no momentum p, which a Hamiltonian model needs: use "
+                "simulated data, which have it, or a Lagrangian model"
             )
         return torch.cat([self.q, self.p], dim=-1)
 

@@ -22,7 +22,10 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        raise LogError(f"root is {str(folder.absolute())!r}, which is no folder")
+        raise LogError(
+            f"root is {str(folder.absolute())!r}, which is no folder: give the folder of the logs "
+            "as dataset.root=..., or set the variable PINN_DYN_LOGS where the data set uses it"
+        )
     found: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         if Path(pattern).is_absolute():
