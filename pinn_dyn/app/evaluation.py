@@ -38,7 +38,14 @@ from pinn_dyn.mechanics import MechanicalSystem, Trajectory, stack
 log = logging.getLogger(__name__)
 
 # Columns of the terminal's table; the files hold all of them.
-_SHOWN = ("error_mean", "error_std", "error_median", "error_worst", "squared_error_mean")
+_SHOWN = (
+    "error_mean",
+    "error_std",
+    "error_median",
+    "error_worst",
+    "diverged",
+    "squared_error_mean",
+)
 
 
 @dataclass(frozen=True)

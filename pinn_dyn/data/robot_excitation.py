@@ -80,8 +80,9 @@ class TrackedMultiSine(RobotExcitation):
         r_i(t) = centre_i + amplitude_i sum_h w_ih sin(2 pi f_ih t + phi_ih),   sum_h w_ih = 1
         u = M(q) (d2r/dt2 + 2 w (dr/dt - v) + w^2 (r - q)) + C v + G + D v,   w = bandwidth
 
-    The robot starts on the reference. References lie within ``reach`` of the joint ranges, each
-    with an amplitude from a third of that to all of it. A joint's frequencies are lowered until
+    The robot starts on the reference. References lie within ``reach`` of the joint ranges; small
+    amplitudes make fast motions, from which inertia is learned, large ones see more of gravity. A
+    joint's frequencies are lowered until
     its peak speed is within ``speed``, all of them together until the torque along the reference
     is within ``torque``.
 
@@ -92,6 +93,7 @@ class TrackedMultiSine(RobotExcitation):
         frequency: [low, high] in Hz; each f_ih is drawn from it, uniform in its logarithm.
         harmonics: number of sines.
         reach: fraction of the joint ranges.
+        amplitude: [low, high] of each joint's amplitude, as a fraction of the reach.
         speed: fraction of the velocity limits.
         torque: fraction of the torque limits.
         bandwidth: of the controller, rad/s.
@@ -104,6 +106,7 @@ class TrackedMultiSine(RobotExcitation):
     frequency: Sequence[float]
     harmonics: int
     reach: float
+    amplitude: Sequence[float]
     speed: float
     torque: float
     bandwidth: float
@@ -112,13 +115,18 @@ class TrackedMultiSine(RobotExcitation):
         MultiSine(offset=[0.0], amplitude=[1.0], frequency=self.frequency, harmonics=self.harmonics)
         for name in ("reach", "speed", "torque"):
             _require(self, name, getattr(self, name), 1.0)
+        if len(self.amplitude) != 2 or not 0 < self.amplitude[0] <= self.amplitude[1] <= 1:
+            raise ValueError(
+                f"TrackedMultiSine: amplitude is {list(self.amplitude)}, expected [low, high] with "
+                "0 < low <= high <= 1"
+            )
         _require(self, "bandwidth", self.bandwidth)
 
     def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
         """Draw a reference and its tracking law."""
         size = len(robot.q_low)
         half = self.reach * (robot.q_high - robot.q_low) / 2
-        amplitude = half * rng.uniform(1 / 3, 1.0, size)
+        amplitude = half * rng.uniform(*self.amplitude, size)
         middle = (robot.q_low + robot.q_high) / 2
         centre = middle + (half - amplitude) * rng.uniform(-1, 1, size)
         shape = (size, self.harmonics)
@@ -174,9 +182,9 @@ class TorqueMultiSine(RobotExcitation):
 
     s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit. The spring k_i is so
     stiff that a constant s_i at its peak would move the joint by ``reach`` of the way from the
-    centre to the nearer limit; c_i damps it critically for the inertia M_ii(centre). The robot
-    starts near the centre, which is drawn from the middle half of the range, with up to a fifth
-    of the velocity limits.
+    centre to the nearer limit; c_i damps it critically for the inertia M_ii(centre). The centre is
+    drawn from the middle half of the range. The robot starts where spring and torque balance, and
+    moves as they do: no jump in the torque, which would dominate a squared loss.
 
     Args:
         frequency: [low, high] in Hz; each sine's is drawn from it, uniform in its logarithm.
@@ -199,7 +207,7 @@ class TorqueMultiSine(RobotExcitation):
             _require(self, name, getattr(self, name), 1.0)
 
     def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
-        """Draw a torque signal, a centre and an initial state near it."""
+        """Draw a torque signal and a centre."""
         size = len(robot.q_low)
         half = (robot.q_high - robot.q_low) / 2
         centre = (robot.q_low + robot.q_high) / 2 + half * rng.uniform(-0.5, 0.5, size)
@@ -215,5 +223,5 @@ class TorqueMultiSine(RobotExcitation):
             gravity = robot.dynamics(q, rest)[1]
             return gravity + stiffness * (centre - q) - friction * v + signal[k]
 
-        q0 = centre + way * rng.uniform(-0.5, 0.5, size)
-        return Plan(q0, 0.2 * robot.v_max * rng.uniform(-1, 1, size), law)
+        balance = centre + signal[:2] / stiffness
+        return Plan(balance[0], (balance[1] - balance[0]) / (t[1] - t[0]), law)

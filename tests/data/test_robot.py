@@ -32,6 +32,7 @@ TRACKED = {
     "frequency": [0.05, 0.5],
     "harmonics": 4,
     "reach": 0.9,
+    "amplitude": [0.33, 1.0],
     "speed": 0.5,
     "torque": 0.9,
     "bandwidth": 10.0,
@@ -297,7 +298,7 @@ def test_a_motion_beyond_the_limits_is_given_up_with_its_place(cache):
     source = build(cache)
     source.excitations = [*source.excitations, Push()]
     with pytest.raises(
-        SimulationError, match=r"trajectory 2 of the train split: q of joint .*20 draws: lower"
+        SimulationError, match=r"trajectory 3 of the train split: q of joint .*20 draws: lower"
     ):
         source.simulate()
 
@@ -319,6 +320,7 @@ def test_a_robot_too_weak_to_hold_itself_is_reported(source):
 @pytest.mark.parametrize(
     ("kind", "change", "message"),
     [
+        (TrackedMultiSine, {"amplitude": [0.5, 0.2]}, r"amplitude is \[0.5, 0.2\], expected"),
         (TrackedMultiSine, {"reach": 1.2}, r"reach is 1.2, expected more than 0 and at most 1"),
         (TrackedMultiSine, {"bandwidth": 0.0}, r"bandwidth is 0.0, expected a positive number"),
         (TrackedMultiSine, {"frequency": [2.0, 1.0]}, r"frequency is \[2.0, 1.0\]"),
