@@ -183,8 +183,8 @@ class TorqueMultiSine(RobotExcitation):
     s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit. The spring k_i is so
     stiff that a constant s_i at its peak would move the joint by ``reach`` of the way from the
     centre to the nearer limit; c_i damps it critically for the inertia M_ii(centre). The centre is
-    drawn from the middle half of the range. The robot starts where spring and torque balance, and
-    moves as they do: no jump in the torque, which would dominate a squared loss.
+    drawn from the middle half of the range. The robot starts at rest where spring and torque
+    balance: a jump in the acceleration would weigh heavily in a squared loss.
 
     Args:
         frequency: [low, high] in Hz; each sine's is drawn from it, uniform in its logarithm.
@@ -223,5 +223,4 @@ class TorqueMultiSine(RobotExcitation):
             gravity = robot.dynamics(q, rest)[1]
             return gravity + stiffness * (centre - q) - friction * v + signal[k]
 
-        balance = centre + signal[:2] / stiffness
-        return Plan(balance[0], (balance[1] - balance[0]) / (t[1] - t[0]), law)
+        return Plan(centre + signal[0] / stiffness, rest, law)

@@ -20,11 +20,10 @@ TINY_DATA = [
     "dataset.validation=2",
     "dataset.test=2",
 ]
-TINY = [
-    *TINY_DATA,
+STRIDE = "data.stride=5"
+TINY_TRAINING = [
     "data.pairs=64",
     "data.batch_size=32",
-    "data.stride=5",
     "data.batches_per_epoch=2",
     "validator.horizon=0.1",
     "validator.step=null",
@@ -32,6 +31,7 @@ TINY = [
     "trainer.check_val_every_n_epoch=1",
     "trainer.enable_progress_bar=false",
 ]
+TINY = [*TINY_DATA, STRIDE, *TINY_TRAINING]
 # Drawing takes longer than the training itself.
 NO_FIGURES = "~callbacks.figures"
 

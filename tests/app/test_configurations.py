@@ -4,10 +4,11 @@ import json
 
 import hydra
 import pytest
-from omegaconf import OmegaConf
 
 from pinn_dyn.app.config import CONF
-from tests.app.entry import NO_FIGURES, TINY, run_script, train
+from tests.app.entry import NO_FIGURES, ROOT, STRIDE, TINY_DATA, TINY_TRAINING, run_script, train
+from tests.app.hardware_logs import write_neck, write_panda
+from tests.data.test_log_presets import LOGS, needs_logs
 
 MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
 EXPERIMENTS = sorted(
@@ -39,17 +40,56 @@ def assert_trained(folder, steps=2):
     assert 0 < record["validation"]["val/error_mean"] < 10
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_trains(tmp_path, experiment):
+def of_arm_1(folder):
+    return [*TINY_DATA, STRIDE]
+
+
+def of_arm_2(folder):
+    short = ["dataset.test_duration=0.2", "dataset.keep_every=1", "dataset.compile=false"]
+    return [*TINY_DATA, STRIDE, *short]
+
+
+def of_panda(folder):
+    pytest.importorskip("pybullet", reason="the Panda is simulated by PyBullet: pinn_dyn[panda]")
+    counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1", "dataset.workers=1"]
+    return ["dataset.duration=0.2", *counts, STRIDE]
+
+
+def of_logs(folder):
+    return []
+
+
+# How to make each data set small, or to write a stand-in for it.
+DATA = {
+    "soft_arm_1": of_arm_1,
+    "soft_arm_2": of_arm_2,
+    "panda": of_panda,
+    "neck": write_neck,
+    "panda_real": write_panda,
+    "example_log": of_logs,
+    "double_pendulum": of_logs,
+    "panda_gaz": of_logs,
+    "soft_neck": of_logs,
+    "trunk": of_logs,
+}
+
+
+@pytest.mark.parametrize(
+    "experiment",
+    [pytest.param(x, marks=needs_logs if x.startswith("logs/") else ()) for x in EXPERIMENTS],
+)
+def test_every_experiment_trains(tmp_path, monkeypatch, experiment):
+    monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))
+    monkeypatch.chdir(ROOT)  # from where the example log is found
+    if not experiment.endswith("/lnn"):  # its rivals have the same log to draw
+        monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     choice = f"experiment={experiment}"
-    composed = compose(choice)
-    # Only what the experiment's own data set and trainer have can be made tiny.
-    tiny = [x for x in TINY if OmegaConf.select(composed, x.split("=")[0], default="no") != "no"]
     folder = tmp_path / "run"
     run_script(
         "train.py",
         choice,
-        *tiny,
+        *TINY_TRAINING,
+        *DATA[compose(choice).dataset.name](tmp_path),
         NO_FIGURES,
         "compile=false",
         f"hydra.run.dir={folder}",
@@ -91,5 +131,7 @@ def test_windows_of_several_steps_train(tmp_path):
 def test_there_are_models_heads_and_experiments_to_test():
     """The lists above come from globs: an empty one would test nothing."""
     assert {"hnn", "lnn", "mlp"} <= set(MODELS)
-    assert {"mass/network", "damping/fixed", "input/network"} <= set(HEADS)
-    assert len(EXPERIMENTS) >= 3
+    assert {"mass/network", "damping/fixed", "input/network", "friction/coulomb"} <= set(HEADS)
+    assert {"soft_arm_1", "soft_arm_2", "panda", "logs", "example_log", "neck", "panda_real"} <= {
+        x.split("/")[0] for x in EXPERIMENTS
+    }
