@@ -1,0 +1,138 @@
+"""The example log, from the script that writes it to its evaluation, and logs with a mistake."""
+
+import json
+import runpy
+import shutil
+
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+
+from tests.app.entry import NO_FIGURES, ROOT, TINY_TRAINING, fails, run_script
+from tests.app.test_configurations import assert_trained, compose
+
+EXAMPLES = ROOT / "examples"
+TINY = ["experiment=example_log/lnn", "compile=false", *TINY_TRAINING, NO_FIGURES]
+
+
+@pytest.fixture
+def at_root(monkeypatch):
+    """The folder of the example is given as seen from the root of the repository."""
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run on a copy of the example log, which a test may take away."""
+    place = tmp_path_factory.mktemp("example")
+    shutil.copy(EXAMPLES / "example_log.csv", place)
+    run_script("train.py", *TINY, f"dataset.root='{place}'", f"hydra.run.dir={place / 'run'}")
+    return place / "run"
+
+
+def said(error, capsys):
+    captured = capsys.readouterr()
+    text = f"{captured.out}\n{captured.err}\n{error.code}"
+    assert "Traceback" not in text
+    return text
+
+
+def evaluation_of(run, folder):
+    return [f"runs=[{run}]", f"hydra.run.dir={folder}"]
+
+
+def test_the_script_writes_the_example_log_again(tmp_path):
+    script = runpy.run_path(str(EXAMPLES / "write_example_log.py"))
+    script["main"](tmp_path / "again.csv")
+    again = pd.read_csv(tmp_path / "again.csv").set_index("run")
+    kept = pd.read_csv(EXAMPLES / "example_log.csv").set_index("run")
+    # Two units of the last digit: solvers of other machines may round the other way.
+    pd.testing.assert_frame_equal(again, kept, rtol=0, atol=0.02)
+    assert (EXAMPLES / "example_log.csv").stat().st_size < 250_000
+
+
+def test_a_run_on_a_log_keeps_the_report_and_a_picture_of_the_cleaning(run):
+    assert_trained(run)
+    report = (run / "log_report.md").read_text()
+    assert "from example_log.csv" in report
+    assert "9 trajectories of 5 to 5 s" in report
+    assert "## Warnings\n\n- none" in report
+    picture = imread(run / "log_cleaning.png")
+    assert min(picture.shape[:2]) > 200
+    assert picture[..., :3].std() > 0.01
+
+
+def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, capsys):
+    run_script("evaluate.py", *evaluation_of(run, tmp_path / "out"))
+    assert "example_log: 2 unseen test trajectories, 5 s open loop" in capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert row["model"] == "lnn"
+    # q wanders by some tenths of a rad; an untrained model is no better than that.
+    assert 0 < row["error_mean"] < 2
+    for name in ("trajectory.png", "error.png"):
+        assert (tmp_path / "out" / name).is_file()
+    assert not (tmp_path / "out" / "terms.txt").exists()
+
+
+def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):
+    error = fails("evaluate.py", *evaluation_of(run, tmp_path / "out"), "horizon=6")
+    assert "horizon is 6" in said(error, capsys)
+
+
+def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
+    log = run.parent / "example_log.csv"
+    log.rename(tmp_path / "elsewhere.csv")
+    try:
+        error = fails("evaluate.py", *evaluation_of(run, tmp_path / "out"))
+    finally:
+        (tmp_path / "elsewhere.csv").rename(log)
+    text = said(error, capsys)
+    assert "nothing matches 'example_log.csv'" in text
+    assert str(run.parent) in text
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (
+            "dataset.q.columns=[bend_x,bend_y,strech]",
+            ["example_log.csv: no column 'strech'", "did you mean 'stretch'", "torque_y"],
+        ),
+        ("dataset.q.unit=degree", ["dataset: q: unit is 'degree'", "did you mean 'deg'"]),
+        ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
+        ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
+        ("dataset.test.piece=7.0", ["test: ", "no stretch is as long as its piece, 7 s"]),
+        ("data.pairs=5000", ["5000 windows", "fewer pairs"]),
+    ],
+)
+def test_a_mistake_about_a_log_ends_with_its_name_and_place(
+    at_root, tmp_path, capsys, mistake, words
+):
+    error = fails("train.py", *TINY, mistake, f"hydra.run.dir={tmp_path / 'run'}")
+    text = said(error, capsys)
+    for word in words:
+        assert word in text
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
+@pytest.mark.parametrize("experiment", ["neck/lnn", "neck/polynomial", "panda_real/lnn"])
+def test_presets_of_hardware_ask_for_the_log(tmp_path, capsys, experiment):
+    error = fails("train.py", f"experiment={experiment}", f"hydra.run.dir={tmp_path / 'run'}")
+    assert "no value for dataset.files, dataset.root" in said(error, capsys)
+
+
+def test_presets_of_hardware_have_the_structure_of_the_paper():
+    neck, fit, panda = (
+        compose(f"experiment={name}") for name in ("neck/lnn", "neck/polynomial", "panda_real/lnn")
+    )
+    assert neck.dataset.steps.smooth.window == 50
+    assert neck.dataset.steps.fit is None
+    assert fit.dataset.steps.smooth is None
+    assert fit.dataset.steps.fit.degree == 7
+    assert len(neck.dataset.u.columns) == 4
+    assert neck.model.input._target_.endswith("NetworkInput")
+    assert panda.model.mass.bound == 3.5
+    assert panda.model.input._target_.endswith("FixedInput")
+    assert len(panda.model.angles) == len(panda.dataset.q.columns) == 7
+    for preset in (neck, fit, panda):
+        assert preset.model.friction._target_.endswith("CoulombFriction")
