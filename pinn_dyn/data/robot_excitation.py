@@ -126,7 +126,8 @@ class TrackedMultiSine(RobotExcitation):
         """Draw a reference and its tracking law."""
         size = len(robot.q_low)
         half = self.reach * (robot.q_high - robot.q_low) / 2
-        amplitude = half * rng.uniform(*self.amplitude, size)
+        smallest, largest = self.amplitude
+        amplitude = half * rng.uniform(smallest, largest, size)
         middle = (robot.q_low + robot.q_high) / 2
         centre = middle + (half - amplitude) * rng.uniform(-1, 1, size)
         shape = (size, self.harmonics)
