@@ -8,8 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.evaluation.prediction import double_copy
-from pinn_dyn.mechanics import MechanicalSystem, Terms
+from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
 
 
 @dataclass(frozen=True)

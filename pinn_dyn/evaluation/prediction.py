@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import Predictor, Trajectory
-
-_Model = TypeVar("_Model", bound=Predictor)
+from pinn_dyn.mechanics import Predictor, Trajectory, double_copy
 
 
 @dataclass(frozen=True)
@@ -111,11 +107,6 @@ def predict_windows(
     q = truth.q[:, : last + 1 : stride].double()
     q_hat = torch.cat([q[:, :1], ends.reshape(q.shape[0], -1, q.shape[-1])], dim=1)
     return Prediction(truth.t[: last + 1 : stride].double(), q_hat, q)
-
-
-def double_copy(model: _Model, device: torch.device) -> _Model:
-    """A copy of the model in float64 and evaluation mode; the model itself stays as it is."""
-    return copy.deepcopy(model).to(device=device, dtype=torch.float64).eval()
 
 
 def _roll_out(

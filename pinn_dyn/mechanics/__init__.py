@@ -1,7 +1,7 @@
 """The equations of mechanics: systems, states, trajectories and their integration."""
 
 from pinn_dyn.mechanics.integration import rollout
-from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor
+from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor, double_copy
 from pinn_dyn.mechanics.system import MechanicalSystem, Terms
 from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation, Trajectory, stack
 
@@ -13,6 +13,7 @@ __all__ = [
     "Predictor",
     "Terms",
     "Trajectory",
+    "double_copy",
     "rollout",
     "stack",
 ]

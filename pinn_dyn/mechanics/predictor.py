@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import abc
+import copy
 from collections.abc import Callable
-from typing import final
+from typing import TypeVar, final
 
 import torch
 from torch import Tensor, nn
@@ -115,3 +116,11 @@ class ContinuousPredictor(Predictor):
             interpolation=interpolation,
             substeps=self.substeps,
         )
+
+
+_Model = TypeVar("_Model", bound=Predictor)
+
+
+def double_copy(model: _Model, device: torch.device | str = "cpu") -> _Model:
+    """A copy of the model in float64 and evaluation mode; the model itself stays as it is."""
+    return copy.deepcopy(model).to(device=device, dtype=torch.float64).eval()
