@@ -79,7 +79,6 @@ class DynamicsData(L.LightningDataModule):
                 steps=self.steps,
                 stride=self.stride,
                 seed=self.seed,
-                momentum=splits.momentum,
             )
         return self._windows
 

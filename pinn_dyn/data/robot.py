@@ -138,10 +138,10 @@ class RobotSource(DataSource):
         for split in _SPLITS:
             q, v, u = (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
             q, v, u = q[:, :-1], (v[:, :-1] + v[:, 1:]) / 2, u[:, :-1]
-            # Those of the training windows are computed when they are drawn.
-            p = [None] * len(q) if split == "train" else self._momentum(q, v)
-            splits[split] = [Trajectory(t, q[k], v[k], u[k], p[k]) for k in range(len(q))]
-        return Splits(splits["train"], splits["validation"], splits["test"], self._momentum)
+            splits[split] = [
+                Trajectory(t, q[k], v[k], u[k], momentum=self._momentum) for k in range(len(q))
+            ]
+        return Splits(splits["train"], splits["validation"], splits["test"])
 
     def describe(self) -> dict[str, object]:
         """Everything the trajectories depend on: the key of the cache."""

@@ -191,10 +191,10 @@ class SimulatedSource(DataSource):
                 torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
             )
             splits[split] = [
-                Trajectory(t[: q.shape[1]], q[k], v[k], u[k], p=self._momenta(arrays, split, k))
+                Trajectory(t[: q.shape[1]], q[k], v[k], u[k], momentum=self._momentum)
                 for k in range(q.shape[0])
             ]
-        return Splits(splits["train"], splits["validation"], splits["test"], self._momentum)
+        return Splits(splits["train"], splits["validation"], splits["test"])
 
     def describe(self) -> dict[str, object]:
         """Everything the trajectories depend on: the key of the cache."""
@@ -220,13 +220,21 @@ class SimulatedSource(DataSource):
         }
 
     def simulate(self) -> Arrays:
-        """Simulate all trajectories anew: arrays ``<split>_<q, v, u, p>``, each ``(K, T, .)``."""
-        samples = round(self.duration / self.step) + 1
-        t = np.arange(samples) * self.step
+        """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
+        # Splits of one duration are one batch.
+        if self.test_duration == self.duration:
+            return self._simulate(_SPLITS, self.duration)
+        return {
+            **self._simulate(_SPLITS[1:], self.test_duration),
+            **self._simulate(_SPLITS[:1], self.duration),  # the longer times, "t", last
+        }
+
+    def _simulate(self, splits: Sequence[str], duration: float) -> Arrays:
+        t = np.arange(round(duration / self.step) + 1) * self.step
         starts, signals, pick = [], [], []
-        # One generator per split: more test trajectories do not change the training set.
-        for index, split in enumerate(_SPLITS):
-            rng = np.random.default_rng([self.seed, index])
+        for split in splits:
+            # One generator per split: more test trajectories do not change the training set.
+            rng = np.random.default_rng([self.seed, _SPLITS.index(split)])
             states, inputs = self.counts[split]
             starts.append(self.initial_states.draw(states, rng))
             signals.append(self.excitation.draw(inputs, self.duration, rng))
@@ -254,16 +262,10 @@ class SimulatedSource(DataSource):
         )
         ends = np.cumsum([0, *(len(p) for p in pick)])
         arrays = {"t": t}
-        for index, split in enumerate(_SPLITS):
+        for index, split in enumerate(splits):
             part = slice(ends[index], ends[index + 1])
-            last = round((self.duration if split == "train" else self.test_duration) / self.step)
-            q_part, v_part = q[part, : last + 1], v[part, : last + 1]
-            arrays[f"{split}_q"], arrays[f"{split}_v"] = q_part, v_part
-            arrays[f"{split}_u"] = signals[index](t[: last + 1])[pick[index][:, 1]]
-            if split != "train":
-                arrays[f"{split}_p"] = self._momentum(
-                    torch.from_numpy(q_part), torch.from_numpy(v_part)
-                ).numpy()
+            arrays[f"{split}_q"], arrays[f"{split}_v"] = q[part], v[part]
+            arrays[f"{split}_u"] = signals[index](t)[pick[index][:, 1]]
         return arrays
 
     def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
@@ -272,10 +274,6 @@ class SimulatedSource(DataSource):
         pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
         with torch.no_grad():
             return torch.cat([self.system.momentum(a, b) for a, b in pieces]).reshape(q.shape)
-
-    def _momenta(self, arrays: Arrays, split: str, k: int) -> Tensor | None:
-        key = f"{split}_p"
-        return torch.from_numpy(arrays[key][k, :: self.keep_every]) if key in arrays else None
 
 
 def _describe(value: object) -> object:

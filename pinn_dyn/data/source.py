@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from dataclasses import dataclass
-
-from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 
@@ -17,14 +14,11 @@ class Splits:
 
     Attributes:
         train, validation, test: the trajectories.
-        momentum: p = M(q) v where the truth is known, ``(*batch, N), (*batch, N) -> (*batch, N)``;
-            None for measured data.
     """
 
     train: list[Trajectory]
     validation: list[Trajectory]
     test: list[Trajectory]
-    momentum: Callable[[Tensor, Tensor], Tensor] | None = None
 
 
 class DataSource(abc.ABC):

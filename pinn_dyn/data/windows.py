@@ -100,7 +100,6 @@ def draw_windows(
     steps: int,
     stride: int,
     seed: int,
-    momentum: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Windows:
     """Draw windows at random starts, uniform over all starts of all trajectories.
 
@@ -110,7 +109,6 @@ def draw_windows(
         steps: steps H of a window.
         stride: samples in a step.
         seed: seed of the starts.
-        momentum: p = M(q) v, for data without recorded momenta.
 
     Raises:
         ValueError: on counts below 1, differing sample times, trajectories shorter than a window,
@@ -153,12 +151,8 @@ def draw_windows(
     u = torch.stack(
         [trajectories[i].u[k : k + span + 1] for i, k in zip(which, offset, strict=True)]
     )
-    if momentum is not None:
-        p = momentum(q, v)
-    elif all(item.p is not None for item in trajectories):
-        p = torch.stack([trajectories[i].p[k + knots] for i, k in zip(which, offset, strict=True)])
-    else:
-        p = q.new_zeros((count, steps + 1, 0))
+    momentum = trajectories[0].momentum
+    p = q.new_zeros((count, steps + 1, 0)) if momentum is None else momentum(q, v)
     return Windows(
         t=knots.double() * sample,
         t_input=torch.arange(span + 1, dtype=torch.float64) * sample,

@@ -51,7 +51,7 @@ def predict_trajectories(
     stride = 1 if step is None else _samples_of("step", step, truth.t)
     prediction = _roll_out(
         double_copy(model, truth.q.device),
-        truth.state(model.coordinates)[:, 0].double(),
+        truth.state(model.coordinates, slice(1))[:, 0].double(),
         truth.t.double(),
         truth.u.double(),
         stride,
@@ -93,7 +93,7 @@ def predict_windows(
             "use a shorter window"
         )
     last = windows * samples
-    x0 = truth.state(model.coordinates)[:, :last:samples].double()
+    x0 = truth.state(model.coordinates, slice(0, last, samples)).double()
     # (K, windows, samples + 1, M): neighbouring windows share the sample between them.
     u = truth.u[:, : last + 1].double().unfold(1, samples + 1, samples).movedim(-1, -2)
     ends = _roll_out(

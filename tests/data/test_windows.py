@@ -1,5 +1,7 @@
 """Windows, their order in batches, and the data module that serves them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -78,6 +80,10 @@ def test_starts_are_drawn_from_all_trajectories_alike(trajectories):
     np.testing.assert_allclose(share, np.array([34, 19, 34]) / 87, atol=0.12)
 
 
+def with_momenta(trajectories, system):
+    return [dataclasses.replace(item, momentum=system.momentum) for item in trajectories]
+
+
 def test_a_seed_gives_the_same_windows_again_and_another_seed_gives_others(trajectories):
     first, again, other = (draw(trajectories, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first.q, again.q)
@@ -86,7 +92,7 @@ def test_a_seed_gives_the_same_windows_again_and_another_seed_gives_others(traje
 
 def test_momenta_come_from_the_mass_matrix_at_the_start_and_at_every_step(trajectories):
     system = CartPole().requires_grad_(False)
-    windows = draw(trajectories, momentum=system.momentum)
+    windows = draw(with_momenta(trajectories, system))
 
     def momentum(q, v):
         return (system.mass_matrix(q) @ v.unsqueeze(-1)).squeeze(-1)
@@ -96,15 +102,6 @@ def test_momenta_come_from_the_mass_matrix_at_the_start_and_at_every_step(trajec
     v = windows.v[:, None] + windows.dv
     torch.testing.assert_close(windows.p, start, rtol=0, atol=1e-12)
     torch.testing.assert_close(windows.dp, momentum(q, v) - start[:, None], rtol=0, atol=1e-12)
-
-
-def test_recorded_momenta_are_used_where_no_truth_is_known():
-    recorded = [make_trajectory(k, p=torch.randn(40, 2, dtype=torch.float64)) for k in range(2)]
-    windows = draw(recorded)
-    for index, (number, k) in enumerate(origin(recorded, windows)):
-        p = recorded[number].p
-        assert torch.equal(windows.p[index], p[k])
-        assert torch.equal(windows.dp[index], p[[k + 3, k + 6]] - p[k])
 
 
 def test_without_momenta_there_are_none(trajectories):
@@ -133,7 +130,7 @@ def test_increments_stay_precise_in_single_precision():
 
 def test_statistics_are_those_of_the_windows(trajectories):
     system = CartPole().requires_grad_(False)
-    windows = draw(trajectories, momentum=system.momentum)
+    windows = draw(with_momenta(trajectories, system))
     statistics = windows.statistics()
     expected = {
         "q_mean": windows.q.mean(0),

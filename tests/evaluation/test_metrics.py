@@ -172,7 +172,7 @@ def test_a_breakdown_costs_only_its_own_trajectory():
 
 def test_a_momentum_model_starts_from_the_momentum():
     truth = ramps()
-    truth = Trajectory(truth.t, truth.q, 7 * truth.v, truth.u, p=truth.v)
+    truth = Trajectory(truth.t, truth.q, 7 * truth.v, truth.u, momentum=lambda q, v: v / 7)
     model = PointMass(coordinates="momentum")
     for prediction in (
         predict_trajectories(model, truth),

@@ -8,7 +8,12 @@ import torch
 from pinn_dyn.mechanics import Trajectory, stack
 
 
-def trajectory(samples=11, step=0.1, start=0.0, batch=(), momentum=True, **changes):
+def twice(q, v):
+    """p of a body of 2 kg."""
+    return 2 * v
+
+
+def trajectory(samples=11, step=0.1, start=0.0, batch=(), **changes):
     generator = torch.Generator().manual_seed(0)
 
     def values(size):
@@ -19,7 +24,7 @@ def trajectory(samples=11, step=0.1, start=0.0, batch=(), momentum=True, **chang
         "q": values(3),
         "v": values(3),
         "u": values(2),
-        "p": values(3) if momentum else None,
+        "momentum": twice,
     }
     return Trajectory(**(fields | changes))
 
@@ -34,7 +39,6 @@ def trajectory(samples=11, step=0.1, start=0.0, batch=(), momentum=True, **chang
         ({"v": torch.zeros(11, 2)}, r"^v has shape \(11, 2\), expected \(\*batch, 11, 3\)"),
         ({"u": torch.zeros(10, 2)}, r"^u has shape \(10, 2\), expected \(\*batch, 11, 2\)"),
         ({"u": torch.zeros(11)}, r"^u has shape \(11,\)"),
-        ({"p": torch.zeros(11, 4)}, r"^p has shape \(11, 4\)"),
         ({"interpolation": "cubic"}, "interpolation is 'cubic'"),
     ],
 )
@@ -69,15 +73,16 @@ def test_duration_runs_from_the_first_to_the_last_sample():
 
 def test_state_stacks_configuration_and_velocity_or_momentum():
     item = trajectory(batch=(2,))
-    for coordinates, second in (("velocity", item.v), ("momentum", item.p)):
+    for coordinates, second in (("velocity", item.v), ("momentum", 2 * item.v)):
         state = item.state(coordinates)
         assert torch.equal(state[..., :3], item.q)
         assert torch.equal(state[..., 3:], second)
+        assert torch.equal(item.state(coordinates, slice(2, 9, 3)), state[:, 2:9:3])
 
 
-def test_state_in_momentum_says_that_none_was_recorded():
+def test_state_in_momentum_says_that_the_mass_is_not_known():
     with pytest.raises(ValueError, match="no momentum p"):
-        trajectory(momentum=False).state("momentum")
+        trajectory(momentum=None).state("momentum")
 
 
 @pytest.mark.parametrize(("horizon", "samples"), [(1.0, 11), (0.5, 6), (0.3, 4), (0.1, 2)])
@@ -89,12 +94,9 @@ def test_until_keeps_the_sample_at_the_horizon(horizon, samples, start):
     assert part.duration == pytest.approx(horizon)
     assert part.interpolation == "hold"
     assert torch.equal(part.t, whole.t[:samples])
-    for name in ("q", "v", "u", "p"):
+    assert part.momentum is twice
+    for name in ("q", "v", "u"):
         assert torch.equal(getattr(part, name), getattr(whole, name)[:, :samples]), name
-
-
-def test_until_works_without_momentum():
-    assert trajectory(momentum=False).until(0.5).p is None
 
 
 def test_until_refuses_a_horizon_beyond_the_end():
@@ -109,15 +111,11 @@ def test_stack_adds_a_batch_dimension_and_starts_at_zero():
     assert both.t[0] == 0
     torch.testing.assert_close(both.t, early.t)
     assert torch.equal(both.u[1], late.u)
-    assert torch.equal(both.p[1], late.p)
+    assert both.momentum is twice
 
 
 def test_stack_keeps_the_interpolation():
     assert stack([trajectory(interpolation="hold")] * 2).interpolation == "hold"
-
-
-def test_stack_has_momentum_only_if_every_trajectory_has():
-    assert stack([trajectory(), trajectory(momentum=False)]).p is None
 
 
 @pytest.mark.parametrize("other", [{"samples": 10}, {"step": 0.2}], ids=["samples", "step"])

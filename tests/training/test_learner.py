@@ -59,9 +59,11 @@ def splits():
 
     q, v = simulate(system, *rng.uniform(-1, 1, (2, 6, 2)), signal, t)
     q, v, u = (torch.from_numpy(np.ascontiguousarray(x)) for x in (q, v, signal(t)))
-    p = system.momentum(q, v)
-    made = [Trajectory(torch.from_numpy(t), q[k], v[k], u[k], p=p[k]) for k in range(6)]
-    return Splits(made[:4], made[4:5], made[5:], system.momentum)
+    made = [
+        Trajectory(torch.from_numpy(t), q[k], v[k], u[k], momentum=system.momentum)
+        for k in range(6)
+    ]
+    return Splits(made[:4], made[4:5], made[5:])
 
 
 @pytest.fixture
