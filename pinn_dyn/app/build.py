@@ -11,17 +11,18 @@ from hydra.utils import instantiate
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.data import DataSource, DynamicsData
+from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
+from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.mechanics import Predictor
+from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.training import DynamicsLearner
 
 CHECKPOINTS = "checkpoints"
 
 
-def _build(name: str, config: dict[str, Any], **extra: Any) -> Any:
+def _build(name: str, config: dict[str, Any], *given: Any, **extra: Any) -> Any:
     """Instantiate a part of the configuration; its own error message comes first.
 
     Raises:
@@ -30,7 +31,7 @@ def _build(name: str, config: dict[str, Any], **extra: Any) -> Any:
     try:
         # Plain lists and dicts reach the constructors: no room below knows a config object.
         built = instantiate(config, _convert_="all")
-        return built(**extra) if extra else built
+        return built(*given, **extra) if given or extra else built
     except InstantiationException as error:
         raise ConfigError(f"{name}: {error.__cause__ or error}") from error
     except (TypeError, ValueError) as error:
@@ -111,3 +112,55 @@ def build_trainer(
         logger=logger,
         default_root_dir=str(folder),
     )
+
+
+def build_robot(dataset: dict[str, Any], changes: dict[str, Any]) -> MechanicalSystem:
+    """The system of a data set, with some arguments of its constructor changed."""
+    return _build("robot", {**dataset["system"], **changes})
+
+
+def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:
+    """The reference of ``config["reference"]``; one that needs the robot's kinematics gets it."""
+    part = config["reference"]
+    return _build("reference", part, *([robot] if part.get("_partial_") else []))
+
+
+def build_law(
+    config: dict[str, Any], name: str, learned: Predictor, truth: MechanicalSystem
+) -> Controller:
+    """One of ``config["controllers"]``, on the terms that it asks for.
+
+    Raises:
+        ConfigError: on terms of another name, or a law that cannot be built on them.
+    """
+    part = config["controllers"][name]
+    needs: dict[str, dict[str, Any]] = {
+        "learned": {"model": learned},
+        "truth": {"model": truth},
+        "none": {"num_coordinates": truth.num_coordinates, "num_inputs": truth.num_inputs},
+    }
+    if part["terms"] not in needs:
+        raise ConfigError(
+            f"controllers.{name}.terms is {part['terms']!r}, expected one of {', '.join(needs)}"
+        )
+    return _build(f"controllers.{name}", part["law"], **needs[part["terms"]])
+
+
+def build_plant(config: dict[str, Any], robot: MechanicalSystem) -> Plant:
+    """The plant of ``config["plant"]``, made of the robot."""
+    return _build("plant", config["plant"], robot)
+
+
+def build_actuator(config: dict[str, Any]) -> Actuator:
+    """The limits of ``config["actuator"]``."""
+    return _build("actuator", config["actuator"])
+
+
+def build_sensor(config: dict[str, Any]) -> Sensor:
+    """The noise of ``config["sensor"]``."""
+    return _build("sensor", config["sensor"])
+
+
+def build_initial_states(config: dict[str, Any]) -> InitialStates:
+    """The box of ``config["initial_states"]``."""
+    return _build("initial_states", config["initial_states"])

@@ -1,6 +1,61 @@
 """Control on a mechanical system, true or learned: laws, references, closed loop, stability."""
 
+from pinn_dyn.control.closed_loop import close_loop, close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
+from pinn_dyn.control.effects import Actuator, Delay, Sensor
+from pinn_dyn.control.export import export_law, load_law
+from pinn_dyn.control.factor import fit_factor
+from pinn_dyn.control.helix import Helix
+from pinn_dyn.control.laws import ComputedTorque, ProportionalDerivative, Regulation, Tracking
+from pinn_dyn.control.plants import BulletPlant, SystemPlant
 from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.control.references import (
+    PointToPoint,
+    RandomSetPoints,
+    SetPoint,
+    Sines,
+    check_limits,
+)
+from pinn_dyn.control.region import DataRegion, Guarded
+from pinn_dyn.control.stability import certify, predict_steady_state, required_gain
+from pinn_dyn.control.stability_report import (
+    check_without_truth,
+    model_report,
+    stability_report,
+)
 
-__all__ = ["ClosedLoopRecord", "Controller", "Motion", "Plant", "Reference"]
+__all__ = [
+    "Actuator",
+    "BulletPlant",
+    "ClosedLoopRecord",
+    "ComputedTorque",
+    "Controller",
+    "DataRegion",
+    "Delay",
+    "Guarded",
+    "Helix",
+    "Motion",
+    "Plant",
+    "PointToPoint",
+    "ProportionalDerivative",
+    "RandomSetPoints",
+    "Reference",
+    "Regulation",
+    "Sensor",
+    "SetPoint",
+    "Sines",
+    "SystemPlant",
+    "Tracking",
+    "certify",
+    "check_limits",
+    "check_without_truth",
+    "close_loop",
+    "close_loop_continuous",
+    "export_law",
+    "fit_factor",
+    "load_law",
+    "model_report",
+    "predict_steady_state",
+    "required_gain",
+    "stability_report",
+]

@@ -1,7 +1,19 @@
 """How good a model is: roll-out errors, learned terms against true ones, tables and figures."""
 
+from pinn_dyn.evaluation.animation import animate_bullet_arm, animate_soft_arm, soft_arm_strip
+from pinn_dyn.evaluation.control_figures import (
+    closed_loop_figure,
+    controller_comparison_figure,
+    steady_state_figure,
+    tip_path_figure,
+)
+from pinn_dyn.evaluation.control_metrics import (
+    ClosedLoopMetrics,
+    closed_loop_metrics,
+    comparison_table,
+)
 from pinn_dyn.evaluation.figures import error_figure, save, terms_figure, trajectory_figure
-from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms, fit_factor
+from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import RolloutMetrics, diverged_trajectories, rollout_metrics
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
@@ -15,25 +27,34 @@ from pinn_dyn.evaluation.tables import (
 from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
 
 __all__ = [
+    "ClosedLoopMetrics",
     "Prediction",
     "RolloutFigures",
     "RolloutMetrics",
     "RolloutValidator",
     "RunResult",
     "TermComparison",
+    "animate_bullet_arm",
+    "animate_soft_arm",
     "cleaning_figure",
+    "closed_loop_figure",
+    "closed_loop_metrics",
     "compare_terms",
+    "comparison_table",
+    "controller_comparison_figure",
     "diverged_trajectories",
     "error_figure",
-    "fit_factor",
     "format_table",
     "grouped_table",
     "predict_trajectories",
     "predict_windows",
     "rollout_metrics",
     "save",
+    "soft_arm_strip",
+    "steady_state_figure",
     "summary_table",
     "terms_figure",
+    "tip_path_figure",
     "trajectory_figure",
     "write_table",
 ]

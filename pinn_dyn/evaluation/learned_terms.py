@@ -8,6 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
 
 
@@ -20,7 +21,8 @@ class TermComparison:
         q: configurations, ``(K, N)``.
         true: M, D, G, A of the true system.
         learned: M, D, G, A of the model.
-        P: best-fit factor, ``(K, N, N)``, see :func:`fit_factor`.
+        P: best-fit factor, ``(K, N, N)``, see
+            :func:`pinn_dyn.control.factor.fit_factor`.
         P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``; the paper's controllers
             are proven for a positive one.
     """
@@ -131,28 +133,6 @@ def compare_terms(
     P = fit_factor(true, learned)
     smallest = torch.linalg.eigvalsh(0.5 * (P + P.transpose(-1, -2)))[..., 0]
     return TermComparison(names, q, true, learned, P, smallest)
-
-
-def fit_factor(true: Terms, learned: Terms) -> Tensor:
-    """The factor P(q), ``(*batch, N, N)``, that fits the learned terms best::
-
-        P = argmin  sum_X |P X - X_L|^2 / |X|^2,     X in {M, D, A, G}
-
-    with Frobenius norms, so that no term outweighs the others by its units. A true term that
-    vanishes is left out; where P is not unique it is the one of smallest norm. Motion determines
-    the terms only up to such a P, as P on both sides of the equation of motion cancels.
-
-    Source: paper, section PINN-based controllers, X_L = P X. The column P(q) of the paper's table
-    holds the inverse of this one: its numbers satisfy P X_L = X.
-    """
-    pairs = zip(_as_matrices(true).values(), _as_matrices(learned).values(), strict=True)
-    true_blocks, learned_blocks = [], []
-    for X, X_L in pairs:
-        norm = torch.linalg.matrix_norm(X)[..., None, None]
-        weight = torch.where(norm > 0, 1 / norm, 0.0)
-        true_blocks.append(weight * X)
-        learned_blocks.append(weight * X_L)
-    return torch.cat(learned_blocks, -1) @ torch.linalg.pinv(torch.cat(true_blocks, -1))
 
 
 def _as_matrices(terms: Terms) -> dict[str, Tensor]:

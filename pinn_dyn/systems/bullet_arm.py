@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
@@ -42,6 +43,11 @@ class BulletArm(MechanicalSystem):
             computes from mass and collision shapes.
         damping: viscous friction of the joints, Nms/rad, one number or N.
         gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
+        tip: name of the link whose frame is the tip, any but the base; None for the last of the
+            file's joints with no joint behind it (of the Panda: ``panda_grasptarget``).
+        mass_scale: factor of the masses and inertias of all links.
+        payload: point mass at the origin of the tip's frame, kg, which is not scaled; it adds
+            m J^T J to M and -m J^T gravity to G, with J the tip's Jacobian.
 
     Attributes:
         joint_names: names of the joints, N.
@@ -53,7 +59,8 @@ class BulletArm(MechanicalSystem):
         ImportError: without PyBullet.
         FileNotFoundError: if there is no such URDF or mesh.
         ValueError: on a URDF that is no arm (see :func:`read_urdf`), a damping that is negative
-            or of another length, or masses that make no positive definite M.
+            or of another length, an unknown tip, a mass_scale or payload that is none, or masses
+            that make no positive definite M.
     """
 
     _damping: Tensor
@@ -66,21 +73,36 @@ class BulletArm(MechanicalSystem):
         inertia: Inertia = "file",
         damping: float | Sequence[float] = 0.5,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
+        tip: str | None = None,
+        mass_scale: float = 1.0,
+        payload: float = 0.0,
     ):
         if inertia not in ("file", "collision"):
             raise ValueError(f"inertia is {inertia!r}, expected 'file' or 'collision'")
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity is {list(gravity)}, expected 3 finite numbers in m/s^2")
+        if not 0 < mass_scale < np.inf:
+            raise ValueError(f"mass_scale is {mass_scale}, expected a positive finite number")
+        if not 0 <= payload < np.inf:
+            raise ValueError(f"payload is {payload}, expected a finite number of at least 0 in kg")
         import_bullet()
         import pybullet_data
 
         source = find_urdf(urdf, Path(pybullet_data.getDataPath()))
-        description = read_urdf(source, locked_joints, inertia)
+        description = read_urdf(
+            source,
+            locked_joints,
+            inertia,
+            tip=tip,
+            mass_scale=float(mass_scale),
+            payload=float(payload),
+        )
         size = len(description.limits)
         super().__init__(num_coordinates=size, num_inputs=size)
         self.urdf = description
         self.inertia: Inertia = inertia
         self.gravity = tuple(float(g) for g in gravity)
+        self.mass_scale, self.payload = float(mass_scale), float(payload)
         self.joint_names = self._world.names
         if inertia == "file":
             for link, found in self._world.moments.items():
@@ -104,6 +126,12 @@ class BulletArm(MechanicalSystem):
         """Everything the motion depends on, JSON-serializable; part of the key of a cache."""
         from importlib.metadata import version
 
+        # Only where they change the motion, so that data made before they existed stay valid.
+        changes: dict[str, object] = {}
+        if self.mass_scale != 1:
+            changes["mass_scale"] = self.mass_scale
+        if self.payload:
+            changes |= {"payload": self.payload, "tip": self.urdf.tip}
         return {
             "urdf": self.urdf.digest,
             "joints": self.joint_names,
@@ -111,6 +139,7 @@ class BulletArm(MechanicalSystem):
             "damping": self._damping.tolist(),
             "gravity": self.gravity,
             "pybullet": version("pybullet"),
+            **changes,
         }
 
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -132,6 +161,21 @@ class BulletArm(MechanicalSystem):
     def input_matrix(self, q: Tensor) -> Tensor:
         """A = I: each joint has its motor, ``(*batch, N, N)``."""
         return torch.eye(self.num_inputs, dtype=q.dtype, device=q.device).expand(*q.shape, -1)
+
+    def tip_position(self, q: Tensor) -> Tensor:
+        """Origin of the tip's frame in the frame of the base, ``(*batch, 3)``, m."""
+        self._check(q=q)
+        return _Known.apply(
+            lambda q: _each(self._tip_point, q), lambda q: self.tip_jacobian(q)[..., :3, :], q
+        )
+
+    def tip_jacobian(self, q: Tensor) -> Tensor:
+        """J with (velocity of the tip's origin in m/s, angular velocity in rad/s) = J v.
+
+        ``(*batch, 6, N)``, in the frame of the base; the linear rows come first.
+        """
+        self._check(q=q)
+        return _each(self._tip_slope, q)
 
     def dynamics(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """M ``(N, N)`` and C v + G + D v ``(N,)`` at one state, for a control law in NumPy."""
@@ -159,26 +203,49 @@ class BulletArm(MechanicalSystem):
         Returns:
             q, v and u, ``(steps + 1, N)`` each.
         """
-        world = self._world
-        bullet, target = world.bullet, {"physicsClientId": world.client}
-        bullet.setTimeStep(step, **target)
-        for joint, position, speed in zip(world.joints, q0, v0, strict=True):
-            bullet.resetJointState(world.body, joint, float(position), float(speed), **target)
+        self.set_state(q0, v0)
+        self._set_time_step(step)
         q, v, u = (np.empty((steps + 1, self.num_coordinates)) for _ in range(3))
+        q[0], v[0] = q0, v0
         for k in range(steps + 1):
-            states = bullet.getJointStates(world.body, world.joints, **target)
-            q[k], v[k] = [state[0] for state in states], [state[1] for state in states]
             u[k] = torque(k, q[k], v[k])
             if k < steps:
-                bullet.setJointMotorControlArray(
-                    world.body,
-                    world.joints,
-                    bullet.TORQUE_CONTROL,
-                    forces=(u[k] - self._friction * v[k]).tolist(),
-                    **target,
-                )
-                bullet.stepSimulation(**target)
+                q[k + 1], v[k + 1] = self._move(v[k], u[k])
         return q, v, u
+
+    def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Put the arm in Bullet into a state, ``(N,)`` each, from which :meth:`step` moves it.
+
+        Arms of the same URDF, inertia and gravity share one state in a process: to move several
+        in turn, set the state of each before its steps.
+        """
+        self._world.put(q, v)
+
+    def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """One step of :meth:`simulate` from the present state: q and v after it, ``(N,)`` each.
+
+        Args:
+            torque: motor torque, ``(N,)``, Nm, held over the step.
+            step: time step, s.
+        """
+        self._set_time_step(step)
+        return self._move(self._world.state()[1], torque)
+
+    def _set_time_step(self, step: float) -> None:
+        self._world.bullet.setTimeStep(step, physicsClientId=self._world.client)
+
+    def _move(self, v: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One step from the present state, whose velocity is v."""
+        world = self._world
+        world.bullet.setJointMotorControlArray(
+            world.body,
+            world.joints,
+            world.bullet.TORQUE_CONTROL,
+            forces=(torque - self._friction * v).tolist(),
+            physicsClientId=world.client,
+        )
+        world.bullet.stepSimulation(physicsClientId=world.client)
+        return world.state()
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return _each(self._bias, q, torch.zeros_like(q))
@@ -237,14 +304,38 @@ class BulletArm(MechanicalSystem):
         return symbols + symbols.swapaxes(0, 1)
 
     def _energy(self, q: np.ndarray) -> np.ndarray:
-        world, target = self._world, {"physicsClientId": self._world.client}
-        for joint, position in zip(world.joints, q, strict=True):
-            world.bullet.resetJointState(world.body, joint, float(position), **target)
+        world = self._scratch
+        world.put(q, 0 * q)
         states = world.bullet.getLinkStates(
-            world.body, world.links, computeForwardKinematics=True, **target
+            world.body, world.links, computeForwardKinematics=True, physicsClientId=world.client
         )
         centres = np.array([state[0] for state in states])
         return -world.masses @ (centres @ np.array(self.gravity))
+
+    def _tip_point(self, q: np.ndarray) -> np.ndarray:
+        world = self._scratch
+        world.put(q, 0 * q)
+        link = world.link_names.index(self.urdf.tip)
+        # Of the link's own frame Bullet gives float32 only, of its centre of mass float64.
+        centre, turn, offset, own_turn = world.bullet.getLinkState(
+            world.body, link, computeForwardKinematics=True, physicsClientId=world.client
+        )[:4]
+        frame = Rotation.from_quat(turn) * Rotation.from_quat(own_turn).inv()
+        return np.array(centre) - frame.apply(offset)
+
+    def _tip_slope(self, q: np.ndarray) -> np.ndarray:
+        world, zero = self._world, [0.0] * len(q)
+        # Bullet counts the point (0, 0, 0) from the link's frame, whatever its manual says.
+        linear, angular = world.bullet.calculateJacobian(
+            world.body,
+            world.link_names.index(self.urdf.tip),
+            [0.0, 0.0, 0.0],
+            q.tolist(),
+            zero,
+            zero,
+            physicsClientId=world.client,
+        )
+        return np.array([*linear, *angular])
 
     @property
     def _friction(self) -> np.ndarray:
@@ -253,6 +344,10 @@ class BulletArm(MechanicalSystem):
     @property
     def _world(self) -> World:
         return open_world(self.urdf.text, self.inertia, self.gravity)
+
+    @property
+    def _scratch(self) -> World:
+        return open_world(self.urdf.text, self.inertia, self.gravity, scratch=True)
 
 
 def _joint_values(damping: float | Sequence[float], names: list[str], path: Path) -> Tensor:

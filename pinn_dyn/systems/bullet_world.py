@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pinn_dyn.systems.urdf import Inertia
+from pinn_dyn.systems.urdf import POINT_MASS, Inertia
 
 
 class World(NamedTuple):
@@ -22,18 +22,39 @@ class World(NamedTuple):
     joints: list[int]  # N, those that move
     names: list[str]  # N
     links: list[int]  # all but the base
+    link_names: list[str]
     masses: np.ndarray  # (links,)
     moments: dict[str, float]  # sum of the principal moments, by link
 
+    def put(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Set the positions in rad and velocities in rad/s of the joints, ``(N,)`` each."""
+        for joint, position, speed in zip(self.joints, q, v, strict=True):
+            self.bullet.resetJointState(
+                self.body, joint, float(position), float(speed), physicsClientId=self.client
+            )
 
-def open_world(text: str, inertia: Inertia, gravity: tuple[float, ...]) -> World:
-    """The client of this process that holds the arm of a URDF's text, opened on the first call."""
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions in rad and velocities in rad/s of the joints, ``(N,)`` each."""
+        states = self.bullet.getJointStates(self.body, self.joints, physicsClientId=self.client)
+        return np.array([state[0] for state in states]), np.array([state[1] for state in states])
+
+
+def open_world(
+    text: str, inertia: Inertia, gravity: tuple[float, ...], *, scratch: bool = False
+) -> World:
+    """The client of this process that holds the arm of a URDF's text, opened on the first call.
+
+    There is a second one, ``scratch``, for forward kinematics: it may be put into any state
+    without disturbing a motion in the first.
+    """
     # The process is part of the key, as a forked one must not use the clients of its parent.
-    return _open_world(os.getpid(), text, inertia, gravity)
+    return _open_world(os.getpid(), scratch, text, inertia, gravity)
 
 
 @functools.cache
-def _open_world(pid: int, text: str, inertia: Inertia, gravity: tuple[float, ...]) -> World:
+def _open_world(
+    pid: int, scratch: bool, text: str, inertia: Inertia, gravity: tuple[float, ...]
+) -> World:
     bullet = import_bullet()
     client = bullet.connect(bullet.DIRECT)
     target = {"physicsClientId": client}
@@ -52,6 +73,11 @@ def _open_world(pid: int, text: str, inertia: Inertia, gravity: tuple[float, ...
         bullet.changeDynamics(
             body, link, linearDamping=0, angularDamping=0, jointDamping=0, **target
         )
+    link_names = [info[12].decode() for info in infos]
+    if POINT_MASS in link_names:
+        # To a link without shape Bullet gives the inertia of a box of its collision margin.
+        point = link_names.index(POINT_MASS)
+        bullet.changeDynamics(body, point, localInertiaDiagonal=[0, 0, 0], **target)
     # Bullet holds every joint by a velocity motor, as strong as its friction, unless told not to.
     idle = [0.0] * len(joints)
     bullet.setJointMotorControlArray(body, joints, bullet.VELOCITY_CONTROL, forces=idle, **target)
@@ -63,10 +89,9 @@ def _open_world(pid: int, text: str, inertia: Inertia, gravity: tuple[float, ...
         joints,
         names=[infos[joint][1].decode() for joint in joints],
         links=links,
+        link_names=link_names,
         masses=np.array([values[0] for values in dynamics]),
-        moments={
-            info[12].decode(): sum(values[2]) for info, values in zip(infos, dynamics, strict=True)
-        },
+        moments={name: sum(values[2]) for name, values in zip(link_names, dynamics, strict=True)},
     )
 
 

@@ -118,17 +118,9 @@ class SoftArm(MechanicalSystem):
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q) = stiffness |q|^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
-        weight = q.new_zeros(q.shape[:-1])
-        position = q.new_zeros((*q.shape[:-1], 3))
-        rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
-        weights = self._weights.to(q)
-        for index in range(self.segments):
-            local = self._local_points(q[..., 3 * index : 3 * index + 3], self._s.to(q))
-            world = position.unsqueeze(-2) + local @ rotation.transpose(-1, -2)
-            weight = weight + self._masses[index].to(q) * (world[..., 2] @ weights)
-            position, rotation = self._tip_frame(q, index, position, rotation)
+        depths = self.backbone(q, self._s)[..., 2] @ self._weights.to(q)
         elastic = 0.5 * self.stiffness * (q * q).sum(-1)
-        return elastic - self.gravity * weight
+        return elastic - self.gravity * (depths @ self._masses.to(q))
 
     def damping_matrix(self, q: Tensor) -> Tensor:
         """D = damping I, ``(*batch, N, N)``."""
@@ -148,13 +140,21 @@ class SoftArm(MechanicalSystem):
 
     def tip_positions(self, q: Tensor) -> Tensor:
         """World position of each segment's tip, ``(*batch, n, 3)``, m."""
+        return self.backbone(q, q.new_ones(1)).squeeze(-2)
+
+    def backbone(self, q: Tensor, s: Tensor) -> Tensor:
+        """World position of the backbone, ``(*batch, n, S, 3)``, m.
+
+        Each segment is taken at the fractions s in [0, 1] of its length, ``(S,)``.
+        """
         position = q.new_zeros((*q.shape[:-1], 3))
         rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
-        tips = []
+        segments = []
         for index in range(self.segments):
+            local = self._local_points(q[..., 3 * index : 3 * index + 3], s.to(q))
+            segments.append(position.unsqueeze(-2) + local @ rotation.transpose(-1, -2))
             position, rotation = self._tip_frame(q, index, position, rotation)
-            tips.append(position)
-        return torch.stack(tips, dim=-2)
+        return torch.stack(segments, dim=-3)
 
     # Closed formulas in place of automatic differentiation: for point masses
     # C(q, v) v = sum m J^T (dJ/dt) v, which needs no derivative of M.

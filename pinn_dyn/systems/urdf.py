@@ -13,7 +13,11 @@ from typing import Literal, NamedTuple
 Inertia = Literal["file", "collision"]
 """Whether inertias are those of the URDF, or those that Bullet computes from collision shapes."""
 
+POINT_MASS = "pinn_dyn_point_mass"
+"""Name of the link that is added for a payload."""
+
 _TURNING = ("revolute", "continuous")
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class JointLimits(NamedTuple):
@@ -34,6 +38,7 @@ class Urdf(NamedTuple):
         digest: SHA-256 of the file and of the meshes that its inertias come from.
         limits: by the name of each joint that moves.
         moments: by the name of each link, the sum of its principal moments of inertia, kg m^2.
+        tip: the name of the link at the end of the arm.
     """
 
     path: Path
@@ -41,18 +46,29 @@ class Urdf(NamedTuple):
     digest: str
     limits: dict[str, JointLimits]
     moments: dict[str, float]
+    tip: str
 
 
-def read_urdf(path: Path, locked_joints: Sequence[str], inertia: Inertia) -> Urdf:
+def read_urdf(
+    path: Path,
+    locked_joints: Sequence[str],
+    inertia: Inertia,
+    *,
+    tip: str | None = None,
+    mass_scale: float = 1.0,
+    payload: float = 0.0,
+) -> Urdf:
     """Read a URDF and change what would make Bullet's motion differ from M, G and C.
 
     Locked joints become fixed at zero, so their links' masses stay; all others become continuous,
     as Bullet's joint limits are walls. Visual shapes go, and collision shapes stay only where
-    inertias come from them.
+    inertias come from them. All masses and inertias are multiplied by ``mass_scale``; a point mass
+    ``payload`` in kg is then fixed to the origin of the link ``tip``, which is by default the last
+    of the file's joints that has no other joint behind it.
 
     Raises:
-        ValueError: on text that is no URDF, an unknown locked joint, a joint that moves and is not
-            revolute, no revolute joint, or a moving link without mass, inertia or shape.
+        ValueError: on text that is no URDF, an unknown locked joint or tip, a joint that moves and
+            is not revolute, no revolute joint, or a moving link without mass, inertia or shape.
         FileNotFoundError: if a mesh that is needed is missing.
     """
     content = path.read_bytes()
@@ -89,6 +105,9 @@ def read_urdf(path: Path, locked_joints: Sequence[str], inertia: Inertia) -> Urd
         )
     limits = {name: _limits(path, name, joint) for name, joint in moving.items()}
     _check_masses(path, robot, set(moving), inertia)
+    tip = _tip(path, robot, tip)
+    if mass_scale != 1:
+        _scale_masses(path, robot, mass_scale)
     digest = hashlib.sha256(content)
     for name, joint in joints.items():
         joint.set("type", "continuous" if name in moving else "fixed")
@@ -98,8 +117,11 @@ def read_urdf(path: Path, locked_joints: Sequence[str], inertia: Inertia) -> Urd
             file = _find_mesh(path, mesh.get("filename", ""))
             digest.update(file.read_bytes())
             mesh.set("filename", str(file))
+    if payload:
+        _add_point_mass(robot, tip, payload)
     moments = {link.get("name", ""): _moments(path, link) for link in robot.findall("link")}
-    return Urdf(path, ET.tostring(robot, encoding="unicode"), digest.hexdigest(), limits, moments)
+    text = ET.tostring(robot, encoding="unicode")
+    return Urdf(path, text, digest.hexdigest(), limits, moments, tip)
 
 
 def find_urdf(urdf: str, folder: Path) -> Path:
@@ -169,8 +191,39 @@ def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Iner
         if link.find("inertial") is None:
             inertial = ET.SubElement(link, "inertial")
             ET.SubElement(inertial, "mass", value="0")
-            zero = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-            ET.SubElement(inertial, "inertia", zero)
+            ET.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
+
+
+def _tip(path: Path, robot: ET.Element, tip: str | None) -> str:
+    links = {link.get("name", ""): link for link in robot.findall("link")}
+    joints = robot.findall("joint")
+    children = [_end(path, joint, "child", links) for joint in joints]
+    if tip is None:
+        parents = {_end(path, joint, "parent", links) for joint in joints}
+        return [name for name in children if name not in parents][-1]
+    if tip not in children:
+        raise ValueError(
+            f"{path}: tip is {tip!r}, expected a link behind a joint: {', '.join(children)}"
+        )
+    return tip
+
+
+def _scale_masses(path: Path, robot: ET.Element, factor: float) -> None:
+    for link in robot.findall("link"):
+        for tag in ("mass", "inertia"):
+            for element in link.findall(f"inertial/{tag}"):
+                for key in element.attrib:
+                    value = _number(path, link.get("name", ""), element, key)
+                    element.set(key, repr(factor * value))
+
+
+def _add_point_mass(robot: ET.Element, link: str, mass: float) -> None:
+    inertial = ET.SubElement(ET.SubElement(robot, "link", name=POINT_MASS), "inertial")
+    ET.SubElement(inertial, "mass", value=repr(mass))
+    ET.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
+    joint = ET.SubElement(robot, "joint", name=POINT_MASS, type="fixed")
+    ET.SubElement(joint, "parent", link=link)
+    ET.SubElement(joint, "child", link=POINT_MASS)
 
 
 def _end(path: Path, joint: ET.Element, end: str, links: dict[str, ET.Element]) -> str:

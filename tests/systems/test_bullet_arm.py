@@ -1,6 +1,7 @@
 """PyBullet arms: against the contract, closed forms, Bullet's own steps, and bad input."""
 
 import copy
+import hashlib
 import pickle
 import sys
 import xml.etree.ElementTree as ET
@@ -16,7 +17,7 @@ import pybullet_data  # noqa: E402
 from pinn_dyn.evaluation.learned_terms import compare_terms  # noqa: E402
 from pinn_dyn.systems import BulletArm  # noqa: E402
 from tests.contracts.mechanical_system import Configurations, MechanicalSystemContract  # noqa: E402
-from tests.support.finite_differences import assert_near  # noqa: E402
+from tests.support.finite_differences import assert_near, partial_derivatives  # noqa: E402
 
 pytestmark = pytest.mark.panda
 
@@ -84,6 +85,17 @@ def pendulum(tmp_path):
     return write
 
 
+@pytest.fixture
+def spatial(tmp_path):
+    path = tmp_path / "spatial.urdf"
+    path.write_text(SPATIAL)
+    return str(path)
+
+
+def panda_text():
+    return Path(pybullet_data.getDataPath(), PANDA).read_text()
+
+
 @pytest.fixture(scope="module")
 def panda():
     return BulletArm(PANDA, locked_joints=FINGERS, damping=0.5)
@@ -149,16 +161,14 @@ def placed(R, r, origin):
     return R @ turn, r + R @ numbers(origin, "xyz")
 
 
-def urdf_mass_matrix(text, q):
-    """sum m J^T J + Jw^T I Jw over all links of a URDF that names parents before children.
+def urdf_frames(text, q):
+    """(R, r, [(axis, point), ...]) of every link of a URDF that names parents before children.
 
     Revolute joints take their angles from q in turn, prismatic ones stay at zero.
     """
-    robot = ET.fromstring(text)
-    links = {link.get("name"): link.find("inertial") for link in robot.findall("link")}
-    joints = robot.findall("joint")
+    joints = ET.fromstring(text).findall("joint")
     frames = {joints[0].find("parent").get("link"): (np.eye(3), np.zeros(3), [])}
-    angles, mass_matrix = list(q), np.zeros((len(q), len(q)))
+    angles = list(q)
     for joint in joints:
         R, r, axes = frames[joint.find("parent").get("link")]
         R, r = placed(R, r, joint.find("origin"))
@@ -166,20 +176,34 @@ def urdf_mass_matrix(text, q):
             axis = numbers(joint.find("axis"), "xyz")
             axes = [*axes, (R @ axis, r)]
             R = R @ rotation(axis, angles.pop(0))
-        name = joint.find("child").get("link")
-        frames[name] = (R, r, axes)
+        frames[joint.find("child").get("link")] = (R, r, axes)
+    assert not angles
+    return frames
+
+
+def jacobian_of(point, axes, size):
+    linear, angular = np.zeros((2, 3, size))
+    for index, (axis, origin) in enumerate(axes):
+        linear[:, index], angular[:, index] = np.cross(axis, point - origin), axis
+    return linear, angular
+
+
+def urdf_mass_matrix(text, q):
+    """sum m J^T J + Jw^T I Jw over all links of a URDF but its base."""
+    links = {link.get("name"): link.find("inertial") for link in ET.fromstring(text).iter("link")}
+    mass_matrix = np.zeros((len(q), len(q)))
+    for name, (R, r, axes) in urdf_frames(text, q).items():
+        if not axes:
+            continue
         Rc, centre = placed(R, r, links[name].find("origin"))
         xx, xy, xz, yy, yz, zz = (
             float(links[name].find("inertia").get(f"i{key}"))
             for key in ("xx", "xy", "xz", "yy", "yz", "zz")
         )
         inertia = Rc @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ Rc.T
-        linear, angular = np.zeros((2, 3, len(q)))
-        for index, (axis, point) in enumerate(axes):
-            linear[:, index], angular[:, index] = np.cross(axis, centre - point), axis
+        linear, angular = jacobian_of(centre, axes, len(q))
         mass = float(links[name].find("mass").get("value"))
         mass_matrix += mass * linear.T @ linear + angular.T @ inertia @ angular
-    assert not angles
     return mass_matrix
 
 
@@ -187,15 +211,13 @@ def test_panda_has_the_mass_matrix_of_its_urdf_with_the_fingers_locked(panda):
     assert panda.num_coordinates == 7
     q = states(panda)[0]
     M = panda.mass_matrix(torch.from_numpy(q))
-    text = Path(pybullet_data.getDataPath(), PANDA).read_text()
+    text = panda_text()
     for k in range(len(q)):
         np.testing.assert_allclose(M[k], urdf_mass_matrix(text, q[k]), rtol=0, atol=1e-9)
 
 
-def test_products_of_inertia_and_turned_frames_count_in_full(tmp_path):
-    path = tmp_path / "spatial.urdf"
-    path.write_text(SPATIAL)
-    arm = BulletArm(str(path), damping=0)
+def test_products_of_inertia_and_turned_frames_count_in_full(spatial):
+    arm = BulletArm(spatial, damping=0)
     q, v, _ = states(arm)
     M = arm.mass_matrix(torch.from_numpy(q))
     for k in range(len(q)):
@@ -216,7 +238,135 @@ def test_inertia_from_collision_shapes_differs_in_inertia_alone(panda):
     assert (smallest[0] < 0.1 * smallest[1]).all()
 
 
+@pytest.mark.parametrize("tip", [None, "panda_link5", "panda_hand"])
+def test_tip_of_the_panda_is_where_its_urdf_puts_it(tip):
+    arm = BulletArm(PANDA, locked_joints=FINGERS, tip=tip)
+    check_tip(arm, panda_text(), tip or "panda_grasptarget")
+
+
+@pytest.mark.parametrize("tip", [None, "one"])
+def test_tip_with_turned_and_shifted_inertial_frames(spatial, tip):
+    check_tip(BulletArm(spatial, tip=tip), SPATIAL, tip or "two")
+
+
+def check_tip(arm, text, link):
+    q = states(arm)[0]
+    position, jacobian = (f(torch.from_numpy(q)) for f in (arm.tip_position, arm.tip_jacobian))
+    for k in range(len(q)):
+        _, r, axes = urdf_frames(text, q[k])[link]
+        np.testing.assert_allclose(position[k], r, rtol=0, atol=1e-12)
+        expected = np.concatenate(jacobian_of(r, axes, len(q[k])))
+        np.testing.assert_allclose(jacobian[k], expected, rtol=0, atol=1e-12)
+    slopes = partial_derivatives(arm.tip_position, torch.from_numpy(q))
+    assert_near(jacobian[:, :3], slopes, 1e-10, scale=1)
+    x = torch.from_numpy(q[0]).requires_grad_()
+    (gradient,) = torch.autograd.grad(arm.tip_position(x)[1], x)
+    assert torch.equal(gradient, jacobian[0, 1])
+
+
+def test_default_tip_is_the_frame_behind_the_last_joint(pendulum):
+    arm = BulletArm(pendulum(('child link="tool"/', 'child link="tool"/><origin xyz="0 0 -0.4"/')))
+    q = torch.tensor([0.3, 0.5], dtype=torch.float64)
+    a, b = 0.3, 0.8
+    expected = [-0.5 * np.sin(a) - 0.4 * np.sin(b), 0, -0.5 * np.cos(a) - 0.4 * np.cos(b)]
+    np.testing.assert_allclose(arm.tip_position(q), expected, rtol=0, atol=1e-12)
+    assert arm.tip_position(q.float()).dtype == torch.float32
+
+
+# Plants that differ from their model.
+
+
+@pytest.mark.parametrize("inertia", ["file", "collision"])
+def test_mass_scale_multiplies_mass_matrix_and_gravity(inertia):
+    options = {"locked_joints": FINGERS, "inertia": inertia}
+    arm, heavy = BulletArm(PANDA, **options), BulletArm(PANDA, mass_scale=1.2, **options)
+    q = torch.from_numpy(states(arm)[0])
+    assert_near(heavy.mass_matrix(q), 1.2 * arm.mass_matrix(q), 1e-14)
+    assert_near(heavy.potential_force(q), 1.2 * arm.potential_force(q), 1e-14)
+    assert_near(heavy.potential_energy(q), 1.2 * arm.potential_energy(q), 1e-14)
+
+
+@pytest.mark.parametrize("inertia", ["file", "collision"])
+@pytest.mark.parametrize("tip", [None, "panda_link5"])
+def test_payload_is_a_point_mass_at_the_tip(inertia, tip):
+    options = {"locked_joints": FINGERS, "inertia": inertia, "tip": tip, "gravity": (1, -2, -9.81)}
+    arm, loaded = BulletArm(PANDA, **options), BulletArm(PANDA, payload=2.3, **options)
+    q = torch.from_numpy(states(arm)[0])
+    J, g = arm.tip_jacobian(q)[:, :3], torch.tensor(arm.gravity, dtype=torch.float64)
+    added = loaded.mass_matrix(q) - arm.mass_matrix(q)
+    torch.testing.assert_close(added, 2.3 * J.mT @ J, rtol=0, atol=1e-13)
+    added = loaded.potential_force(q) - arm.potential_force(q)
+    torch.testing.assert_close(added, -2.3 * J.mT @ g, rtol=0, atol=1e-12)
+    added = loaded.potential_energy(q) - arm.potential_energy(q)
+    torch.testing.assert_close(added, -2.3 * arm.tip_position(q) @ g, rtol=0, atol=1e-12)
+    assert torch.equal(loaded.tip_position(q), arm.tip_position(q))
+
+
+def test_describe_names_what_changes_the_motion_and_nothing_else(panda):
+    described = panda.describe()
+    assert list(described) == ["urdf", "joints", "inertia", "damping", "gravity", "pybullet"]
+    assert described["urdf"] == hashlib.sha256(panda_text().encode()).hexdigest()
+    options = {"locked_joints": FINGERS, "damping": 0.5}
+    assert BulletArm(PANDA, tip="panda_hand", **options).describe() == described
+    changed = BulletArm(PANDA, mass_scale=0.9, payload=1.0, **options).describe()
+    extra = {"mass_scale": 0.9, "payload": 1.0, "tip": "panda_grasptarget"}
+    assert changed == {**described, **extra}
+
+
 # Bullet's own motion.
+
+
+def check_steps(q, v, u, arm):
+    a = arm.forward_dynamics(*(torch.from_numpy(x[:-1]) for x in (q, v, u))).numpy()
+    assert np.abs(a).max() > 5  # so 1e-8 is a statement about the motion
+    np.testing.assert_allclose(v[1:], v[:-1] + 1e-3 * a, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(q[1:], q[:-1] + 1e-3 * v[1:], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("change", [{"payload": 3.0}, {"mass_scale": 1.3}])
+@pytest.mark.parametrize("inertia", ["file", "collision"])
+def test_recorded_steps_of_a_changed_arm(inertia, change):
+    arm = BulletArm(PANDA, locked_joints=FINGERS, inertia=inertia, damping=0, **change)
+    q0, v0, _ = states(arm, 1)
+    check_steps(*arm.simulate(q0[0], v0[0], lambda k, q, v: 3 + 0 * q, steps=40, step=1e-3), arm)
+
+
+def test_copies_stepped_in_turn_move_as_if_alone(panda):
+    """Bullet keeps nothing of an earlier copy, nor of an arm whose damping alone differs."""
+    rng = np.random.default_rng(3)
+    q0, v0, _ = states(panda, 3)
+    torques = rng.uniform(-10, 10, (3, 41, 7))
+    arms = [panda, panda, BulletArm(PANDA, locked_joints=FINGERS, damping=2.0)]
+    alone = [
+        arm.simulate(q0[i], v0[i], lambda k, q, v, i=i: torques[i, k], steps=40, step=1e-3)
+        for i, arm in enumerate(arms)
+    ]
+    q, v = q0.copy(), v0.copy()
+    for k in range(40):
+        for i, arm in enumerate(arms):
+            arm.set_state(q[i], v[i])
+            q[i], v[i] = arm.step(torques[i, k], 1e-3)
+            np.testing.assert_array_equal(q[i], alone[i][0][k + 1])
+            np.testing.assert_array_equal(v[i], alone[i][1][k + 1])
+
+
+def test_several_steps_from_one_state_and_a_law_that_looks_at_the_arm(panda):
+    (q0, *_), (v0, *_), _ = states(panda)
+    torque = np.full(7, 2.0)
+
+    def law(k, q, v):
+        elsewhere = torch.zeros(7, dtype=torch.float64)
+        panda.potential_energy(elsewhere), panda.tip_position(elsewhere)
+        panda.dynamics(0 * q, v), panda.tip_jacobian(elsewhere)
+        return torque
+
+    panda.set_state(q0, v0)
+    stepped = [panda.step(law(k, q0, v0), 1e-3) for k in range(20)]
+    q, v, _ = panda.simulate(q0, v0, lambda k, q, v: torque, steps=20, step=1e-3)
+    np.testing.assert_array_equal(np.array([x for x, _ in stepped]), q[1:])
+    np.testing.assert_array_equal(np.array([x for _, x in stepped]), v[1:])
+    again, _, _ = panda.simulate(q0, v0, law, steps=20, step=1e-3)
+    np.testing.assert_array_equal(again, q)
 
 
 @pytest.mark.parametrize("damping", [0.0, 2.0])
@@ -230,10 +380,7 @@ def test_recorded_steps_are_those_of_the_equation_of_motion(inertia, damping):
         arm.q_high + 0.5, 2 * arm.v_max, lambda k, q, v: torques[k], steps=60, step=1e-3
     )
     np.testing.assert_array_equal(u, torques)
-    a = arm.forward_dynamics(*(torch.from_numpy(x[:-1]) for x in (q, v, u))).numpy()
-    assert np.abs(a).max() > 5  # so 1e-8 is a statement about the motion
-    np.testing.assert_allclose(v[1:], v[:-1] + 1e-3 * a, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(q[1:], q[:-1] + 1e-3 * v[1:], rtol=0, atol=1e-12)
+    check_steps(q, v, u, arm)
 
 
 def test_pendulum_swings_without_walls_and_friction_and_keeps_its_energy(pendulum):
@@ -300,6 +447,11 @@ def test_terms_are_compared_with_the_arm_as_the_truth(panda):
         ([], {"inertia": "guess"}, r"inertia is 'guess', expected 'file' or 'collision'"),
         ([], {"inertia": "collision"}, r"link 'upper' moves and has no <collision>"),
         ([], {"gravity": [0, -9.81]}, r"gravity is \[0, -9.81\], expected 3"),
+        ([], {"tip": "hand"}, r"tip is 'hand', expected a link behind a joint: upper, lower, tool"),
+        ([], {"tip": "base"}, r"tip is 'base', expected a link behind a joint: upper, lower, tool"),
+        ([], {"mass_scale": 0}, r"mass_scale is 0, expected a positive finite number"),
+        ([], {"payload": -1.0}, r"payload is -1.0, expected a finite number of at least 0 in kg"),
+        ([], {"payload": float("nan")}, r"payload is nan, expected a finite number"),
         ([('"continuous"', '"floating"')], {}, r"joint 'elbow' is of type 'floating', but an arm"),
         ([('"continuous"', '"prismatic"')], {}, r"'elbow' is of type 'prismatic'.*locked_joints"),
         ([('value="0.8"', 'value="0"')], {}, r"link 'lower' moves with joint 'elbow' and has no m"),

@@ -170,6 +170,15 @@ def test_tips_match_a_composition_of_rotations(segments, motion):
 
 
 @pytest.mark.parametrize("segments", [1, 2, 3])
+def test_backbone_matches_a_composition_of_rotations(segments, motion):
+    q = motion[0][: 3 * segments]
+    s = np.linspace(0, 1, 7)
+    points = SoftArm(segments).backbone(torch.from_numpy(q).expand(2, -1), torch.from_numpy(s))
+    assert points.shape == (2, segments, 7, 3)
+    np.testing.assert_allclose(points[1], backbone(q, s)[0], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("segments", [1, 2, 3])
 def test_kinetic_energy_is_that_of_the_moving_backbone(segments, motion):
     q, v = (x[: 3 * segments] for x in motion)
 

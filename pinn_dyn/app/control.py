@@ -1,0 +1,231 @@
+"""Control a robot by a learned model, as control.py does."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from torch import Tensor
+
+from pinn_dyn.app.build import (
+    build_actuator,
+    build_initial_states,
+    build_law,
+    build_plant,
+    build_reference,
+    build_robot,
+    build_sensor,
+    build_source,
+)
+from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.control_results import write_results, write_stability
+from pinn_dyn.app.runs import load_run, provenance, write_config
+from pinn_dyn.control import (
+    ClosedLoopRecord,
+    Controller,
+    DataRegion,
+    Guarded,
+    ProportionalDerivative,
+    Reference,
+    check_limits,
+    check_without_truth,
+    close_loop,
+    close_loop_continuous,
+    export_law,
+    model_report,
+)
+from pinn_dyn.data import DataSource
+from pinn_dyn.mechanics import MechanicalSystem, double_copy
+from pinn_dyn.systems import BulletArm
+
+log = logging.getLogger(__name__)
+
+# States per trajectory that a region of training data is drawn from.
+_REGION_SAMPLES = 200
+
+
+def control(cfg: DictConfig) -> float:
+    """Close the loop of each controller; returns the RMS error of the learned one.
+
+    Raises:
+        ConfigError: on a run that is no mechanical model, or a part that does not fit the robot.
+    """
+    config = plain(cfg)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    write_config(folder, config)
+    torch.set_num_threads(config["threads"])
+    run = load_run(Path(config["run"]), config["checkpoint"])
+    if not isinstance(run.model, MechanicalSystem):
+        raise ConfigError(
+            f"run: {run.folder} holds a black box ({run.config['model_name']}), which has no terms "
+            "M, G and A for a control law: give a run of model=lnn or model=hnn"
+        )
+    learned = double_copy(run.model)
+    source = build_source(run.config)
+    record = {"config": config, "run": run.config, **provenance()}
+    (folder / "provenance.json").write_text(json.dumps(record, indent=2))
+    if source.system is None:
+        return _report_without_truth(learned, source, folder)
+
+    robot = build_robot(run.config["dataset"], config["robot"])
+    reference = build_reference(config, robot)
+    q0, v0 = _initial_states(config, reference)
+    if isinstance(robot, BulletArm):
+        with _errors_of("reference"):
+            check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
+    laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
+    if config["export"]:
+        path = _export(laws, Path(config["export"]))
+        log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
+    if config["guard"]["threshold"] is not None:
+        laws["learned"] = _guarded(laws, config, source)
+
+    records: dict[str, ClosedLoopRecord] = {}
+    for name, law in laws.items():
+        records[name] = _close_loop(name, law, robot, reference, q0, v0, config)
+        _write_record(records[name], folder / f"record_{name}.npz")
+        for index, reason in enumerate(records[name].stopped):
+            if reason:
+                log.warning("%s, run %d was stopped: %s", name, index, reason)
+    if config["stability"] is not None:
+        with _errors_of("stability"):
+            write_stability(learned, robot, records["learned"], config, folder)
+    return write_results(records, source, robot, reference, config, folder)
+
+
+def _report_without_truth(learned: MechanicalSystem, source: DataSource, folder: Path) -> float:
+    """Of a model of measured data, what can be said where nobody knows the truth."""
+    q = torch.cat([item.q[:: _stride(item.q)] for item in source.load().train]).double()
+    with _errors_of("run"):
+        check = check_without_truth(learned, q, region=f"the training data of {source.name}")
+    text = model_report(check)
+    (folder / "stability.md").write_text(text)
+    print(text)
+    log.info(
+        "%s is measured data, there is no robot to close the loop with: what can be said of the "
+        "model alone is in %s",
+        source.name,
+        folder / "stability.md",
+    )
+    return float("nan")
+
+
+def _initial_states(config: dict[str, Any], reference: Reference) -> tuple[Tensor, Tensor]:
+    """q0 and v0, ``(K, N)``: drawn from a box, or on the reference."""
+    if config["initial_states"] is None:
+        start = reference(0.0)
+        shape = (-1, start.q.shape[-1])
+        return start.q.double().reshape(shape), start.v.double().reshape(shape)
+    # Another stream than the one that set points are drawn from, with the same seed.
+    rng = np.random.default_rng([config["seed"], 1])
+    q0, v0 = build_initial_states(config).draw(config["runs"], rng)
+    return torch.from_numpy(q0), torch.from_numpy(v0)
+
+
+def _export(laws: dict[str, Controller], path: Path) -> Path:
+    if "learned" not in laws:
+        raise ConfigError("export: there is no controller named 'learned' to export")
+    with _errors_of("export"):
+        return export_law(laws["learned"], path)
+
+
+def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSource) -> Controller:
+    """The learned law with an eye on its distance from the training data."""
+    law = laws["learned"]
+    train = source.load().train
+    fallback = None
+    if config["guard"]["fallback"]:
+        gains = config["gains"]
+        fallback = ProportionalDerivative(
+            law.num_coordinates, law.num_inputs, gains["position"], gains["velocity"]
+        )
+    with _errors_of("guard"):
+        region = DataRegion(
+            [item.q[:: _stride(item.q)] for item in train],
+            [item.v[:: _stride(item.v)] for item in train],
+            angles=getattr(getattr(law, "model", None), "angles", ()),
+        )
+        return Guarded(
+            law,
+            fallback,
+            region,
+            threshold=config["guard"]["threshold"],
+            fallback_active=fallback is not None,
+        )
+
+
+def _stride(samples: Tensor) -> int:
+    return max(1, samples.shape[0] // _REGION_SAMPLES)
+
+
+def _close_loop(
+    name: str,
+    law: Controller,
+    robot: MechanicalSystem,
+    reference: Reference,
+    q0: Tensor,
+    v0: Tensor,
+    config: dict[str, Any],
+) -> ClosedLoopRecord:
+    """One controller on the robot, in continuous time or at a rate."""
+    actuator, sensor = build_actuator(config), build_sensor(config)
+    progress = f"closing the loop: {name}"
+    law.reset()
+    with _errors_of(f"controllers.{name}"):
+        if config["rate"] is None:
+            if config["delay"] or np.any(sensor.q_noise) or np.any(sensor.v_noise):
+                raise ValueError(
+                    "rate is null, a law in continuous time, which has neither delay nor sensor "
+                    "noise: give a rate, or set them to 0"
+                )
+            return close_loop_continuous(
+                robot,
+                law,
+                reference,
+                q0,
+                v0,
+                duration=config["duration"],
+                samples_rate=config["samples_rate"],
+                actuator=actuator,
+                progress=progress,
+            )
+        return close_loop(
+            build_plant(config, robot),
+            law,
+            reference,
+            q0,
+            v0,
+            duration=config["duration"],
+            rate=config["rate"],
+            actuator=actuator,
+            sensor=sensor,
+            delay=config["delay"],
+            progress=progress,
+        )
+
+
+def _write_record(record: ClosedLoopRecord, path: Path) -> None:
+    arrays: dict[str, Any] = {
+        **{name: getattr(record, name).numpy() for name in ("t", "q", "v", "u", "u_wanted")},
+        **{f"{name}_ref": value.numpy() for name, value in record.reference._asdict().items()},
+        **{name: value.numpy() for name, value in record.diagnostics.items()},
+        "stopped": np.array([reason or "" for reason in record.stopped]),
+    }
+    np.savez_compressed(path, **arrays)
+
+
+@contextlib.contextmanager
+def _errors_of(part: str) -> Iterator[None]:
+    """Name the part of the configuration that an error is about."""
+    try:
+        yield
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"{part}: {error}") from error

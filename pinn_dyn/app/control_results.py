@@ -1,0 +1,209 @@
+"""What control.py writes: tables, figures, animation, the stability report, the TensorBoard log."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+
+from pinn_dyn.control import (
+    ClosedLoopRecord,
+    Helix,
+    Reference,
+    certify,
+    predict_steady_state,
+    required_gain,
+    stability_report,
+)
+from pinn_dyn.data import DataSource
+from pinn_dyn.evaluation import (
+    animate_bullet_arm,
+    animate_soft_arm,
+    closed_loop_figure,
+    closed_loop_metrics,
+    comparison_table,
+    controller_comparison_figure,
+    format_table,
+    save,
+    soft_arm_strip,
+    steady_state_figure,
+    tip_path_figure,
+    write_table,
+)
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.systems import BulletArm, SoftArm
+
+log = logging.getLogger(__name__)
+
+# Columns of the terminal's table; the files hold all of them.
+_SHOWN = (
+    "controller",
+    "runs",
+    "stopped",
+    "rms_error",
+    "max_error",
+    "step_error",
+    "settling_time_worst",
+    "overshoot_worst",
+    "steady_state_error_percent",
+    "input_peak",
+    "saturated_percent",
+)
+
+_STRIP_TIMES = (0.0, 0.1, 0.3, 0.6, 1.0)  # s, those of the paper's figure
+_WANTED_ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
+
+
+def write_results(
+    records: dict[str, ClosedLoopRecord],
+    source: DataSource,
+    robot: MechanicalSystem,
+    reference: Reference,
+    config: dict[str, Any],
+    folder: Path,
+) -> float:
+    """Write tables, figures and the animation; returns the RMS error of the first controller."""
+    actuator = config["actuator"]
+    metrics = {
+        name: closed_loop_metrics(
+            record,
+            settle_fraction=config["settle_fraction"],
+            settled_after=config["settled_after"] if _at_rest(record) else None,
+            u_low=actuator["low"],
+            u_high=actuator["high"],
+        )
+        for name, record in records.items()
+    }
+    table = comparison_table(metrics)
+    write_table(table, folder, "summary")
+    write_table(
+        _together({name: m.per_coordinate() for name, m in metrics.items()}), folder, "coordinates"
+    )
+    write_table(_together({name: m.per_input() for name, m in metrics.items()}), folder, "inputs")
+
+    figures = _figures(records, source, robot, reference, config)
+    for name, figure in figures.items():
+        save(figure, folder / f"{name}.png")
+    with SummaryWriter(str(folder / "tensorboard")) as writer:
+        writer.add_text("summary", f"<pre>{format_table(table)}</pre>")
+        for name, figure in figures.items():
+            writer.add_figure(name, figure)
+        for row in table.to_dict("records"):
+            for key, value in row.items():
+                if isinstance(value, (int, float)):
+                    writer.add_scalar(f"{key}/{row['controller']}", value)
+    first = next(iter(records))
+    if config["animate"]:
+        _animate(records[first], robot, config["trajectory"], folder / f"animation_{first}.gif")
+
+    shown = [column for column in table if column.startswith(_SHOWN)]
+    duration, runs = f"{config['duration']:g} s", len(records[first].stopped)
+    print(f"\n{source.name}: closed loop of {duration}, {runs} run{'s' if runs > 1 else ''}")
+    print(format_table(table[shown]))
+    print(f"\ntables, figures and recorded motions are in {folder}")
+    return metrics[first].rms_error
+
+
+def write_stability(
+    learned: MechanicalSystem,
+    robot: MechanicalSystem,
+    record: ClosedLoopRecord,
+    config: dict[str, Any],
+    folder: Path,
+) -> None:
+    """Proposition 1 over a box, and the predicted steady state of every set point of the runs.
+
+    Raises:
+        ValueError: if the runs are not of set points, or the system is not fully actuated.
+    """
+    box = config["stability"]
+    low, high = (torch.tensor(box[key], dtype=torch.float64) for key in ("q_low", "q_high"))
+    generator = torch.Generator().manual_seed(config["seed"])
+    shape = (box["samples"], len(low))
+    q = low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+    gains = config["gains"]["position"], config["gains"]["velocity"]
+    certificate = certify(learned, robot, q, *gains, region=box["region"])
+    write_table(certificate.to_frame(), folder, "stability_region")
+
+    q_ref = record.reference.q[:, 0]
+    if bool((record.reference.q != record.reference.q[:, :1]).any()):
+        raise ValueError(
+            "the reference moves: a steady state is predicted for set points only, use "
+            "reference=set_point or reference=random_set_points"
+        )
+    predicted = predict_steady_state(learned, robot, q_ref, *gains)
+    measured = torch.linalg.vector_norm(record.q[:, -1] - q_ref, dim=-1)
+    table = predicted.to_frame()
+    table["measured_error"] = measured.numpy()
+    write_table(table, folder, "stability_set_points")
+    wanted = {error: required_gain(learned, robot, q_ref, error=error) for error in _WANTED_ERRORS}
+    text = stability_report(certificate, [predicted], [measured], wanted)
+    (folder / "stability.md").write_text(text)
+    figure = steady_state_figure(
+        torch.where(predicted.holds, predicted.bound, torch.inf),
+        measured,
+        title="Steady-state error of the learned regulator and its predicted bound",
+    )
+    save(figure, folder / "steady_state.png")
+    log.info("the stability report is in %s", folder / "stability.md")
+
+
+def _figures(
+    records: dict[str, ClosedLoopRecord],
+    source: DataSource,
+    robot: MechanicalSystem,
+    reference: Reference,
+    config: dict[str, Any],
+) -> dict[str, Figure]:
+    run = config["trajectory"]
+    figures = {
+        f"closed_loop_{name}": closed_loop_figure(
+            record,
+            run,
+            title=f"{source.name}, {name} controller, run {run}",
+            labels=source.labels,
+            input_labels=source.input_labels,
+        )
+        for name, record in records.items()
+    }
+    figures["comparison"] = controller_comparison_figure(
+        records, title=f"{source.name}: error of the closed loop"
+    )
+    first = next(iter(records.values()))
+    if isinstance(robot, SoftArm):
+        times = [time for time in _STRIP_TIMES if time <= config["duration"]]
+        figures["strip"] = soft_arm_strip(
+            first, run, robot, times, title=f"{source.name}, {next(iter(records))} controller"
+        )
+    if isinstance(reference, Helix) and isinstance(robot, BulletArm):
+        figures["tip_path"] = tip_path_figure(
+            first.t,
+            {name: robot.tip_position(record.q[run]) for name, record in records.items()},
+            torch.stack([torch.as_tensor(reference.path(float(t))) for t in first.t]),
+            title=f"{source.name}: path of the end effector",
+        )
+    return figures
+
+
+def _together(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """Tables of several controllers under each other."""
+    named = pd.concat(tables, names=["controller"]).reset_index("controller")
+    return named.reset_index(drop=True)
+
+
+def _at_rest(record: ClosedLoopRecord) -> bool:
+    """Whether the reference is a set point that the runs do not start at."""
+    constant = bool((record.reference.q == record.reference.q[:, :1]).all())
+    return constant and not bool((record.q[:, 0] == record.reference.q[:, 0]).all(-1).any())
+
+
+def _animate(record: ClosedLoopRecord, robot: MechanicalSystem, run: int, path: Path) -> None:
+    if isinstance(robot, SoftArm):
+        animate_soft_arm(record, run, robot, path)
+    elif isinstance(robot, BulletArm):
+        animate_bullet_arm(record, run, robot, path)

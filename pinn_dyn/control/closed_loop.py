@@ -1,0 +1,429 @@
+"""Run a closed loop: a control law on a plant, at control instants or in continuous time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.integrate import BDF
+from scipy.sparse import bsr_matrix, csc_matrix
+from torch import Tensor
+from tqdm import tqdm
+
+from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
+from pinn_dyn.control.effects import Actuator, Delay, Sensor
+from pinn_dyn.control.plants import solve_by_halves
+from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import require_finite
+
+
+def close_loop(
+    plant: Plant,
+    controller: Controller,
+    reference: Reference,
+    q0: Tensor,
+    v0: Tensor,
+    *,
+    duration: float,
+    rate: float,
+    actuator: Actuator | None = None,
+    sensor: Sensor | None = None,
+    delay: int = 0,
+    q_bound: float = 1e3,
+    progress: str | None = None,
+) -> ClosedLoopRecord:
+    """Run a sampled closed loop, K copies at once, with the input held between instants::
+
+        u_wanted(t_k) = law(t_k, q + noise, v + noise, reference(t_k))
+        u(t_k) = actuator(u_wanted(t_k-d)),    t_k = k / rate,  k = 0 ... duration * rate
+
+    A copy is stopped, and the others go on, once its state is not finite or q leaves its bound,
+    the sensor or the law give something that is not finite, or the controller reports a fault.
+    What was known at that instant is recorded: everything after it is NaN. The law sees a stopped
+    copy at rest where it was last measured, and the plant is started afresh without it. Ctrl-C
+    ends the run early and gives the record so far.
+
+    Args:
+        plant: what is controlled.
+        controller: the law; it is reset first.
+        reference: the desired motion.
+        q0: initial configurations, ``(K, N)``, float64.
+        v0: initial velocities, ``(K, N)``, float64.
+        duration: length of the run in s, an integer multiple of 1 / rate.
+        rate: control instants per second, 1/s.
+        actuator: limits of the input; none if None.
+        sensor: noise of the measurement; none if None.
+        delay: dead time of the input in control instants; zero input arrives before the first.
+        q_bound: a copy with an entry of |q| beyond it has diverged, in the units of q.
+        progress: label of a progress bar; no bar if None.
+
+    Raises:
+        ValueError: on sizes that do not agree, initial states that are not finite, or a duration
+            that is no multiple of 1 / rate.
+    """
+    run = _Run(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)
+    queue = Delay(delay)
+    if sensor is not None:
+        sensor.reset()
+    q, v, moving = q0.clone(), v0.clone(), run.running.clone()
+    k, u = 0, torch.empty(0)
+    try:
+        with torch.no_grad():
+            plant.start(q0, v0)
+            for k in tqdm(range(len(run.t)), desc=progress, disable=progress is None):
+                if not torch.equal(moving, run.running):
+                    moving = run.running.clone()
+                    plant.start(q[moving], v[moving])
+                if k > 0:
+                    q[moving], v[moving] = plant.advance(u[moving], 1 / rate)
+                run.observe(k, q, v)
+                run.measure(k, *((q, v) if sensor is None else sensor(q, v)))
+                u = run.apply(k, queue(run.ask(k)))
+                if not run.running.any():
+                    break
+    except KeyboardInterrupt:
+        run.stop(run.running, float(run.t[k]), "interrupted")
+        return run.record(k + 1)
+    return run.record(len(run.t))
+
+
+def close_loop_continuous(
+    system: MechanicalSystem,
+    controller: Controller,
+    reference: Reference,
+    q0: Tensor,
+    v0: Tensor,
+    *,
+    duration: float,
+    samples_rate: float,
+    actuator: Actuator | None = None,
+    rtol: float = 1e-6,
+    atol: float = 1e-8,
+    q_bound: float = 1e3,
+    progress: str | None = None,
+) -> ClosedLoopRecord:
+    """Run a closed loop whose law acts in continuous time, K copies at once::
+
+        M(q) dv/dt + C(q, v) v + G(q) + D(q) v = A(q) u,   u = limits(law(t, q, v, reference(t)))
+
+    High gains on small inertias make it stiff, so the solver is SciPy's BDF, implicit and of order
+    1 to 5 (Shampine, Reichelt 1997), with a block-diagonal Jacobian by finite differences. The
+    copies share its steps, whose error is controlled in each of them. A copy that the solver
+    cannot follow is stopped there, the others go on. Inputs, diagnostics and faults are those of
+    the samples.
+
+    Args:
+        system: what is controlled.
+        controller: the law; it must not remember what it was called with.
+        reference: the desired motion.
+        q0: initial configurations, ``(K, N)``, float64.
+        v0: initial velocities, ``(K, N)``, float64.
+        duration: length of the run in s, an integer multiple of 1 / samples_rate.
+        samples_rate: samples of the record per second, 1/s.
+        actuator: limits of the input, without a rate; none if None.
+        rtol: relative tolerance of the solver.
+        atol: absolute tolerance of the solver, in the units of q and v.
+        q_bound: a copy with an entry of |q| beyond it has diverged, in the units of q.
+        progress: label of a progress bar; no bar if None.
+
+    Raises:
+        ValueError: as :func:`close_loop`, or on an actuator with a rate limit.
+    """
+    if actuator is not None and actuator.rate is not None:
+        raise ValueError(
+            f"actuator has rate = {actuator.rate}, but in continuous time there is no instant "
+            "before to limit the rate from: leave it out, or use close_loop"
+        )
+    run = _Run(system, controller, reference, q0, v0, duration, samples_rate, actuator, q_bound)
+
+    def law_and_system(t: float, x: Tensor, *motion: Tensor) -> Tensor:
+        q, v = x.chunk(2, dim=-1)
+        u = controller(t, q, v, Motion(*motion))
+        return system.velocity_derivative(x, u if actuator is None else actuator.limit(u))
+
+    with torch.no_grad():
+        x0 = torch.cat([q0, v0], dim=-1)
+        loop = _ContinuousLoop(law_and_system, reference, x0, run.t, q_bound)
+        loop.solve(rtol, atol, progress)
+        controller.reset()
+        for k in range(len(run.t)):
+            for copy, (time, reason) in enumerate(loop.ends):
+                if time <= float(run.t[k]):
+                    run.stop(torch.arange(len(q0)) == copy, time, reason)
+            q, v = loop.states[:, k].chunk(2, dim=-1)
+            run.observe(k, q, v)
+            run.measure(k, q, v)
+            run.apply(k, run.ask(k))
+            if not run.running.any():
+                break
+    return run.record(len(run.t))
+
+
+class _Run:
+    """The state of a run: who is still running, what the law sees, and the record so far."""
+
+    def __init__(
+        self,
+        plant: Plant | MechanicalSystem,
+        controller: Controller,
+        reference: Reference,
+        q0: Tensor,
+        v0: Tensor,
+        duration: float,
+        rate: float,
+        actuator: Actuator | None,
+        q_bound: float,
+    ):
+        n, m = plant.num_coordinates, plant.num_inputs
+        _check_sizes(plant, controller, reference)
+        _check_start(q0, v0, n)
+        self.t = _instants(duration, rate)
+        self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
+        self._shape_of_u = (len(q0), m)
+        self._controller, self._actuator = controller, actuator
+        self._interval, self._q_bound = 1 / rate, q_bound
+        self._seen = q0.clone(), v0.clone()
+        self._motions = [_motion(reference, float(t), q0) for t in self.t]
+        samples = (len(q0), len(self.t))
+        self._q, self._v = (q0.new_full((*samples, n), torch.nan) for _ in range(2))
+        self._u, self._u_wanted = (q0.new_full((*samples, m), torch.nan) for _ in range(2))
+        self._diagnostics: dict[str, Tensor] = {}
+        self._stopped: list[str | None] = [None] * len(q0)
+        controller.reset()
+        if actuator is not None:
+            actuator.reset()
+
+    def stop(self, who: Tensor, time: float, reason: str) -> None:
+        """Stop those of ``who`` that still run."""
+        for copy in (who & self.running).nonzero()[:, 0].tolist():
+            self._stopped[copy] = f"{reason} at t = {time:.6g} s"
+        self.running &= ~who
+
+    def observe(self, k: int, q: Tensor, v: Tensor) -> None:
+        """Take note of the true state at instant k; stops who has diverged."""
+        finite = _finite(q) & _finite(v)
+        self.stop(~finite, float(self.t[k]), "the plant diverged: its state is not finite")
+        self._q[self.running, k] = q[self.running]
+        self._v[self.running, k] = v[self.running]
+        beyond = (q.abs() > self._q_bound).any(-1)
+        reason = f"the plant diverged: |q| is beyond {self._q_bound:g}"
+        self.stop(beyond, float(self.t[k]), reason)
+
+    def measure(self, k: int, q: Tensor, v: Tensor) -> None:
+        """Take what the sensor says at instant k; stops whose measurement is not finite."""
+        lost = ~(_finite(q) & _finite(v))
+        self.stop(lost, float(self.t[k]), "the measurement is not finite")
+        for seen, new in zip(self._seen, (q, v), strict=True):
+            seen[self.running] = new[self.running]
+
+    def ask(self, k: int) -> Tensor:
+        """The input that the law wants at instant k; it means nothing for who has stopped."""
+        time = float(self.t[k])
+        q, v = self._seen
+        u = self._controller(time, q, v, self._motions[k])
+        if u.shape != self._shape_of_u:
+            raise ValueError(
+                f"the controller's input has shape {tuple(u.shape)}, expected {self._shape_of_u}"
+            )
+        self._u_wanted[self.running, k] = u[self.running]
+        self._diagnose(k, self._controller.diagnostics())
+        for reason, who in self._controller.faults().items():
+            self.stop(who, time, reason)
+        self.stop(~_finite(u), time, "the law's input is not finite")
+        return u
+
+    def apply(self, k: int, u: Tensor) -> Tensor:
+        """The input that the actuator lets through at instant k."""
+        if self._actuator is not None:
+            u, changed = self._actuator(u, self._interval)
+            self._diagnose(k, {"saturated_inputs": changed.sum(-1)})
+        self._u[self.running, k] = u[self.running]
+        return u
+
+    def record(self, samples: int) -> ClosedLoopRecord:
+        """What happened at the first instants."""
+        motions = self._motions[:samples]
+        q_ref, v_ref, a_ref = (torch.stack(values, 1) for values in zip(*motions, strict=True))
+        q, v, u, u_wanted = (x[:, :samples] for x in (self._q, self._v, self._u, self._u_wanted))
+        diagnostics = {name: values[:, :samples] for name, values in self._diagnostics.items()}
+        reference = Motion(q_ref, v_ref, a_ref)
+        t = self.t[:samples]
+        return ClosedLoopRecord(t, q, v, u, u_wanted, reference, self._stopped, diagnostics)
+
+    def _diagnose(self, k: int, values: dict[str, Tensor]) -> None:
+        for name, value in values.items():
+            if name not in self._diagnostics:
+                self._diagnostics[name] = self._q.new_full(self._q.shape[:2], torch.nan)
+            self._diagnostics[name][self.running, k] = value[self.running].to(self._q)
+
+
+class _ContinuousLoop:
+    """dx/dt = field(t, x, *motion) for K copies that lose each other without harm, by BDF.
+
+    Attributes:
+        states: solution at the samples, ``(K, T, 2N)``; NaN once a copy is lost.
+        ends: for each copy, when in s it was lost, infinity if never, and why.
+    """
+
+    def __init__(
+        self,
+        field: Callable[..., Tensor],
+        reference: Reference,
+        x0: Tensor,
+        t: Tensor,
+        q_bound: float,
+    ):
+        self._field, self._reference, self._t, self._q_bound = field, reference, t, q_bound
+        self.states = x0.new_full((len(x0), len(t), x0.shape[-1]), torch.nan)
+        self.states[:, 0] = x0
+        self.ends = [(np.inf, "")] * len(x0)
+
+    def solve(self, rtol: float, atol: float, progress: str | None) -> None:
+        """Solve all copies together; where that fails, each half of them on its own."""
+        everyone = torch.arange(len(self.states))
+        pending = [(everyone, 0.0, self.states[:, 0])]
+        with tqdm(
+            total=len(everyone) * float(self._t[-1]),
+            desc=progress,
+            disable=progress is None,
+            bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
+        ) as bar:
+            while pending:
+                who, time, x = pending.pop()
+                time, x, lost = self._solve_together(who, time, x, rtol, atol, bar)
+                if time == float(self._t[-1]) or lost.all():
+                    continue
+                if lost.any():
+                    pending.append((who[~lost], time, x[~lost]))
+                else:
+                    halves = zip(who.tensor_split(2), x.tensor_split(2), strict=True)
+                    pending += [(part, time, states) for part, states in halves]
+
+    def _solve_together(
+        self, who: Tensor, time: float, x: Tensor, rtol: float, atol: float, bar: tqdm
+    ) -> tuple[float, Tensor, Tensor]:
+        """Solve some copies as far as it goes; returns the time, their states and who is lost."""
+        end = float(self._t[-1])
+        lost = ~_finite(self._rows(who, time, x))
+        if lost.any():
+            return self._lose(who, time, x, lost, "the acceleration is not finite")
+        # SciPy takes the root mean square over all copies: this keeps each one within rtol, atol.
+        share = len(who) ** -0.5
+        solver = BDF(
+            lambda t, flat: self._rows(who, t, self._unflatten(who, flat)).numpy().ravel(),
+            time,
+            x.numpy().ravel(),
+            end,
+            rtol=share * rtol,
+            atol=share * atol,
+            jac=lambda t, flat: self._jacobian(who, t, self._unflatten(who, flat)),
+        )
+        while solver.status == "running":
+            solver.step()
+            if solver.status == "failed":
+                lost = torch.full((len(who),), len(who) == 1)
+                return self._lose(who, time, x, lost, "the solver cannot follow the motion")
+            samples = (self._t > time) & (self._t <= solver.t)
+            bar.update(len(who) * (solver.t - time))
+            time, x = float(solver.t), self._unflatten(who, solver.y)
+            if samples.any():
+                dense = torch.from_numpy(solver.dense_output()(self._t[samples].numpy()))
+                self.states[who[:, None], samples.nonzero()[:, 0]] = dense.unflatten(
+                    0, (len(who), -1)
+                ).transpose(1, 2)
+            lost = (x.chunk(2, dim=-1)[0].abs() > self._q_bound).any(-1)
+            if lost.any():
+                return self._lose(who, time, x, lost, f"|q| is beyond {self._q_bound:g}")
+        return end, x, lost
+
+    def _lose(
+        self, who: Tensor, time: float, x: Tensor, lost: Tensor, reason: str
+    ) -> tuple[float, Tensor, Tensor]:
+        for copy in who[lost].tolist():
+            self.ends[copy] = (time, f"the plant diverged: {reason}")
+        return time, x, lost
+
+    def _rows(self, who: Tensor, time: float, x: Tensor) -> Tensor:
+        """dx/dt of states ``(*batch, k, 2N)``; NaN where a matrix is not positive definite."""
+        motion = _motion(self._reference, time, self.states[:, 0].chunk(2, dim=-1)[0])
+        rows = [y[who].expand(*x.shape[:-1], -1).flatten(0, -2) for y in motion]
+        field = partial(self._field, time)
+        return solve_by_halves(field, x.flatten(0, -2), *rows).reshape(x.shape)
+
+    def _jacobian(self, who: Tensor, time: float, x: Tensor) -> csc_matrix:
+        """Forward differences of all copies at once: a block of 2N x 2N for each."""
+        size = x.shape[-1]
+        step = torch.finfo(x.dtype).eps ** 0.5 * x.abs().clamp_min(1.0)
+        shifted = (x[:, None] + torch.diag_embed(step)).transpose(0, 1)
+        values = self._rows(who, time, torch.cat([x[None], shifted]))
+        blocks = (values[1:] - values[:1]).permute(1, 2, 0) / step[:, None]
+        # One entry that is not finite would spoil the factors of every copy.
+        blocks = blocks.nan_to_num(0.0, 0.0, 0.0)
+        index = np.arange(len(who) + 1)
+        shape = (len(who) * size,) * 2
+        return bsr_matrix((blocks.numpy(), index[:-1], index), shape=shape).tocsc()
+
+    def _unflatten(self, who: Tensor, flat: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.array(flat)).reshape(len(who), -1)
+
+
+def _finite(x: Tensor) -> Tensor:
+    return x.isfinite().all(-1)
+
+
+def _motion(reference: Reference, time: float, like: Tensor) -> Motion:
+    """The reference at one time, for each copy: ``(K, N)`` like another tensor."""
+    motion = reference(time)
+    for name, value in zip(Motion._fields, motion, strict=True):
+        if value.shape not in (like.shape, like.shape[1:]):
+            raise ValueError(
+                f"the reference's {name} has shape {tuple(value.shape)}, expected "
+                f"{tuple(like.shape[1:])} or {tuple(like.shape)}: one motion for all copies, or "
+                "one for each"
+            )
+    return Motion(*(value.to(like).expand_as(like) for value in motion))
+
+
+def _check_sizes(
+    plant: Plant | MechanicalSystem, controller: Controller, reference: Reference
+) -> None:
+    for part, name in ((controller, "controller"), (reference, "reference")):
+        if part.num_coordinates != plant.num_coordinates:
+            raise ValueError(
+                f"the {name} has {part.num_coordinates} coordinates and the plant "
+                f"{plant.num_coordinates}: they must be for the same robot"
+            )
+    if controller.num_inputs != plant.num_inputs:
+        raise ValueError(
+            f"the controller has {controller.num_inputs} inputs and the plant "
+            f"{plant.num_inputs}: they must be for the same robot"
+        )
+
+
+def _check_start(q0: Tensor, v0: Tensor, size: int) -> None:
+    for name, value in (("q0", q0), ("v0", v0)):
+        if value.ndim != 2 or value.shape != (len(q0), size) or not len(q0):
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, expected (K, {size}): K copies, the "
+                "same for q0 and v0"
+            )
+        if value.dtype != torch.float64:
+            raise ValueError(f"{name} is {value.dtype}, expected float64: call {name}.double()")
+        require_finite(name, value)
+
+
+def _instants(duration: float, rate: float) -> Tensor:
+    if not (0 < rate < np.inf and 0 < duration < np.inf):
+        raise ValueError(
+            f"duration is {duration} s and the rate {rate} 1/s, expected positive numbers"
+        )
+    steps = round(duration * rate)
+    if steps < 1 or abs(duration * rate - steps) > 1e-6:
+        raise ValueError(
+            f"duration is {duration} s, expected an integer multiple of {1 / rate:g} s, the time "
+            f"between instants at {rate:g} Hz"
+        )
+    return torch.arange(steps + 1, dtype=torch.float64) / rate

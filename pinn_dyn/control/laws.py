@@ -1,0 +1,281 @@
+"""Control laws on the terms of a mechanical system, true or learned, and a PD law without any."""
+
+from __future__ import annotations
+
+import abc
+import math
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.control.gains import Gain, diagonal_gain
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import matvec, require_last_dim
+
+
+class StateFeedback(Controller):
+    """A law without memory, u = law(q, v, q_ref, v_ref, a_ref), with diagonal gains.
+
+    Attributes:
+        position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``, float64.
+
+    Raises:
+        ValueError: on gains that are not positive, or not 1 or N of them.
+    """
+
+    def __init__(
+        self, num_coordinates: int, num_inputs: int, position_gain: Gain, velocity_gain: Gain
+    ):
+        super().__init__(num_coordinates, num_inputs)
+        self.position_gain = diagonal_gain("position_gain", position_gain, num_coordinates)
+        self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, num_coordinates)
+
+    @abc.abstractmethod
+    def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
+        """The formula alone: tensors in, u ``(*batch, M)`` out, no checks and no side effects."""
+
+    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        """The input u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
+
+        Raises:
+            ValueError: on a last dimension that is not N; names the argument.
+        """
+        self._check(q, v, reference)
+        with torch.no_grad():
+            return self.law(q, v, *reference)
+
+    def _check(self, q: Tensor, v: Tensor, reference: Motion) -> None:
+        require_last_dim("q", q, self.num_coordinates, "N")
+        require_last_dim("v", v, self.num_coordinates, "N")
+        for name, value in zip(reference._fields, reference, strict=True):
+            require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
+
+    def _feedback(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor) -> Tensor:
+        """K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
+        return self.position_gain.to(q) * (q_ref - q) + self.velocity_gain.to(q) * (v_ref - v)
+
+
+class ProportionalDerivative(StateFeedback):
+    """PD control without a model, one input to each coordinate::
+
+        u = K_P (q_ref - q) + K_D (v_ref - v)
+
+    Args:
+        num_coordinates: N.
+        num_inputs: M, must equal N.
+        position_gain: diagonal of K_P, 1/m or 1/rad times the unit of u.
+        velocity_gain: diagonal of K_D, s/m or s/rad times the unit of u.
+
+    Raises:
+        ValueError: if M differs from N, or on bad gains.
+    """
+
+    def __init__(
+        self, num_coordinates: int, num_inputs: int, position_gain: Gain, velocity_gain: Gain
+    ):
+        if num_inputs != num_coordinates:
+            raise ValueError(
+                f"num_inputs is {num_inputs}, expected {num_coordinates}, the number of "
+                "coordinates: a PD law alone cannot know how other inputs act on them; use the "
+                "regulation law on a model, which has an input matrix A(q)"
+            )
+        super().__init__(num_coordinates, num_inputs, position_gain, velocity_gain)
+
+    def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
+        return self._feedback(q, v, q_ref, v_ref)
+
+
+class ModelBasedLaw(StateFeedback):
+    """A law on the terms of a model, with A^+(q), the pseudo-inverse of its input matrix.
+
+    For A of full rank, and with damping d (damped least squares, Nakamura and Hanafusa 1986)::
+
+        N <= M:  A^+ = A^T (A A^T + d^2 I)^-1         N > M:  A^+ = (A^T A + d^2 I)^-1 A^T
+
+    - Fully actuated, M = N and d = 0: A^+ is the inverse, and A A^+ tau = tau.
+    - Under-actuated, M < N: A A^+ tau is only the part of tau in the range of A (its orthogonal
+      projection); the rest is not compensated.
+    - Over-actuated, M > N: A^+ tau is the input of least norm that gives tau.
+
+    d = 0 gives infinite or NaN inputs where A loses its rank; d > 0 keeps them finite, below
+    |tau| / (2 d), at the price of A A^+ tau != tau everywhere.
+
+    Args:
+        model: the mechanical system whose terms the law uses, in float64.
+        position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
+        inverse_damping: d, in the unit of the entries of A.
+        max_condition: largest condition number of A(q), the ratio of its largest to its smallest
+            singular value, that is no fault; infinity to accept all but NaN.
+
+    Raises:
+        TypeError: on a model that is no mechanical system.
+        ValueError: on bad gains, a negative damping, or a condition number below 1.
+    """
+
+    def __init__(
+        self,
+        model: MechanicalSystem,
+        position_gain: Gain,
+        velocity_gain: Gain,
+        *,
+        inverse_damping: float = 0.0,
+        max_condition: float = 1e6,
+    ):
+        if not isinstance(model, MechanicalSystem):
+            raise TypeError(
+                f"{type(self).__name__}: model is a {type(model).__name__}, expected a mechanical "
+                "system: a black box has no terms M, G and A for a control law; use a run of "
+                "model=lnn or model=hnn"
+            )
+        if not (inverse_damping >= 0 and math.isfinite(inverse_damping)):
+            raise ValueError(f"inverse_damping is {inverse_damping}, expected 0 or more, finite")
+        if not max_condition >= 1:
+            raise ValueError(f"max_condition is {max_condition}, expected a number of at least 1")
+        super().__init__(model.num_coordinates, model.num_inputs, position_gain, velocity_gain)
+        self.model = model
+        self.inverse_damping = float(inverse_damping)
+        self.max_condition = float(max_condition)
+        self._condition: Tensor | None = None
+
+    def reset(self) -> None:
+        self._condition = None
+
+    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        """The input u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
+
+        Raises:
+            ValueError: on a last dimension that is not N; names the argument.
+        """
+        self._check(q, v, reference)
+        with torch.no_grad():
+            A = self.model.input_matrix(q)
+            self._condition = condition_number(A)
+            return self._input(A, q, v, *reference)
+
+    def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
+        return self._input(self.model.input_matrix(q), q, v, q_ref, v_ref, a_ref)
+
+    @abc.abstractmethod
+    def _input(
+        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
+    ) -> Tensor:
+        """The formula of the law, given A(q) ``(*batch, N, M)``."""
+
+    def diagnostics(self) -> dict[str, Tensor]:
+        """``input_condition``: condition number of A(q), ``(*batch,)``; NaN where A has none."""
+        return {} if self._condition is None else {"input_condition": self._condition}
+
+    def faults(self) -> dict[str, Tensor]:
+        """Where the condition number of A(q) exceeds its limit or is NaN."""
+        if self._condition is None:
+            return {}
+        reason = (
+            "the input matrix A(q) is nearly singular: its condition number exceeds "
+            f"max_condition = {self.max_condition:g}"
+        )
+        return {reason: ~(self._condition <= self.max_condition)}
+
+
+class Regulation(ModelBasedLaw):
+    """Regulation to a constant configuration, PD with gravity compensation.
+
+    Paper eq. (controller_PD), after Tomei 1991::
+
+        u = A^+(q) G(q) + A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
+
+    At a set point v_ref = 0, and this is the paper's law; along a moving reference it is PD with
+    gravity compensation and without feed-forward. Stability is shown for M = N and A of
+    full rank (paper, Corollary on perfect learning: the terms may be those of the plant times one
+    common matrix P(q)). Arguments, A^+ where M differs from N, and errors: :class:`ModelBasedLaw`.
+    K_P in N/m or Nm/rad and K_D in Ns/m or Nms/rad where A has no unit.
+    """
+
+    def _input(
+        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
+    ) -> Tensor:
+        potential = pseudo_inverse_times(A, self.model.potential_force(q), self.inverse_damping)
+        feedback = self._feedback(q, v, q_ref, v_ref)
+        return potential + matvec(A.transpose(-1, -2), feedback)
+
+
+class Tracking(ModelBasedLaw):
+    """Tracking of a desired motion, PD with its feed-forward.
+
+    Paper eq. (controller), PD control with computed feed-forward (Kelly and Salgado 1994)::
+
+        u = A^+(q) (M(q_r) a_r + C(q_r, v_r) v_r + D(q_r) v_r + F(v_r) + G(q_r))
+            + A(q)^T (K_P (q_r - q) + K_D (v_r - v))
+
+    with the dry friction F beside the paper's terms where a model has one. The paper's text takes
+    C from d2L/(dq dv), which gives (dM/dt) v alone; here C v = (dM/dt) v - d(v^T M v / 2)/dq, the
+    whole of what the Euler-Lagrange equation gives. Arguments, A^+ where M differs from N, and
+    errors: :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
+    """
+
+    def _input(
+        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
+    ) -> Tensor:
+        force = self.model.inverse_dynamics(q_ref, v_ref, a_ref)
+        feed_forward = pseudo_inverse_times(A, force, self.inverse_damping)
+        feedback = self._feedback(q, v, q_ref, v_ref)
+        return feed_forward + matvec(A.transpose(-1, -2), feedback)
+
+
+class ComputedTorque(ModelBasedLaw):
+    """Computed torque, inverse dynamics control (Spong, Hutchinson, Vidyasagar 2006, ch. 8)::
+
+        u = A^+(q) (M(q) a + C(q, v) v + G(q) + D(q) v + F(v)),
+        a = a_r + K_D (v_r - v) + K_P (q_r - q)
+
+    With the true terms, M = N and A of full rank, the error e = q_r - q obeys
+    d2e/dt2 = -K_D de/dt - K_P e: K_P in 1/s^2 and K_D in 1/s; K_D = 2 sqrt(K_P) is critically
+    damped. Arguments, A^+ where M differs from N, and errors: :class:`ModelBasedLaw`.
+    """
+
+    def _input(
+        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
+    ) -> Tensor:
+        a = a_ref + self._feedback(q, v, q_ref, v_ref)
+        return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a), self.inverse_damping)
+
+
+def pseudo_inverse_times(A: Tensor, tau: Tensor, damping: float) -> Tensor:
+    """A^+ tau, ``(*batch, M)``; formulas in :class:`ModelBasedLaw`.
+
+    A row of the batch where A lost its rank or is not finite gives infinities or NaN, and leaves
+    the other rows as they are: no LAPACK error stops the loop.
+
+    Args:
+        A: input matrix, ``(*batch, N, M)``.
+        tau: generalized force, ``(*batch, N)``, or ``(N,)`` for the whole batch.
+        damping: d, 0 or more.
+    """
+    rows, columns = A.shape[-2:]
+    transposed = A.transpose(-1, -2)
+    b = tau.expand(A.shape[:-1]).unsqueeze(-1)
+    if damping > 0:
+        square = damping**2 * torch.eye(min(rows, columns), dtype=A.dtype, device=A.device)
+        if rows <= columns:
+            x = transposed @ torch.linalg.solve_ex(A @ transposed + square, b).result
+        else:
+            x = torch.linalg.solve_ex(transposed @ A + square, transposed @ b).result
+    elif rows == columns:
+        x = torch.linalg.solve_ex(A, b).result
+    elif rows < columns:
+        Q, R = torch.linalg.qr(transposed)
+        x = Q @ torch.linalg.solve_triangular(R.transpose(-1, -2), b, upper=False)
+    else:
+        Q, R = torch.linalg.qr(A)
+        x = torch.linalg.solve_triangular(R, Q.transpose(-1, -2) @ b, upper=True)
+    return x.squeeze(-1)
+
+
+def condition_number(A: Tensor) -> Tensor:
+    """Largest over smallest of the min(N, M) singular values of A, ``(*batch,)``.
+
+    NaN where A is zero or not finite.
+    """
+    # svdvals refuses a whole batch for one NaN, so it gets none; the sum brings the NaN back.
+    values = torch.linalg.svdvals(torch.nan_to_num(A, nan=0.0, posinf=0.0, neginf=0.0))
+    return values[..., 0] / values[..., -1] + 0 * A.sum((-2, -1))

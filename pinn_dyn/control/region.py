@@ -1,0 +1,253 @@
+"""The region that training data cover, and a guard for control laws outside it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.mechanics.arrays import require_finite, require_last_dim
+
+log = logging.getLogger(__name__)
+
+
+class DataRegion:
+    """How far a state is from the data that a model was trained on.
+
+    With x = (q, v) in units of the standard deviation of the data (an angle enters as its sine and
+    cosine), and x_1 ... x_S states drawn from the training trajectories::
+
+        distance(q, v) = min_i |x - x_i| / r
+
+    r is the 99th percentile, over the drawn states, of the distance to the nearest drawn state of
+    *another* trajectory: how far a new trajectory of the same kind stays from the data. So 1 is
+    the edge of the data, and what lies inside is below 1. Neighbours along the same trajectory
+    would make r as small as the sample time, and every new trajectory an outlier.
+
+    Args:
+        q: configurations of the training trajectories, ``(T_k, N)`` each.
+        v: their velocities, ``(T_k, N)`` each.
+        angles: which coordinates are angles that may wind, as the model has them.
+        samples: S, largest number of states to keep.
+        seed: seed of their draw.
+
+    A single trajectory is cut into ten pieces of equal length, which count as trajectories.
+
+    Raises:
+        ValueError: on shapes that do not match, non-finite states, too few states, or data without
+            any spread.
+    """
+
+    def __init__(
+        self,
+        q: Sequence[Tensor],
+        v: Sequence[Tensor],
+        *,
+        angles: Sequence[int] = (),
+        samples: int = 5000,
+        seed: int = 0,
+    ):
+        if len(q) == 0 or len(q) != len(v):
+            raise ValueError(
+                f"q holds {len(q)} trajectories and v {len(v)}: expected as many, one at least"
+            )
+        self.num_coordinates = int(q[0].shape[-1])
+        for k, (positions, velocities) in enumerate(zip(q, v, strict=True)):
+            if positions.ndim != 2 or positions.shape != velocities.shape:
+                raise ValueError(
+                    f"q[{k}] has shape {tuple(positions.shape)} and v[{k}] "
+                    f"{tuple(velocities.shape)}: expected (T, {self.num_coordinates}) for both"
+                )
+            require_last_dim(f"q[{k}]", positions, self.num_coordinates, "N")
+            require_finite(f"q[{k}]", positions)
+            require_finite(f"v[{k}]", velocities)
+        if bad := [i for i in angles if not 0 <= i < self.num_coordinates]:
+            raise ValueError(
+                f"angles has the entries {bad}, expected coordinates from 0 to "
+                f"{self.num_coordinates - 1}"
+            )
+        if samples < 2:
+            raise ValueError(f"samples is {samples}, expected at least 2")
+        self.angles = sorted(angles)
+        states = np.concatenate([self._features(*pair) for pair in zip(q, v, strict=True)])
+        spread = states.std(axis=0)
+        if self.angles:  # sine and cosine in one unit, that of the angle where it moves little
+            sine, cosine = np.split(spread[-2 * len(self.angles) :], 2)
+            spread[-2 * len(self.angles) :] = np.tile(np.hypot(sine, cosine), 2)
+        self._scale = np.where(spread > 1e-12, spread, 1.0)
+        if len(q) == 1:
+            owner = np.arange(len(states)) * 10 // len(states)
+        else:
+            owner = np.repeat(np.arange(len(q)), [len(x) for x in q])
+
+        count = min(samples, len(states))
+        drawn = np.random.default_rng(seed).choice(len(states), count, replace=False)
+        states, owner = states[drawn] / self._scale, owner[drawn]
+        self._tree = cKDTree(states)
+        self.radius = _distance_between_trajectories(states, owner)
+
+    def distance(self, q: Tensor, v: Tensor) -> Tensor:
+        """Distance from the data, ``(*batch,)``, 1 at their edge; NaN where a state is NaN.
+
+        Raises:
+            ValueError: on a last dimension that is not N.
+        """
+        require_last_dim("q", q, self.num_coordinates, "N")
+        require_last_dim("v", v, self.num_coordinates, "N")
+        states = self._features(q, v) / self._scale
+        known = np.asarray(np.isfinite(states).all(axis=-1))
+        nearest, _ = self._tree.query(np.where(known[..., None], states, 0.0))
+        return torch.as_tensor(np.where(known, nearest / self.radius, np.nan)).to(q)
+
+    def _features(self, q: Tensor, v: Tensor) -> np.ndarray:
+        x = torch.cat([q, v], dim=-1).detach().cpu().double().numpy()
+        if not self.angles:
+            return x
+        angles = x[..., self.angles]
+        return np.concatenate(
+            [np.delete(x, self.angles, axis=-1), np.sin(angles), np.cos(angles)], axis=-1
+        )
+
+
+def _distance_between_trajectories(states: np.ndarray, owner: np.ndarray) -> float:
+    """99th percentile of the distance from each state to the nearest of another trajectory."""
+    if len(np.unique(owner)) < 2:
+        raise ValueError(
+            f"the {len(states)} states drawn come from one trajectory, expected two at least: give "
+            "more data, or a larger number of samples"
+        )
+    distances = [cKDTree(states[owner != k]).query(states[owner == k])[0] for k in np.unique(owner)]
+    radius = float(np.percentile(np.concatenate(distances), 99))
+    if not radius > 0:
+        raise ValueError(
+            "all trajectories hold the same states, expected different ones: the size of the "
+            "region cannot be told from them"
+        )
+    return radius
+
+
+class Guarded(Controller):
+    """A law with a guard: it tells when the state is outside the data, and may hand over there::
+
+        u = fallback(t, q, v, reference)  if the fallback is active and distance(q, v) > threshold
+            law(t, q, v, reference)       otherwise
+
+    There is no hysteresis: each instant is judged alone, so a state that follows the edge may
+    switch back and forth. One warning is logged per run, when a state is first found outside.
+
+    Args:
+        law: the law to guard.
+        fallback: the law outside, a PD law say; None for a guard that only warns.
+        region: the training data of the law's model.
+        threshold: distance from which a state is outside; 1 is the edge of the data.
+        fallback_active: whether to hand over to the fallback outside, or only to warn.
+
+    Raises:
+        ValueError: on sizes that do not match, a threshold that is not positive, or an active
+            fallback that is None.
+    """
+
+    def __init__(
+        self,
+        law: Controller,
+        fallback: Controller | None,
+        region: DataRegion,
+        *,
+        threshold: float = 2.0,
+        fallback_active: bool,
+    ):
+        super().__init__(law.num_coordinates, law.num_inputs)
+        if region.num_coordinates != self.num_coordinates:
+            raise ValueError(
+                f"region has {region.num_coordinates} coordinates, expected those of the law, "
+                f"{self.num_coordinates}"
+            )
+        if fallback_active and fallback is None:
+            raise ValueError(
+                "fallback_active is True, but fallback is None: give a law to hand over to"
+            )
+        if fallback is not None:
+            found = (fallback.num_coordinates, fallback.num_inputs)
+            if found != (self.num_coordinates, self.num_inputs):
+                raise ValueError(
+                    f"fallback has N, M = {found}, expected those of the law, "
+                    f"{(self.num_coordinates, self.num_inputs)}"
+                )
+        if not threshold > 0:
+            raise ValueError(f"threshold is {threshold}, expected a positive number")
+        self.law = law
+        self.region = region
+        self.threshold = threshold
+        self._fallback = fallback if fallback_active else None
+        self._distance: Tensor | None = None
+        self._warned = False
+
+    def reset(self) -> None:
+        self.law.reset()
+        if self._fallback is not None:
+            self._fallback.reset()
+        self._distance = None
+        self._warned = False
+
+    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        u = self.law(t, q, v, reference)
+        self._distance = self.region.distance(q, v)
+        outside = self._distance > self.threshold
+        if not outside.any():
+            return u
+        self._warn_once(t)
+        if self._fallback is None:
+            return u
+        return torch.where(outside.unsqueeze(-1), self._fallback(t, q, v, reference), u)
+
+    def diagnostics(self) -> dict[str, Tensor]:
+        """Those of the law, with ``distance`` and, as 0 or 1, ``outside`` and ``fallback``."""
+        if self._distance is None:
+            return {}
+        own = {
+            "distance": self._distance,
+            "outside": (self._distance > self.threshold).to(self._distance),
+            "fallback": self._handed_over(self._distance).to(self._distance),
+        }
+        return self.law.diagnostics() | own
+
+    def faults(self) -> dict[str, Tensor]:
+        """Those of the law, and of the fallback where it took over."""
+        if self._distance is None:
+            return {}
+        handed = self._handed_over(self._distance)
+        faults = {reason: mask & ~handed for reason, mask in self.law.faults().items()}
+        if self._fallback is not None and handed.any():
+            for reason, mask in self._fallback.faults().items():
+                faults[reason] = faults.get(reason, torch.zeros_like(mask)) | (mask & handed)
+        return faults
+
+    def _handed_over(self, distance: Tensor) -> Tensor:
+        outside = distance > self.threshold
+        return torch.zeros_like(outside) if self._fallback is None else outside
+
+    def _warn_once(self, t: float) -> None:
+        if self._warned or self._distance is None:
+            return
+        self._warned = True
+        flat = self._distance.nan_to_num(nan=0.0).flatten()
+        farthest = int(flat.argmax())
+        count = int((flat > self.threshold).sum())
+        log.warning(
+            "t = %.4g s: %d of %d states outside the training data, the farthest (index %d) at "
+            "distance %.3g, with 1 the edge of the data and %g the limit; %s",
+            t,
+            count,
+            flat.numel(),
+            farthest,
+            float(flat[farthest]),
+            self.threshold,
+            "the model is not to be trusted there, and the law goes on with it"
+            if self._fallback is None
+            else "the fallback law takes over there",
+        )

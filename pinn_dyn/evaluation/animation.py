@@ -1,0 +1,301 @@
+"""Moving pictures of closed loops as GIFs, and a strip of poses, drawn without a display."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.evaluation.control_metrics import samples_before_stop
+from pinn_dyn.evaluation.figures import _COLOURS, _TRUTH
+from pinn_dyn.systems import BulletArm, SoftArm
+from pinn_dyn.systems.bullet_world import import_bullet
+
+_TIP = "#CC0000"
+_LAST_FRAME = 1000  # ms
+
+
+def animate_soft_arm(
+    record: ClosedLoopRecord,
+    run: int,
+    system: SoftArm,
+    path: Path,
+    *,
+    fps: float = 25,
+    reference: bool = True,
+) -> None:
+    """Write a GIF of the backbone in motion, in real time, with the path of its tip in red.
+
+    Args:
+        record: K runs.
+        run: which of the K to draw; a stopped one is drawn up to its stop.
+        system: the arm whose backbone belongs to q.
+        path: the GIF; its folder is made if there is none.
+        fps: frames per second, rounded to what a GIF can, a multiple of 10 ms each.
+        reference: draw the wanted shape in grey.
+
+    Raises:
+        ValueError: on fps outside (0, 50].
+    """
+    samples, duration = _frames(record, run, fps)
+    shape, wanted = _shapes(record, run, system)
+    scene = _scene(record, run, shape, wanted if reference else None)
+    figure = Figure(figsize=(4.8, 4.8), dpi=90)
+    canvas = FigureCanvasAgg(figure)
+    ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
+    _set_space(ax, scene)
+    images: list[Image.Image] = []
+    for sample in samples:
+        for line in list(ax.lines):
+            line.remove()
+        _draw_pose(ax, shape, wanted if reference else None, sample)
+        text = _time_text(record, run, sample, last=sample == samples[-1])
+        figure.suptitle(text, x=0.03, y=0.98, ha="left", fontsize="medium", family="monospace")
+        if not images:
+            _legend(figure, ax)
+        canvas.draw()
+        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    _save_gif(images, path, duration)
+
+
+def soft_arm_strip(
+    record: ClosedLoopRecord, run: int, system: SoftArm, times: list[float], *, title: str
+) -> Figure:
+    """Poses side by side: the backbone, the wanted one in grey, the path of the tip so far in red.
+
+    Args:
+        record: K runs.
+        run: which of the K to draw.
+        system: the arm whose backbone belongs to q.
+        times: when, s, on the clock of the record; the nearest sample is drawn.
+        title: plant and controller.
+
+    Raises:
+        ValueError: on no times, or times outside the run, which ends where it was stopped.
+    """
+    shape, wanted = _shapes(record, run, system)
+    t = record.t[: len(shape)]
+    first, last = float(t[0]), float(t[-1])
+    slack = 1e-9 * (1 + last - first)
+    if not times or min(times) < first - slack or max(times) > last + slack:
+        raise ValueError(
+            f"times is {times}, expected some between {first:g} and {last:g} s, where run {run} "
+            "begins and ends"
+        )
+    figure = Figure(figsize=(2.7 * len(times), 3.9))
+    axes = figure.subplots(1, len(times), subplot_kw={"projection": "3d"}, squeeze=False)[0]
+    scene = _scene(record, run, shape, wanted)
+    for ax, time in zip(axes, times, strict=True):
+        _set_space(ax, scene)
+        _draw_pose(ax, shape, wanted, int((t - time).abs().argmin()))
+        ax.set_title(f"{time:g} s", y=1.0)
+    _legend(figure, axes[0])
+    figure.suptitle(title)
+    figure.subplots_adjust(left=0.0, right=0.98, bottom=0.12, top=0.86, wspace=0.05)
+    return figure
+
+
+def animate_bullet_arm(
+    record: ClosedLoopRecord,
+    run: int,
+    arm: BulletArm,
+    path: Path,
+    *,
+    fps: float = 20,
+    size: tuple[int, int] = (480, 360),
+    trace: bool = True,
+) -> None:
+    """Write a GIF of the arm in motion, in real time, drawn by Bullet's software renderer.
+
+    Locked joints are at zero. The camera sees the whole arm at all times.
+
+    Args:
+        record: K runs.
+        run: which of the K to draw; a stopped one is drawn up to its stop.
+        arm: the arm, whose URDF has the visual shapes.
+        path: the GIF; its folder is made if there is none.
+        fps: frames per second, rounded to what a GIF can, a multiple of 10 ms each.
+        size: width and height in pixels.
+        trace: draw the path of the tip in red and the wanted one in grey, in front of the arm.
+
+    Raises:
+        ImportError: without PyBullet.
+        ValueError: on fps outside (0, 50].
+    """
+    samples, duration = _frames(record, run, fps)
+    q = record.q[run, samples].double()
+    tips, wanted = arm.tip_position(q), arm.tip_position(record.reference.q[run, samples].double())
+    bullet = import_bullet()
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        target = {"physicsClientId": client}
+        # The arm's own world has no visual shapes.
+        body = bullet.loadURDF(str(arm.urdf.path), useFixedBase=True, **target)
+        links = list(range(bullet.getNumJoints(body, **target)))
+        names = [bullet.getJointInfo(body, link, **target)[1].decode() for link in links]
+        joints = [names.index(name) for name in arm.joint_names]
+
+        def pose(row: Tensor) -> None:
+            for joint, angle in zip(joints, row.tolist(), strict=True):
+                bullet.resetJointState(body, joint, angle, **target)
+
+        points = [np.zeros((1, 3)), tips.numpy(), wanted.numpy()]
+        for row in q:
+            pose(row)
+            states = bullet.getLinkStates(body, links, computeForwardKinematics=True, **target)
+            points.append(np.array([state[4] for state in states]))
+        view, projection = _camera(bullet, np.concatenate(points), size)
+        shown, goal = (_pixels(x.numpy(), view, projection, size) for x in (tips, wanted))
+        images = []
+        for frame, (sample, row) in enumerate(zip(samples, q, strict=True)):
+            pose(row)
+            width, height, rgba, *_ = bullet.getCameraImage(
+                *size,
+                view,
+                projection,
+                shadow=0,
+                renderer=bullet.ER_TINY_RENDERER,
+                flags=bullet.ER_NO_SEGMENTATION_MASK,
+                **target,
+            )
+            pixels = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
+            image = Image.fromarray(pixels)
+            draw = ImageDraw.Draw(image)
+            if trace:
+                draw.line(goal, fill="#707070", width=1)
+                draw.line(shown[: frame + 1], fill=_TIP, width=2)
+                draw.circle(goal[frame], 3, outline="black")
+                draw.circle(shown[frame], 3, fill=_TIP)
+                key = "path of the tip: red, wanted: grey"
+                draw.text((8, size[1] - 20), key, fill="black", font_size=12)
+            text = _time_text(record, run, sample, last=frame == len(samples) - 1)
+            draw.text((8, 6), text, fill="black", font_size=14)
+            images.append(image)
+    finally:
+        bullet.disconnect(client)
+    _save_gif(images, path, duration)
+
+
+def _frames(record: ClosedLoopRecord, run: int, fps: float) -> tuple[list[int], int]:
+    """Samples to draw, the last one before a stop included, and the time of a frame in ms."""
+    if not 0 < fps <= 50:
+        raise ValueError(f"fps is {fps}, expected more than 0 and at most 50, as fast as a GIF is")
+    duration = 10 * round(100 / fps)
+    t = record.t[: samples_before_stop(record, run)].double()
+    times = torch.arange(float(t[0]), float(t[-1]), 1e-3 * duration, dtype=t.dtype)
+    samples = (t - times[:, None]).abs().argmin(dim=1).tolist()
+    return [*dict.fromkeys([*samples, len(t) - 1])], duration
+
+
+def _time_text(record: ClosedLoopRecord, run: int, sample: int, *, last: bool) -> str:
+    reason = record.stopped[run]
+    note = f"\nstopped: {reason}" if last and reason else ""
+    return f"t = {float(record.t[sample]):.2f} s{note}"
+
+
+def _save_gif(images: list[Image.Image], path: Path, duration: int) -> None:
+    """The last frame, which has all the colours, gives the palette, and stays for a second."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    palette = images[-1].quantize(64)
+    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    times = [duration] * (len(frames) - 1) + [_LAST_FRAME]
+    frames[0].save(
+        path, format="GIF", save_all=True, append_images=frames[1:], duration=times, loop=0
+    )
+
+
+# The soft arm.
+
+
+def _shapes(record: ClosedLoopRecord, run: int, system: SoftArm) -> tuple[Tensor, Tensor]:
+    """Backbone reached and wanted, ``(T, n, S, 3)`` each, up to the stop."""
+    end = samples_before_stop(record, run)
+    s = torch.linspace(0, 1, 21, dtype=torch.float64)
+    q, q_ref = record.q[run, :end], record.reference.q[run, :end]
+    return system.backbone(q.double(), s), system.backbone(q_ref.double(), s)
+
+
+def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, wanted: Tensor | None) -> Tensor:
+    """All points ``(P, 3)`` to be seen; of a stopped run not the last tenth, it may run away."""
+    end = len(shape) if record.stopped[run] is None else 1 + int(0.9 * (len(shape) - 1))
+    points = [shape[:end].reshape(-1, 3), shape.new_zeros(1, 3)]
+    return torch.cat(points if wanted is None else [*points, wanted.reshape(-1, 3)])
+
+
+def _set_space(ax: Axes3D, points: Tensor) -> None:
+    """Equal scales around points ``(P, 3)``, gravity downwards."""
+    low, high = points.amin(dim=0), points.amax(dim=0)
+    size = (1.1 * (high - low)).clamp(min=0.5 * float((high - low).max()))
+    middle = 0.5 * (low + high)
+    (x0, y0, z0), (x1, y1, z1) = (middle - size / 2).tolist(), (middle + size / 2).tolist()
+    ax.set(xlim=(x0, x1), ylim=(y0, y1), zlim=(z1, z0))
+    ax.set_box_aspect(size.tolist(), zoom=0.82)
+    for axis, name in ((ax.xaxis, "x (m)"), (ax.yaxis, "y (m)"), (ax.zaxis, "z (m)")):
+        axis.set_label_text(name, fontsize="small")
+        axis.labelpad = 5 if axis is ax.zaxis else -2
+    ax.tick_params(labelsize="x-small", pad=0)
+    ax.locator_params(nbins=3)
+    ax.view_init(elev=15, azim=-60)
+
+
+def _legend(figure: Figure, ax: Axes3D) -> None:
+    handles, names = ax.get_legend_handles_labels()
+    figure.legend(handles, names, loc="lower center", ncols=len(names), fontsize="small")
+
+
+def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor | None, sample: int) -> None:
+    if wanted is not None:
+        ax.plot(
+            *wanted[sample].flatten(0, 1).T.numpy(), color=_TRUTH, linewidth=7, label="reference"
+        )
+    for index, segment in enumerate(shape[sample]):
+        colour = _COLOURS[(0, 5)[index % 2]]
+        name = "arm" if index == 0 else None
+        ax.plot(*segment.T.numpy(), color=colour, linewidth=4, solid_capstyle="butt", label=name)
+    ax.plot([0], [0], [0], "s", color="black", markersize=7)
+    tip = shape[: sample + 1, -1, -1].T.numpy()
+    ax.plot(*tip, color=_TIP, linewidth=1.5, label="path of the tip")
+    ax.plot(*tip[:, -1:], "o", color=_TIP, markersize=4)
+
+
+# The arm in Bullet.
+
+
+def _camera(
+    bullet: Any, points: np.ndarray, size: tuple[int, int]
+) -> tuple[list[float], list[float]]:
+    """View and projection that hold all points, and 0.1 m of what surrounds them."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = np.linalg.norm(points - middle, axis=1).max() + 0.1
+    view = bullet.computeViewMatrixFromYawPitchRoll(
+        middle.tolist(), 3 * radius, yaw=50, pitch=-20, roll=0, upAxisIndex=2
+    )
+    x, y, z, _ = np.reshape(view, (4, 4), order="F") @ _homogeneous(points)
+    aspect = size[0] / size[1]
+    slope = max(((abs(x) + 0.1) / aspect / -z).max(), ((abs(y) + 0.1) / -z).max())
+    angle = 2 * np.degrees(np.arctan(slope))
+    return view, bullet.computeProjectionMatrixFOV(angle, aspect, 2 * radius, 4 * radius)
+
+
+def _pixels(
+    points: np.ndarray, view: list[float], projection: list[float], size: tuple[int, int]
+) -> list[tuple[float, float]]:
+    """Where points ``(T, 3)`` are in the image; Bullet's matrices come column by column."""
+    look, project = (np.reshape(matrix, (4, 4), order="F") for matrix in (view, projection))
+    x, y, _, w = project @ look @ _homogeneous(points)
+    x, y = x / w, y / w
+    columns, rows = (x + 1) / 2 * size[0], (1 - y) / 2 * size[1]
+    return list(zip(columns.tolist(), rows.tolist(), strict=True))
+
+
+def _homogeneous(points: np.ndarray) -> np.ndarray:
+    return np.vstack([points.T, np.ones(len(points))])

@@ -1,0 +1,238 @@
+"""control.py: what it writes, and what it refuses."""
+
+import json
+
+import hydra
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from pinn_dyn.app.config import CONF
+from pinn_dyn.data.simulation import has_cpp_compiler
+from tests.app.entry import NO_FIGURES, STRIDE, TINY_TRAINING, fails, run_script
+
+EXPERIMENTS = sorted(
+    str(path.relative_to(CONF / "experiment").with_suffix(""))
+    for path in (CONF / "experiment").rglob("*.yaml")
+    if "python control.py" in path.read_text()
+)
+LOW, HIGH = "[-0.2,-0.2,0.15]", "[0.2,0.2,0.3]"
+BOX = f"{{_target_: pinn_dyn.data.InitialStates, q_low: {LOW}, q_high: {HIGH}, v_max: [0, 0, 0]}}"
+SET_POINTS = [
+    "reference=random_set_points",
+    f"reference.q_low={LOW}",
+    f"reference.q_high={HIGH}",
+    f"initial_states={BOX}",
+    "runs=3",
+    "duration=0.05",
+    "settled_after=0.03",
+    "gains.position=5",
+    "gains.velocity=0.5",
+    "animate=false",
+]
+
+
+def control(folder, run, *arguments):
+    run_script("control.py", f"run={run}", f"hydra.run.dir={folder}", *SET_POINTS, *arguments)
+    return folder
+
+
+def refused(capsys, run, *arguments):
+    """What control.py says about what it cannot do."""
+    error = fails("control.py", f"run={run}", "hydra.run.dir=out", *SET_POINTS, *arguments)
+    captured = capsys.readouterr()
+    text = f"{captured.out}\n{captured.err}\n{error.code}"
+    assert "Traceback" not in text
+    return text
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory, lnn_run):
+    """Three runs at 200 Hz with an animation."""
+    folder = tmp_path_factory.mktemp("control")
+    return control(folder, lnn_run, "rate=200", "animate=true", "guard.threshold=1.0")
+
+
+def test_the_table_has_a_row_for_each_controller(results):
+    summary = pd.read_csv(results / "summary.csv")
+    assert summary["controller"].tolist() == ["learned", "truth", "pd"]
+    assert (summary["runs"] == 3).all()
+    assert np.isfinite(summary["rms_error"]).all()
+    assert "step_error_after_0.03_s_mean_percent" in summary
+    coordinates = pd.read_csv(results / "coordinates.csv")
+    assert coordinates.groupby("controller").size().to_dict() == {"learned": 3, "truth": 3, "pd": 3}
+
+
+def test_the_motions_are_recorded(results):
+    with np.load(results / "record_learned.npz") as record:
+        assert record["q"].shape == record["q_ref"].shape == (3, 11, 3)
+        np.testing.assert_allclose(record["t"], np.arange(11) / 200)
+        assert (record["q"][:, 0] != record["q_ref"][:, 0]).all()
+        assert {"input_condition", "distance", "outside"} <= set(record)
+        assert (record["stopped"] == "").all()
+        rms = np.sqrt(np.mean((record["q"] - record["q_ref"]) ** 2))
+    summary = pd.read_csv(results / "summary.csv").set_index("controller")
+    assert summary.loc["learned", "rms_error"] == pytest.approx(rms)
+
+
+def test_figures_animation_log_and_provenance_are_written(results):
+    for name in ("closed_loop_learned", "closed_loop_pd", "comparison", "strip"):
+        assert (results / f"{name}.png").stat().st_size > 10_000
+    with Image.open(results / "animation_learned.gif") as animation:
+        assert animation.is_animated
+    assert any((results / "tensorboard").iterdir())
+    record = json.loads((results / "provenance.json").read_text())
+    assert {"config", "run", "commit", "hardware"} <= set(record)
+    assert record["config"]["gains"]["position"] == 5
+
+
+def test_a_law_in_continuous_time_differs_from_a_sampled_one_by_the_sampling_only(
+    tmp_path, results, lnn_run
+):
+    """The sampled law lags by half an instant, 2.5 ms of a motion of a second."""
+    folder = control(tmp_path, lnn_run, "rate=null", "samples_rate=200", "~controllers.pd")
+    with np.load(folder / "record_truth.npz") as a, np.load(results / "record_truth.npz") as b:
+        np.testing.assert_array_equal(a["q"][:, 0], b["q"][:, 0])
+        moved = np.abs(a["q"][:, -1] - a["q"][:, 0])
+        assert np.abs(a["q"][:, -1] - b["q"][:, -1]).max() < 0.1 * moved.max()
+
+
+def test_a_heavier_robot_moves_otherwise_under_the_same_law(tmp_path, results, lnn_run):
+    folder = control(tmp_path, lnn_run, "rate=200", "+robot.mass=0.36")
+    with np.load(folder / "record_pd.npz") as a, np.load(results / "record_pd.npz") as b:
+        assert (a["q"][:, -1] != b["q"][:, -1]).all()
+
+
+def test_limits_noise_and_delay_reach_the_loop(tmp_path, results, lnn_run):
+    effects = ["actuator.low=-1.2", "actuator.high=0.1", "delay=2", "sensor.q_noise=0.01"]
+    folder = control(tmp_path, lnn_run, "rate=200", *effects)
+    with np.load(folder / "record_learned.npz") as record:
+        assert record["u"].min() >= -1.2
+        assert record["u"].max() <= 0.1
+    assert pd.read_csv(folder / "summary.csv")["saturated_samples"].sum() > 0
+
+
+def test_the_stability_report_has_the_conditions_and_every_set_point(tmp_path, lnn_run):
+    box = f"stability={{region: a small box, q_low: {LOW}, q_high: {HIGH}, samples: 20}}"
+    folder = control(tmp_path, lnn_run, "rate=200", box, "~controllers.pd", "~controllers.truth")
+    text = (folder / "stability.md").read_text()
+    assert "over a small box" in text
+    assert "Proposition 1" in text
+    assert len(pd.read_csv(folder / "stability_region.csv")) == 20
+    points = pd.read_csv(folder / "stability_set_points.csv")
+    assert len(points) == 3
+    assert {"bound", "error", "measured_error", "holds"} <= set(points)
+    assert (folder / "steady_state.png").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_cpp_compiler(), reason="exporting a law needs a C++ compiler")
+def test_a_law_is_exported(tmp_path, lnn_run):
+    path = tmp_path / "law.pt2"
+    control(tmp_path / "out", lnn_run, "rate=200", f"export={path}", "~controllers.pd")
+    assert path.stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["gains.position=-1"], ["controllers.learned", "position_gain", "-1"]),
+        (["gains.position=[1,2]"], ["controllers.learned", "position_gain"]),
+        (["reference.q_low=[0,0]", "reference.q_high=[0,0]"], ["reference"]),
+        (["controllers.learned.terms=guess"], ["controllers.learned.terms", "guess", "truth"]),
+        (["delay=-1"], ["Delay", "-1"]),
+        (["+robot.mass=-1"], ["robot", "mass", "-1"]),
+        (["rate=null", "actuator.rate=1.0"], ["rate"]),
+        (["rate=null", "delay=1"], ["delay", "rate"]),
+        (["rate=null", "sensor.v_noise=0.1"], ["sensor", "rate"]),
+        (["plant=bullet"], ["plant"]),
+        (["checkpoint=first"], ["first.ckpt", "best"]),
+    ],
+    ids=lambda value: value[0] if isinstance(value[0], str) else None,
+)
+def test_what_does_not_fit_is_refused_by_name(capsys, lnn_run, arguments, parts):
+    text = refused(capsys, lnn_run, *arguments)
+    for part in parts:
+        assert part in text
+
+
+def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
+    text = refused(capsys, mlp_run)
+    assert "black box" in text
+    assert "model=lnn" in text
+
+
+def test_a_run_of_measured_data_gets_a_report_of_the_model_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(CONF.parent)  # from where the example log is found
+    run = tmp_path / "run"
+    run_script(
+        "train.py",
+        "experiment=example_log/lnn",
+        *TINY_TRAINING,
+        NO_FIGURES,
+        "compile=false",
+        f"hydra.run.dir={run}",
+    )
+    folder = control(tmp_path / "out", run)
+    text = (folder / "stability.md").read_text()
+    assert "example_log" in text
+    assert text in capsys.readouterr().out
+    assert not (folder / "summary.csv").exists()
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_control_experiment_composes(experiment):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        cfg = hydra.compose("control", overrides=[f"experiment={experiment}", "run=runs/x"])
+    assert cfg.name == experiment.replace("/", "_")
+    assert "learned" in cfg.controllers
+
+
+def test_there_are_control_experiments():
+    assert {"soft_arm_2/regulation", "soft_arm_2/stability", "panda/tracking", "panda/helix"} <= {
+        *EXPERIMENTS
+    }
+
+
+@pytest.mark.panda
+@pytest.mark.parametrize("experiment", ["panda/tracking", "panda/helix"])
+def test_the_panda_is_controlled_in_bullet(tmp_path, experiment, panda_run):
+    folder = tmp_path / "out"
+    run_script(
+        "control.py",
+        f"experiment={experiment}",
+        f"run={panda_run}",
+        "duration=0.05",
+        "animate=false",
+        f"hydra.run.dir={folder}",
+    )
+    summary = pd.read_csv(folder / "summary.csv").set_index("controller")
+    assert list(summary.index) == ["learned", "truth", "computed_torque", "gravity_pd", "pd"]
+    assert (summary["stopped"] == 0).all()
+    assert summary.loc["truth", "rms_error"] < 1e-4
+    assert (folder / "tip_path.png").is_file() == (experiment == "panda/helix")
+
+
+@pytest.fixture(scope="module")
+def panda_run(tmp_path_factory):
+    pytest.importorskip("pybullet", reason="the Panda is simulated by PyBullet: pinn_dyn[panda]")
+    folder = tmp_path_factory.mktemp("runs") / "panda"
+    counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1", "dataset.workers=1"]
+    run_script(
+        "train.py",
+        "experiment=panda/lnn",
+        *TINY_TRAINING,
+        "dataset.duration=0.2",
+        *counts,
+        STRIDE,
+        NO_FIGURES,
+        "compile=false",
+        f"hydra.run.dir={folder}",
+    )
+    return folder

@@ -1,0 +1,93 @@
+"""Actuator limits, sensor noise and dead time."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.control.effects import Actuator, Delay, Sensor
+
+
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_inputs_are_cut_to_their_limits_and_the_cut_ones_are_marked():
+    actuator = Actuator(low=-1.0, high=[2.0, 3.0])
+    u, changed = actuator(double([[-4.0, 3.5], [1.0, 2.5], [2.5, -1.0]]), 0.001)
+    torch.testing.assert_close(u, double([[-1.0, 3.0], [1.0, 2.5], [2.0, -1.0]]))
+    assert changed.tolist() == [[True, True], [False, False], [True, False]]
+
+
+def test_a_rate_limit_climbs_from_zero_in_equal_steps():
+    actuator = Actuator(rate=[10.0, 100.0])
+    for expected in ([0.1, 1.0], [0.2, 1.5], [0.3, 1.5]):
+        u, _ = actuator(double([1.0, 1.5]), 0.01)
+        torch.testing.assert_close(u, double(expected))
+    u, changed = actuator(double([-1.0, 1.0]), 0.01)
+    torch.testing.assert_close(u, double([0.2, 1.0]))
+    assert changed.tolist() == [True, False]
+    actuator.reset()
+    torch.testing.assert_close(actuator(double([1.0, 1.5]), 0.01)[0], double([0.1, 1.0]))
+
+
+def test_a_rate_is_counted_from_what_was_applied_not_from_what_was_asked():
+    actuator = Actuator(high=1.0, rate=100.0)
+    actuator(double([50.0]), 1.0)
+    torch.testing.assert_close(actuator(double([-5.0]), 0.01)[0], double([0.0]))
+
+
+def test_without_limits_everything_passes_and_nan_stays_nan():
+    u = double([[1e9, torch.nan]])
+    torch.testing.assert_close(Actuator()(u, 0.1)[0], u, equal_nan=True)
+    assert Actuator(low=-1.0, high=1.0, rate=5.0)(u, 0.1)[0][0, 1].isnan()
+
+
+def test_noise_has_the_standard_deviations_asked_for_and_is_independent():
+    sensor = Sensor(q_noise=[0.1, 0.0], v_noise=2.0, seed=3)
+    q, v = torch.ones(20_000, 2, dtype=torch.float64), torch.zeros(20_000, 2, dtype=torch.float64)
+    q_measured, v_measured = sensor(q, v)
+    noise = (q_measured - q).numpy()
+    assert noise[:, 0].std() == pytest.approx(0.1, rel=0.03)
+    assert noise[:, 0].mean() == pytest.approx(0.0, abs=0.004)
+    assert not noise[:, 1].any()
+    np.testing.assert_allclose(v_measured.std(0), 2.0, rtol=0.03)
+    together = np.corrcoef(np.concatenate([noise[:, :1], v_measured], 1).T)
+    np.testing.assert_allclose(together, np.eye(3), atol=0.03)
+
+
+def test_noise_starts_again_after_a_reset_and_goes_on_without():
+    sensor = Sensor(q_noise=1.0, seed=1)
+    zero = torch.zeros(1, 2)
+    first, second = sensor(zero, zero)[0], sensor(zero, zero)[0]
+    sensor.reset()
+    assert torch.equal(sensor(zero, zero)[0], first)
+    assert not torch.equal(first, second)
+    assert not torch.equal(Sensor(q_noise=1.0, seed=2)(zero, zero)[0], first)
+
+
+@pytest.mark.parametrize("samples", [0, 1, 3])
+def test_a_delay_gives_zeros_and_then_what_went_in(samples):
+    delay = Delay(samples)
+    for _ in range(2):
+        out = [float(delay(double([k + 1.0]))) for k in range(6)]
+        assert out == [0.0] * samples + [k + 1.0 for k in range(6 - samples)]
+        delay.reset()
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Actuator(low=1.0, high=[2.0, 0.0]), "low exceeds high"),
+        (lambda: Actuator(low=float("nan")), "low is nan"),
+        (lambda: Actuator(rate=0.0), "rate is 0.0"),
+        (lambda: Actuator(low=[0.0] * 2, high=[1.0] * 3), "low has 2 entries and high 3"),
+        (lambda: Actuator(high=[1.0] * 3)(torch.zeros(4, 2), 0.1), "3 entries, expected one .* 2"),
+        (lambda: Actuator(rate=[1.0] * 3)(torch.zeros(4, 2), 0.1), "rate have 3 entries"),
+        (lambda: Sensor(q_noise=-0.1), "q_noise is -0.1"),
+        (lambda: Sensor(v_noise=[0.1] * 3)(torch.zeros(1, 2), torch.zeros(1, 2)), "v_noise have 3"),
+        (lambda: Delay(-1), "samples is -1"),
+    ],
+)
+def test_bad_arguments_are_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

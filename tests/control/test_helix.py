@@ -1,0 +1,141 @@
+"""The helix: its path, the joints that follow it, their derivatives, and what is out of reach."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+
+from pinn_dyn.control.helix import Helix
+from pinn_dyn.control.references import check_limits
+from pinn_dyn.systems import BulletArm
+from tests.support.finite_differences import assert_near, slope
+
+pytestmark = pytest.mark.panda
+
+POSTURE = [0.1, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785]
+FAST = {"radius": 0.1, "pitch": 0.06, "period": 4.0, "turns": 1.5}
+
+
+@pytest.fixture(scope="module")
+def arm():
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    return BulletArm("franka_panda/panda.urdf", locked_joints=fingers)
+
+
+@pytest.fixture(scope="module")
+def helix(arm):
+    return Helix(arm, POSTURE, **FAST, rise_time=1.0)
+
+
+def tip(arm, q):
+    return arm.tip_position(q).numpy()
+
+
+def test_tip_follows_the_path_between_knots_too(arm, helix):
+    times = np.random.default_rng(0).uniform(0, helix.duration, 200)
+    errors = [np.linalg.norm(tip(arm, helix(t).q) - helix.path(t)) for t in times]
+    assert max(errors) < 1e-7
+    assert max(errors) < 1.1 * helix.path_error
+    check_limits(helix, arm.q_low, arm.q_high, helix.duration, arm.v_max)
+
+
+def test_path_is_the_helix_of_its_formula(arm, helix):
+    start = tip(arm, torch.tensor(POSTURE, dtype=torch.float64))
+    np.testing.assert_allclose(helix.path(0.0), start, atol=1e-15)
+    centre = start - [0.1, 0, 0]
+    assert helix.duration == pytest.approx(1.5 * 4 + 1)
+    for t in np.linspace(0, helix.duration, 40):
+        x, y, z = helix.path(t) - centre
+        assert math.hypot(x, y) == pytest.approx(0.1, abs=1e-14)
+        # One pitch each turn, counter-clockwise about z.
+        angle = 2 * math.pi * z / 0.06
+        circle = [0.1 * math.cos(angle), 0.1 * math.sin(angle)]
+        np.testing.assert_allclose([x, y], circle, rtol=0, atol=1e-14)
+    # At full speed after the rise, one period is one turn.
+    later = helix.path(5.5) - helix.path(1.5)
+    np.testing.assert_allclose(later, [0, 0, 0.06], atol=1e-14)
+    np.testing.assert_allclose(helix.path(9.0) - start, [-0.2, 0, 0.09], atol=1e-14)
+
+
+@pytest.mark.parametrize(("axis", "to_centre"), [("x", [0, -1, 0]), ("y", [0, 0, -1])])
+def test_path_about_the_other_axes(arm, axis, to_centre):
+    helix = Helix(arm, POSTURE, 0.05, -0.04, 2.0, 0.5, axis)
+    along = {"x": [1, 0, 0], "y": [0, 1, 0]}[axis]
+    expected = 0.1 * np.array(to_centre) - 0.02 * np.array(along)
+    np.testing.assert_allclose(helix.path(9.0) - helix.path(0.0), expected, atol=1e-14)
+    assert tip(arm, helix(9.0).q) == pytest.approx(helix.path(9.0), abs=1e-9)
+
+
+def test_derivatives_match_finite_differences(helix):
+    for t in (0.2, 0.9, 1.01, 2.345, 4.2, 5.99, 6.3, 6.9, 8.0):
+        motion = helix(t)
+        assert motion.q.dtype == torch.float64
+        assert_near(motion.v, slope(lambda e, t=t: helix(t + e).q), 1e-9, scale=1)
+        assert_near(motion.a, slope(lambda e, t=t: helix(t + e).v), 1e-8, scale=1)
+        path_speed = slope(lambda e, t=t: torch.from_numpy(helix.path(t + e)))
+        if 1 < t < 6:
+            speed = 2 * math.pi / 4 * math.hypot(0.1, 0.06 / (2 * math.pi))
+            assert float(path_speed.norm()) == pytest.approx(speed, rel=1e-9)
+
+
+def test_starts_and_stops_at_rest_and_stays(helix):
+    np.testing.assert_array_equal(helix(0.0).q, POSTURE)
+    for t in (0.0, helix.duration, helix.duration + 5):
+        assert not helix(t).v.any()
+        assert not helix(t).a.any()
+    assert torch.equal(helix(helix.duration).q, helix(helix.duration + 5).q)
+    # No jump of the acceleration anywhere.
+    a = np.array([helix(t).a.numpy() for t in np.arange(0, helix.duration, 1e-3)])
+    assert np.abs(np.diff(a, axis=0)).max() < 0.02 * np.abs(a).max()
+
+
+def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
+    for t in (2.0, 4.7, 7.0):
+        q = helix(t).q
+        J = arm.tip_jacobian(q)[:3].numpy()
+        homing = np.array(POSTURE) - q.numpy()
+        assert np.linalg.norm(homing) > 0.1
+        assert np.linalg.norm(homing - np.linalg.pinv(J) @ J @ homing) < 1e-6
+    circle = Helix(arm, POSTURE, 0.08, 0.0, 2.0, 1.0)
+    np.testing.assert_allclose(circle(circle.duration).q, POSTURE, atol=1e-9)
+
+
+# Out of reach, and bad input.
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pitch": 2.0}, r"at t = [\d.]+ s its tip should be at \[.*\] m.* are [\d.e-]+ m from it"),
+        ({"radius": 0.3}, r"cannot follow the helix .*at t = .* take a smaller radius"),
+        (
+            {"posture": [0.1, -0.3, 0, -2.2, 0, 4.0, 0]},
+            r"t = 0 s joint 'panda_joint6' would be at 4",
+        ),
+        ({"posture": [0.1, -0.3]}, r"posture is \[0.1, -0.3\], but the arm has 7 joints"),
+        ({"radius": 0.0}, r"radius is 0.0, expected a positive"),
+        ({"pitch": math.nan}, r"pitch is nan, expected a finite"),
+        ({"period": -1.0}, r"period is -1.0, expected a positive"),
+        ({"turns": 0}, r"turns is 0, expected a positive"),
+        ({"axis": "up"}, r"axis is 'up', expected 'x', 'y' or 'z'"),
+        ({"rise_time": 7.0}, r"rise_time is 7 s, expected at most turns \* period = 6 s"),
+        ({"rise_time": 0.0}, r"rise_time is 0.0, expected a positive"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_with_what_to_change(arm, changes, message):
+    with pytest.raises(ValueError, match=message):
+        Helix(arm, **{"posture": POSTURE, **FAST, **changes})
+
+
+def test_a_joint_limit_on_the_way_is_named():
+    fingers = ("panda_finger_joint1", "panda_finger_joint2")
+    arm = BulletArm("franka_panda/panda.urdf", locked_joints=fingers)
+    free = Helix(arm, POSTURE, **FAST)
+    top = max(float(free(t).q[3]) for t in np.linspace(0, free.duration, 500))
+    arm.q_high[3] = limit = 0.5 * (POSTURE[3] + top)
+    message = rf"t = ([\d.]+) s joint 'panda_joint4' would be at -[\d.]+ rad, .* to {limit:.4g} rad"
+    with pytest.raises(ValueError, match=message):
+        Helix(arm, POSTURE, **FAST)

@@ -1,0 +1,345 @@
+"""Control laws against NumPy, against the closed loop that they promise, and their errors."""
+
+import copy
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.control import Motion
+from pinn_dyn.control.gains import diagonal_gain
+from pinn_dyn.control.laws import (
+    ComputedTorque,
+    ProportionalDerivative,
+    Regulation,
+    Tracking,
+    pseudo_inverse_times,
+)
+from pinn_dyn.models import NetworkCholesky
+from pinn_dyn.systems import SoftArm
+from tests.contracts.controller import ControllerContract, states
+from tests.models.builders import make_model, make_structured
+from tests.models.test_equal_terms import InverseOf
+from tests.support.cart_pole import CartPole
+from tests.support.finite_differences import assert_near
+from tests.support.linear import LinearSystem
+
+MODEL_BASED = [Regulation, Tracking, ComputedTorque]
+
+
+def linear_system(n, m, seed=0):
+    """Random M, D > 0, K and a random N x M input matrix, all full."""
+    random = np.random.default_rng(seed)
+    mass, damping, stiffness = (
+        x @ x.T + 0.5 * np.eye(n) for x in (random.normal(size=(n, n)) for _ in range(3))
+    )
+    return LinearSystem(mass, stiffness, damping, random.normal(size=(n, m)))
+
+
+def cart_pole_force(q):
+    """Gravity and spring of the cart-pole by hand, ``(K, 2)``."""
+    return np.stack([4.0 * q[:, 0], 0.4 * 9.81 * 0.6 * np.sin(q[:, 1])], axis=-1)
+
+
+def cart_pole_motion_force(q, v, a):
+    """M a + C v + D v + G of the cart-pole by hand, ``(K, 2)``."""
+    coupling = 0.4 * 0.6 * np.cos(q[:, 1])
+    first = 1.9 * a[:, 0] + coupling * a[:, 1] - 0.4 * 0.6 * np.sin(q[:, 1]) * v[:, 1] ** 2
+    second = coupling * a[:, 0] + 0.4 * 0.36 * a[:, 1]
+    return np.stack([first, second], axis=-1) + v * [0.3, 0.05] + cart_pole_force(q)
+
+
+def damped_inverse(A, damping):
+    """From the singular values: s / (s^2 + d^2) in place of 1 / s."""
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    return (Vt.T * (s / (s**2 + damping**2))) @ U.T
+
+
+# Against NumPy.
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+@pytest.mark.parametrize(("n", "m"), [(4, 4), (2, 4), (4, 2)])
+def test_regulation_of_a_linear_system_is_the_formula(n, m, damping):
+    system = linear_system(n, m)
+    kp, kd = np.arange(1.0, n + 1), 0.5 * np.arange(1.0, n + 1)
+    law = Regulation(system, kp.tolist(), kd.tolist(), inverse_damping=damping)
+    q, v, motion = states(n)
+    A, K = system.inputs.detach().numpy(), system.stiffness.detach().numpy()
+    inverse = damped_inverse(A, damping) if damping else np.linalg.pinv(A)
+    expected = [
+        inverse @ K @ q_k + A.T @ (kp * (r_k - q_k) - kd * v_k)
+        for q_k, v_k, r_k in zip(q.numpy(), v.numpy(), motion.q.numpy(), strict=True)
+    ]
+    u = law(0.0, q, v, motion)
+    assert_near(u, torch.tensor(np.array(expected)), 1e-12)
+    assert_near(law.law(q, v, *motion), u, 1e-12)
+
+
+def test_regulation_of_the_cart_pole_compensates_what_its_one_input_reaches():
+    q, v, motion = states(2)
+    law = Regulation(CartPole(), [3.0, 5.0], [1.0, 2.0])
+    A = np.array([[1.0], [0.0]])
+    pd = np.array([3.0, 5.0]) * (motion.q - q).numpy() - np.array([1.0, 2.0]) * v.numpy()
+    expected = cart_pole_force(q.numpy()) @ np.linalg.pinv(A).T + pd @ A
+    assert_near(law(0.0, q, v, motion), torch.tensor(expected), 1e-12)
+
+
+def test_tracking_of_the_cart_pole_is_the_formula():
+    q, v, motion = states(2)
+    law = Tracking(CartPole(), [3.0, 5.0], [1.0, 2.0])
+    A = np.array([[1.0], [0.0]])
+    pd = [3.0, 5.0] * (motion.q - q).numpy() + [1.0, 2.0] * (motion.v - v).numpy()
+    force = cart_pole_motion_force(*(x.numpy() for x in motion))
+    expected = force @ np.linalg.pinv(A).T + pd @ A
+    assert_near(law(0.0, q, v, motion), torch.tensor(expected), 1e-12)
+
+
+def test_computed_torque_of_the_cart_pole_is_the_formula():
+    q, v, motion = states(2)
+    law = ComputedTorque(CartPole(), [3.0, 5.0], [1.0, 2.0])
+    pd = [3.0, 5.0] * (motion.q - q).numpy() + [1.0, 2.0] * (motion.v - v).numpy()
+    force = cart_pole_motion_force(q.numpy(), v.numpy(), motion.a.numpy() + pd)
+    assert_near(law(0.0, q, v, motion), torch.tensor(force[:, :1]), 1e-12)
+
+
+def test_proportional_derivative_is_the_formula():
+    q, v, motion = states(2)
+    u = ProportionalDerivative(2, 2, [3.0, 5.0], 2.0)(0.0, q, v, motion)
+    expected = torch.stack(
+        [
+            3.0 * (motion.q - q)[:, 0] + 2.0 * (motion.v - v)[:, 0],
+            5.0 * (motion.q - q)[:, 1] + 2.0 * (motion.v - v)[:, 1],
+        ],
+        dim=-1,
+    )
+    assert_near(u, expected, 1e-12)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 2), (1, 3), (3, 1)])
+@pytest.mark.parametrize("batch", [(), (1,), (2,), (2, 3)])
+def test_one_force_serves_a_batch_of_any_shape(n, m, batch, damping):
+    generator = torch.Generator().manual_seed(0)
+    A = torch.randn(*batch, n, m, generator=generator, dtype=torch.float64)
+    tau = torch.arange(1.0, n + 1, dtype=torch.float64)
+    expected = [damped_inverse(a, damping) @ tau.numpy() for a in A.reshape(-1, n, m).numpy()]
+    u = pseudo_inverse_times(A, tau, damping)
+    assert_near(u, torch.tensor(np.array(expected)).reshape(*batch, m), 1e-9)
+
+
+# The closed loop that the laws promise.
+
+
+@pytest.fixture(
+    params=[
+        partial(SoftArm, 2),
+        partial(linear_system, 3, 3),
+        partial(linear_system, 2, 4),
+        partial(make_structured, "lnn"),
+        partial(make_structured, "hnn"),
+    ],
+    ids=["soft arm", "linear", "over-actuated", "lnn", "hnn"],
+)
+def system(request):
+    """A system that its inputs can give any acceleration."""
+    return request.param()
+
+
+def test_regulation_on_the_truth_holds_the_robot_where_it_should_be(system):
+    q, v, _ = states(system.num_coordinates)
+    u = Regulation(system, 10.0, 1.0)(0.0, q, 0 * v, Motion(q, 0 * v, 0 * v))
+    unheld = system.forward_dynamics(q, 0 * v, 0 * u).detach()
+    a = system.forward_dynamics(q, 0 * v, u).detach()
+    assert float(unheld.abs().max()) > 1e-2
+    assert_near(a, 0 * a, 1e-9, scale=unheld.abs().max())
+
+
+def test_tracking_on_the_truth_gives_the_acceleration_of_the_reference(system):
+    *_, motion = states(system.num_coordinates)
+    u = Tracking(system, 10.0, 1.0)(0.0, motion.q, motion.v, motion)
+    a = system.forward_dynamics(motion.q, motion.v, u).detach()
+    assert_near(a, motion.a, 1e-9)
+
+
+def test_computed_torque_on_the_truth_gives_the_linear_error_dynamics(system):
+    q, v, motion = states(system.num_coordinates)
+    kp = torch.linspace(4.0, 9.0, system.num_coordinates, dtype=torch.float64)
+    kd = 2 * kp.sqrt()
+    u = ComputedTorque(system, kp, kd.tolist())(0.0, q, v, motion)
+    error_acceleration = motion.a - system.forward_dynamics(q, v, u).detach()
+    assert_near(error_acceleration, -kd * (motion.v - v) - kp * (motion.q - q), 1e-9)
+
+
+@pytest.mark.parametrize("law", MODEL_BASED)
+def test_hamiltonian_and_lagrangian_network_of_equal_terms_give_equal_inputs(law):
+    lagrangian = make_structured("lnn", mass=partial(NetworkCholesky, hidden=[6], epsilon=1.0))
+    mass = copy.deepcopy(lagrangian.mass)
+    hamiltonian = make_structured("hnn", mass=lambda **_: InverseOf(mass))
+    mass.load_state_dict(lagrangian.mass.state_dict())
+    for name in ("potential", "damping", "input"):
+        getattr(hamiltonian, name).load_state_dict(getattr(lagrangian, name).state_dict())
+    at = states(3)
+    expected = law(lagrangian, 5.0, 1.0)(0.0, *at)
+    assert_near(law(hamiltonian, 5.0, 1.0)(0.0, *at), expected, 1e-9)
+
+
+# Singular input matrices.
+
+
+def test_the_condition_number_is_reported_for_each_state():
+    arm = SoftArm(1)
+    q, v, motion = states(3)
+    law = Regulation(arm, 1.0, 1.0)
+    law(0.0, q, v, motion)
+    expected = np.linalg.cond(arm.input_matrix(q).numpy())
+    assert_near(law.diagnostics()["input_condition"], torch.tensor(expected), 1e-9)
+    (mask,) = law.faults().values()
+    assert not mask.any()
+
+
+class HalfSingular(CartPole):
+    """A(q) = diag(1, q_0): singular at q_0 = 0."""
+
+    def __init__(self):
+        super().__init__()
+        self.num_inputs = 2
+
+    def input_matrix(self, q):
+        return torch.diag_embed(torch.stack([torch.ones_like(q[..., 0]), q[..., 0]], -1))
+
+
+def test_a_singular_input_matrix_is_a_fault_of_its_row_only():
+    q, v, motion = states(2)
+    expected = Regulation(HalfSingular(), 1.0, 1.0)(0.0, q, v, motion)
+    q = q.clone()
+    q[1, 0], q[4, 0] = 0.0, 1e-4
+    law = Regulation(HalfSingular(), 1.0, 1.0, max_condition=1e3)
+    u = law(0.0, q, v, motion)
+    ((reason, mask),) = law.faults().items()
+    assert "max_condition = 1000" in reason
+    assert mask.tolist() == [False, True, False, False, True, False]
+    assert not torch.isfinite(u[1]).all()
+    assert_near(u[[0, 2, 3, 5]], expected[[0, 2, 3, 5]], 1e-12)
+
+    damped = Regulation(HalfSingular(), 1.0, 1.0, inverse_damping=0.1, max_condition=np.inf)
+    assert torch.isfinite(damped(0.0, q, v, motion)).all()
+    assert not any(mask.any() for mask in damped.faults().values())
+
+
+def test_an_infinite_limit_still_flags_a_matrix_that_is_nan():
+    q, v, motion = states(2)
+    q = q.clone()
+    q[3] = torch.nan
+    law = Regulation(HalfSingular(), 1.0, 1.0, max_condition=np.inf)
+    law(0.0, q, v, motion)
+    (mask,) = law.faults().values()
+    assert mask.nonzero().flatten().tolist() == [3]
+
+
+# Deployment.
+
+
+@pytest.mark.parametrize("law", MODEL_BASED)
+def test_the_formula_can_be_exported(law):
+    controller = law(make_model("lnn", 2, 2).requires_grad_(False), 5.0, 1.0)
+    q, v, motion = states(2)
+
+    class Formula(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.model = controller.model
+
+        def forward(self, *state):
+            return controller.law(*state)
+
+    exported = torch.export.export(Formula(), (q, v, *motion)).module()
+    other = states(2, seed=6)
+    assert_near(exported(*other[:2], *other[2]), controller(0.0, *other), 1e-12)
+
+
+# Errors.
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (0.0, r"^position_gain is 0.0: expected one positive number or 2 of them"),
+        (-1.0, "positive"),
+        (float("nan"), "^position_gain is nan"),
+        ([1.0, float("inf")], r"\[1.0, inf\]"),
+        ([1.0, 0.0], r"\[1.0, 0.0\]"),
+        ([1.0], r"^position_gain has shape \(1,\): expected .* 2 of them"),
+        ([1.0, 2.0, 3.0], r"has shape \(3,\)"),
+        ([[1.0, 0.0], [0.0, 1.0]], r"has shape \(2, 2\)"),
+        ("high", "^position_gain is 'high'"),
+        (None, "^position_gain is None"),
+    ],
+)
+def test_a_bad_gain_is_named(value, message):
+    with pytest.raises(ValueError, match=message):
+        Regulation(CartPole(), value, 1.0)
+
+
+def test_the_velocity_gain_is_named_too():
+    with pytest.raises(ValueError, match=r"^velocity_gain is -2"):
+        ProportionalDerivative(2, 2, 1.0, -2.0)
+
+
+def test_a_gain_is_one_number_or_one_for_each_coordinate():
+    assert diagonal_gain("k", 2, 3).tolist() == [2.0, 2.0, 2.0]
+    assert diagonal_gain("k", [1, 2.5, 3], 3).tolist() == [1.0, 2.5, 3.0]
+    assert diagonal_gain("k", torch.tensor([1.0, 2.0]), 2).dtype == torch.float64
+
+
+@pytest.mark.parametrize("law", MODEL_BASED)
+@pytest.mark.parametrize("kind", ["next_state", "acceleration"])
+def test_a_black_box_has_no_terms_for_a_law(law, kind):
+    with pytest.raises(TypeError, match=r"MLP, expected .* no terms M, G and A .* model=lnn"):
+        law(make_model(kind), 1.0, 1.0)
+
+
+def test_a_pd_law_needs_one_input_for_each_coordinate():
+    with pytest.raises(ValueError, match=r"num_inputs is 1, expected 2.* cannot know how"):
+        ProportionalDerivative(2, 1, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("inverse_damping", -0.1),
+        ("inverse_damping", float("inf")),
+        ("max_condition", 0.5),
+        ("max_condition", float("nan")),
+    ],
+)
+def test_a_bad_option_is_named(option, value):
+    with pytest.raises(ValueError, match=f"^{option} is {value}, expected"):
+        Regulation(CartPole(), 1.0, 1.0, **{option: value})
+
+
+# The contract.
+
+
+@pytest.mark.parametrize(
+    ("law", "model", "damping"),
+    [
+        *((law, model, 0.0) for law in MODEL_BASED for model in (CartPole, SoftArm)),
+        (Regulation, CartPole, 0.1),
+        (Regulation, partial(linear_system, 2, 4), 0.1),
+        (Tracking, partial(linear_system, 1, 1), 0.0),
+        (Tracking, partial(make_structured, "lnn", 2, 4), 0.0),
+        (ComputedTorque, partial(make_structured, "hnn"), 0.0),
+    ],
+)
+class TestModelBasedLaw(ControllerContract):
+    @pytest.fixture
+    def controller(self, law, model, damping):
+        return law(model(), 5.0, 1.0, inverse_damping=damping)
+
+
+class TestProportionalDerivative(ControllerContract):
+    @pytest.fixture
+    def controller(self):
+        return ProportionalDerivative(3, 3, [1.0, 2.0, 3.0], 0.5)

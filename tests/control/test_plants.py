@@ -1,0 +1,215 @@
+"""The plants of a closed loop, against SciPy, matrix exponentials and Bullet's own roll-out."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from pinn_dyn.control import plants
+from pinn_dyn.control.plants import BulletPlant, SystemPlant, solve_by_halves
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.systems import SoftArm
+from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
+
+PANDA = "franka_panda/panda.urdf"
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+
+
+class Vanishing(MechanicalSystem):
+    """A free mass 1 - q that is gone at q = 1."""
+
+    def __init__(self):
+        super().__init__(num_coordinates=1, num_inputs=1)
+
+    def mass_matrix(self, q):
+        return (1 - q).unsqueeze(-1)
+
+    def potential_energy(self, q):
+        return 0 * q[..., 0]
+
+    def damping_matrix(self, q):
+        return 0 * q.unsqueeze(-1)
+
+    def input_matrix(self, q):
+        return torch.ones_like(q).unsqueeze(-1)
+
+
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def run(plant, q0, v0, inputs, duration):
+    """States after each of the inputs, ``(K, steps, 2N)``."""
+    plant.start(q0, v0)
+    return torch.stack([torch.cat(plant.advance(u, duration), -1) for u in inputs], 1)
+
+
+def random_arm_states(count):
+    q0 = 0.6 * torch.rand(count, 3, generator=torch.manual_seed(0), dtype=torch.float64)
+    return q0, q0.flip(-1) - 0.3
+
+
+def test_soft_arm_moves_as_scipy_says_at_a_tight_tolerance():
+    arm = SoftArm()
+    q0, v0 = random_arm_states(3)
+    inputs = torch.randn(4, 3, 3, generator=torch.manual_seed(1), dtype=torch.float64)
+    states = run(SystemPlant(arm, rtol=1e-9, atol=1e-11), q0, v0, inputs, 0.02)
+    for k in range(3):
+        x = torch.cat([q0[k], v0[k]]).numpy()
+        for i, u in enumerate(inputs[:, k]):
+
+            def derivative(t, x, u=u):
+                return arm.velocity_derivative(torch.from_numpy(x), u).numpy()
+
+            x = solve_ivp(derivative, (0, 0.02), x, "DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+            np.testing.assert_allclose(states[k, i], x, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("duration", [0.001, 0.1, 0.5])
+def test_linear_system_moves_as_its_matrix_exponential(duration):
+    system = damped_oscillators()
+    q0, v0 = double([[0.5, -0.2], [1.0, 2.0]]), double([[0.0, 1.0], [-1.0, 0.3]])
+    inputs = torch.randn(5, 2, 1, generator=torch.manual_seed(1), dtype=torch.float64)
+    states = run(SystemPlant(system, rtol=1e-9, atol=1e-11), q0, v0, inputs, duration)
+    t = duration * torch.arange(6, dtype=torch.float64)
+    for k in range(2):
+        u = torch.cat([inputs[:, k], inputs[-1:, k]])
+        expected = exact_solution(system, torch.cat([q0[k], v0[k]]), t, u, "previous")[1:]
+        torch.testing.assert_close(states[k], expected, rtol=0, atol=2e-8)
+
+
+def test_energy_of_a_damped_arm_without_input_decays():
+    arm = SoftArm()
+    q0, v0 = random_arm_states(3)
+    states = run(SystemPlant(arm), q0, v0, [torch.zeros(3, 3, dtype=torch.float64)] * 20, 0.01)
+    energy = arm.total_energy(*states.chunk(2, dim=-1))
+    assert (energy.diff(dim=1) < 0).all()
+
+
+def test_a_copy_moves_alone_as_among_others():
+    q0, v0 = random_arm_states(4)
+    inputs = torch.randn(5, 4, 3, generator=torch.manual_seed(1), dtype=torch.float64)
+    together = run(SystemPlant(SoftArm()), q0, v0, inputs, 0.01)
+    for k in range(4):
+        one = slice(k, k + 1)
+        alone = run(SystemPlant(SoftArm()), q0[one], v0[one], inputs[:, one], 0.01)
+        torch.testing.assert_close(together[one], alone, rtol=1e-5, atol=1e-5)
+
+
+def test_copies_at_rest_do_not_hide_the_error_of_one_that_moves():
+    system = LinearSystem([[1.0]], [[100.0]], [[0.0]], [[1.0]])
+    q0 = torch.zeros(10_000, 1, dtype=torch.float64)
+    q0[0] = 1.0
+    q = run(SystemPlant(system, rtol=1e-5), q0, 0 * q0, [0 * q0] * 5, 0.5)[0, :, 0]
+    expected = torch.cos(10 * 0.5 * torch.arange(1, 6, dtype=torch.float64))
+    torch.testing.assert_close(q, expected, rtol=0, atol=3e-4)
+
+
+def test_a_copy_that_loses_its_mass_matrix_is_nan_and_the_others_go_on():
+    q0, v0 = double([[0.0], [0.0], [0.5]]), double([[-0.1], [3.0], [-0.2]])
+    inputs = [torch.zeros(3, 1, dtype=torch.float64)] * 10
+    states = run(SystemPlant(Vanishing()), q0, v0, inputs, 0.05)
+    # Without forces (1 - q) v^2 is constant: 1.5 v0 t = 1 - (1 - q)^1.5 for q0 = 0.
+    assert states[1, :4].isfinite().all()
+    assert states[1, 4:].isnan().all()
+    expected = 1 - (1 - 1.5 * 3.0 * 0.05 * torch.arange(1, 5, dtype=torch.float64)) ** (2 / 3)
+    torch.testing.assert_close(states[1, :4, 0], expected, rtol=0, atol=1e-5)
+    others = run(SystemPlant(Vanishing()), q0[[0, 2]], v0[[0, 2]], [u[:2] for u in inputs], 0.05)
+    torch.testing.assert_close(states[[0, 2]], others, rtol=0, atol=1e-6)
+
+
+def test_a_copy_with_an_input_that_is_not_finite_is_nan_and_stays_so():
+    q0, v0 = random_arm_states(3)
+    inputs = torch.zeros(3, 3, 3, dtype=torch.float64)
+    inputs[1, 2, 0] = torch.inf
+    states = run(SystemPlant(SoftArm()), q0, v0, inputs, 0.001)
+    assert states[:2].isfinite().all()
+    assert states[2, 0].isfinite().all()
+    assert states[2, 1:].isnan().all()
+
+
+def test_only_the_row_that_cannot_be_solved_is_nan():
+    matrix = torch.eye(2, dtype=torch.float64).repeat(5, 1, 1)
+    matrix[3, 0, 0] = -1.0
+    x = torch.arange(10, dtype=torch.float64).reshape(5, 2)
+    y = solve_by_halves(lambda x, m: (torch.linalg.cholesky(m) @ x[..., None])[..., 0], x, matrix)
+    assert y[3].isnan().all()
+    torch.testing.assert_close(y[[0, 1, 2, 4]], x[[0, 1, 2, 4]])
+
+
+def test_without_a_compiler_it_runs_uncompiled_and_says_so(monkeypatch, caplog):
+    monkeypatch.setattr(plants, "has_cpp_compiler", lambda: False)
+    with caplog.at_level(logging.WARNING):
+        plant = SystemPlant(damped_oscillators(), compile=True)
+    assert "no C++ compiler" in caplog.text
+    q0 = double([[1.0, 0.0]])
+    assert run(plant, q0, q0, [q0[:, :1]], 0.01).isfinite().all()
+
+
+def test_bad_arguments_are_named():
+    plant = SystemPlant(damped_oscillators())
+    q0 = double([[1.0, 0.0]])
+    with pytest.raises(ValueError, match=r"v0 has shape \(1, 3\)"):
+        plant.start(q0, torch.zeros(1, 3))
+    with pytest.raises(ValueError, match="q0 has 1 non-finite"):
+        plant.start(q0 * torch.tensor([torch.nan, 1.0]), q0)
+    with pytest.raises(ValueError, match=r"q0 has shape \(2,\)"):
+        plant.start(q0[0], q0[0])
+    plant.start(q0, q0)
+    with pytest.raises(ValueError, match=r"u has shape \(1, 2\), expected \(1, 1\)"):
+        plant.advance(q0, 0.1)
+    with pytest.raises(ValueError, match="duration is 0"):
+        plant.advance(q0[:, :1], 0.0)
+
+
+@pytest.fixture(scope="module")
+def panda():
+    pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+    from pinn_dyn.systems import BulletArm
+
+    return BulletArm(PANDA, locked_joints=FINGERS, damping=0.5)
+
+
+def panda_states(panda):
+    rng = np.random.default_rng(0)
+    q0 = torch.from_numpy(rng.uniform(panda.q_low, panda.q_high, (2, 7)))
+    return q0, torch.from_numpy(rng.uniform(-1, 1, (2, 7))), rng.uniform(-5, 5, (6, 2, 7))
+
+
+@pytest.mark.panda
+def test_bullet_copies_move_as_in_a_roll_out_of_bullet(panda):
+    q0, v0, inputs = panda_states(panda)
+    states = run(BulletPlant(panda, step=0.001), q0, v0, torch.from_numpy(inputs), 0.003)
+    for k in range(2):
+
+        def torque(i, q, v, k=k):
+            return inputs[min(i // 3, 5), k]
+
+        q, v, _ = panda.simulate(q0[k].numpy(), v0[k].numpy(), torque, steps=18, step=0.001)
+        expected = np.concatenate([q, v], -1)[3::3]
+        np.testing.assert_allclose(states[k], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.panda
+def test_a_bullet_copy_outside_the_finite_numbers_is_nan_and_the_other_goes_on(panda):
+    q0, v0, inputs = panda_states(panda)
+    inputs = torch.from_numpy(inputs)
+    expected = run(BulletPlant(panda), q0, v0, inputs, 0.001)
+    inputs[2, 0, 3] = torch.nan
+    states = run(BulletPlant(panda), q0, v0, inputs, 0.001)
+    assert states[0, 2:].isnan().all()
+    torch.testing.assert_close(states[0, :2], expected[0, :2])
+    torch.testing.assert_close(states[1], expected[1])
+
+
+@pytest.mark.panda
+def test_bullet_refuses_a_time_between_its_steps(panda):
+    q0, v0, inputs = panda_states(panda)
+    plant = BulletPlant(panda, step=0.001)
+    plant.start(q0, v0)
+    with pytest.raises(ValueError, match="integer multiple"):
+        plant.advance(torch.from_numpy(inputs[0]), 0.0025)
+    with pytest.raises(ValueError, match="step is 0"):
+        BulletPlant(panda, step=0)

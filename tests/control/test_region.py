@@ -1,0 +1,275 @@
+"""The region of the training data, and the guard of a law outside it."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.control import Controller, Motion
+from pinn_dyn.control.laws import ProportionalDerivative, Regulation
+from pinn_dyn.control.region import DataRegion, Guarded
+from tests.contracts.controller import ControllerContract, states
+from tests.support.cart_pole import CartPole
+from tests.support.linear import LinearSystem
+
+LOGGER = "pinn_dyn.control.region"
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def comb(count=50):
+    """Two trajectories at rest: q = 0, 2, 4, ... and q = 1, 3, 5, ...; each 1 from the other."""
+    q = [torch.arange(2 * count, dtype=torch.float64)[k::2, None] for k in (0, 1)]
+    return q, [torch.zeros_like(x) for x in q]
+
+
+def loops(count, seed, size=2):
+    """Slow random Fourier motions, sampled so often that neighbours in time almost coincide."""
+    random = np.random.default_rng(seed)
+    t = np.linspace(0, 20, 4000)
+    amplitude, phase = (
+        random.uniform(0.2, 0.6, (count, size, 3)),
+        random.uniform(0, 2 * np.pi, (count, size, 3)),
+    )
+    rate = random.uniform(0.5, 2.0, (count, size, 3))
+    angle = t[:, None, None] * rate[:, None] + phase[:, None]
+    q = (amplitude[:, None] * np.sin(angle)).sum(-1)
+    v = (amplitude[:, None] * rate[:, None] * np.cos(angle)).sum(-1)
+    return torch.from_numpy(q), torch.from_numpy(v)
+
+
+# The distance.
+
+
+def test_the_distance_on_a_line_is_that_of_the_nearest_point_in_units_of_the_spacing():
+    region = DataRegion(*comb())
+    q = tensor([[0.0], [50.25], [60.5], [99.0], [102.0], [-7.5]])
+    expected = tensor([0.0, 0.25, 0.5, 0.0, 3.0, 7.5])
+    assert region.distance(q, 0 * q) == pytest.approx(expected, abs=1e-12)
+    assert region.distance(q[4], q[4] * 0).shape == ()
+    assert float(region.distance(q[4], q[4] * 0)) == pytest.approx(3.0)
+
+
+def test_the_distance_is_euclidean_in_standard_deviations():
+    """q and v alternate between -1 and 1, and -10 and 10: standard deviations 1 and 10."""
+    q = [tensor([[-1.0], [1.0]]), tensor([[-1.0], [1.0]])]
+    v = [tensor([[-10.0], [-10.0]]), tensor([[10.0], [10.0]])]
+    region = DataRegion(q, v)
+    assert region.radius == pytest.approx(2.0)  # from v = -10 to v = 10 at the same q
+    distance = region.distance(tensor([1.0 + 3.0]), tensor([10.0 + 40.0]))
+    assert float(distance) == pytest.approx(np.hypot(3.0, 4.0) / 2)
+
+
+def test_new_trajectories_of_the_same_kind_are_inside_and_far_states_outside():
+    region = DataRegion(*loops(40, seed=1))
+    q, v = loops(10, seed=2)
+    distance = region.distance(q[:, ::50], v[:, ::50])
+    assert distance.shape == (10, 80)
+    assert float((distance <= 1).double().mean()) > 0.97
+    assert float(distance.quantile(0.9)) > 0.2  # else the edge would be far too wide
+    assert bool((region.distance(q[:, ::50] + 20, v[:, ::50]) > 10).all())
+    assert bool((region.distance(q[:, ::50], v[:, ::50] - 20) > 10).all())
+
+
+def test_the_edge_does_not_shrink_with_the_sample_time():
+    q, v = loops(20, seed=1)
+    fine = DataRegion(q, v, samples=10_000)
+    coarse = DataRegion(q[:, ::8], v[:, ::8], samples=10_000)
+    assert fine.radius == pytest.approx(coarse.radius, rel=0.1)
+
+
+def test_one_trajectory_is_cut_into_ten():
+    """q = 0, 1 ... 999: a state of a piece is up to 50 from the next, at either end up to 100.
+
+    So 990 of the 1000 distances are at most 95 and the next larger is 96.
+    """
+    q = torch.arange(1000, dtype=torch.float64)[:, None]
+    region = DataRegion([q], [0 * q])
+    assert float(region.distance(tensor([-95.01]), tensor([0.0]))) == pytest.approx(1)
+
+
+def test_the_draw_of_states_follows_its_seed():
+    at = loops(10, seed=1)
+    radii = [DataRegion(*at, samples=300, seed=seed).radius for seed in (0, 0, 1)]
+    assert radii[0] == radii[1] != radii[2]
+
+
+def test_an_angle_may_wind_and_another_coordinate_may_not():
+    q, v = loops(10, seed=1)
+    turn = tensor([2 * np.pi, 0.0])
+    region = DataRegion(q, v, angles=[0])
+    inside = region.distance(q[:, ::50], v[:, ::50])
+    assert region.distance(q[:, ::50] + 3 * turn, v[:, ::50]) == pytest.approx(inside, abs=1e-9)
+    assert bool((region.distance(q[:, ::50] + turn.flip(0), v[:, ::50]) > 2).all())
+
+
+def test_a_small_angle_counts_as_the_angle_itself():
+    q, v = loops(10, seed=1)
+    plain, wound = DataRegion(0.01 * q, v), DataRegion(0.01 * q, v, angles=[0, 1])
+    at = 0.01 * loops(3, seed=2)[0][:, ::50], loops(3, seed=2)[1][:, ::50]
+    assert wound.distance(*at) == pytest.approx(plain.distance(*at), rel=1e-2, abs=1e-3)
+
+
+def test_a_state_that_is_nan_has_no_distance():
+    region = DataRegion(*comb())
+    distance = region.distance(tensor([[1.0], [np.nan]]), tensor([[0.0], [0.0]]))
+    assert distance[0] == 0
+    assert torch.isnan(distance[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda q, v: (q, v[:1]), "q holds 2 trajectories and v 1"),
+        (lambda q, v: ([], []), "q holds 0 trajectories"),
+        (lambda q, v: (q, [v[0], v[1][:-1]]), r"v\[1\] \(49, 1\): expected \(T, 1\)"),
+        (lambda q, v: ([q[0], q[1] / 0], v), r"q\[1\] has 50 non-finite"),
+        (lambda q, v: (q, [v[0] * torch.nan, v[1]]), r"v\[0\] has 50 non-finite"),
+        (lambda q, v: ([0 * x for x in q], v), "the same states, expected different ones"),
+        (lambda q, v: ([q[0][:1]], [v[0][:1]]), "one trajectory, expected two"),
+    ],
+)
+def test_bad_data_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        DataRegion(*change(*comb()))
+
+
+def test_bad_options_are_named():
+    with pytest.raises(ValueError, match=r"samples is 1, expected at least 2"):
+        DataRegion(*comb(), samples=1)
+    with pytest.raises(ValueError, match=r"angles has the entries \[1\], expected .* 0 to 0"):
+        DataRegion(*comb(), angles=[0, 1])
+    with pytest.raises(ValueError, match=r"^q has shape \(2,\), expected \(\*batch, 1\)"):
+        DataRegion(*comb()).distance(torch.zeros(2), torch.zeros(2))
+
+
+# The guard.
+
+
+def spring():
+    return LinearSystem([[1.0]], [[2.0]], [[0.1]], [[4.0]])
+
+
+def guard(active, threshold=2.0, fallback=True):
+    pd = ProportionalDerivative(1, 1, 1.0, 1.0) if fallback else None
+    law = Regulation(spring(), 3.0, 1.0)
+    return Guarded(law, pd, DataRegion(*comb()), threshold=threshold, fallback_active=active)
+
+
+MIXED = tensor([[10.0], [103.5], [100.5], [-9.0]])  # distances 0, 4.5, 1.5 and 9
+REST = Motion(*(torch.zeros(1, dtype=torch.float64) for _ in range(3)))
+
+
+def law_and_pd(q):
+    """2 q / 4 - 4 * 3 q and -q, by hand, at rest and with the reference zero."""
+    return 0.5 * q - 12 * q, -q
+
+
+def test_the_fallback_takes_the_states_outside_and_no_others():
+    guarded = guard(active=True)
+    u = guarded(0.5, MIXED, 0 * MIXED, REST)
+    law, pd = law_and_pd(MIXED)
+    expected = torch.stack([law[0], pd[1], law[2], pd[3]])
+    assert u == pytest.approx(expected, rel=1e-12)
+    found = guarded.diagnostics()
+    assert found["distance"] == pytest.approx(tensor([0.0, 4.5, 1.5, 9.0]))
+    assert found["outside"].tolist() == [0, 1, 0, 1]
+    assert found["fallback"].tolist() == [0, 1, 0, 1]
+    assert found["input_condition"].tolist() == [1, 1, 1, 1]
+
+
+def test_without_an_active_fallback_the_law_goes_on():
+    for guarded in (guard(active=False), guard(active=False, fallback=False)):
+        u = guarded(0.5, MIXED, 0 * MIXED, REST)
+        assert u == pytest.approx(law_and_pd(MIXED)[0], rel=1e-12)
+        assert guarded.diagnostics()["outside"].tolist() == [0, 1, 0, 1]
+        assert guarded.diagnostics()["fallback"].tolist() == [0, 0, 0, 0]
+
+
+def test_a_state_that_comes_back_is_given_back_to_the_law():
+    guarded = guard(active=True)
+    for q in (MIXED[1], MIXED[0]):
+        u = guarded(0.0, q, 0 * q, REST)
+    assert float(u) == pytest.approx(float(law_and_pd(MIXED[0])[0]))
+    assert float(guarded.diagnostics()["fallback"]) == 0
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_one_warning_in_each_run(active, caplog):
+    guarded = guard(active)
+    with caplog.at_level(logging.WARNING, LOGGER):
+        for run in (1, 2):
+            guarded.reset()
+            guarded(0.0, MIXED[:1], 0 * MIXED[:1], REST)
+            assert len(caplog.messages) == run - 1
+            for t in (0.25, 0.5, 0.75):
+                guarded(t, MIXED, 0 * MIXED, REST)
+            assert len(caplog.messages) == run
+    message = caplog.messages[-1]
+    assert "t = 0.25 s: 2 of 4 states outside" in message
+    assert "(index 3) at distance 9," in message
+    assert "2 the limit" in message
+    assert ("the fallback law takes over" in message) == active
+    assert ("the law goes on" in message) != active
+
+
+def test_a_single_state_is_warned_of_too(caplog):
+    with caplog.at_level(logging.WARNING, LOGGER):
+        guard(active=True)(1.0, MIXED[1], 0 * MIXED[1], REST)
+    assert "1 of 1 states outside" in caplog.text
+
+
+class Faulty(Controller):
+    """Finds fault with every state, under two reasons."""
+
+    def __init__(self, *reasons):
+        super().__init__(1, 1)
+        self.reasons = reasons
+        self.size = None
+
+    def __call__(self, t, q, v, reference):
+        self.size = q.shape[:-1]
+        return 0 * q
+
+    def faults(self):
+        return {reason: torch.ones(self.size, dtype=torch.bool) for reason in self.reasons}
+
+
+def test_faults_are_those_of_who_is_in_charge():
+    law, fallback = Faulty("law", "both"), Faulty("fallback", "both")
+    for active, expected in (
+        (False, {"law": [1, 1, 1, 1], "both": [1, 1, 1, 1]}),
+        (True, {"law": [1, 0, 1, 0], "both": [1, 1, 1, 1], "fallback": [0, 1, 0, 1]}),
+    ):
+        guarded = Guarded(law, fallback, DataRegion(*comb()), fallback_active=active)
+        guarded(0.0, MIXED, 0 * MIXED, REST)
+        found = {reason: mask.int().tolist() for reason, mask in guarded.faults().items()}
+        assert found == expected
+
+
+def test_bad_guards_are_named():
+    law, region = Regulation(spring(), 1.0, 1.0), DataRegion(*comb())
+    pd = ProportionalDerivative(1, 1, 1.0, 1.0)
+    with pytest.raises(ValueError, match="fallback_active is True, but fallback is None"):
+        Guarded(law, None, region, fallback_active=True)
+    with pytest.raises(ValueError, match=r"threshold is 0.0, expected a positive"):
+        Guarded(law, pd, region, threshold=0.0, fallback_active=True)
+    with pytest.raises(ValueError, match=r"fallback has N, M = \(2, 2\), expected .* \(1, 1\)"):
+        Guarded(law, ProportionalDerivative(2, 2, 1.0, 1.0), region, fallback_active=True)
+    with pytest.raises(ValueError, match=r"region has 1 coordinates, expected .* the law, 2"):
+        Guarded(Regulation(CartPole(), 1.0, 1.0), None, region, fallback_active=False)
+
+
+@pytest.mark.parametrize("threshold", [0.01, 1.0, 1e3], ids=["outside", "both", "inside"])
+@pytest.mark.parametrize("active", [True, False])
+class TestGuarded(ControllerContract):
+    @pytest.fixture
+    def controller(self, threshold, active):
+        system = LinearSystem(np.eye(2), np.eye(2), np.eye(2), [[1.0, 0.5], [0.0, 2.0]])
+        law, pd = Regulation(system, 2.0, 1.0), ProportionalDerivative(2, 2, 1.0, 1.0)
+        q, v, _ = states(2, batch=60, seed=1)
+        region = DataRegion(0.5 * q.unflatten(0, (6, 10)), 0.5 * v.unflatten(0, (6, 10)))
+        return Guarded(law, pd, region, threshold=threshold, fallback_active=active)

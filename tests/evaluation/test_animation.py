@@ -1,0 +1,178 @@
+import matplotlib.image
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pinn_dyn.control.contracts import Motion
+from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.evaluation import save
+from pinn_dyn.evaluation.animation import (
+    _camera,
+    _pixels,
+    animate_bullet_arm,
+    animate_soft_arm,
+    soft_arm_strip,
+)
+from pinn_dyn.systems import SoftArm
+
+PANDA = "franka_panda/panda.urdf"
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+RED = np.array([0xCC, 0, 0])
+
+
+def make_record(q, q_ref, t):
+    zero = torch.zeros_like(q)
+    return ClosedLoopRecord(t, q, zero, zero, zero, Motion(q_ref, zero, zero), [None])
+
+
+@pytest.fixture
+def bending():
+    """Two segments that bend up to a set point within 0.5 s, sampled at 10 ms."""
+    t = 0.01 * torch.arange(51, dtype=torch.float64)
+    goal = torch.tensor([1.0, 0.4, 0.1, -0.5, 0.8, 0.0], dtype=torch.float64)
+    q_ref = goal.expand(1, 51, 6)
+    return make_record(q_ref * (2 * t)[:, None], q_ref, t)
+
+
+def stop(record, sample, reason="0.20 s: too fast"):
+    record.q[0, sample:] = torch.nan
+    record.stopped[0] = reason
+
+
+def frames(path):
+    """The pixels of a GIF and the time of each of its frames in ms."""
+    with Image.open(path) as image:
+        found, times = [], []
+        for k in range(image.n_frames):
+            image.seek(k)
+            found.append(np.asarray(image.convert("RGB")).astype(int))
+            times.append(image.info["duration"])
+    return found, times
+
+
+def count_red(pixels):
+    return int((np.abs(pixels - RED).sum(-1) < 60).sum())
+
+
+@pytest.mark.parametrize(("fps", "duration", "count"), [(25, 40, 14), (12, 80, 8)])
+def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(
+    bending, fps, duration, count, tmp_path
+):
+    path = tmp_path / "new" / "arm.gif"
+    animate_soft_arm(bending, 0, SoftArm(2), path, fps=fps)
+    found, times = frames(path)
+    # From 0 s up to 0.48 s, and the last sample at 0.5 s.
+    assert times == [duration] * (count - 1) + [1000]
+    assert path.stat().st_size < 200_000
+    # The path of the tip grows.
+    assert count_red(found[-1]) > count_red(found[count // 2]) > count_red(found[0])
+
+
+def test_the_reference_is_drawn_in_grey(bending, tmp_path):
+    pictures = []
+    for shown in (True, False):
+        animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "a.gif", fps=2, reference=shown)
+        first = frames(tmp_path / "a.gif")[0][0]
+        grey = np.abs(first - 0.7 * 255).max(-1) < 8
+        pictures.append(int(grey[40:-40].sum()))  # the legend is below
+    assert pictures[0] > 300 + pictures[1]
+
+
+def test_a_stopped_run_is_drawn_up_to_its_stop(bending, tmp_path):
+    stop(bending, 21)
+    animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=25)
+    assert frames(tmp_path / "arm.gif")[1] == [40] * 5 + [1000]  # 0 to 0.16 s, 0.2 s
+
+
+def test_bad_frame_rates_and_runs_that_never_started_are_refused(bending, tmp_path):
+    with pytest.raises(ValueError, match="fps is 60"):
+        animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=60)
+    stop(bending, 0)
+    with pytest.raises(ValueError, match="run 0 has no finite q at its start"):
+        animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "arm.gif")
+
+
+def test_a_strip_shows_the_arm_at_the_times_asked_for(bending, tmp_path):
+    times = [0.0, 0.1, 0.3]
+    arm = SoftArm(2)
+    figure = soft_arm_strip(bending, 0, arm, times, title="fake")
+    save(figure, tmp_path / "strip.png")
+    assert np.ptp(matplotlib.image.imread(tmp_path / "strip.png")[..., :3]) > 0.5
+    assert [ax.get_title() for ax in figure.axes] == ["0 s", "0.1 s", "0.3 s"]
+    for ax, time in zip(figure.axes, times, strict=True):
+        wanted, upper, lower, _base, path, tip = (np.array(line.get_data_3d()) for line in ax.lines)
+        tips = arm.tip_positions(bending.reference.q[0, 0] * 2 * time)
+        np.testing.assert_allclose(upper[:, -1], tips[0], atol=1e-12)
+        np.testing.assert_allclose(lower[:, -1], tips[1], atol=1e-12)
+        np.testing.assert_allclose(tip[:, 0], tips[1], atol=1e-12)
+        np.testing.assert_allclose(wanted[:, -1], arm.tip_positions(bending.reference.q[0, 0])[1])
+        assert path.shape[1] == round(time / 0.01) + 1
+        low, high = ax.get_zlim()
+        assert low > high  # gravity, +z, points downwards
+    limits = {(ax.get_xlim(), ax.get_ylim(), ax.get_zlim()) for ax in figure.axes}
+    assert len(limits) == 1
+
+
+def test_a_run_that_ran_away_does_not_set_the_scale(bending):
+    bending.q[0, 39:] *= 1e3
+    stop(bending, 41)
+    figure = soft_arm_strip(bending, 0, SoftArm(2), [0.1], title="fake")
+    assert abs(np.subtract(*figure.axes[0].get_zlim())) < 1.0
+
+
+@pytest.mark.parametrize("times", [[], [0.6], [-0.1, 0.2]])
+def test_times_outside_the_run_are_refused(bending, times):
+    with pytest.raises(ValueError, match=r"expected some between 0 and 0\.5 s"):
+        soft_arm_strip(bending, 0, SoftArm(2), times, title="fake")
+
+
+@pytest.mark.panda
+def test_panda_moves_in_view_of_the_camera(tmp_path):
+    pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+    from pinn_dyn.systems import BulletArm
+
+    t = 0.01 * torch.arange(51, dtype=torch.float64)
+    home = torch.tensor([0, -0.785, 0, -2.356, 0, 1.571, 0.785], dtype=torch.float64)
+    q_ref = (home + t[:, None] * torch.tensor([3.0, 1, 0, 2, 0, 0, 0]))[None]
+    record = make_record(q_ref - 0.05, q_ref, t)
+    arm = BulletArm(PANDA, locked_joints=FINGERS)
+    path = tmp_path / "panda.gif"
+    animate_bullet_arm(record, 0, arm, path, fps=10, size=(240, 180))
+    found, times = frames(path)
+    assert times == [100] * 5 + [1000]
+    assert count_red(found[-1]) > count_red(found[0]) + 30
+    animate_bullet_arm(record, 0, arm, path, fps=10, size=(240, 180), trace=False)
+    plain = frames(path)[0]
+    for picture in plain:
+        arm_pixels = (picture < 220).all(-1)
+        assert arm_pixels.mean() > 0.05
+        border = np.ones_like(arm_pixels)
+        border[3:-3, 3:-3] = False
+        assert not arm_pixels[border].any()
+    assert (np.abs(plain[-1] - plain[0]).max(-1) > 40).mean() > 0.03
+    assert not any(count_red(picture) for picture in plain)
+
+
+@pytest.mark.panda
+@pytest.mark.parametrize("size", [(160, 120), (120, 160)])
+def test_points_are_where_bullet_draws_them(size):
+    bullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+    points = np.array([[0.5, 0.2, 0.1], [-0.3, 0.4, 0.9], [0.1, -0.6, 0.4]])
+    view, projection = _camera(bullet, points, size)
+    expected = _pixels(points, view, projection, size)
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        ball = bullet.createVisualShape(bullet.GEOM_SPHERE, radius=0.03, physicsClientId=client)
+        body = bullet.createMultiBody(baseVisualShapeIndex=ball, physicsClientId=client)
+        for point, (column, row) in zip(points, expected, strict=True):
+            bullet.resetBasePositionAndOrientation(
+                body, point, [0, 0, 0, 1], physicsClientId=client
+            )
+            mask = bullet.getCameraImage(
+                *size, view, projection, renderer=bullet.ER_TINY_RENDERER, physicsClientId=client
+            )[4]
+            rows, columns = np.nonzero(np.reshape(mask, size[::-1]) >= 0)
+            assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx((column, row), abs=1)
+    finally:
+        bullet.disconnect(client)
