@@ -134,16 +134,12 @@ def build_law(
         ConfigError: on terms of another name, or a law that cannot be built on them.
     """
     part = config["controllers"][name]
-    needs: dict[str, dict[str, Any]] = {
-        "learned": {"model": learned},
-        "truth": {"model": truth},
-        "none": {"num_coordinates": truth.num_coordinates, "num_inputs": truth.num_inputs},
-    }
-    if part["terms"] not in needs:
+    models = {"learned": learned, "truth": truth}
+    if part["terms"] not in models:
         raise ConfigError(
-            f"controllers.{name}.terms is {part['terms']!r}, expected one of {', '.join(needs)}"
+            f"controllers.{name}.terms is {part['terms']!r}, expected {' or '.join(models)}"
         )
-    return _build(f"controllers.{name}", part["law"], **needs[part["terms"]])
+    return _build(f"controllers.{name}", part["law"], models[part["terms"]])
 
 
 def build_plant(config: dict[str, Any], robot: MechanicalSystem) -> Plant:

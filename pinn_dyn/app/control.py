@@ -33,6 +33,7 @@ from pinn_dyn.control import (
     Controller,
     DataRegion,
     Guarded,
+    ModelBasedLaw,
     ProportionalDerivative,
     Reference,
     check_limits,
@@ -140,18 +141,18 @@ def _export(laws: dict[str, Controller], path: Path) -> Path:
 def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSource) -> Controller:
     """The learned law with an eye on its distance from the training data."""
     law = laws["learned"]
+    assert isinstance(law, ModelBasedLaw)
     train = source.load().train
     fallback = None
     if config["guard"]["fallback"]:
         gains = config["gains"]
-        fallback = ProportionalDerivative(
-            law.num_coordinates, law.num_inputs, gains["position"], gains["velocity"]
-        )
+        with _errors_of("guard"):
+            fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
     with _errors_of("guard"):
         region = DataRegion(
             [item.q[:: _stride(item.q)] for item in train],
             [item.v[:: _stride(item.v)] for item in train],
-            angles=getattr(getattr(law, "model", None), "angles", ()),
+            angles=getattr(law.model, "angles", ()),
         )
         return Guarded(
             law,

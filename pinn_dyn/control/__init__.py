@@ -6,7 +6,13 @@ from pinn_dyn.control.effects import Actuator, Delay, Sensor
 from pinn_dyn.control.export import export_law, load_law
 from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.control.helix import Helix
-from pinn_dyn.control.laws import ComputedTorque, ProportionalDerivative, Regulation, Tracking
+from pinn_dyn.control.laws import (
+    ComputedTorque,
+    ModelBasedLaw,
+    ProportionalDerivative,
+    Regulation,
+    Tracking,
+)
 from pinn_dyn.control.plants import BulletPlant, SystemPlant
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.references import (
@@ -34,6 +40,7 @@ __all__ = [
     "Delay",
     "Guarded",
     "Helix",
+    "ModelBasedLaw",
     "Motion",
     "Plant",
     "PointToPoint",

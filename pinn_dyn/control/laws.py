@@ -1,4 +1,4 @@
-"""Control laws on the terms of a mechanical system, true or learned, and a PD law without any."""
+"""Control laws on the terms of a mechanical system, true or learned."""
 
 from __future__ import annotations
 
@@ -54,36 +54,6 @@ class StateFeedback(Controller):
     def _feedback(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor) -> Tensor:
         """K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
         return self.position_gain.to(q) * (q_ref - q) + self.velocity_gain.to(q) * (v_ref - v)
-
-
-class ProportionalDerivative(StateFeedback):
-    """PD control without a model, one input to each coordinate::
-
-        u = K_P (q_ref - q) + K_D (v_ref - v)
-
-    Args:
-        num_coordinates: N.
-        num_inputs: M, must equal N.
-        position_gain: diagonal of K_P, 1/m or 1/rad times the unit of u.
-        velocity_gain: diagonal of K_D, s/m or s/rad times the unit of u.
-
-    Raises:
-        ValueError: if M differs from N, or on bad gains.
-    """
-
-    def __init__(
-        self, num_coordinates: int, num_inputs: int, position_gain: Gain, velocity_gain: Gain
-    ):
-        if num_inputs != num_coordinates:
-            raise ValueError(
-                f"num_inputs is {num_inputs}, expected {num_coordinates}, the number of "
-                "coordinates: a PD law alone cannot know how other inputs act on them; use the "
-                "regulation law on a model, which has an input matrix A(q)"
-            )
-        super().__init__(num_coordinates, num_inputs, position_gain, velocity_gain)
-
-    def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
-        return self._feedback(q, v, q_ref, v_ref)
 
 
 class ModelBasedLaw(StateFeedback):
@@ -175,6 +145,21 @@ class ModelBasedLaw(StateFeedback):
             f"max_condition = {self.max_condition:g}"
         )
         return {reason: ~(self._condition <= self.max_condition)}
+
+
+class ProportionalDerivative(ModelBasedLaw):
+    """PD control without compensation, the feedback part of the paper's laws alone::
+
+        u = A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
+
+    Of the model only A is used; with A = I, torques at the joints, nothing of it. Arguments and
+    errors: :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
+    """
+
+    def _input(
+        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
+    ) -> Tensor:
+        return matvec(A.transpose(-1, -2), self._feedback(q, v, q_ref, v_ref))
 
 
 class Regulation(ModelBasedLaw):

@@ -15,6 +15,7 @@ from pinn_dyn.control.laws import ProportionalDerivative, Regulation, Tracking
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential
 from tests.models.builders import make_structured
+from tests.support.linear import unit_masses
 
 needs_compiler = pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
 
@@ -171,14 +172,14 @@ class Silent(Controller):
 
 @needs_compiler
 def test_a_law_without_finite_inputs_is_not_exported(tmp_path):
-    law = ProportionalDerivative(2, 2, 10.0, 1.0)
+    law = ProportionalDerivative(unit_masses(2), 10.0, 1.0)
     law.position_gain[0] = float("nan")
-    with pytest.raises(ValueError, match=r"u of the ProportionalDerivative law has 10 non-finite"):
+    with pytest.raises(ValueError, match=r"u of the ProportionalDerivative law has 20 non-finite"):
         export_law(law, tmp_path / "law.pt2")
 
 
 def test_bad_arguments_are_named_before_anything_is_compiled(tmp_path):
-    law = ProportionalDerivative(2, 2, 10.0, 1.0)
+    law = ProportionalDerivative(unit_masses(2), 10.0, 1.0)
     with pytest.raises(ValueError, match=r"path is .*law\.onnx.*\.pt2"):
         export_law(law, tmp_path / "law.onnx")
     with pytest.raises(TypeError, match=r"controller is a Silent, expected a law"):
@@ -188,7 +189,7 @@ def test_bad_arguments_are_named_before_anything_is_compiled(tmp_path):
 def test_without_a_compiler_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RuntimeError, match=r"needs a C\+\+ compiler .* apt install g\+\+"):
-        export_law(ProportionalDerivative(2, 2, 10.0, 1.0), tmp_path / "law.pt2")
+        export_law(ProportionalDerivative(unit_masses(2), 10.0, 1.0), tmp_path / "law.pt2")
 
 
 @needs_compiler
@@ -199,5 +200,5 @@ def test_a_law_that_cannot_be_traced_is_named(tmp_path):
             return u if float(u.sum()) > 0 else -u
 
     with pytest.raises(ValueError, match="the Branching law cannot be exported"):
-        export_law(Branching(2, 2, 10.0, 1.0), tmp_path / "law.pt2")
+        export_law(Branching(unit_masses(2), 10.0, 1.0), tmp_path / "law.pt2")
     assert not list(tmp_path.iterdir())

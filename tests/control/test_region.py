@@ -11,7 +11,7 @@ from pinn_dyn.control.laws import ProportionalDerivative, Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
 from tests.contracts.controller import ControllerContract, states
 from tests.support.cart_pole import CartPole
-from tests.support.linear import LinearSystem
+from tests.support.linear import LinearSystem, unit_masses
 
 LOGGER = "pinn_dyn.control.region"
 
@@ -154,7 +154,7 @@ def spring():
 
 
 def guard(active, threshold=2.0, fallback=True):
-    pd = ProportionalDerivative(1, 1, 1.0, 1.0) if fallback else None
+    pd = ProportionalDerivative(unit_masses(1), 1.0, 1.0) if fallback else None
     law = Regulation(spring(), 3.0, 1.0)
     return Guarded(law, pd, DataRegion(*comb()), threshold=threshold, fallback_active=active)
 
@@ -252,13 +252,13 @@ def test_faults_are_those_of_who_is_in_charge():
 
 def test_bad_guards_are_named():
     law, region = Regulation(spring(), 1.0, 1.0), DataRegion(*comb())
-    pd = ProportionalDerivative(1, 1, 1.0, 1.0)
+    pd = ProportionalDerivative(unit_masses(1), 1.0, 1.0)
     with pytest.raises(ValueError, match="fallback_active is True, but fallback is None"):
         Guarded(law, None, region, fallback_active=True)
     with pytest.raises(ValueError, match=r"threshold is 0.0, expected a positive"):
         Guarded(law, pd, region, threshold=0.0, fallback_active=True)
     with pytest.raises(ValueError, match=r"fallback has N, M = \(2, 2\), expected .* \(1, 1\)"):
-        Guarded(law, ProportionalDerivative(2, 2, 1.0, 1.0), region, fallback_active=True)
+        Guarded(law, ProportionalDerivative(unit_masses(2), 1.0, 1.0), region, fallback_active=True)
     with pytest.raises(ValueError, match=r"region has 1 coordinates, expected .* the law, 2"):
         Guarded(Regulation(CartPole(), 1.0, 1.0), None, region, fallback_active=False)
 
@@ -269,7 +269,7 @@ class TestGuarded(ControllerContract):
     @pytest.fixture
     def controller(self, threshold, active):
         system = LinearSystem(np.eye(2), np.eye(2), np.eye(2), [[1.0, 0.5], [0.0, 2.0]])
-        law, pd = Regulation(system, 2.0, 1.0), ProportionalDerivative(2, 2, 1.0, 1.0)
+        law, pd = Regulation(system, 2.0, 1.0), ProportionalDerivative(unit_masses(2), 1.0, 1.0)
         q, v, _ = states(2, batch=60, seed=1)
         region = DataRegion(0.5 * q.unflatten(0, (6, 10)), 0.5 * v.unflatten(0, (6, 10)))
         return Guarded(law, pd, region, threshold=threshold, fallback_active=active)

@@ -45,6 +45,11 @@ class LinearSystem(MechanicalSystem):
         return f, b
 
 
+def unit_masses(n):
+    """n uncoupled unit masses on unit springs and dampers, each with its input: A = I."""
+    return LinearSystem(np.eye(n), np.eye(n), np.eye(n), np.eye(n))
+
+
 def damped_oscillators():
     """Two coupled damped masses, pushed by one input."""
     return LinearSystem(
