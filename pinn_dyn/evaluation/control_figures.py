@@ -13,6 +13,9 @@ from pinn_dyn.evaluation.figures import _COLOURS, _TRUTH, _limits, _names
 
 _WARNING = "#D55E00"
 
+# A peak of the input this many times above its 95th percentile gets a logarithmic axis.
+_SPIKE = 20
+
 
 def closed_loop_figure(
     record: ClosedLoopRecord,
@@ -69,6 +72,8 @@ def closed_loop_figure(
         input_axes[k].plot(
             t, u[:, k], color=colour, linewidth=1.2, drawstyle="steps-post", label=label
         )
+    for k in range(1 if shared else len(input_labels)):
+        _make_room_for_spikes(input_axes[k], u if shared else u[:, k])
     for ax in dict.fromkeys(error_axes[: len(labels)]):
         ax.axhline(0, color="black", linestyle=":", linewidth=1)
     if shared:
@@ -254,6 +259,15 @@ def steady_state_figure(
         lines.append(f"not drawn: {unbounded} without a bound, {endless} without a finite error")
     figure.suptitle("\n".join(lines), fontsize="medium")
     return figure
+
+
+def _make_room_for_spikes(ax: Axes, values: Tensor) -> None:
+    """A logarithmic axis beyond the usual values where a spike would flatten these."""
+    sizes = values.abs().nan_to_num(0.0, 0.0, 0.0).flatten()
+    usual = float(torch.quantile(sizes, 0.95))
+    if usual > 0 and float(sizes.max()) > _SPIKE * usual:
+        ax.set_yscale("symlog", linthresh=usual)
+        ax.set_ylabel(f"{ax.get_ylabel()}\nlogarithmic beyond ±{usual:.2g}")
 
 
 def _label_grid(panels: list[list[Axes]], labels: list[str], input_labels: list[str]) -> None:

@@ -177,3 +177,13 @@ def test_bounds_that_all_hold_need_no_warning(tmp_path):
     assert len(figure.axes[0].collections) == 1
     with pytest.raises(ValueError, match=r"bound has shape \(3,\) and measured \(2,\)"):
         steady_state_figure(torch.ones(3), torch.ones(2), title="fake")
+
+
+def test_a_spike_of_the_input_leaves_the_rest_readable():
+    record = make_record(3)
+    assert closed_loop_figure(record, 0, title="calm").axes[2].get_yscale() == "linear"
+    u = record.u.clone()
+    u[:, 0] = 1e4
+    spiked = closed_loop_figure(dataclasses.replace(record, u=u), 0, title="spike")
+    assert spiked.axes[2].get_yscale() == "symlog"
+    assert "logarithmic" in spiked.axes[2].get_ylabel()
