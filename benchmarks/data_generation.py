@@ -50,6 +50,14 @@ def naive_rk4(source: SimulatedSource, q: torch.Tensor, v: torch.Tensor, steps: 
     return time.perf_counter() - start
 
 
+def _batches(shapes: list[tuple[int, int]]) -> dict[int, int]:
+    """Number of trajectories by their number of steps."""
+    batches: dict[int, int] = {}
+    for count, samples in shapes:
+        batches[samples - 1] = batches.get(samples - 1, 0) + count
+    return batches
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--steps", type=int, default=400, help="samples in the timed piece")
@@ -66,8 +74,11 @@ def main() -> None:
     start = time.perf_counter()
     arrays = source.simulate()
     adaptive = time.perf_counter() - start
-    count = sum(arrays[f"{split}_q"].shape[0] for split in ("train", "validation", "test"))
-    samples = arrays["t"].shape[0] - 1
+    # Trajectories and their samples: a naive script would not simulate more than it keeps either.
+    shapes = [arrays[f"{split}_q"].shape[:2] for split in ("train", "validation", "test")]
+    count = sum(shape[0] for shape in shapes)
+    samples = max(shape[1] for shape in shapes) - 1
+    all_samples = sum(shape[0] * (shape[1] - 1) for shape in shapes)
 
     t, *test = (torch.from_numpy(arrays[key]) for key in ("t", "test_q", "test_v", "test_u"))
     truth = Trajectory(t[: test[0].shape[1]], *test).until(5.0)
@@ -76,15 +87,22 @@ def main() -> None:
 
     rng = np.random.default_rng(0)
     q, v = (torch.from_numpy(x) for x in source.initial_states.draw(count, rng))
-    single = naive_rk4(source, q[:1], v[:1], steps) * samples / steps * count
-    batched = naive_rk4(source, q, v, steps) * samples / steps
+    single = naive_rk4(source, q[:1], v[:1], steps) * all_samples / steps
+    # One batch after the other for splits of different length.
+    batched = sum(
+        naive_rk4(source, q[:size], v[:size], steps) * length / steps
+        for length, size in _batches(shapes).items()
+    )
 
     rows = [
         ("adaptive, batched, dense output (this package)", adaptive),
         ("fixed step, batched (scaled from a piece)", batched),
         ("fixed step, one trajectory at a time (scaled from a piece)", single),
     ]
-    print(f"{count} trajectories of {source.duration:g} s at {source.step:g} s")
+    print(
+        f"{count} trajectories at {source.step:g} s, training {source.duration:g} s, the others "
+        f"{source.test_duration:g} s"
+    )
     print(f"fixed-step loops timed over {steps} of {samples} samples; {provenance()['hardware']}")
     print(f"the truth, rolled out for 5 s by RK4 at {ROLLOUT_STEP:g} s, misses by {error:.1e}")
     RESULTS.mkdir(exist_ok=True)

@@ -223,13 +223,18 @@ class SimulatedSource(DataSource):
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
         # Splits of one duration are one batch.
         if self.test_duration == self.duration:
-            return self._simulate(_SPLITS, self.duration)
+            return self._simulate(_SPLITS, self.duration, 0)
+        # Two batches of one size: the compiled equation of motion serves both.
+        states, inputs = self.counts["train"]
+        train = states * inputs if self.pairing == "product" else states
+        size = max(train, self.counts["validation"][0] + self.counts["test"][0])
         return {
-            **self._simulate(_SPLITS[1:], self.test_duration),
-            **self._simulate(_SPLITS[:1], self.duration),  # the longer times, "t", last
+            **self._simulate(_SPLITS[1:], self.test_duration, size),
+            **self._simulate(_SPLITS[:1], self.duration, size),  # the longer times, "t", last
         }
 
-    def _simulate(self, splits: Sequence[str], duration: float) -> Arrays:
+    def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
+        """Trajectories of some splits in one batch, filled up with copies to ``size``."""
         t = np.arange(round(duration / self.step) + 1) * self.step
         starts, signals, pick = [], [], []
         for split in splits:
@@ -243,12 +248,15 @@ class SimulatedSource(DataSource):
             else:
                 pick.append(np.array([(a, a) for a in range(states)]))
 
+        count = sum(map(len, pick))
+        rows = np.arange(max(count, size)) % count
+
         def signal(time: np.ndarray) -> np.ndarray:
             drawn = [part(time) for part in signals]
-            return np.concatenate([d[p[:, 1]] for d, p in zip(drawn, pick, strict=True)])
+            return np.concatenate([d[p[:, 1]] for d, p in zip(drawn, pick, strict=True)])[rows]
 
-        q0 = np.concatenate([s[0][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
-        v0 = np.concatenate([s[1][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
+        q0 = np.concatenate([s[0][p[:, 0]] for s, p in zip(starts, pick, strict=True)])[rows]
+        v0 = np.concatenate([s[1][p[:, 0]] for s, p in zip(starts, pick, strict=True)])[rows]
         q, v = simulate(
             self.system,
             q0,
@@ -258,7 +266,7 @@ class SimulatedSource(DataSource):
             rtol=self.rtol,
             atol=self.atol,
             compile=self.compile,
-            progress=f"simulating {len(q0)} trajectories of {self.name}",
+            progress=f"simulating {count} trajectories of {self.name}",
         )
         ends = np.cumsum([0, *(len(p) for p in pick)])
         arrays = {"t": t}
