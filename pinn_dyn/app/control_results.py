@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from pinn_dyn.control import (
@@ -183,11 +184,19 @@ def _figures(
     if isinstance(reference, Helix) and isinstance(robot, BulletArm):
         figures["tip_path"] = tip_path_figure(
             first.t,
-            {name: robot.tip_position(record.q[run]) for name, record in records.items()},
+            {name: _tip_path(robot, record.q[run]) for name, record in records.items()},
             torch.stack([torch.as_tensor(reference.path(float(t))) for t in first.t]),
             title=f"{source.name}: path of the end effector",
         )
     return figures
+
+
+def _tip_path(arm: BulletArm, q: Tensor) -> Tensor:
+    """Positions of the tip, ``(T, 3)``, NaN after a stop."""
+    alive = q.isfinite().all(-1)
+    path = q.new_full((len(q), 3), torch.nan)
+    path[alive] = arm.tip_position(q[alive])
+    return path
 
 
 def _together(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
