@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 import torch
-from scipy.integrate import BDF
-from scipy.sparse import bsr_matrix, csc_matrix
 from torch import Tensor
 from tqdm import tqdm
 
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Delay, Sensor
-from pinn_dyn.control.plants import solve_by_halves
 from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.control.stiff_loop import StiffLoop, finite_rows, motion_of_copies
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite
 
@@ -42,9 +37,9 @@ def close_loop(
 
     A copy is stopped, and the others go on, once its state is not finite or q leaves its bound,
     the sensor or the law give something that is not finite, or the controller reports a fault.
-    What was known at that instant is recorded: everything after it is NaN. The law sees a stopped
-    copy at rest where it was last measured, and the plant is started afresh without it. Ctrl-C
-    ends the run early and gives the record so far.
+    What was known at that instant is recorded: all of the plant after it is NaN. The law sees a
+    stopped copy at rest where it was last measured, and the plant is started afresh without it.
+    Ctrl-C ends the run early and gives the record so far.
 
     Args:
         plant: what is controlled.
@@ -146,7 +141,7 @@ def close_loop_continuous(
 
     with torch.no_grad():
         x0 = torch.cat([q0, v0], dim=-1)
-        loop = _ContinuousLoop(law_and_system, reference, x0, run.t, q_bound)
+        loop = StiffLoop(law_and_system, reference, x0, run.t, q_bound)
         loop.solve(rtol, atol, progress)
         controller.reset()
         for k in range(len(run.t)):
@@ -186,7 +181,7 @@ class _Run:
         self._controller, self._actuator = controller, actuator
         self._interval, self._q_bound = 1 / rate, q_bound
         self._seen = q0.clone(), v0.clone()
-        self._motions = [_motion(reference, float(t), q0) for t in self.t]
+        self._motions = [motion_of_copies(reference, float(t), q0) for t in self.t]
         samples = (len(q0), len(self.t))
         self._q, self._v = (q0.new_full((*samples, n), torch.nan) for _ in range(2))
         self._u, self._u_wanted = (q0.new_full((*samples, m), torch.nan) for _ in range(2))
@@ -204,7 +199,7 @@ class _Run:
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Take note of the true state at instant k; stops who has diverged."""
-        finite = _finite(q) & _finite(v)
+        finite = finite_rows(q) & finite_rows(v)
         self.stop(~finite, float(self.t[k]), "the plant diverged: its state is not finite")
         self._q[self.running, k] = q[self.running]
         self._v[self.running, k] = v[self.running]
@@ -214,7 +209,7 @@ class _Run:
 
     def measure(self, k: int, q: Tensor, v: Tensor) -> None:
         """Take what the sensor says at instant k; stops whose measurement is not finite."""
-        lost = ~(_finite(q) & _finite(v))
+        lost = ~(finite_rows(q) & finite_rows(v))
         self.stop(lost, float(self.t[k]), "the measurement is not finite")
         for seen, new in zip(self._seen, (q, v), strict=True):
             seen[self.running] = new[self.running]
@@ -232,7 +227,7 @@ class _Run:
         self._diagnose(k, self._controller.diagnostics())
         for reason, who in self._controller.faults().items():
             self.stop(who, time, reason)
-        self.stop(~_finite(u), time, "the law's input is not finite")
+        self.stop(~finite_rows(u), time, "the law's input is not finite")
         return u
 
     def apply(self, k: int, u: Tensor) -> Tensor:
@@ -258,133 +253,6 @@ class _Run:
             if name not in self._diagnostics:
                 self._diagnostics[name] = self._q.new_full(self._q.shape[:2], torch.nan)
             self._diagnostics[name][self.running, k] = value[self.running].to(self._q)
-
-
-class _ContinuousLoop:
-    """dx/dt = field(t, x, *motion) for K copies that lose each other without harm, by BDF.
-
-    Attributes:
-        states: solution at the samples, ``(K, T, 2N)``; NaN once a copy is lost.
-        ends: for each copy, when in s it was lost, infinity if never, and why.
-    """
-
-    def __init__(
-        self,
-        field: Callable[..., Tensor],
-        reference: Reference,
-        x0: Tensor,
-        t: Tensor,
-        q_bound: float,
-    ):
-        self._field, self._reference, self._t, self._q_bound = field, reference, t, q_bound
-        self.states = x0.new_full((len(x0), len(t), x0.shape[-1]), torch.nan)
-        self.states[:, 0] = x0
-        self.ends = [(np.inf, "")] * len(x0)
-
-    def solve(self, rtol: float, atol: float, progress: str | None) -> None:
-        """Solve all copies together; where that fails, each half of them on its own."""
-        everyone = torch.arange(len(self.states))
-        pending = [(everyone, 0.0, self.states[:, 0])]
-        with tqdm(
-            total=len(everyone) * float(self._t[-1]),
-            desc=progress,
-            disable=progress is None,
-            bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
-        ) as bar:
-            while pending:
-                who, time, x = pending.pop()
-                time, x, lost = self._solve_together(who, time, x, rtol, atol, bar)
-                if time == float(self._t[-1]) or lost.all():
-                    continue
-                if lost.any():
-                    pending.append((who[~lost], time, x[~lost]))
-                else:
-                    halves = zip(who.tensor_split(2), x.tensor_split(2), strict=True)
-                    pending += [(part, time, states) for part, states in halves]
-
-    def _solve_together(
-        self, who: Tensor, time: float, x: Tensor, rtol: float, atol: float, bar: tqdm
-    ) -> tuple[float, Tensor, Tensor]:
-        """Solve some copies as far as it goes; returns the time, their states and who is lost."""
-        end = float(self._t[-1])
-        lost = ~_finite(self._rows(who, time, x))
-        if lost.any():
-            return self._lose(who, time, x, lost, "the acceleration is not finite")
-        # SciPy takes the root mean square over all copies: this keeps each one within rtol, atol.
-        share = len(who) ** -0.5
-        solver = BDF(
-            lambda t, flat: self._rows(who, t, self._unflatten(who, flat)).numpy().ravel(),
-            time,
-            x.numpy().ravel(),
-            end,
-            rtol=share * rtol,
-            atol=share * atol,
-            jac=lambda t, flat: self._jacobian(who, t, self._unflatten(who, flat)),
-        )
-        while solver.status == "running":
-            solver.step()
-            if solver.status == "failed":
-                lost = torch.full((len(who),), len(who) == 1)
-                return self._lose(who, time, x, lost, "the solver cannot follow the motion")
-            samples = (self._t > time) & (self._t <= solver.t)
-            bar.update(len(who) * (solver.t - time))
-            time, x = float(solver.t), self._unflatten(who, solver.y)
-            if samples.any():
-                dense = torch.from_numpy(solver.dense_output()(self._t[samples].numpy()))
-                self.states[who[:, None], samples.nonzero()[:, 0]] = dense.unflatten(
-                    0, (len(who), -1)
-                ).transpose(1, 2)
-            lost = (x.chunk(2, dim=-1)[0].abs() > self._q_bound).any(-1)
-            if lost.any():
-                return self._lose(who, time, x, lost, f"|q| is beyond {self._q_bound:g}")
-        return end, x, lost
-
-    def _lose(
-        self, who: Tensor, time: float, x: Tensor, lost: Tensor, reason: str
-    ) -> tuple[float, Tensor, Tensor]:
-        for copy in who[lost].tolist():
-            self.ends[copy] = (time, f"the plant diverged: {reason}")
-        return time, x, lost
-
-    def _rows(self, who: Tensor, time: float, x: Tensor) -> Tensor:
-        """dx/dt of states ``(*batch, k, 2N)``; NaN where a matrix is not positive definite."""
-        motion = _motion(self._reference, time, self.states[:, 0].chunk(2, dim=-1)[0])
-        rows = [y[who].expand(*x.shape[:-1], -1).flatten(0, -2) for y in motion]
-        field = partial(self._field, time)
-        return solve_by_halves(field, x.flatten(0, -2), *rows).reshape(x.shape)
-
-    def _jacobian(self, who: Tensor, time: float, x: Tensor) -> csc_matrix:
-        """Forward differences of all copies at once: a block of 2N x 2N for each."""
-        size = x.shape[-1]
-        step = torch.finfo(x.dtype).eps ** 0.5 * x.abs().clamp_min(1.0)
-        shifted = (x[:, None] + torch.diag_embed(step)).transpose(0, 1)
-        values = self._rows(who, time, torch.cat([x[None], shifted]))
-        blocks = (values[1:] - values[:1]).permute(1, 2, 0) / step[:, None]
-        # One entry that is not finite would spoil the factors of every copy.
-        blocks = blocks.nan_to_num(0.0, 0.0, 0.0)
-        index = np.arange(len(who) + 1)
-        shape = (len(who) * size,) * 2
-        return bsr_matrix((blocks.numpy(), index[:-1], index), shape=shape).tocsc()
-
-    def _unflatten(self, who: Tensor, flat: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.array(flat)).reshape(len(who), -1)
-
-
-def _finite(x: Tensor) -> Tensor:
-    return x.isfinite().all(-1)
-
-
-def _motion(reference: Reference, time: float, like: Tensor) -> Motion:
-    """The reference at one time, for each copy: ``(K, N)`` like another tensor."""
-    motion = reference(time)
-    for name, value in zip(Motion._fields, motion, strict=True):
-        if value.shape not in (like.shape, like.shape[1:]):
-            raise ValueError(
-                f"the reference's {name} has shape {tuple(value.shape)}, expected "
-                f"{tuple(like.shape[1:])} or {tuple(like.shape)}: one motion for all copies, or "
-                "one for each"
-            )
-    return Motion(*(value.to(like).expand_as(like) for value in motion))
 
 
 def _check_sizes(

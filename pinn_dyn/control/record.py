@@ -11,7 +11,9 @@ from pinn_dyn.control.contracts import Motion
 
 @dataclass(frozen=True)
 class ClosedLoopRecord:
-    """K runs of a closed loop, sampled at its control instants; NaN after a run has stopped.
+    """K runs of a closed loop, sampled at its control instants.
+
+    What belongs to the plant or the law is NaN after a run has stopped.
 
     Attributes:
         t: control instants, ``(T,)``, s.
