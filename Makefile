@@ -50,7 +50,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 # PyBullet has Linux wheels for Python 3.10 and 3.11 only; building it from source is not tried.
-$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+$(VENV)/.installed: pyproject.toml setup.py constraints.txt | $(BIN)/python
 	@echo "installing the runtime packages into $(VENV)"
 	@if $(INSTALL) --dry-run --no-deps --only-binary pybullet pybullet >/dev/null 2>&1; then \
 	    $(INSTALL) --only-binary pybullet -e '.[panda]'; \

@@ -98,7 +98,7 @@ def make_step(
         for k in range(0, count, chunk):
             part = slice(k, k + chunk)
             predicted = increments(batch["x0"][part], batch["t"], batch["u"][part])
-            value = loss(predicted[:, 1:], batch["measured"][part])
+            value = loss.error(predicted[:, 1:], batch["measured"][part])
             value = value * (predicted.shape[0] / count)
             value.backward()
             total += float(value.detach())

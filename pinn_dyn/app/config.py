@@ -19,7 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from pinn_dyn.data import SimulationError
 from pinn_dyn.training import NonFiniteLossError
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
+# An installed package has its conf/ inside, a checkout beside the entry scripts.
+_INSTALLED = Path(__file__).resolve().parents[1] / "conf"
+CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
 class ConfigError(ValueError):
@@ -49,7 +51,8 @@ def main(task: Callable[[DictConfig], object], config_name: str) -> None:
     A misspelt key ends the program before anything is written, with the keys that were probably
     meant; so does an error that the user can mend, without a traceback.
     """
-    problem = misspelt_key(config_name, sys.argv[1:])
+    completing = {"-sc", "--shell-completion"} & set(sys.argv)  # whose words are no overrides
+    problem = None if completing else misspelt_key(config_name, sys.argv[1:])
     if problem:
         raise SystemExit(f"Error: {problem}")
 

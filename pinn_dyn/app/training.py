@@ -70,7 +70,8 @@ def train(cfg: DictConfig) -> float:
     if model.coordinates == "momentum" and data.windows.p.shape[-1] == 0:
         raise ConfigError(
             f"model: {config['model_name']} learns from momenta p = M(q) v, and the data set "
-            f"{data.source.name} has none, as they cannot be measured: use model=lnn"
+            f"{data.source.name} has none, as they cannot be measured: set "
+            "model.coordinates=velocity, which learns from (q, v), or use model=lnn"
         )
     learner = build_learner(config, model, statistics, validator)
     trainer = build_trainer(config, folder, data.source, validator)

@@ -68,6 +68,17 @@ class Windows:
         """Increments to each step, ``(B, H, 2N)``, of (q, v) or (q, p)."""
         return torch.cat([self.dq, self.dv if coordinates == "velocity" else self.dp], dim=-1)
 
+    def first(self, steps: int) -> Windows:
+        """The windows cut after their first ``steps`` steps."""
+        samples = steps * ((len(self.t_input) - 1) // (len(self.t) - 1)) + 1
+        return replace(
+            self,
+            t=self.t[: steps + 1],
+            t_input=self.t_input[:samples],
+            u=self.u[:, :samples],
+            **{name: getattr(self, name)[:, :steps] for name in ("dq", "dv", "dp")},
+        )
+
     def statistics(self) -> Statistics:
         """Means and standard deviations over the windows."""
         one = torch.ones_like(self.q[0])

@@ -1,4 +1,4 @@
-"""The Hamiltonian network: learns the inverse mass, V, D and A; its state is (q, p)."""
+"""The Hamiltonian network: learns the inverse mass, V, D and A; its state is (q, p) or (q, v)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from pinn_dyn.mechanics import Coordinates
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
@@ -31,11 +32,23 @@ class HamiltonianNetwork(StructuredNetwork):
 
     One reverse pass through the mass head gives the gradient; nothing is solved or inverted.
 
+    Momenta cannot be measured. With ``coordinates="velocity"`` the same equations, in the state
+    (q, v) with p = W^-1 v, learn and predict from (q, v) alone::
+
+        dq/dt = v,    dv/dt = (dW/dt) p + W dp/dt
+
+    That costs two triangular solves and a tangent pass more. The scale of the energies is then
+    free where A is learned: W / c with c V, c D, c A moves in the same way.
+
     Args:
-        statistics: scales of the data; needs momenta.
+        statistics: scales of the data.
         inverse_mass, potential, damping, input, friction: builders of the heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
         substeps: RK4 steps within a step of the data.
+        coordinates: the state, (q, p) or (q, v); (q, p) needs data with momenta.
+
+    Raises:
+        ValueError: on other coordinates.
     """
 
     def __init__(
@@ -48,13 +61,23 @@ class HamiltonianNetwork(StructuredNetwork):
         friction: FrictionHead = NoFriction,
         angles: Sequence[int] = (),
         substeps: int = 1,
+        coordinates: Coordinates = "momentum",
     ):
+        if coordinates not in ("momentum", "velocity"):
+            raise ValueError(f"coordinates is {coordinates!r}, expected 'momentum' or 'velocity'")
         super().__init__(
-            statistics, "momentum", potential, damping, friction, input, angles, substeps
+            statistics, coordinates, potential, damping, friction, input, angles, substeps
         )
+        size = self.num_coordinates
+        if coordinates == "momentum":
+            inverse_mass_scale = statistics.v_std / statistics.p_std
+        else:
+            # As in the Lagrangian network: what an acceleration takes, without a momentum.
+            acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
+            inverse_mass_scale = acceleration / self.input.typical_force(statistics.u_rms)
         self.inverse_mass = inverse_mass(
-            size=self.num_coordinates,
-            scale=(statistics.v_std / statistics.p_std).sqrt(),
+            size=size,
+            scale=inverse_mass_scale.sqrt(),
             mean=statistics.q_mean,
             std=statistics.q_std,
             angles=angles,

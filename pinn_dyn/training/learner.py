@@ -12,8 +12,9 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data.windows import Windows
-from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
+from pinn_dyn.mechanics import Predictor, Trajectory
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.training.losses import WindowLoss
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
 """Maps a model and true trajectories ``(K, T, N)`` to named figures of merit."""
@@ -24,17 +25,17 @@ class NonFiniteLossError(RuntimeError):
 
 
 class DynamicsLearner(L.LightningModule):
-    """Trains a predictor: windows in, loss on their increments, roll-outs to validate.
+    """Trains a predictor: windows in, loss on them, roll-outs to validate.
 
     Args:
         model: the predictor.
-        loss: loss of predicted and measured increments, ``(B, H, 2N)``.
+        loss: loss of the model on a batch of windows.
         optimizer: builds the optimizer from the parameters.
         scheduler: builds the learning-rate schedule from the optimizer and ``total_steps``.
         validator: figures of merit on validation trajectories.
         config: the resolved configuration as plain values; saved in the checkpoint.
         statistics: scales of the data; saved in the checkpoint.
-        compile: compile the state derivative for training.
+        compile: compile the dynamics for training.
 
     Raises:
         NonFiniteLossError: in training, when the loss is NaN or infinite.
@@ -44,7 +45,7 @@ class DynamicsLearner(L.LightningModule):
         self,
         model: Predictor,
         *,
-        loss: Callable[[Tensor, Tensor], Tensor],
+        loss: WindowLoss,
         optimizer: Callable[..., Optimizer],
         scheduler: Callable[..., LRScheduler],
         validator: Validator,
@@ -59,19 +60,14 @@ class DynamicsLearner(L.LightningModule):
         self.validator = validator
         self._optimizer = optimizer
         self._scheduler = scheduler
-        if compile and isinstance(model, ContinuousPredictor):
-            model.compile_derivative()
+        if compile:
+            loss.compile_dynamics(model)
 
     def training_step(self, batch: Windows, batch_idx: int) -> Tensor:
         """Loss of one batch of windows."""
-        predicted = self.model.increments(
-            batch.start(self.model.coordinates),
-            batch.t,
-            batch.u,
-            t_input=batch.t_input,
-            interpolation=batch.interpolation,
-        )
-        loss = self.loss(predicted[..., 1:, :], batch.increments(self.model.coordinates))
+        # Both counts come back with a checkpoint: a resumed training is as far as it was.
+        progress = self.global_step / self.trainer.estimated_stepping_batches
+        loss = self.loss(self.model, batch, progress)
         if not torch.isfinite(loss):
             raise NonFiniteLossError(
                 f"the training loss became {float(loss.detach())} at step {self.global_step} "

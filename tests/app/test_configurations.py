@@ -6,11 +6,22 @@ import hydra
 import pytest
 
 from pinn_dyn.app.config import CONF
-from tests.app.entry import NO_FIGURES, ROOT, STRIDE, TINY_DATA, TINY_TRAINING, run_script, train
+from tests.app.entry import (
+    NO_FIGURES,
+    ROOT,
+    STRIDE,
+    TINY,
+    TINY_DATA,
+    TINY_TRAINING,
+    fails,
+    run_script,
+    train,
+)
 from tests.app.hardware_logs import write_neck, write_panda
 from tests.data.test_log_presets import LOGS, needs_logs
 
 MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
+LOSSES = sorted(path.stem for path in (CONF / "loss").glob("*.yaml"))
 EXPERIMENTS = sorted(
     str(path.relative_to(CONF / "experiment").with_suffix(""))
     for path in (CONF / "experiment").rglob("*.yaml")
@@ -39,6 +50,11 @@ def assert_trained(folder, steps=2):
     record = json.loads((folder / "metrics.json").read_text())
     assert record["steps"] == steps
     assert 0 < record["validation"]["val/error_mean"] < 10
+
+
+def said(error, capsys):
+    captured = capsys.readouterr()
+    return f"{captured.out}\n{captured.err}\n{error.code}"
 
 
 def of_arm_1(folder):
@@ -129,9 +145,54 @@ def test_windows_of_several_steps_train(tmp_path):
     assert_trained(folder)
 
 
+@pytest.mark.parametrize("model", ["lnn", "hnn"])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_every_loss_trains(tmp_path, loss, model):
+    assert_trained(train(tmp_path / "run", f"loss={loss}", f"model={model}", NO_FIGURES))
+
+
+def test_a_curriculum_trains(tmp_path):
+    several = ["data.steps=4", "loss.curriculum=[1,2,4]", "trainer.max_epochs=3"]
+    folder = train(tmp_path / "run", "model=lnn", *several, NO_FIGURES)
+    assert_trained(folder, steps=6)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (["loss=impulse", "model=mlp"], "loss: model is a NextStateMLP"),
+        (["loss=impulse", "data.steps=3"], "loss: the windows have 3 steps"),
+        (["data.steps=3", "loss.curriculum=[1,2]"], "loss: curriculum is [1, 2]"),
+    ],
+)
+def test_a_loss_that_does_not_fit_ends_with_its_name(tmp_path, capsys, mistake, words):
+    error = fails("train.py", *TINY, *mistake, f"hydra.run.dir={tmp_path / 'run'}")
+    assert words in said(error, capsys)
+
+
+HNN_ON_A_LOG = ["experiment=example_log/lnn", "model=hnn", "compile=false", *TINY_TRAINING]
+
+
+def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
+    folder = tmp_path / "run"
+    choices = ["model.coordinates=velocity", NO_FIGURES, f"hydra.run.dir={folder}"]
+    run_script("train.py", *HNN_ON_A_LOG, *choices)
+    assert_trained(folder)
+
+
+def test_a_hamiltonian_network_on_momenta_is_told_how_to_do_without(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
+    error = fails("train.py", *HNN_ON_A_LOG, f"hydra.run.dir={tmp_path / 'run'}")
+    assert "set model.coordinates=velocity" in said(error, capsys)
+
+
 def test_there_are_models_heads_and_experiments_to_test():
     """The lists above come from globs: an empty one would test nothing."""
     assert {"hnn", "lnn", "mlp"} <= set(MODELS)
+    assert {"increment", "impulse"} <= set(LOSSES)
     assert {"mass/network", "damping/fixed", "input/network", "friction/coulomb"} <= set(HEADS)
     assert {"soft_arm_1", "soft_arm_2", "panda", "logs", "example_log", "neck", "panda_real"} <= {
         x.split("/")[0] for x in EXPERIMENTS

@@ -21,7 +21,7 @@ from pinn_dyn.models import (
     NetworkPotential,
     NextStateMLP,
 )
-from pinn_dyn.training import DynamicsLearner, IncrementLoss, NonFiniteLossError
+from pinn_dyn.training import DynamicsLearner, IncrementLoss, NonFiniteLossError, WindowLoss
 from tests.support.linear import damped_oscillators
 
 HEADS = dict(
@@ -109,11 +109,7 @@ def make_trainer(folder, *, max_epochs, **extra):
 def loss_of(learner, data):
     windows = data.windows.to(torch.device("cpu"), torch.float32)
     with torch.no_grad():
-        predicted = learner.model.increments(
-            windows.start(learner.model.coordinates), windows.t, windows.u, t_input=windows.t_input
-        )
-        measured = windows.increments(learner.model.coordinates)
-        return float(learner.loss(predicted[:, 1:], measured))
+        return float(learner.loss(learner.model, windows, 0.0))
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -135,14 +131,33 @@ def test_the_logged_loss_is_that_of_the_batches(tmp_path, data):
     expected = []
     for batch in loader:
         with torch.no_grad():
-            predicted = learner.model.increments(
-                batch.start("velocity"), batch.t, batch.u, t_input=batch.t_input
-            )
-            expected.append(float(learner.loss(predicted[:, 1:], batch.increments("velocity"))))
+            expected.append(float(learner.loss(learner.model, batch, 0.0)))
     assert len(expected) == 30
     assert float(trainer.callback_metrics["train/loss"]) == pytest.approx(
         np.mean(expected), rel=1e-5
     )
+
+
+class Recorder(WindowLoss):
+    """Notes how far the training is at each step."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def forward(self, model, windows, progress):
+        self.seen.append(progress)
+        return sum(p.sum() for p in model.parameters())
+
+    def compile_dynamics(self, model):
+        raise AssertionError("nothing to compile")
+
+
+def test_the_loss_is_told_how_far_the_training_is(tmp_path, data):
+    learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
+    learner.loss = Recorder()
+    make_trainer(tmp_path, max_epochs=2, enable_checkpointing=False).fit(learner, data)
+    assert learner.loss.seen == pytest.approx([k / 60 for k in range(60)])
 
 
 def test_the_learning_rate_moves_with_every_step(tmp_path, data):

@@ -1,4 +1,4 @@
-"""The loss against a hand computation, and which half of the state it sees."""
+"""The loss against a hand computation, which half of the state it sees, and its curriculum."""
 
 from dataclasses import replace
 from functools import partial
@@ -6,6 +6,8 @@ from functools import partial
 import pytest
 import torch
 
+from pinn_dyn.data import draw_windows
+from pinn_dyn.mechanics import ContinuousPredictor, Trajectory
 from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
@@ -72,13 +74,13 @@ BY_HAND_ONE_STEP = {
 @pytest.mark.parametrize("kind", MODELS)
 def test_the_loss_equals_a_hand_computation(kind):
     loss = IncrementLoss(STATISTICS, MODELS[kind]())
-    assert float(loss(PREDICTED, MEASURED)) == pytest.approx(BY_HAND[kind], rel=1e-6)
+    assert float(loss.error(PREDICTED, MEASURED)) == pytest.approx(BY_HAND[kind], rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_the_loss_of_one_step_equals_a_hand_computation(kind):
     loss = IncrementLoss(ONE_STEP, MODELS[kind]())
-    found = float(loss(PREDICTED[:, :1], MEASURED[:, :1]))
+    found = float(loss.error(PREDICTED[:, :1], MEASURED[:, :1]))
     assert found == pytest.approx(BY_HAND_ONE_STEP[kind], rel=1e-6)
 
 
@@ -102,18 +104,106 @@ def test_the_configuration_half_counts_but_in_one_step_where_it_holds_by_constru
     measured = MEASURED[:, : len(statistics.velocity_increment_std)]
     moved = measured.clone()
     moved[..., 0] += 1
-    assert (float(loss(moved, measured)) > 0) == sees
+    assert (float(loss.error(moved, measured)) > 0) == sees
     moved = measured.clone()
     moved[..., 1] += 1
-    assert float(loss(moved, measured)) > 0
+    assert float(loss.error(moved, measured)) > 0
 
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_exact_predictions_have_no_loss(kind):
-    assert float(IncrementLoss(STATISTICS, MODELS[kind]())(MEASURED, MEASURED)) == 0
+    assert float(IncrementLoss(STATISTICS, MODELS[kind]()).error(MEASURED, MEASURED)) == 0
 
 
 def test_the_loss_has_nothing_to_learn_or_to_save():
     loss = IncrementLoss(STATISTICS, MODELS["lnn"]())
     assert not list(loss.parameters())
     assert not loss.state_dict()
+
+
+class Drift(ContinuousPredictor):
+    """dq/dt = v, dv/dt = u, and a count of the evaluations."""
+
+    def __init__(self):
+        super().__init__(1, 1, "velocity")
+        self.calls = 0
+
+    def state_derivative(self, x, u):
+        self.calls += 1
+        return torch.cat([x[..., 1:], u], -1)
+
+
+@pytest.fixture
+def windows():
+    generator = torch.Generator().manual_seed(0)
+    t = torch.arange(60, dtype=torch.float64) * 0.01
+    q, v, u = torch.randn(3, 60, 1, generator=generator, dtype=torch.float64)
+    return draw_windows([Trajectory(t, q, v, u)], count=8, steps=10, stride=2, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("progress", "steps"),
+    [(0.0, 1), (0.24, 1), (0.25, 2), (0.5, 5), (0.74, 5), (0.75, 10), (1, 10)],
+)
+def test_a_curriculum_rolls_out_and_compares_the_first_steps_alone(windows, progress, steps):
+    model = Drift()
+    loss = IncrementLoss(windows.statistics(), model, curriculum=[1, 2, 5, 10]).double()
+    found = float(loss(model, windows, progress))
+    assert model.calls == 4 * steps
+    # By hand: under a linear input the steps are those of the trapezoidal rule in v.
+    u = windows.u
+    dv = (0.01 * 0.5 * (u[:, 1:] + u[:, :-1])).cumsum(1)[:, 1::2]
+    spread = windows.statistics().velocity_increment_std
+    residual = ((dv - windows.dv) / spread[:, 1:])[:, :steps]
+    if steps == 1:  # q counts from two steps on
+        assert found == pytest.approx(float(residual.square().mean()), rel=1e-6)
+    else:
+        with_q = model.predict(windows.start("velocity"), windows.t, u, t_input=windows.t_input)
+        dq = (with_q[:, 1:, :1] - windows.q[:, None] - windows.dq) / spread[:, :1]
+        both = torch.cat([dq[:, :steps], residual], -1)
+        assert found == pytest.approx(float(both.square().mean()), rel=1e-6)
+
+
+def test_every_epoch_belongs_to_one_stage(windows):
+    """Also where the fraction of the training is not a round number."""
+    for epochs in range(1, 60):
+        loss = IncrementLoss(windows.statistics(), Drift(), curriculum=list(range(1, 11)))
+        stages = [loss.steps(epoch / epochs) for epoch in range(epochs)]
+        assert stages == [1 + epoch * 10 // epochs for epoch in range(epochs)]
+
+
+def test_without_a_curriculum_all_steps_count_from_the_start(windows):
+    model = Drift()
+    IncrementLoss(windows.statistics(), model)(model, windows, 0.0)
+    assert model.calls == 40
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_what_it_compiles_is_the_state_derivative_where_there_is_one(monkeypatch, kind):
+    compiled = []
+    monkeypatch.setattr(torch, "compile", lambda function: compiled.append(function) or function)
+    model = MODELS[kind]()
+    IncrementLoss(STATISTICS, model).compile_dynamics(model)
+    assert compiled == ([] if kind == "next state" else [model.state_derivative])
+
+
+@pytest.mark.parametrize("curriculum", [[], [1, 2], [1, 20], [0, 10], [5, 2, 10], [1, 1, 10]])
+def test_a_curriculum_has_to_increase_to_all_steps(windows, curriculum):
+    with pytest.raises(ValueError, match=r"curriculum is .*to the 10 of the windows"):
+        IncrementLoss(windows.statistics(), Drift(), curriculum=curriculum)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+def test_cut_windows_are_windows_of_fewer_steps(interpolation):
+    generator = torch.Generator().manual_seed(0)
+    t = torch.arange(21, dtype=torch.float64) * 0.01
+    q, v, u = torch.randn(3, 21, 2, generator=generator, dtype=torch.float64)
+    trajectory = Trajectory(t, q, v, u, interpolation=interpolation, momentum=lambda q, v: 2 * v)
+    # One start each, the first sample.
+    whole = draw_windows([trajectory], count=1, steps=5, stride=4, seed=0)
+    short = Trajectory(t[:9], q[:9], v[:9], u[:9], interpolation=interpolation)
+    short = replace(short, momentum=trajectory.momentum)
+    expected = draw_windows([short], count=1, steps=2, stride=4, seed=0)
+    for name, value in vars(whole.first(2)).items():
+        wanted = getattr(expected, name)
+        assert torch.equal(value, wanted) if isinstance(value, torch.Tensor) else value == wanted

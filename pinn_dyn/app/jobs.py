@@ -1,0 +1,149 @@
+"""What became of trainings: run folders with and without a result."""
+
+from __future__ import annotations
+
+import difflib
+import glob
+import json
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.runs import CONFIG, METRICS
+from pinn_dyn.evaluation.sweep_table import Cell, flatten
+
+_HYDRA_CONFIG = Path(".hydra") / "config.yaml"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A folder that train.py wrote, whatever became of the training.
+
+    Attributes:
+        folder: the run folder.
+        config: its flattened configuration, as far as it is known.
+        derived: keys that the configuration computes from others.
+        record: what metrics.json holds; None if the training did not get there.
+        problem: why there is no record.
+    """
+
+    folder: Path
+    config: dict[str, Cell]
+    derived: frozenset[str]
+    record: dict[str, Any] | None
+    problem: str
+
+
+def find_jobs(patterns: list[str] | str) -> list[Job]:
+    """Jobs of train.py in folders, or below them; in the order in which they finished.
+
+    Raises:
+        ConfigError: if a pattern leads to no job.
+    """
+    found: dict[Path, Job] = {}
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        places = [Path(p) for p in sorted(glob.glob(os.path.expanduser(pattern)))]
+        below = {
+            path.parent.parent if path.parent.name == ".hydra" else path.parent
+            for place in places
+            for path in place.rglob(CONFIG)
+        }
+        jobs = [job for job in map(_read_job, sorted(below, key=_natural)) if job is not None]
+        if not jobs:
+            what = "leads to no run" if places else "matches nothing"
+            raise ConfigError(f"runs: '{pattern}' {what}; give folders that train.py wrote")
+        found |= {job.folder: job for job in jobs}
+    return sorted(found.values(), key=lambda job: _finished_at(job.folder))
+
+
+def _read_job(folder: Path) -> Job | None:
+    """A folder as a job; None if something else than a training wrote it."""
+    resolved, raw = _read_yaml(folder / CONFIG), _read_yaml(folder / _HYDRA_CONFIG)
+    # A job that found no use for its configuration has not written it in full.
+    if "trainer" not in {**raw, **resolved}:
+        return None
+    values = flatten(raw)
+    derived = frozenset(key for key, value in values.items() if "${" in str(value))
+    config = flatten(resolved) or {k: v for k, v in values.items() if k not in derived}
+    # Also where a run has been copied without its .hydra folder.
+    derived |= {k for k, v in config.items() if k.endswith(".seed") and v == config.get("seed")}
+    record, problem = None, ""
+    try:
+        record = json.loads((folder / METRICS).read_text())
+        if not resolved:
+            record, problem = None, f"failed: {CONFIG} cannot be read"
+    except FileNotFoundError:
+        problem = _last_words(folder)
+    except ValueError:
+        problem = f"failed: {METRICS} cannot be read, it may be cut short"
+    return Job(folder, config, derived, record, problem)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """A configuration; empty if it is missing or damaged."""
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
+def _last_words(folder: Path) -> str:
+    """How a job without a record ended: the last line of its log."""
+    lines = []
+    for path in sorted(folder.glob("*.log")):
+        lines += [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
+    if not lines:
+        return "running or stopped, without a log"
+    failed = any(line.startswith("Traceback") or "][ERROR]" in line for line in lines)
+    # Without date, module and level, and without the module of an error.
+    last = re.sub(r"^((\[[^]]*\])+ - |([a-z_]\w*\.)+(?=[A-Z]\w*:))", "", lines[-1])
+    return f"failed: {last}" if failed else f"running or stopped, its log ends with: {last}"
+
+
+def _natural(folder: Path) -> list[tuple[int, str]]:
+    """Order of folders by name in which 2_lnn comes before 10_lnn."""
+    return [(int(n or 0), text) for n, text in re.findall(r"(\d*)(\D*)", str(folder))]
+
+
+def _finished_at(folder: Path) -> float:
+    path = folder / METRICS
+    return path.stat().st_mtime if path.is_file() else math.inf
+
+
+def filter_jobs(jobs: list[Job], conditions: dict[str, Any]) -> list[Job]:
+    """The jobs that meet all conditions; a list of values means any of them.
+
+    Raises:
+        ConfigError: if no job has a key, or none is left.
+    """
+    known = sorted({key for job in jobs for key in job.config})
+    for key, value in conditions.items():
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=3)
+            hint = f", did you mean {' or '.join(close)}?" if close else ""
+            raise ConfigError(f"filter: the runs have no key '{key}'{hint}")
+        wanted = [flatten({key: v})[key] for v in (value if isinstance(value, list) else [value])]
+        # What an early failure did not write down is no reason to hide it.
+        left = [
+            job
+            for job in jobs
+            if job.config.get(key) in wanted or (job.record is None and key not in job.config)
+        ]
+        if not left:
+            found = sorted({str(job.config[key]) for job in jobs if key in job.config})
+            raise ConfigError(f"filter: no run has {key}={value}; there are {', '.join(found)}")
+        jobs = left
+    return jobs
+
+
+def derived_keys(jobs: list[Job]) -> set[str]:
+    """Keys that follow from others in every run that has them."""
+    keys = {key for job in jobs for key in job.derived}
+    return {key for key in keys if all(key in j.derived or key not in j.config for j in jobs)}

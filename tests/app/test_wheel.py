@@ -1,0 +1,131 @@
+"""The wheel: its commands work far from the repository, with the configuration inside."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from importlib import metadata
+
+import pytest
+
+from tests.app.entry import NO_FIGURES, ROOT, TINY
+
+
+def has_tools():
+    """Whether a wheel can be built without a network: with pip and the setuptools it needs."""
+    try:
+        metadata.version("pip")
+        return int(metadata.version("setuptools").split(".")[0]) >= 77
+    except metadata.PackageNotFoundError:
+        return False
+
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not has_tools(), reason="building a wheel needs pip and setuptools>=77"),
+]
+
+
+def pip(*arguments):
+    command = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *arguments]
+    subprocess.run(command, check=True, timeout=100)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    # From a copy: setuptools leaves a build folder beside the sources.
+    source = tmp_path_factory.mktemp("source") / "pinn_dyn"
+    source.mkdir()
+    for name in ("pinn_dyn", "conf"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, source / name, ignore=ignored)
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        if (ROOT / name).is_file():
+            shutil.copy(ROOT / name, source)
+    folder = tmp_path_factory.mktemp("wheel")
+    offline = ["--no-deps", "--no-index", "--no-build-isolation"]
+    pip("wheel", *offline, "--wheel-dir", str(folder), str(source))
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("installed")
+    pip("install", "--no-deps", "--no-index", "--target", str(folder), str(wheel))
+    return folder
+
+
+def call(installed, folder, *command):
+    """Run a program on the installed wheel in an empty folder; returns what it printed."""
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# Many commands in one process: starting one takes longer than what it does here.
+MANY = """
+import json, sys
+from importlib.metadata import distribution
+
+commands = {entry.name: entry for entry in distribution("pinn_dyn").entry_points}
+for name, *arguments in json.loads(sys.argv[1]):
+    sys.argv = [name, *arguments]
+    print("=== command")
+    try:
+        commands[name].load()()
+    except SystemExit as end:
+        assert not end.code, end.code
+"""
+
+
+def call_many(installed, folder, *commands):
+    return call(installed, folder, "-c", MANY, json.dumps(commands)).split("=== command")[1:]
+
+
+def test_the_wheel_holds_every_module_and_every_configuration(wheel):
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    modules = {str(p.relative_to(ROOT)) for p in (ROOT / "pinn_dyn").rglob("*.py")}
+    configurations = {f"pinn_dyn/{p.relative_to(ROOT)}" for p in (ROOT / "conf").rglob("*.yaml")}
+    assert len(configurations) > 50
+    assert {name for name in inside if ".dist-info/" not in name} == modules | configurations
+
+
+def test_every_command_teaches(installed, tmp_path):
+    names = ["train", "evaluate", "control", "gather"]
+    *helps, composed, completion = call_many(
+        installed,
+        tmp_path,
+        *[[f"pinn-dyn-{name}", "--help"] for name in names],
+        ["pinn-dyn-train", "experiment=soft_arm_1/lnn", "--cfg", "job"],
+        ["pinn-dyn-train", "-sc", "install=bash"],
+    )
+    for name, text in zip(names, helps, strict=True):
+        assert f"python {name}.py" in text
+    assert "model_name: ${hydra:runtime.choices.model}" in composed
+    assert "max_epochs: 60" in composed
+    assert "complete -o nospace" in completion
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_training_runs_and_is_gathered(installed, tmp_path):
+    script = str(installed / "bin" / "pinn-dyn-train")
+    call(installed, tmp_path, script, "model=lnn", *TINY, NO_FIGURES, "hydra.run.dir=run")
+    # It took the configuration of the wheel, not the one of the repository.
+    sources = (tmp_path / "run" / ".hydra" / "hydra.yaml").read_text()
+    assert str(installed / "pinn_dyn" / "conf") in sources
+    assert str(ROOT / "conf") not in sources
+    gathering = ["pinn-dyn-gather", "runs=[run]", "hydra.run.dir=table"]
+    (text,) = call_many(installed, tmp_path, gathering)
+    assert "runs: 1" in text
+    assert (tmp_path / "table" / "sweep.csv").is_file()
