@@ -20,9 +20,10 @@ INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check $(PIP_FLA
 help:  ## list the targets
 	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-7s %s\n", $$1, $$2 }'
 
-demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, compare them
+demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, compare them, control it
 	$(BIN)/python train.py -m 'experiment=soft_arm_1/demo/hnn,soft_arm_1/demo/lnn,soft_arm_1/demo/mlp' hydra.sweep.dir=runs/demo
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' hydra.run.dir=runs/demo-evaluation
+	$(BIN)/python control.py experiment=soft_arm_1/regulation run=runs/demo/1_lnn-seed0 hydra.run.dir=runs/demo-control
 
 test: $(VENV)/.installed-dev  ## run the tests
 	$(BIN)/python -m pytest

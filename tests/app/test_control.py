@@ -236,3 +236,11 @@ def panda_run(tmp_path_factory):
         f"hydra.run.dir={folder}",
     )
     return folder
+
+
+def test_the_help_lists_the_options_that_there_are():
+    text = (CONF / "control.yaml").read_text()
+    for group in ("controllers", "plant", "reference"):
+        options = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+        assert f"{group}: {', '.join(options)}\n" in text
+    assert f"experiment: {', '.join(EXPERIMENTS)}\n" in text
