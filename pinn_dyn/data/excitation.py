@@ -171,12 +171,15 @@ class Steps(_Bounded):
         level = rng.uniform(-1, 1, shape)
         start = np.cumsum(rng.uniform(self.hold[0], self.hold[1], shape), axis=-1)
         jump = np.diff(level, axis=-1)
+        rows, _, columns = np.ix_(range(count), range(1), range(peak.shape[1]))
 
         def signal(t: np.ndarray) -> np.ndarray:
-            ramp = (t[:, None, None] - start[:, None, :, :-1]) / self.rise_time
-            ramp = np.clip(ramp, 0.0, 1.0)
+            # A ramp ends before the next begins: only the last one begun is under way.
+            begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)
+            last = (rows, columns, np.maximum(begun - 1, 0))
+            ramp = np.clip((t[:, None] - start[last]) / self.rise_time, 0.0, 1.0)
             smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
-            return self._scaled(level[:, None, :, 0] + (jump[:, None] * smooth).sum(-1), peak)
+            return self._scaled(level[last] + jump[last] * smooth, peak)
 
         return signal
 
