@@ -82,6 +82,12 @@ def control(cfg: DictConfig) -> float:
     if isinstance(robot, BulletArm):
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
+    if not 0 <= config["trajectory"] < len(q0):
+        raise ConfigError(
+            f"trajectory is {config['trajectory']}, expected one of the {len(q0)} runs, 0 to "
+            f"{len(q0) - 1}"
+        )
+    _check_box(config["stability"], robot.num_coordinates)
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["export"]:
         path = _export(laws, Path(config["export"]))
@@ -129,6 +135,18 @@ def _initial_states(config: dict[str, Any], reference: Reference) -> tuple[Tenso
     rng = np.random.default_rng([config["seed"], 1])
     q0, v0 = build_initial_states(config).draw(config["runs"], rng)
     return torch.from_numpy(q0), torch.from_numpy(v0)
+
+
+def _check_box(box: dict[str, Any] | None, size: int) -> None:
+    """Refuse a stability region that does not fit the robot, before anything is run."""
+    if box is None:
+        return
+    for key in ("q_low", "q_high"):
+        if len(box.get(key, ())) != size:
+            raise ConfigError(
+                f"stability.{key} is {box.get(key)}, expected {size} numbers, one for each "
+                "coordinate of the robot"
+            )
 
 
 def _export(laws: dict[str, Controller], path: Path) -> Path:

@@ -152,6 +152,8 @@ def test_a_law_is_exported(tmp_path, lnn_run):
         (["rate=null", "delay=1"], ["delay", "rate"]),
         (["rate=null", "sensor.v_noise=0.1"], ["sensor", "rate"]),
         (["plant=bullet"], ["plant"]),
+        (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
+        (["stability={region: x, q_low: [0], q_high: [1], samples: 5}"], ["stability.q_low", "3"]),
         (["checkpoint=first"], ["first.ckpt", "best"]),
     ],
     ids=lambda value: value[0] if isinstance(value[0], str) else None,
