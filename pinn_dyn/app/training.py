@@ -23,6 +23,7 @@ from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.runs import CHECKPOINTS, METRICS, provenance, read_config, write_config
 from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation import cleaning_figure, save
+from pinn_dyn.evaluation.sweep_table import flatten
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +102,7 @@ def train(cfg: DictConfig) -> float:
     (folder / METRICS).write_text(json.dumps(record, indent=2))
     for logger in trainer.loggers:
         logger.log_hyperparams(
-            _flat(config),
+            flatten(config),
             {"val/error_mean": error, "training_seconds": seconds},
         )
         logger.finalize("success")
@@ -128,14 +129,3 @@ def _write_report(source: LogSource, folder: Path) -> None:
     )
     save(figure, folder / "log_cleaning.png")
     log.info("what was done to the log is in %s and log_cleaning.png", folder / "log_report.md")
-
-
-def _flat(values: dict, prefix: str = "") -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for key, value in values.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{name}.")
-        else:
-            flat[name] = value if isinstance(value, (int, float, bool, str)) else str(value)
-    return flat
