@@ -72,6 +72,15 @@ def fails(script, *arguments):
     return caught.value
 
 
+def refused_text(capsys, script, *arguments):
+    """What an entry script says, without a traceback, when it has to end with an error."""
+    error = fails(script, *arguments)
+    captured = capsys.readouterr()
+    text = f"{captured.out}\n{captured.err}\n{error.code}"
+    assert "Traceback" not in text
+    return text
+
+
 def start_process(script, *arguments, folder, output):
     """Start an entry script in another process, with its output going to a file."""
     return subprocess.Popen(

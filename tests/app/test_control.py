@@ -10,7 +10,7 @@ from PIL import Image
 
 from pinn_dyn.app.config import CONF
 from pinn_dyn.data.simulation import has_cpp_compiler
-from tests.app.entry import NO_FIGURES, STRIDE, TINY_TRAINING, fails, run_script
+from tests.app.entry import NO_FIGURES, STRIDE, TINY_TRAINING, refused_text, run_script
 
 EXPERIMENTS = sorted(
     str(path.relative_to(CONF / "experiment").with_suffix(""))
@@ -40,11 +40,9 @@ def control(folder, run, *arguments):
 
 def refused(capsys, run, *arguments):
     """What control.py says about what it cannot do."""
-    error = fails("control.py", f"run={run}", "hydra.run.dir=out", *SET_POINTS, *arguments)
-    captured = capsys.readouterr()
-    text = f"{captured.out}\n{captured.err}\n{error.code}"
-    assert "Traceback" not in text
-    return text
+    return refused_text(
+        capsys, "control.py", f"run={run}", "hydra.run.dir=out", *SET_POINTS, *arguments
+    )
 
 
 @pytest.fixture(autouse=True)
