@@ -13,6 +13,7 @@ from pinn_dyn.control.laws import (
     Regulation,
     Tracking,
 )
+from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.plants import BulletPlant, SystemPlant
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.references import (
@@ -38,6 +39,7 @@ __all__ = [
     "Controller",
     "DataRegion",
     "Delay",
+    "DisturbanceObserver",
     "Guarded",
     "Helix",
     "ModelBasedLaw",

@@ -1,0 +1,331 @@
+"""The disturbance observer, against closed forms and against the loop without it."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import expm
+from torch import nn
+
+from pinn_dyn.control import Motion, Plant
+from pinn_dyn.control.closed_loop import close_loop, close_loop_continuous
+from pinn_dyn.control.effects import Actuator
+from pinn_dyn.control.export import export_law
+from pinn_dyn.control.laws import Regulation, Tracking
+from pinn_dyn.control.observer import DisturbanceObserver
+from pinn_dyn.control.plants import SystemPlant
+from pinn_dyn.control.references import SetPoint, Sines
+from tests.contracts.controller import ControllerContract, states
+from tests.support.cart_pole import CartPole
+from tests.support.finite_differences import assert_near
+from tests.support.linear import LinearSystem, unit_masses
+
+ZERO = np.zeros((2, 2))
+MASS = np.array([[2.0, 0.5], [0.5, 1.0]])
+INPUTS = np.array([[1.0, 0.3], [-0.2, 0.8]])
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def free_masses(factor=1.0):
+    """M dv/dt = A u: momentum grows by the impulse of the input, exactly."""
+    return LinearSystem(factor * MASS, ZERO, ZERO, INPUTS)
+
+
+class PushedCartPole(CartPole):
+    """The cart-pole under a constant force d, which enters as a potential."""
+
+    def __init__(self, push):
+        super().__init__()
+        self.push = nn.Parameter(tensor(push))
+
+    def potential_energy(self, q):
+        return super().potential_energy(q) - q @ self.push
+
+
+class ExactPlant(Plant):
+    """A linear system under held inputs and a constant force, moved by matrix exponentials."""
+
+    def __init__(self, system, push=(0.0, 0.0)):
+        self.num_coordinates, self.num_inputs = system.num_coordinates, system.num_inputs
+        f, b = system.state_space()
+        inverse = np.linalg.inv(system.mass.detach().numpy())
+        self.slope = np.hstack([f, b, np.vstack([np.zeros((2, 1)), inverse @ np.c_[list(push)]])])
+
+    def start(self, q0, v0):
+        self.x = torch.cat([q0, v0], dim=-1)
+
+    def advance(self, u, duration):
+        n = len(self.slope[0])
+        flow = expm(duration * np.vstack([self.slope, np.zeros((n - 4, n))]))[:4]
+        one = torch.ones_like(self.x[:, :1])
+        self.x = torch.cat([self.x, u, one], dim=-1) @ torch.from_numpy(flow).T
+        return self.x.clone().tensor_split(2, dim=-1)
+
+
+def run(plant, law, reference, *, duration, rate, q0=None, **effects):
+    start = reference(0.0)
+    q0 = start.q if q0 is None else tensor(q0)
+    q0, v0 = q0.expand(1, -1).clone(), start.v.expand(1, -1).clone()
+    return close_loop(plant, law, reference, q0, v0, duration=duration, rate=rate, **effects)
+
+
+def residuals(observer, plant, period, steps, push=(0.0, 0.0)):
+    """Free masses under the observer's input, moved exactly; r after each call, ``(steps, 2)``."""
+    inverse = torch.linalg.inv(tensor(MASS))
+    goal = Motion(tensor([0.3, -0.2]), *torch.zeros(2, 2, dtype=torch.float64))
+    q, v = torch.zeros(2, 2, dtype=torch.float64)
+    found = []
+    for k in range(steps):
+        u = observer(k * period, q, v, goal)
+        found.append(observer.residual)
+        a = inverse @ (tensor(INPUTS) @ u + tensor(push))
+        q, v = q + period * v + 0.5 * period**2 * a, v + period * a
+    return torch.stack(found)
+
+
+# The residual.
+
+
+def test_the_residual_goes_to_a_constant_disturbance_with_time_constant_one_over_bandwidth():
+    system, push, period, bandwidth = free_masses(), [0.7, -1.3], 0.01, 12.0
+    observer = DisturbanceObserver(Regulation(system, 3.0, 2.0), bandwidth)
+    found = residuals(observer, system, period, 60, push)
+    t = period * torch.arange(60, dtype=torch.float64)
+    assert_near(found, (1 - torch.exp(-bandwidth * t))[:, None] * tensor(push), 1e-10)
+
+
+def test_the_input_is_that_of_the_law_less_what_undoes_the_residual():
+    system = free_masses()
+    law = Regulation(system, 3.0, 2.0)
+    observer = DisturbanceObserver(law, 12.0)
+    residuals(observer, system, 0.01, 5, [0.7, -1.3])
+    q, v, motion = states(2)
+    u = observer(0.04, q[0], v[0], Motion(*(x[0] for x in motion)))  # the time of the last call
+    expected = np.linalg.solve(INPUTS, observer.residual.numpy())
+    difference = law(0.04, q[0], v[0], Motion(*(x[0] for x in motion))) - u
+    np.testing.assert_allclose(difference, expected, rtol=1e-10)
+    assert np.abs(expected).min() > 0.1
+    size = observer.diagnostics()["compensation"]
+    assert float(size) == pytest.approx(np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("push", [(0.0, 0.0), (0.4, 0.25)])
+def test_on_a_nonlinear_system_the_residual_is_the_force_that_the_model_misses(push):
+    """All terms are at work; what is left is the trapezoidal rule's error, of second order."""
+    bandwidth, errors = 15.0, []
+    plant = SystemPlant(PushedCartPole(push), rtol=1e-8, atol=1e-10)
+    for rate in (50.0, 100.0):
+        observer = DisturbanceObserver(Regulation(CartPole(), 8.0, 1.0), bandwidth)
+        reference = SetPoint([0.3, 0.4])
+        record = run(plant, observer, reference, duration=0.6, rate=rate, q0=[-0.4, 1.2])
+        assert record.v[0].abs().max() > 2
+        expected = (1 - np.exp(-bandwidth * 0.6)) * tensor([push])
+        errors.append((observer.residual - expected).abs().max().item())
+    assert errors[0] < 5e-3
+    assert errors[1] < errors[0] / 3
+
+
+def test_limits_that_are_known_are_not_taken_for_a_disturbance():
+    system, reference = free_masses(), SetPoint([3.0, -2.0])
+    plant = ExactPlant(system)
+    limits = {"low": -1.5, "high": [1.0, 2.0], "rate": 100.0}
+    largest = []
+    for actuator in (None, Actuator(**limits)):
+        observer = DisturbanceObserver(Regulation(system, 40.0, 5.0), 30.0, actuator=actuator)
+        for _ in range(2):  # the rate's memory must not outlive a run
+            record = run(
+                plant,
+                observer,
+                reference,
+                duration=0.3,
+                rate=100.0,
+                q0=[0.0, 0.0],
+                actuator=Actuator(**limits),
+            )
+        assert record.diagnostics["saturated_inputs"].sum() > 10
+        largest.append(float(record.diagnostics["compensation"].max()))
+    assert largest[0] > 10
+    assert largest[1] < 1e-8
+
+
+# The closed loop.
+
+
+def test_with_the_exact_model_the_loop_is_that_without_the_observer():
+    system = LinearSystem(MASS, 3 * np.eye(2), 0.4 * np.eye(2), INPUTS)
+    reference = Sines([0.0, 0.1], [0.4, 0.3], [0.5, 0.8])
+    law = Tracking(system, 40.0, 8.0)
+    plant, observer = ExactPlant(system), DisturbanceObserver(law, 50.0)
+    plain = run(plant, law, reference, duration=0.5, rate=500.0)
+    observed = run(plant, observer, reference, duration=0.5, rate=500.0)
+    assert observed.diagnostics["compensation"].max() < 1e-4
+    assert_near(observed.q, plain.q, 1e-5)
+
+
+def test_a_wrong_model_tracks_far_better_with_the_observer():
+    """The model lacks a third of the mass, all of the friction and a load."""
+    plant = ExactPlant(LinearSystem(1.5 * MASS, 3 * np.eye(2), 2 * np.eye(2), INPUTS), [0.5, 0.2])
+    model = LinearSystem(MASS, 3.3 * np.eye(2), ZERO, INPUTS)
+    reference = Sines([0.3, -0.2], [0.4, 0.3], [0.5, 0.8])
+    law = Tracking(model, 40.0, 8.0)
+    errors = []
+    for controller in (law, DisturbanceObserver(law, 100.0)):
+        record = run(plant, controller, reference, duration=1.0, rate=250.0)
+        errors.append((record.q - record.reference.q).square().mean().sqrt().item())
+    assert errors[1] < errors[0] / 15
+
+
+def test_a_load_leaves_no_steady_state_error():
+    plant = ExactPlant(unit_masses(2), [0.8, -0.5])
+    law = Regulation(unit_masses(2), 20.0, 8.0)
+    reference = SetPoint([0.2, 0.1])
+    plain = run(plant, law, reference, duration=3.0, rate=50.0)
+    observed = run(plant, DisturbanceObserver(law, 20.0), reference, duration=3.0, rate=50.0)
+    goal = reference(0.0).q
+    assert_near(plain.q[0, -1] - goal, tensor([0.8, -0.5]) / 20, 1e-3)  # d / K_P
+    assert (observed.q[0, -1] - goal).norm() < 1e-5
+
+
+@pytest.mark.parametrize(("factor", "stable"), [(0.3, True), (1.8, True), (2.2, False)])
+def test_a_fast_observer_is_stable_for_models_below_twice_the_mass(factor, stable):
+    """a = 1 - exp(-K_O T) is 1 here: the residual's factor per period is 1 - M_L / M."""
+    observer = DisturbanceObserver(Regulation(free_masses(factor), 1e-3, 1e-3), 1e4)
+    found = residuals(observer, free_masses(), 0.01, 60, [0.7, -1.3])
+    changes = (found[1:] - found[:-1]).norm(dim=-1)
+    assert bool(changes[-1] < 1e-3 * changes[0]) == stable
+    if not stable:
+        assert changes[-1] > 1e3 * changes[0]
+
+
+def test_the_limited_rate_bounds_what_would_grow():
+    """The unstable case above: now each entry of r steps by max_rate T at most, about the truth."""
+    law = Regulation(free_masses(2.2), 1e-3, 1e-3)
+    observer = DisturbanceObserver(law, 1e4, max_rate=5.0)
+    found = residuals(observer, free_masses(), 0.01, 100, [0.7, -1.3])
+    assert (found[1:] - found[:-1]).abs().max() == pytest.approx(0.05)
+    assert_near(found[:14, 0], 0.05 * torch.arange(14, dtype=torch.float64), 1e-12)
+    # M_L dv/dt = A u_law + d_L with d_L = 2.2 d - 1.2 r is at rest at r = d.
+    assert (found[50:] - tensor([0.7, -1.3])).abs().max() < 0.06
+
+
+@pytest.mark.parametrize(("gain", "stable"), [(0.5, True), (0.7, False)])
+def test_an_unknown_dead_time_of_two_periods_limits_the_bandwidth(gain, stable):
+    """The limit for n = 2 is a = 2 sin(pi / 10) = 0.618."""
+    plant = ExactPlant(unit_masses(2), [0.8, -0.5])
+    law = Regulation(unit_masses(2), 1e-3, 1e-3)
+    observer = DisturbanceObserver(law, -np.log(1 - gain) / 0.01)
+    record = run(plant, observer, SetPoint([0.0, 0.0]), duration=1.0, rate=100.0, delay=2)
+    size = record.diagnostics["compensation"][0]
+    assert bool((size[-10:] - tensor([0.8, -0.5]).norm()).abs().max() < 0.05) == stable
+
+
+# The contract, memory and errors.
+
+
+class TestOnTheCartPole(ControllerContract):
+    @pytest.fixture
+    def controller(self):
+        law = Tracking(CartPole(), 5.0, 1.0)
+        return DisturbanceObserver(law, 50.0, max_rate=30.0, actuator=Actuator(-20.0, 20.0))
+
+
+class TestOnALinearSystem(ControllerContract):
+    @pytest.fixture
+    def controller(self):
+        system = LinearSystem(MASS, ZERO, ZERO, INPUTS)
+        return DisturbanceObserver(Regulation(system, 5.0, 1.0), 50.0)
+
+
+def cart_pole_observer():
+    return DisturbanceObserver(Tracking(CartPole(), 5.0, 1.0), 50.0)
+
+
+def test_the_rows_of_a_batch_do_not_see_each_other():
+    q, v, motion = states(2)
+    together = cart_pole_observer()
+    alone = [copy.deepcopy(together) for _ in q]
+    for k in range(4):
+        u = together(0.01 * k, (1 - 0.1 * k) * q, v, motion)
+        for row, observer in enumerate(alone):
+            at = Motion(*(x[row] for x in motion))
+            expected = observer(0.01 * k, (1 - 0.1 * k) * q[row], v[row], at)
+            assert_near(u[row], expected, 1e-12)
+    assert together.residual.abs().min() > 1e-3
+
+
+def test_a_row_that_becomes_nan_leaves_the_memory_of_the_others_alone():
+    q, v, motion = states(2)
+    sound, struck = cart_pole_observer(), cart_pole_observer()
+    for k in range(3):
+        expected = sound(0.01 * k, q, v, motion)
+        lost = q.clone()
+        if k == 1:
+            lost[2] = torch.nan
+        u = struck(0.01 * k, lost, v, motion)
+    others = [0, 1, 3, 4, 5]
+    assert torch.equal(u[others], expected[others])
+    assert u[2].isnan().all()
+
+
+def test_a_reset_or_another_batch_starts_without_a_residual():
+    q, v, motion = states(2)
+    observer = cart_pole_observer()
+    fresh = observer(0.0, q, v, motion)
+    assert not torch.equal(observer(0.01, q, v, motion), fresh)
+    observer.reset()
+    assert observer.residual is None
+    assert torch.equal(observer(0.0, q, v, motion), fresh)
+    observer(0.01, q, v, motion)
+    half = Motion(*(x[:3] for x in motion))
+    assert_near(observer(0.02, q[:3], v[:3], half), fresh[:3], 1e-12)
+
+
+def test_time_that_goes_back_is_refused_and_with_it_continuous_time():
+    q, v, motion = states(2)
+    observer = cart_pole_observer()
+    observer(0.5, q, v, motion)
+    with pytest.raises(ValueError, match=r"t is 0\.4 s.*0\.5 s.*reset\(\)"):
+        observer(0.4, q, v, motion)
+    observer = DisturbanceObserver(Regulation(unit_masses(2), 5.0, 1.0), 50.0)
+    with pytest.raises(ValueError, match="continuous time"):
+        close_loop_continuous(
+            unit_masses(2), observer, SetPoint([0.1, 0.2]), q[:1], v[:1], duration=0.1,
+            samples_rate=100.0,
+        )  # fmt: skip
+
+
+def test_faults_of_the_law_are_passed_on():
+    system = LinearSystem(MASS, ZERO, ZERO, [[1.0, 0.0], [0.0, 0.01]])
+    observer = DisturbanceObserver(Regulation(system, 5.0, 1.0, max_condition=50.0), 50.0)
+    q, v, motion = states(2)
+    observer(0.0, q, v, motion)
+    ((reason, mask),) = observer.faults().items()
+    assert "max_condition" in reason
+    assert mask.all()
+    assert set(observer.diagnostics()) == {"input_condition", "compensation"}
+
+
+@pytest.mark.parametrize("max_rate", [0.0, -1.0, np.nan])
+def test_a_rate_that_is_not_positive_is_refused(max_rate):
+    with pytest.raises(ValueError, match=r"max_rate is .*, expected a positive number"):
+        DisturbanceObserver(Tracking(CartPole(), 5.0, 1.0), 50.0, max_rate=max_rate)
+
+
+@pytest.mark.parametrize("bandwidth", [0.0, -1.0, np.nan, np.inf])
+def test_a_bandwidth_that_is_not_positive_is_refused(bandwidth):
+    with pytest.raises(ValueError, match=r"bandwidth is .* expected a positive"):
+        DisturbanceObserver(Tracking(CartPole(), 5.0, 1.0), bandwidth)
+
+
+def test_it_cannot_be_exported(tmp_path):
+    with pytest.raises(TypeError, match=r"DisturbanceObserver, expected a law .* without memory"):
+        export_law(cart_pole_observer(), tmp_path / "law.pt2")
+
+
+def test_a_law_without_a_model_is_refused():
+    with pytest.raises(TypeError, match="law is a DisturbanceObserver, expected a law on the"):
+        DisturbanceObserver(cart_pole_observer(), 50.0)
