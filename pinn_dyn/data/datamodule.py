@@ -7,7 +7,13 @@ import torch
 from torch.utils.data import DataLoader
 
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.data.windows import BatchSampler, WindowDataset, Windows, draw_windows
+from pinn_dyn.data.windows import (
+    BatchSampler,
+    MemberSampler,
+    WindowLoader,
+    Windows,
+    draw_windows,
+)
 from pinn_dyn.mechanics import Trajectory, stack
 from pinn_dyn.models.statistics import Statistics
 
@@ -23,6 +29,10 @@ class DynamicsData(L.LightningDataModule):
         batch_size: windows in a batch.
         batches_per_epoch: batches in what the trainer counts as an epoch.
         seed: seed of the windows and their order.
+        coverage: how evenly the windows cover the configurations, 0 to 1; see
+            :func:`~pinn_dyn.data.windows.draw_windows`.
+        members: models that are trained at once; member k sees the same windows in the order of
+            the seed ``seed + k``.
 
     Raises:
         ValueError: on counts below 1, or a batch larger than the number of pairs.
@@ -38,9 +48,15 @@ class DynamicsData(L.LightningDataModule):
         batch_size: int,
         batches_per_epoch: int,
         seed: int,
+        coverage: float = 0.0,
+        members: int = 1,
     ):
         super().__init__()
-        for name, value in (("batch_size", batch_size), ("batches_per_epoch", batches_per_epoch)):
+        for name, value in (
+            ("batch_size", batch_size),
+            ("batches_per_epoch", batches_per_epoch),
+            ("members", members),
+        ):
             if value < 1:
                 raise ValueError(f"{name} is {value}, expected at least 1")
         if batch_size > pairs:
@@ -54,6 +70,8 @@ class DynamicsData(L.LightningDataModule):
         self.batch_size = batch_size
         self.batches_per_epoch = batches_per_epoch
         self.seed = seed
+        self.coverage = coverage
+        self.members = members
         self._splits: Splits | None = None
         self._windows: Windows | None = None
 
@@ -79,6 +97,7 @@ class DynamicsData(L.LightningDataModule):
                 steps=self.steps,
                 stride=self.stride,
                 seed=self.seed,
+                coverage=self.coverage,
             )
         return self._windows
 
@@ -87,18 +106,27 @@ class DynamicsData(L.LightningDataModule):
         """Scales of the training windows."""
         return self.windows.statistics()
 
-    def train_dataloader(self) -> DataLoader[Windows]:
-        """Batches of windows, in single precision."""
-        windows = self.windows.to(torch.device("cpu"), torch.float32)
-        return DataLoader(
-            WindowDataset(windows),
-            batch_size=None,
-            sampler=BatchSampler(
-                len(windows),
+    def train_dataloader(self) -> WindowLoader:
+        """Batches of windows, in single precision; of several processes each gets its share.
+
+        The windows are moved to the device that trains once, and batches are picked there.
+        """
+        trainer = self.trainer
+        device = torch.device("cpu") if trainer is None else trainer.strategy.root_device
+        samplers = [
+            BatchSampler(
+                len(self.windows),
                 batch_size=self.batch_size,
                 batches=self.batches_per_epoch,
-                seed=self.seed,
-            ),
+                seed=self.seed + member,
+                rank=0 if trainer is None else trainer.global_rank,
+                processes=1 if trainer is None else trainer.world_size,
+            )
+            for member in range(self.members)
+        ]
+        return WindowLoader(
+            self.windows.to(device, torch.float32),
+            samplers[0] if self.members == 1 else MemberSampler(samplers),
         )
 
     def val_dataloader(self) -> DataLoader[Trajectory]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import Sampler
 
 from pinn_dyn.mechanics import Coordinates, Interpolation, Trajectory
 from pinn_dyn.models.statistics import Statistics
@@ -75,8 +76,8 @@ class Windows:
             self,
             t=self.t[: steps + 1],
             t_input=self.t_input[:samples],
-            u=self.u[:, :samples],
-            **{name: getattr(self, name)[:, :steps] for name in ("dq", "dv", "dp")},
+            u=self.u[..., :samples, :],
+            **{name: getattr(self, name)[..., :steps, :] for name in ("dq", "dv", "dp")},
         )
 
     def statistics(self) -> Statistics:
@@ -111,8 +112,16 @@ def draw_windows(
     steps: int,
     stride: int,
     seed: int,
+    coverage: float = 0.0,
 ) -> Windows:
-    """Draw windows at random starts, uniform over all starts of all trajectories.
+    """Draw windows at random starts, over all starts of all trajectories.
+
+    With ``coverage`` c = 0 every start is as likely as any other, and most windows lie where the
+    robot was most of the time. With c > 0 the starts are drawn from candidates (400,000 or ten
+    times as many as asked for) with probabilities ~ (d_k)^(c N), where d_k is the distance from a
+    candidate's q, ``(N,)`` in units of its spread, to its tenth nearest: as 1/d_k^N estimates the
+    density (Loftsgaarden and Quesenberry 1965), c = 1 spreads them evenly over all configurations
+    that were visited.
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
@@ -120,14 +129,17 @@ def draw_windows(
         steps: steps H of a window.
         stride: samples in a step.
         seed: seed of the starts.
+        coverage: c, from 0 to 1.
 
     Raises:
-        ValueError: on counts below 1, differing sample times, trajectories shorter than a window,
-            or more windows than there are starts.
+        ValueError: on counts below 1, a coverage outside 0 to 1, differing sample times,
+            trajectories shorter than a window, or more windows than there are starts.
     """
     for name, value in (("count", count), ("steps", steps), ("stride", stride)):
         if value < 1:
             raise ValueError(f"{name} is {value}, expected at least 1")
+    if not 0 <= coverage <= 1:
+        raise ValueError(f"coverage is {coverage}, expected a number from 0 to 1")
     span = steps * stride
     sample = float(trajectories[0].t[1] - trajectories[0].t[0])
     for k, item in enumerate(trajectories):
@@ -146,12 +158,12 @@ def draw_windows(
             "fewer pairs, a shorter window or more data"
         )
     generator = torch.Generator().manual_seed(seed)
-    # Starts without repetition, also where there are too many of them for a permutation.
-    flat = torch.unique(torch.randint(total, (count,), generator=generator))
-    while flat.shape[0] < count:
-        more = torch.randint(total, (count,), generator=generator)
-        flat = torch.unique(torch.cat([flat, more]))
-    flat = flat[torch.randperm(flat.shape[0], generator=generator)[:count]]
+    if coverage > 0:
+        flat = _distinct(total, min(max(10 * count, 400_000), total), generator)
+        q = torch.cat([item.q[:n] for item, n in zip(trajectories, starts, strict=True)])[flat]
+        flat = flat[_spread_out(q, count, coverage * q.shape[-1], generator)]
+    else:
+        flat = _distinct(total, count, generator)
     ends = starts.cumsum(0)
     which = torch.searchsorted(ends, flat, right=True)
     offset = flat - (ends - starts)[which]
@@ -178,17 +190,45 @@ def draw_windows(
     )
 
 
-class WindowDataset(Dataset[Windows]):
-    """Windows in memory; an item is a whole batch, picked by a tensor of positions."""
+def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
+    """``count`` different numbers below ``total``, in random order."""
+    # Also where there are too many of them for a permutation.
+    numbers = torch.unique(torch.randint(total, (count,), generator=generator))
+    while numbers.shape[0] < count:
+        more = torch.randint(total, (count,), generator=generator)
+        numbers = torch.unique(torch.cat([numbers, more]))
+    return numbers[torch.randperm(numbers.shape[0], generator=generator)[:count]]
 
-    def __init__(self, windows: Windows):
+
+def _spread_out(q: Tensor, count: int, power: float, generator: torch.Generator) -> Tensor:
+    """Positions of ``count`` rows, drawn without repetition with weights (d_k)^power."""
+    z = (q / q.std(0).clamp(min=1e-12)).numpy()
+    neighbours = min(11, z.shape[0])  # the nearest is the row itself
+    distance = torch.from_numpy(cKDTree(z).query(z, k=neighbours)[0][:, -1])
+    # Rows with the largest log(uniform)/weight: Efraimidis and Spirakis (2006).
+    uniform = torch.rand(z.shape[0], generator=generator, dtype=torch.float64)
+    return torch.topk(uniform.log() / distance.clamp(min=1e-12) ** power, count).indices
+
+
+class WindowLoader:
+    """Windows in the memory of a device; a batch is picked there by a tensor of positions.
+
+    Args:
+        windows: all windows, on the device that trains.
+        sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble.
+    """
+
+    def __init__(self, windows: Windows, sampler: BatchSampler | MemberSampler):
         self.windows = windows
+        self.sampler = sampler  # the trainer looks for it here, to tell it the epoch
 
     def __len__(self) -> int:
-        return len(self.windows)
+        return len(self.sampler)
 
-    def __getitem__(self, index: Tensor) -> Windows:
-        return self.windows[index]
+    def __iter__(self) -> Iterator[Windows]:
+        device = self.windows.q.device
+        for index in self.sampler:
+            yield self.windows[index.to(device, non_blocking=True)]
 
 
 class BatchSampler(Sampler[Tensor]):
@@ -196,13 +236,32 @@ class BatchSampler(Sampler[Tensor]):
 
     The order depends on the seed and the epoch alone, so a resumed training sees the batches that
     an uninterrupted one would have seen.
+
+    Args:
+        size: number of windows.
+        batch_size: windows in a batch.
+        batches: batches in an epoch.
+        seed: seed of the order.
+        rank, processes: of several processes that train together, each yields its own share of
+            every batch, so that all of them see what one alone would have seen.
     """
 
-    def __init__(self, size: int, *, batch_size: int, batches: int, seed: int):
+    def __init__(
+        self,
+        size: int,
+        *,
+        batch_size: int,
+        batches: int,
+        seed: int,
+        rank: int = 0,
+        processes: int = 1,
+    ):
         self.size = size
         self.batch_size = batch_size
         self.batches = batches
         self.seed = seed
+        self.rank = rank
+        self.processes = processes
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -219,4 +278,26 @@ class BatchSampler(Sampler[Tensor]):
             if number % per_pass == 0:
                 order = torch.randperm(self.size, generator=generator)
             first = (number % per_pass) * self.batch_size
-            yield order[first : first + self.batch_size]
+            yield order[first : first + self.batch_size][self.rank :: self.processes]
+
+
+class MemberSampler(Sampler[Tensor]):
+    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own.
+
+    Args:
+        samplers: the order of each member.
+    """
+
+    def __init__(self, samplers: list[BatchSampler]):
+        self.samplers = samplers
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by the trainer at the start of each epoch."""
+        for sampler in self.samplers:
+            sampler.set_epoch(epoch)
+
+    def __len__(self) -> int:
+        return len(self.samplers[0])
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return map(torch.stack, zip(*self.samplers, strict=True))

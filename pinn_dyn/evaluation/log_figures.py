@@ -21,7 +21,7 @@ def cleaning_figure(
 ) -> Figure:
     """Raw dots and cleaned lines of one stretch: a column each for q, v and u.
 
-    Where the log has no velocity the middle column has lines only.
+    A velocity or an input rate that the log does not have has lines only.
 
     Args:
         cleaned: the stretch, one of ``LogSource.cleaned``.
@@ -36,7 +36,7 @@ def cleaning_figure(
     raw = cleaned.raw
     for name, given, width in (
         ("labels", labels, raw.q.shape[1]),
-        ("input_labels", input_labels, raw.u.shape[1]),
+        ("input_labels", input_labels, [raw, *cleaned.clean][-1].u.shape[1]),
     ):
         if len(given) != width:
             raise ValueError(f"{name} has {len(given)} entries, expected {width}: {given}")
@@ -56,7 +56,7 @@ def cleaning_figure(
                 ax.set_axis_off()
                 continue
             before = getattr(raw, signal)
-            if before is not None:
+            if before is not None and row < before.shape[1]:
                 ax.plot(raw.t[shown], before[shown, row], ".", color=_RAW, markersize=3)
             for part in cleaned.clean:
                 seen = (part.t >= first) & (part.t <= last)

@@ -9,7 +9,7 @@ import scipy.io
 import torch
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.data.logs import UNITS, Butterworth, Columns, LogError, SplitGaps
+from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
@@ -226,6 +226,23 @@ def test_the_figure_holds_raw_and_cleaned_values(folder):
     assert "oscillator: run, train" in figure.get_suptitle()
     with pytest.raises(ValueError, match="labels has 1 entries, expected 2"):
         cleaning_figure(part, title="", labels=["q"], input_labels=["u1", "u2"])
+
+
+def test_rates_of_the_inputs_arrive_named_and_drawn(folder):
+    table = motion()
+    table["u1"] = table["q1"]  # an input whose rate is known: v1
+    write(folder, table)
+    with_rates = source(folder, steps={"rates": InputRates(window=5)})
+    (train,) = with_rates.load().train
+    assert train.u.shape == (601, 4)
+    np.testing.assert_allclose(train.u[5:-5, 2], table["v1"][5:596], atol=1e-5)
+    labels = ["u1 [Nm]", "u2 [Nm]", "d/dt u1 [Nm/s]", "d/dt u2 [Nm/s]"]
+    assert with_rates.input_labels == labels
+    figure = cleaning_figure(
+        with_rates.cleaned[0], title="", labels=with_rates.labels, input_labels=labels
+    )
+    lines = {ax.get_ylabel(): len(ax.get_lines()) for ax in figure.axes}
+    assert (lines["u2 [Nm]"], lines["d/dt u1 [Nm/s]"]) == (2, 1)
 
 
 @pytest.mark.parametrize(

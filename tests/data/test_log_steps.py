@@ -9,6 +9,7 @@ from pinn_dyn.data.logs import (
     Butterworth,
     Deduplicate,
     InputDelay,
+    InputRates,
     InterpolateHeld,
     LogError,
     MovingAverage,
@@ -96,6 +97,26 @@ def test_savitzky_golay_velocity_is_the_slope_of_local_polynomials():
             assert done.v[k, column] == pytest.approx(fit[-2], rel=1e-8)
     end = np.polyfit(item.t[-7:] - item.t[-1], NOISE[-7:, 0], 3)
     assert done.v[-1, 0] == pytest.approx(end[-2], rel=1e-8)
+
+
+def test_input_rates_follow_the_inputs_and_are_slopes_of_local_polynomials():
+    item = recording(RNG.normal(size=(300, 1)), u=NOISE)
+    done, text = only(InputRates(window=7, order=3), item)
+    assert done.u.shape == (300, 4)
+    np.testing.assert_array_equal(done.u[:, :2], NOISE)
+    np.testing.assert_array_equal(done.q, item.q)
+    for k in (3, 50, 296):
+        near = slice(k - 3, k + 4)
+        for column in range(2):
+            fit = np.polyfit(item.t[near] - item.t[k], NOISE[near, column], 3)
+            assert done.u[k, 2 + column] == pytest.approx(fit[-2], rel=1e-8)
+    assert "du/dt" in text
+    assert InputRates().input_labels(["m1 [rad]", "m2"]) == [
+        "m1 [rad]",
+        "m2",
+        "d/dt m1 [rad/s]",
+        "d/dt m2",
+    ]
 
 
 def test_resample_draws_straight_lines_on_a_uniform_clock():
@@ -214,6 +235,7 @@ def test_given_delay_shifts_by_whole_samples():
         Butterworth(cutoff=5.0),
         SavitzkyGolayVelocity(),
         InputDelay(delay=0.02),
+        InputRates(),
     ],
 )
 def test_steps_that_count_samples_refuse_a_jittered_clock(step):
@@ -234,6 +256,9 @@ def test_steps_that_count_samples_refuse_a_jittered_clock(step):
         lambda: SavitzkyGolayVelocity(window=10),
         lambda: SavitzkyGolayVelocity().apply(recording(NOISE, v=NOISE)),
         lambda: SavitzkyGolayVelocity().apply(recording(NOISE[:9])),
+        lambda: InputRates(window=10),
+        lambda: InputRates(order=0),
+        lambda: InputRates().apply(recording(NOISE[:9])),
         lambda: Resample(rate=0.0, max_gap=1.0),
         lambda: Resample(rate=9.0, max_gap=1.0).apply(recording([1, 2], t=[1.0, 1.0])),
         lambda: Deduplicate(longest=0),

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.stats import kstest
 
 from pinn_dyn.data import DataSource, DynamicsData, Splits, draw_windows
-from pinn_dyn.data.windows import BatchSampler
+from pinn_dyn.data.windows import BatchSampler, MemberSampler
 from pinn_dyn.mechanics import Trajectory
 from tests.support.cart_pole import CartPole
 
@@ -212,6 +213,31 @@ def test_the_sampler_tells_its_length():
     assert len(BatchSampler(64, batch_size=16, batches=7, seed=0)) == 7
 
 
+def test_the_shares_of_several_processes_are_the_batch_of_one():
+    settings = dict(batch_size=12, batches=7, seed=3)
+    alone = BatchSampler(64, **settings)
+    shares = [BatchSampler(64, **settings, rank=rank, processes=3) for rank in range(3)]
+    for sampler in (alone, *shares):
+        sampler.set_epoch(2)
+    for batch, *parts in zip(alone, *shares, strict=True):
+        assert [len(part) for part in parts] == [4, 4, 4]
+        assert sorted(torch.cat(parts).tolist()) == sorted(batch.tolist())
+
+
+def test_the_members_of_an_ensemble_have_the_orders_of_their_own_seeds():
+    alone = [BatchSampler(64, batch_size=16, batches=6, seed=seed) for seed in (5, 6, 7)]
+    together = MemberSampler(
+        [BatchSampler(64, batch_size=16, batches=6, seed=seed) for seed in (5, 6, 7)]
+    )
+    assert len(together) == 6
+    for epoch in (0, 3):
+        together.set_epoch(epoch)
+        for sampler in alone:
+            sampler.set_epoch(epoch)
+        found = torch.stack(list(together), dim=1)
+        assert torch.equal(found, torch.stack([torch.stack(list(x)) for x in alone]))
+
+
 # The data module.
 
 
@@ -253,6 +279,42 @@ def test_training_batches_have_the_asked_shapes_in_single_precision():
         assert {batch.q.dtype, batch.u.dtype, batch.t.dtype} == {torch.float32}
 
 
+def test_the_members_of_an_ensemble_get_batches_of_the_same_windows():
+    data, alone = make_data(members=2, seed=3), make_data(seed=3)
+    both, single = list(data.train_dataloader()), list(alone.train_dataloader())
+    assert len(both) == 9
+    for batch, first in zip(both, single, strict=True):
+        assert batch.q.shape == (2, 16, 2)
+        assert batch.u.shape == (2, 16, 7, 1)
+        for name in ("q", "dv", "u", "p"):
+            assert torch.equal(getattr(batch, name)[0], getattr(first, name))
+        short = batch.first(1)
+        assert short.dq.shape == (2, 16, 1, 2)
+        assert torch.equal(short.u, batch.u[:, :, :4])
+    windows = data.windows.q.float()
+    second = torch.cat([batch.q[1] for batch in both])
+    assert (second[:, None] == windows).all(-1).any(-1).all()
+    assert not torch.equal(second, torch.cat([batch.q[0] for batch in both]))
+
+
+def test_batches_are_picked_on_the_device_that_trains():
+    """The windows are moved once; a batch is where they are."""
+    data = make_data()
+
+    class Strategy:
+        root_device = torch.device("meta")
+
+    class Trainer:
+        strategy, global_rank, world_size = Strategy(), 0, 1
+
+    data.trainer = Trainer()
+    loader = data.train_dataloader()
+    assert loader.windows.q.device.type == "meta"
+    batch = next(iter(loader))
+    assert batch.q.device.type == "meta"
+    assert batch.q.shape == (16, 2)
+
+
 def test_windows_come_from_training_trajectories_alone():
     data = make_data()
     splits = data.source.splits
@@ -284,6 +346,7 @@ def test_the_source_is_asked_once():
     [
         (dict(batch_size=0), "batch_size is 0"),
         (dict(batches_per_epoch=0), "batches_per_epoch is 0"),
+        (dict(members=0), "members is 0"),
         (dict(batch_size=91), "batch_size is 91, expected at most the number of pairs, 90"),
     ],
 )
@@ -295,3 +358,54 @@ def test_bad_sizes_are_refused_by_name(changes, message):
 def test_more_pairs_than_the_data_have_are_refused():
     with pytest.raises(ValueError, match="only 102 starts"):
         make_data(pairs=1000).windows  # noqa: B018
+
+
+def slow_in_the_middle(samples=60_000):
+    """q = s^3 over s = -1 to 1: the density of the samples, ~ |q|^(-2/3), peaks at q = 0."""
+    s = torch.linspace(-1, 1, samples, dtype=torch.float64).unsqueeze(-1)
+    return Trajectory(torch.arange(samples, dtype=torch.float64) * STEP, s**3, 0 * s, 0 * s)
+
+
+def test_coverage_draws_starts_evenly_over_the_configurations():
+    trajectory = slow_in_the_middle()
+    q = {
+        c: draw([trajectory], count=3000, steps=1, stride=1, coverage=c).q.flatten().numpy()
+        for c in (0.0, 0.5, 1.0)
+    }
+    # Largest distance to the distribution function of the uniform density on -1 to 1.
+    distance = {c: kstest(value, "uniform", args=(-1, 2)).statistic for c, value in q.items()}
+    # It is |a^(1/3) - a| / 2 at q = a without coverage, largest where a^(2/3) = 1/3.
+    assert distance[0.0] == pytest.approx(27**-0.5, abs=0.03)
+    assert distance[1.0] < 0.06
+    assert distance[1.0] < distance[0.5] < distance[0.0]
+
+
+def test_coverage_counts_coordinates_in_units_of_their_spread(trajectories):
+    scaled = [
+        dataclasses.replace(item, q=item.q * torch.tensor([1.0, 1000.0], dtype=torch.float64))
+        for item in trajectories
+    ]
+    for a, b in zip(
+        origin(trajectories, draw(trajectories, coverage=1.0)),
+        origin(scaled, draw(scaled, coverage=1.0)),
+        strict=True,
+    ):
+        assert a == b
+
+
+def test_coverage_never_draws_a_start_twice_and_takes_them_all_if_asked(trajectories):
+    starts = sum(item.t.shape[0] - 6 for item in trajectories)
+    found = origin(trajectories, draw(trajectories, count=starts, coverage=1.0))
+    assert len(set(found)) == starts
+
+
+def test_coverage_of_a_robot_at_rest_draws_what_is_there():
+    still = make_trajectory(0)
+    still = dataclasses.replace(still, q=torch.zeros_like(still.q))
+    assert len(draw([still], coverage=1.0)) == 30
+
+
+@pytest.mark.parametrize("coverage", [-0.1, 1.5, float("nan")])
+def test_a_coverage_outside_zero_to_one_is_refused(trajectories, coverage):
+    with pytest.raises(ValueError, match=r"coverage is .*, expected a number from 0 to 1"):
+        draw(trajectories, coverage=coverage)

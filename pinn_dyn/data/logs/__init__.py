@@ -5,6 +5,7 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
     Butterworth,
+    InputRates,
     MovingAverage,
     PolynomialFit,
     SavitzkyGolayVelocity,
@@ -23,6 +24,7 @@ __all__ = [
     "Columns",
     "Deduplicate",
     "InputDelay",
+    "InputRates",
     "InterpolateHeld",
     "LogError",
     "LogSource",

@@ -165,7 +165,8 @@ def check_force_signs(training: list[Recording], u: Columns, step: float, report
         return
     q = np.vstack([item.q for item in training])
     v = np.vstack([item.v for item in training if item.v is not None])
-    forces = np.vstack([item.u for item in training])
+    # Rates of the inputs may follow the inputs of the log.
+    forces = np.vstack([item.u[:, : len(u.columns)] for item in training])
     acceleration = np.vstack(
         [np.gradient(item.v, step, axis=0) for item in training if item.v is not None]
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pandas as pd
 from numpy.polynomial import polynomial
 from scipy.signal import butter, savgol_filter, sosfiltfilt
@@ -192,3 +193,43 @@ class SavitzkyGolayVelocity(Step):
             )
         v = savgol_filter(recording.q, self.window, self.order, deriv=1, delta=step, axis=0)
         return [replace(recording, v=v)], f"v from q in windows of {self.window * step:.3g} s"
+
+
+@dataclass(frozen=True)
+class InputRates(Step):
+    """The rates of the inputs as further inputs: u becomes (u, du/dt), 2 M columns.
+
+    For inputs that are positions, such as motor angles of tendons. A tendon that pulls like a
+    spring and a damper side by side has the force k (u - q) + c (du/dt - dq/dt), so it needs
+    A(q) (u, du/dt), and a drive that holds its place by friction moves with du/dt alone. The rate
+    is the slope of the polynomial through ``window`` samples of u around each sample, as in
+    :class:`SavitzkyGolayVelocity`, so it looks half a window ahead.
+
+    Args:
+        window: number of samples, odd.
+        order: order of the polynomial.
+    """
+
+    window: int = 11
+    order: int = 3
+
+    def __post_init__(self) -> None:
+        if self.window % 2 == 0 or not 1 <= self.order < self.window:
+            raise LogError(
+                f"InputRates: window is {self.window} and order {self.order}, expected an odd "
+                "window and an order from 1 to below the window"
+            )
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        step = sample_time(recording, "InputRates")
+        if len(recording) < self.window:
+            raise LogError(
+                f"{recording.place}: {len(recording)} samples are too few for InputRates, "
+                f"expected at least {self.window}"
+            )
+        rates = savgol_filter(recording.u, self.window, self.order, deriv=1, delta=step, axis=0)
+        text = f"du/dt, in windows of {self.window * step:.3g} s, follows u"
+        return [replace(recording, u=np.hstack([recording.u, rates]))], text
+
+    def input_labels(self, labels: list[str]) -> list[str]:
+        return [*labels, *(f"d/dt {label.replace(']', '/s]')}" for label in labels)]

@@ -129,6 +129,8 @@ class LogSource(DataSource):
         ):
             if len(given) != len(columns):
                 raise LogError(f"{key} has {len(given)} entries, expected {len(columns)}")
+        for step in self.steps.values():
+            self.input_labels = step.input_labels(self.input_labels)
         self.system = None
         self.configurations = dict(configurations or {})
         self._loaded: tuple[Splits, Report, list[Cleaned]] | None = None

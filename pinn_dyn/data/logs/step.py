@@ -34,6 +34,10 @@ class Step(abc.ABC):
             LogError: if the step cannot be applied; says what to do first.
         """
 
+    def input_labels(self, labels: list[str]) -> list[str]:
+        """Names and units of the inputs after the step, given those before it."""
+        return labels
+
 
 def sample_time(recording: Recording, wanted_by: str) -> float:
     """The sample time of a uniform clock, s.
