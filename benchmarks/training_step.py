@@ -1,31 +1,44 @@
-"""Time of one Lagrangian training step, against per-sample Hessians of the Lagrangian.
+"""Time of one Lagrangian training step, beside JAX and beside Hessians of the Lagrangian.
 
-A step is: gradients set to None, one RK4 step of the whole batch, the increment loss, its backward
-pass. No optimizer. Both sides share weights, batch, integrator and loss, and are first checked to
-give the same loss and the same gradients in float64.
+A step is: one RK4 step of the batch, the increment loss, its gradient; no optimizer. All sides
+share weights, data, integrator (3/8 rule) and loss, and are first checked in float64 to give the
+same loss and the same gradient.
 
-    python benchmarks/training_step.py                # the table in benchmarks/README.md
-    python benchmarks/training_step.py --quick        # a smoke run, some seconds
+    ours, compiled    loss.compile_dynamics, as a training with compile=true
+    ours, eager       the same without it
+    jax autodiff      the structured formulas in JAX, two spellings, jitted with their gradient
+    jax explicit
+    jax hessian       the paper's way in JAX: Hessian of L and an explicit inverse, jitted
+    torch hessian     the same in torch.func with a linear solve, eager
+
+    python benchmarks/training_step.py                    # 1 core, then 2; the tables of README.md
+    python benchmarks/training_step.py --quick            # a smoke run, no file
+
+Each number of cores is a process of its own that may run on so many cores only. Ours takes one
+thread in both, as train.py does; JAX takes what it finds.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
 import os
-import platform
 import statistics
 import subprocess
+import sys
 import time
 from collections.abc import Callable
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from hessian_baseline import HessianBaseline
 from torch import Tensor
 
+from pinn_dyn.app.runs import provenance
+from pinn_dyn.data.windows import Windows
 from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkCholesky,
@@ -36,20 +49,9 @@ from pinn_dyn.models import (
 from pinn_dyn.training import IncrementLoss
 
 STEP = 2e-3
-HERE = Path(__file__).parent
-FIELDS = [
-    "coordinates",
-    "batch",
-    "ours",
-    "baseline_chunk",
-    "pairs",
-    "ours_ms",
-    "baseline_ms",
-    "ratio_median",
-    "ratio_min",
-    "ratio_max",
-    "compile_s",
-]
+RESULTS = Path(__file__).parent / "results"
+OURS = "ours, compiled"
+Step = Callable[[], Any]
 
 
 def make_model(size: int, dtype: torch.dtype) -> tuple[LagrangianNetwork, Statistics]:
@@ -71,35 +73,55 @@ def make_model(size: int, dtype: torch.dtype) -> tuple[LagrangianNetwork, Statis
     return model.to(dtype).train(), scales
 
 
-def make_batch(size: int, batch: int, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Windows of one step: states, inputs at both ends, measured increments."""
+def make_windows(size: int, batch: int, dtype: torch.dtype) -> Windows:
+    """Windows of one step, at random."""
     generator = torch.Generator().manual_seed(1)
-    x0 = torch.randn(batch, 2 * size, generator=generator, dtype=torch.float64)
-    u = torch.randn(batch, 2, size, generator=generator, dtype=torch.float64)
-    measured = STEP * torch.randn(batch, 1, 2 * size, generator=generator, dtype=torch.float64)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
     t = torch.tensor([0.0, STEP], dtype=torch.float64)
-    return {"x0": x0.to(dtype), "u": u.to(dtype), "measured": measured.to(dtype), "t": t}
+    empty = torch.zeros(batch, 0, dtype=torch.float64)
+    windows = Windows(
+        t=t,
+        t_input=t,
+        q=normal(batch, size),
+        v=normal(batch, size),
+        p=empty,
+        dq=STEP * normal(batch, 1, size),
+        dv=STEP * normal(batch, 1, size),
+        dp=empty[:, None],
+        u=normal(batch, 2, size),
+        interpolation="linear",
+    )
+    return windows.to(torch.device("cpu"), dtype)
 
 
-def make_step(
-    increments: Callable[..., Tensor],
-    model: LagrangianNetwork,
-    loss: IncrementLoss,
-    batch: dict[str, Tensor],
-    chunk: int | None = None,
-) -> Callable[[], float]:
-    """One training step; in chunks of samples, gradients added up, if ``chunk`` is given."""
-    count = batch["x0"].shape[0]
-    chunk = chunk or count
+def torch_step(model: LagrangianNetwork, loss: Callable[[], Tensor]) -> Step:
+    """Gradients set to None, loss, backward pass."""
+
+    def step() -> float:
+        model.zero_grad(set_to_none=True)
+        value = loss()
+        value.backward()
+        return float(value.detach())
+
+    return step
+
+
+def hessian_step(
+    model: LagrangianNetwork, loss: IncrementLoss, windows: Windows, chunk: int
+) -> Step:
+    """The step of the torch.func baseline, gradients added up over chunks of the batch."""
+    baseline, count = HessianBaseline(model), len(windows)
 
     def step() -> float:
         model.zero_grad(set_to_none=True)
         total = 0.0
-        for k in range(0, count, chunk):
-            part = slice(k, k + chunk)
-            predicted = increments(batch["x0"][part], batch["t"], batch["u"][part])
-            value = loss.error(predicted[:, 1:], batch["measured"][part])
-            value = value * (predicted.shape[0] / count)
+        for index in torch.arange(count).split(chunk):
+            part = windows[index]
+            path = baseline.increments(part.start("velocity"), part.t, part.u)
+            value = loss.error(path[:, 1:], part.increments("velocity")) * (len(part) / count)
             value.backward()
             total += float(value.detach())
         return total
@@ -107,101 +129,145 @@ def make_step(
     return step
 
 
+def jax_steps(
+    model: LagrangianNetwork, loss: IncrementLoss, windows: Windows, names: list[str]
+) -> dict[str, Step]:
+    """Jitted loss and gradient of the named accelerations, each ending when the result is there."""
+    import jax
+    import jax_networks
+
+    network, parameters = jax_networks.Network(model), jax_networks.parameters_of(model)
+    batch = {
+        "x0": windows.start("velocity"),
+        "u": windows.u,
+        "measured": windows.increments("velocity")[:, 0],
+    }
+    arrays = jax_networks.to_jax(batch)
+    steps: dict[str, Step] = {}
+    for name in names:
+        step = jax_networks.training_step(getattr(network, name), STEP, loss.scale[0].numpy())
+
+        def run(step: Any = step) -> Any:
+            return jax.block_until_ready(step(parameters, arrays))
+
+        steps[f"jax {name}"] = run
+    return steps
+
+
+def check_equal(size: int) -> float:
+    """Largest relative difference of loss and gradients between all ways, in float64.
+
+    Raises:
+        RuntimeError: if it exceeds 1e-8.
+    """
+    import jax
+
+    with jax.enable_x64(True):
+        model, scales = make_model(size, torch.float64)
+        loss = IncrementLoss(scales, model).double()
+        windows = make_windows(size, 64, torch.float64)
+        value = torch_step(model, lambda: loss(model, windows, 0.0))()
+        expected = gradients(model)
+        largest = max(float(g.abs().max()) for g in expected.values())
+        others = {"torch hessian": (hessian_step(model, loss, windows, 64)(), gradients(model))}
+        for name, run in jax_steps(
+            model, loss, windows, ["autodiff", "explicit", "hessian"]
+        ).items():
+            jax_value, tree = run()
+            others[name] = (float(jax_value), named(tree))
+    worst = 0.0
+    for other, found in others.values():
+        worst = max(worst, abs(other - value) / value)
+        for name, gradient in found.items():
+            scale = max(float(expected[name].abs().max()), 1e-3 * largest)
+            worst = max(worst, float((gradient - expected[name]).abs().max()) / scale)
+    if not worst <= 1e-8:
+        raise RuntimeError(f"N = {size}: loss or gradients differ by {worst:.2g} (relative)")
+    return worst
+
+
 def gradients(model: LagrangianNetwork) -> dict[str, Tensor]:
+    """Gradients by name; zero where there is none."""
     return {
         name: torch.zeros_like(p) if p.grad is None else p.grad.clone()
         for name, p in model.named_parameters()
     }
 
 
-def check_equal(size: int, dtype: torch.dtype, tolerance: float, compiled: bool) -> float:
-    """Largest relative difference of loss and gradients between the two sides.
-
-    Raises:
-        RuntimeError: if it exceeds the tolerance.
-    """
-    model, scales = make_model(size, dtype)
-    loss = IncrementLoss(scales, model).to(dtype)
-    batch = make_batch(size, 256 if compiled else 64, dtype)
-    if compiled:
-        model.compile_derivative()
-    sides = []
-    for increments in (model.increments, HessianBaseline(model).increments):
-        value = make_step(increments, model, loss, batch)()
-        sides.append((value, gradients(model)))
-    (ours, our_gradients), (theirs, their_gradients) = sides
-    largest = max(float(g.abs().max()) for g in their_gradients.values())
-    worst = abs(ours - theirs) / abs(theirs)
-    for name, expected in their_gradients.items():
-        difference = float((our_gradients[name] - expected).abs().max())
-        worst = max(worst, difference / max(float(expected.abs().max()), 1e-3 * largest))
-    if not worst <= tolerance:
-        raise RuntimeError(f"N = {size}: loss or gradients differ by {worst:.2g} (relative)")
-    return worst
+def named(tree: dict[str, Any]) -> dict[str, Tensor]:
+    """A gradient of jax_networks under the names of the torch parameters."""
+    found = {"potential.stiffness_root": torch.tensor(tree["root"].__array__())}
+    for head in ("mass", "potential", "damping", "input"):
+        for k, (weight, bias) in enumerate(tree[head]):
+            found[f"{head}.network.layers.{k}.weight"] = torch.tensor(weight.__array__()).T
+            found[f"{head}.network.layers.{k}.bias"] = torch.tensor(bias.__array__())
+    return found
 
 
-def measure(
-    ours: Callable[[], float], baseline: Callable[[], float], pairs: int
-) -> tuple[list[float], list[float]]:
-    """Seconds of both, turn by turn (A B A B ...), after one step of each to warm up."""
-    times: tuple[list[float], list[float]] = ([], [])
-    ours(), baseline()
-    for _ in range(pairs):
-        for step, record in zip((ours, baseline), times, strict=True):
-            start = time.perf_counter()
-            step()
-            record.append(time.perf_counter() - start)
-    return times
-
-
-def timed(step: Callable[[], float]) -> float:
+def timed(step: Step) -> float:
+    """Seconds of one step."""
     start = time.perf_counter()
     step()
     return time.perf_counter() - start
 
 
-def best_chunk(make: Callable[[int | None], Callable[[], float]], batch: int) -> int | None:
-    """The fastest of the whole batch and smaller parts of it, in favour of the baseline."""
-    if batch <= 1000:
-        return None
-    candidates: list[int | None] = [None, 2000, 500]
-    make(500)()
-    return min(candidates, key=lambda chunk: timed(make(chunk)))
+def peak_memory(step: Step) -> float:
+    """Most memory that a step adds to the process, MiB (Linux); what is cached is freed first."""
+
+    def status(key: str) -> float:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith(key)) / 1024
+
+    ctypes.CDLL(None).malloc_trim(0)
+    Path("/proc/self/clear_refs").write_text("5")  # starts the high-water mark anew
+    before = status("VmRSS")
+    step()
+    return status("VmHWM") - before
 
 
-def run_cell(size: int, batch_size: int, pairs: int, compile_ours: bool) -> list[dict[str, object]]:
-    """Rows of one cell: our model eager and compiled, each beside the baseline."""
-    dtype = torch.float32
-    batch = make_batch(size, batch_size, dtype)
-    model, scales = make_model(size, dtype)
-    loss = IncrementLoss(scales, model).to(dtype)
-    rival = HessianBaseline(model)
-
-    def rival_step(chunk: int | None) -> Callable[[], float]:
-        return make_step(rival.increments, model, loss, batch, chunk)
-
-    chunk = best_chunk(rival_step, batch_size)
+def run_cell(size: int, batch: int, cores: int, seconds: float) -> list[dict[str, object]]:
+    """Rows of one cell; every round runs each way once, for ``seconds`` or 5 rounds."""
+    torch._dynamo.reset()  # one batch size after another would compile for varying sizes
+    windows = make_windows(size, batch, torch.float32)
+    model, scales = make_model(size, torch.float32)
+    eager_loss, loss = IncrementLoss(scales, model), IncrementLoss(scales, model)
+    eager_model, _ = make_model(size, torch.float32)
+    loss.compile_dynamics(model)
+    names = ["autodiff", "explicit", "hessian"]
+    steps = {
+        OURS: torch_step(model, lambda: loss(model, windows, 0.0)),
+        "ours, eager": torch_step(eager_model, lambda: eager_loss(eager_model, windows, 0.0)),
+        **jax_steps(model, loss, windows, names),
+        "torch hessian": hessian_step(eager_model, eager_loss, windows, 1024),
+    }
+    compiling = {name: timed(step) - timed(step) for name, step in steps.items()}
+    memory = {name: peak_memory(step) for name, step in steps.items()}
+    # The slowest way alone takes most of a round: it sits out all but the first three.
+    times: dict[str, list[float]] = {name: [] for name in steps}
+    start = time.perf_counter()
+    rounds = 0
+    while rounds < 5 or time.perf_counter() - start < seconds:
+        for name, step in steps.items():
+            if rounds < 3 or "hessian" not in name:
+                times[name].append(timed(step))
+        rounds += 1
     rows: list[dict[str, object]] = []
-    for name in ["eager", "compiled"] if compile_ours else ["eager"]:
-        if name == "compiled":
-            model.compile_derivative()
-        ours = make_step(model.increments, model, loss, batch)
-        first, second = timed(ours), timed(ours)
-        a, b = measure(ours, rival_step(chunk), pairs)
-        ratios = [theirs / own for own, theirs in zip(a, b, strict=True)]
+    for name, values in times.items():
+        ratios = [other / own for own, other in zip(times[OURS], values, strict=False)]
         rows.append(
             {
                 "coordinates": size,
-                "batch": batch_size,
-                "ours": name,
-                "baseline_chunk": chunk or batch_size,
-                "pairs": pairs,
-                "ours_ms": round(1e3 * statistics.median(a), 2),
-                "baseline_ms": round(1e3 * statistics.median(b), 2),
-                "ratio_median": round(statistics.median(ratios), 2),
-                "ratio_min": round(min(ratios), 2),
-                "ratio_max": round(max(ratios), 2),
-                "compile_s": round(first - second, 1) if name == "compiled" else 0.0,
+                "batch": batch,
+                "cores": cores,
+                "method": name,
+                "rounds": len(values),
+                "ms": round(1e3 * statistics.median(values), 3),
+                "us_per_sample": round(1e6 * statistics.median(values) / batch, 2),
+                "slower_than_ours": round(statistics.median(ratios), 3),
+                "smallest": round(min(ratios), 3),
+                "largest": round(max(ratios), 3),
+                "first_step_s": 0.0 if "eager" in name else round(max(compiling[name], 0.0), 1),
+                "memory_mib": round(memory[name], 1),
             }
         )
         print(table_row(rows[-1]), flush=True)
@@ -209,77 +275,73 @@ def run_cell(size: int, batch_size: int, pairs: int, compile_ours: bool) -> list
 
 
 def table_row(row: dict[str, object]) -> str:
+    """A line of the README's table."""
     return (
-        f"| {row['coordinates']} | {row['batch']} | {row['ours']} | {row['ours_ms']} "
-        f"| {row['baseline_ms']} ({row['baseline_chunk']}) | **{row['ratio_median']}** "
-        f"| {row['ratio_min']} to {row['ratio_max']} | {row['compile_s'] or '-'} |"
+        f"| {row['coordinates']} | {row['batch']} | {row['method']} | {row['ms']} "
+        f"| {row['us_per_sample']} | **{row['slower_than_ours']}** | {row['smallest']} to "
+        f"{row['largest']} | {row['first_step_s'] or '-'} | {row['memory_mib']} |"
     )
 
 
-def hardware() -> str:
-    """Model name of the processor and the number of cores, as the system tells them."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        name = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return f"{name}, {os.cpu_count()} cores"
-
-
-def commit() -> str:
-    """Short hash of the checkout, with a plus if pinn_dyn differs from it."""
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", *arguments], cwd=HERE, capture_output=True, text=True, check=False
+def summary(rows: list[dict[str, object]]) -> str:
+    """Geometric means over the cells, against the faster of the two structured versions in JAX."""
+    cells: dict[tuple[object, object], dict[object, float]] = {}
+    for row in rows:
+        cell = cells.setdefault((row["coordinates"], row["batch"]), {})
+        cell[row["method"]] = float(str(row["slower_than_ours"]))
+    lines = []
+    for title, value in (
+        ("structured JAX", lambda cell: min(cell["jax autodiff"], cell["jax explicit"])),
+        ("Hessian in JAX", lambda cell: cell["jax hessian"]),
+        ("Hessian in torch", lambda cell: cell["torch hessian"]),
+    ):
+        ratios = [value(cell) for cell in cells.values()]
+        lines.append(
+            f"{title}: time of a step over ours {statistics.geometric_mean(ratios):.2f} in the "
+            f"geometric mean, {min(ratios):.2f} in the closest cell"
         )
-        return done.stdout.strip()
+    return "\n".join(lines)
 
-    return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "-s", "../pinn_dyn") else "")
+
+def run(cores: int, sizes: list[int], batches: list[int], seconds: float, output: Path) -> None:
+    """All cells in this process, on its first ``cores`` cores."""
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    torch.set_num_threads(1)
+    for size in sizes:
+        print(f"N = {size}: same loss and gradients in float64 up to {check_equal(size):.1e}")
+    print(f"cores: {cores}")
+    print("| N | batch | way | ms | us a sample | x ours | smallest to largest | compile s | MiB |")
+    print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    rows = [row for n in sizes for b in batches for row in run_cell(n, b, cores, seconds)]
+    print(summary(rows), flush=True)
+    import jax
+
+    record = {key: provenance()[key] for key in ("hardware", "torch", "commit")}
+    with output.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*rows[0], *record, "jax"])
+        writer.writeheader()
+        writer.writerows({**row, **record, "jax": jax.__version__} for row in rows)
+    print(f"wrote {output}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, default=1, help="torch threads (default 1)")
-    parser.add_argument("--pairs", type=int, default=0, help="measured pairs per row")
-    parser.add_argument("--no-compile", action="store_true", help="leave out compiled variants")
-    parser.add_argument("--quick", action="store_true", help="smoke run: small, eager, no file")
-    parser.add_argument("--output", type=Path, default=HERE / "results" / "training_step.csv")
+    parser.add_argument("--cores", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[3, 6, 7], help="N")
+    parser.add_argument("--batches", type=int, nargs="+", default=[256, 1024, 8192])
+    parser.add_argument("--seconds", type=float, default=3.0, help="timing of each cell")
+    parser.add_argument("--quick", action="store_true", help="smoke run: one small cell, no file")
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    compile_ours = not (arguments.no_compile or arguments.quick)
-    sizes = [3] if arguments.quick else [3, 7]
-    for size in sizes:
-        worst = check_equal(size, torch.float64, 1e-8, compiled=False)
-        print(f"N = {size}: same loss and gradients in float64 up to {worst:.1e} (relative)")
-    environment: dict[str, object] = {
-        "hardware": hardware(),
-        "threads": arguments.threads,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "commit": commit(),
-        "date": datetime.now(timezone.utc).isoformat(timespec="minutes"),
-    }
-    print("; ".join(f"{key} {value}" for key, value in environment.items()))
-    print(
-        "| N | batch | ours | ours, ms | Hessian, ms (chunk) | ratio | smallest to largest "
-        "| compile, s |\n|---|---|---|---|---|---|---|---|"
-    )
-    rows = []
-    for size in sizes:
-        for batch_size, pairs in [(32, 2)] if arguments.quick else [(256, 15), (8000, 5)]:
-            rows += run_cell(size, batch_size, arguments.pairs or pairs, compile_ours)
-    if compile_ours:
-        for size in sizes:
-            worst = check_equal(size, torch.float32, 1e-3, compiled=True)
-            print(f"N = {size}: compiled, float32, same up to {worst:.1e} (relative)")
-    if not arguments.quick:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        with arguments.output.open("w", newline="") as file:
-            writer = csv.DictWriter(file, [*FIELDS, *environment])
-            writer.writeheader()
-            writer.writerows({**row, **environment} for row in rows)
-        print(f"wrote {arguments.output}")
+    if arguments.quick:
+        run(1, [2], [32], 0.1, Path(os.devnull))
+    elif len(arguments.cores) == 1:
+        (cores,) = arguments.cores
+        output = RESULTS / f"training_step_{cores}_core{'s' if cores > 1 else ''}.csv"
+        run(cores, arguments.sizes, arguments.batches, arguments.seconds, output)
+    else:
+        for cores in arguments.cores:
+            command = [sys.executable, *sys.argv, "--cores", str(cores)]
+            subprocess.run(command, check=True)
 
 
 if __name__ == "__main__":

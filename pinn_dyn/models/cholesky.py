@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP, Tape
+from pinn_dyn.models.mlp import MLP, Tape, columns, rows
 
 
 class CholeskyFactor(nn.Module, abc.ABC):
@@ -18,7 +18,12 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     ``linearize`` returns L and a tape; ``pushforward`` gives dL for a tangent dq, ``pullback``
     gives the gradient in q for a cotangent of L.
+
+    Attributes:
+        transposed: the matrix is L^T L instead, with L^T the upper triangular factor.
     """
+
+    transposed: bool = False
 
     @abc.abstractmethod
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
@@ -37,9 +42,10 @@ class CholeskyFactor(nn.Module, abc.ABC):
         return self.linearize(q)[0]
 
     def matrix(self, q: Tensor) -> Tensor:
-        """L(q) L(q)^T, ``(*batch, N, N)``."""
-        factor = self(q)
-        return factor @ factor.transpose(-1, -2)
+        """L(q) L(q)^T, or L(q)^T L(q) if transposed, ``(*batch, N, N)``."""
+        factor = self(q).transpose(-1, -2) if self.transposed else self(q)
+        # For matrices this small a sum of products: a batched matrix product cannot be fused.
+        return (factor.unsqueeze(-2) * factor.unsqueeze(-3)).sum(-1)
 
 
 class NetworkCholesky(CholeskyFactor):
@@ -55,6 +61,11 @@ class NetworkCholesky(CholeskyFactor):
 
         L_ii = scale_i (b sigmoid(y_i) + epsilon),   L_ij = scale_i b (2 sigmoid(y_ij) - 1)
 
+    In a chain of bodies row i of L in M = L^T L (``transposed``) describes the bodies from joint i
+    to the tip and depends on the joints there alone, so that most entries are simpler functions
+    than those of L in M = L L^T (Featherstone 2005, "Efficient factorization of the joint-space
+    inertia matrix for branched kinematic trees"). The scale is then that of the columns of L.
+
     Args:
         size: N.
         scale: typical size of the rows of L, ``(N,)``; from the data.
@@ -65,6 +76,7 @@ class NetworkCholesky(CholeskyFactor):
         diagonal: what keeps the diagonal non-negative, softplus or relu.
         epsilon: smallest diagonal entry in units of the scale; 0 allows a semi-definite matrix.
         bound: b above, or None.
+        transposed: use L for L^T L.
 
     Raises:
         ValueError: on an unknown diagonal, a negative epsilon or a bound that is not positive.
@@ -85,6 +97,7 @@ class NetworkCholesky(CholeskyFactor):
         diagonal: Literal["softplus", "relu"] = "softplus",
         epsilon: float = 1e-3,
         bound: float | None = None,
+        transposed: bool = False,
     ):
         super().__init__()
         if diagonal not in ("softplus", "relu"):
@@ -97,6 +110,7 @@ class NetworkCholesky(CholeskyFactor):
         self.diagonal = diagonal
         self.epsilon = epsilon
         self.bound = bound
+        self.transposed = transposed
         outputs = size * (size + 1) // 2
         self.network = MLP(size, outputs, hidden, activation, mean, std, angles)
         with torch.no_grad():
@@ -104,18 +118,34 @@ class NetworkCholesky(CholeskyFactor):
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
             last.bias[:size] = 0.54 if diagonal == "softplus" else 1.0
-        # vec(L) = y S, where S holds the scales: a product with a mostly zero matrix is faster
-        # than indexing, above all backwards.
-        rows, columns = torch.tril_indices(size, size, offset=-1)
-        order = torch.cat([torch.arange(size) * (size + 1), rows * size + columns])
+        # vec(L) = y S, where S holds the scales and says which entry of y goes where.
+        row, column = torch.tril_indices(size, size, offset=-1)
+        order = torch.cat([torch.arange(size) * (size + 1), row * size + column])
         placement = torch.zeros(outputs, size * size)
-        placement[torch.arange(outputs), order] = scale.float()[order // size]
+        placement[torch.arange(outputs), order] = scale.float()[
+            order % size if transposed else order // size
+        ]
         self.register_buffer("placement", placement)
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
         """L(q) and its tape."""
         y, tape = self.network.linearize(q)
-        diagonal, lower = y[..., : self.size], y[..., self.size :]
+        values, slopes = self._entries(columns(y))
+        return _matrices(self._assemble(values), q), (*tape, slopes)
+
+    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
+        """dL for dq."""
+        dy = columns(self.network.pushforward(tape[:-1], dq))
+        return _matrices(self._assemble(tape[-1] * dy), dq)
+
+    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
+        """Gradient of <cotangent, L(q)> in q."""
+        dy = self._take(columns(cotangent.flatten(-2))) * tape[-1]
+        return self.network.pullback(tape[:-1], rows(dy, cotangent[..., 0]))
+
+    def _entries(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Entries of L in units of its scale, the diagonal first, and their slopes in y."""
+        diagonal, lower = y[: self.size], y[self.size :]
         if self.bound is not None:
             sigmoid, side = torch.sigmoid(diagonal), torch.sigmoid(lower)
             diagonal, diagonal_slope = (
@@ -129,22 +159,35 @@ class NetworkCholesky(CholeskyFactor):
             else:
                 diagonal, diagonal_slope = F.relu(diagonal), (diagonal > 0).to(y.dtype)
             lower_slope = torch.ones_like(lower)
-        values = torch.cat([diagonal + self.epsilon, lower], dim=-1)
-        slopes = torch.cat([diagonal_slope, lower_slope], dim=-1)
-        return self._assemble(values), (*tape, slopes)
+        values = torch.cat([diagonal + self.epsilon, lower])
+        return values, torch.cat([diagonal_slope, lower_slope])
 
-    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """dL for dq."""
-        return self._assemble(tape[-1] * self.network.pushforward(tape[:-1], dq))
-
-    def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Gradient of <cotangent, L(q)> in q."""
-        return self.network.pullback(
-            tape[:-1], (cotangent.flatten(-2) @ self.placement.T) * tape[-1]
-        )
+    def _scales(self, y: Tensor) -> Tensor:
+        """Scale of the row of L that each entry is in, to multiply y ``(K, ...)`` with."""
+        return self.placement.sum(1).reshape(-1, *[1] * (y.ndim - 1))
 
     def _assemble(self, values: Tensor) -> Tensor:
-        return (values @ self.placement).unflatten(-1, (self.size, self.size))
+        """L, ``(N, N, ...)``, from its entries ``(K, ...)``; cheaper than indexing backwards."""
+        values = values * self._scales(values)
+        diagonal, *lower = values.split([self.size, *range(1, self.size)])
+        zero = torch.zeros_like(diagonal)
+        pieces = [diagonal[:1], zero[1:]]
+        for i, row in enumerate(lower, 1):
+            pieces += [row, diagonal[i : i + 1], zero[i + 1 :]]
+        return torch.cat(pieces).unflatten(0, (self.size, self.size))
+
+    def _take(self, matrix: Tensor) -> Tensor:
+        """The transpose of :meth:`_assemble`: entries ``(K, B)`` of a matrix ``(N * N, B)``."""
+        size = self.size
+        lower = [matrix[i * size : i * size + i] for i in range(1, size)]
+        entries = torch.cat([matrix[:: size + 1], *lower])
+        return entries * self._scales(entries)
+
+
+def _matrices(square: Tensor, like: Tensor) -> Tensor:
+    """``(N, N, B)`` as ``(*batch, N, N)``, a view, for ``like`` ``(*batch, k)``."""
+    size = square.shape[0]
+    return rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
 
 
 class _ConstantFactor(CholeskyFactor):

@@ -48,7 +48,7 @@ class HamiltonianNetwork(StructuredNetwork):
         coordinates: the state, (q, p) or (q, v); (q, p) needs data with momenta.
 
     Raises:
-        ValueError: on other coordinates.
+        ValueError: on other coordinates, or a transposed head.
     """
 
     def __init__(
@@ -82,6 +82,11 @@ class HamiltonianNetwork(StructuredNetwork):
             std=statistics.q_std,
             angles=angles,
         )
+        if self.inverse_mass.transposed:
+            raise ValueError(
+                "inverse_mass.transposed is true, expected false: M^-1 = L L^T is already M = R^T "
+                "R with the lower triangular R = L^-1, the form that suits a chain of bodies"
+            )
 
     def inverse_mass_matrix(self, q: Tensor) -> Tensor:
         """W(q) = M(q)^-1 = L L^T, ``(*batch, N, N)``."""

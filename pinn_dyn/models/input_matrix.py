@@ -76,7 +76,7 @@ class NetworkInput(InputMatrix):
 
     def forward(self, q: Tensor) -> Tensor:
         """A(q), ``(*batch, N, M)``."""
-        y = self.network(q).unflatten(-1, self.shape)
+        y = self.network.linearize(q)[0].unflatten(-1, self.shape)
         if self.bound is not None:
             y = self.bound * (2 * torch.sigmoid(y) - 1)
         return self.scale * y

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
@@ -64,31 +65,45 @@ class LagrangianNetwork(StructuredNetwork):
         )
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q) = L L^T, ``(*batch, N, N)``."""
+        """M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""
         return self.mass.matrix(q)
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         factor, bias = self._factor_and_coriolis_force(q, v)
-        return matvec(factor, matvec(factor.transpose(-1, -2), a)) + bias
+        root = self._root(factor)
+        return matvec(root.transpose(-1, -2), matvec(root, a)) + bias
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         factor, bias = self._factor_and_coriolis_force(q, v)
-        return upper_solve(factor, lower_solve(factor, force - bias - self._potential_force(q)))
+        return self._solve(factor, force - bias - self._potential_force(q))
 
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        factor = self.mass(q)
-        return upper_solve(factor, lower_solve(factor, p))
+        return self._solve(self.mass(q), p)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
         factor, tape = self.mass.linearize(q)
-        w = matvec(factor.transpose(-1, -2), v)
-        return self.mass.pullback(tape, v.unsqueeze(-1) * w.unsqueeze(-2))
+        return self._energy_gradient(tape, v, matvec(self._root(factor), v))
 
     def _factor_and_coriolis_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """L and C v = (dL L^T + L dL^T) v - d(|L^T v|^2 / 2)/dq, with dL along v."""
+        """L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq, M = R^T R, with dR along v."""
         factor, tape = self.mass.linearize(q)
-        rate = self.mass.pushforward(tape, v)
-        w = matvec(factor.transpose(-1, -2), v)
-        mass_rate_v = matvec(rate, w) + matvec(factor, matvec(rate.transpose(-1, -2), v))
-        gradient = self.mass.pullback(tape, v.unsqueeze(-1) * w.unsqueeze(-2))
-        return factor, mass_rate_v - gradient
+        root, rate = self._root(factor), self._root(self.mass.pushforward(tape, v))
+        w = matvec(root, v)
+        mass_rate_v = matvec(rate.transpose(-1, -2), w)
+        mass_rate_v = mass_rate_v + matvec(root.transpose(-1, -2), matvec(rate, v))
+        return factor, mass_rate_v - self._energy_gradient(tape, v, w)
+
+    def _root(self, factor: Tensor) -> Tensor:
+        """R with M = R^T R: L^T, or L with a transposed head."""
+        return factor if self.mass.transposed else factor.transpose(-1, -2)
+
+    def _energy_gradient(self, tape: Tape, v: Tensor, w: Tensor) -> Tensor:
+        """d(|R v|^2 / 2)/dq, with w = R v."""
+        left, right = (w, v) if self.mass.transposed else (v, w)
+        return self.mass.pullback(tape, left.unsqueeze(-1) * right.unsqueeze(-2))
+
+    def _solve(self, factor: Tensor, force: Tensor) -> Tensor:
+        """M^-1 force, by the two triangular solves."""
+        if self.mass.transposed:
+            return lower_solve(factor, upper_solve(factor, force))
+        return upper_solve(factor, lower_solve(factor, force))

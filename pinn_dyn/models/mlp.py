@@ -101,53 +101,74 @@ class MLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
-        return self.linearize(x)[0]
+        h = (x - self.mean) / self.std
+        if self._has_angles:
+            cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
+            h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
+        *hidden, last = self.linears
+        for layer in hidden:
+            h, _ = self._activation(layer(h))
+        return last(h)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
         """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
-        h = (x - self.mean) / self.std
-        *hidden, last = self.linears
-        tape = []
+        tape: list[Tensor] = []
+        column = columns(x)
+        h = (column - self.mean[:, None]) / self.std[:, None]
         if self._has_angles:
             # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
-            sine, cosine, zero = torch.sin(x), torch.cos(x), torch.zeros_like(x)
-            h = torch.cat(
-                [
-                    torch.where(self.is_angle, sine, h),
-                    torch.where(self.is_angle, cosine, zero),
-                ],
-                dim=-1,
+            is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
+            sine, cosine = torch.sin(column), torch.cos(column)
+            slope = (1 / self.std[:, None]).expand_as(column)
+            h = torch.cat([torch.where(is_angle, sine, h), torch.where(is_angle, cosine, zero)])
+            tape.append(
+                torch.cat(
+                    [torch.where(is_angle, cosine, slope), torch.where(is_angle, -sine, zero)]
+                )
             )
-            slopes = [
-                torch.where(self.is_angle, cosine, (1 / self.std).expand_as(x)),
-                torch.where(self.is_angle, -sine, zero),
-            ]
-            tape.append(torch.cat(slopes, dim=-1))
+        *hidden, last = self.linears
         for layer in hidden:
-            h, slope = self._activation(layer(h))
+            h, slope = self._activation(torch.addmm(layer.bias[:, None], layer.weight, h))
             tape.append(slope)
-        return last(h), tuple(tape)
+        return rows(torch.addmm(last.bias[:, None], last.weight, h), x), tuple(tape)
 
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
         *hidden, last = self.linears
-        h = dx / self.std
+        h = columns(dx)
         if self._has_angles:
-            h, tape = torch.cat([dx, dx], dim=-1) * tape[0], tape[1:]
+            h, tape = torch.cat([h, h]) * tape[0], tape[1:]
+        else:
+            h = h / self.std[:, None]
         for layer, slope in zip(hidden, tape, strict=True):
-            h = F.linear(h, layer.weight) * slope
-        return F.linear(h, last.weight)
+            h = (layer.weight @ h) * slope
+        return rows(last.weight @ h, dx)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
         *hidden, last = self.linears
         first, rest = (tape[0], tape[1:]) if self._has_angles else (None, tape)
+        h = columns(dy)
         # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
         # ones(B, 1) @ W to a wrong gradient at some small sizes.
-        h = dy * last.weight[0] if last.out_features == 1 else dy @ last.weight
+        h = last.weight.T * h if last.out_features == 1 else last.weight.T @ h
         for layer, slope in zip(reversed(hidden), reversed(rest), strict=True):
-            h = (h * slope) @ layer.weight
+            h = layer.weight.T @ (h * slope)
         if first is None:
-            return h / self.std
-        sine_or_linear, cosine = (h * first).chunk(2, dim=-1)
-        return sine_or_linear + cosine
+            return rows(h / self.std[:, None], dy)
+        sine_or_linear, cosine = (h * first).chunk(2)
+        return rows(sine_or_linear + cosine, dy)
+
+
+def columns(x: Tensor) -> Tensor:
+    """``(*batch, n)`` as ``(n, B)``, a view: the layout in which the passes compute.
+
+    With the batch along memory every product of small matrices and every triangular solve becomes
+    a few operations on long vectors.
+    """
+    return x.reshape(-1, x.shape[-1]).T
+
+
+def rows(column: Tensor, like: Tensor) -> Tensor:
+    """``(n, B)`` as ``(*batch, n)``, a view; the batch is that of ``like`` ``(*batch, k)``."""
+    return column.T.reshape(*like.shape[:-1], column.shape[0])

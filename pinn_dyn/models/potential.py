@@ -58,8 +58,8 @@ class NetworkPotential(nn.Module):
         y, tape = self.network.linearize(q)
         force = self.network.pullback(tape, torch.ones_like(y))
         if self.stiffness_root is not None:
-            root = self.stiffness_root
-            well = (self._lengths(q) @ root) @ root.T / self.network.std
+            stiffness = self.stiffness_root @ self.stiffness_root.T
+            well = self._lengths(q) @ stiffness / self.network.std
             force = force + well.masked_fill(self.network.is_angle, 0.0)
         return self.scale * force
 

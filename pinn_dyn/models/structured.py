@@ -94,22 +94,21 @@ def lower_solve(factor: Tensor, vector: Tensor) -> Tensor:
     Unrolled over N: for the few coordinates of a robot this is faster than a batched LAPACK call,
     and its derivative is made of the same few operations.
     """
+    entries = [row.unbind(-1) for row in factor.unbind(-2)]
     x: list[Tensor] = []
-    for i in range(vector.shape[-1]):
-        rest = vector[..., i]
-        for j in range(i):
-            rest = rest - factor[..., i, j] * x[j]
-        x.append(rest / factor[..., i, i])
-    return torch.stack(x, dim=-1)
+    for row, rest in zip(entries, vector.unbind(-1), strict=True):
+        for j, known in enumerate(x):
+            rest = rest - row[j] * known
+        x.append(rest / row[len(x)])
+    return torch.stack(x).movedim(0, -1)
 
 
 def upper_solve(factor: Tensor, vector: Tensor) -> Tensor:
     """x with L^T x = b, for the same lower triangular L."""
-    size = vector.shape[-1]
-    x: list[Tensor] = [vector[..., 0]] * size
-    for i in reversed(range(size)):
-        rest = vector[..., i]
-        for j in range(i + 1, size):
-            rest = rest - factor[..., j, i] * x[j]
-        x[i] = rest / factor[..., i, i]
-    return torch.stack(x, dim=-1)
+    entries = [row.unbind(-1) for row in factor.unbind(-2)]
+    x = list(vector.unbind(-1))
+    for i in reversed(range(len(x))):
+        for j in range(i + 1, len(x)):
+            x[i] = x[i] - entries[j][i] * x[j]
+        x[i] = x[i] / entries[i][i]
+    return torch.stack(x).movedim(0, -1)

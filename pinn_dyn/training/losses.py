@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,13 +13,20 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
 from pinn_dyn.models.statistics import Statistics
 
+CHUNK = 512
+"""Windows that compiled dynamics take at once: what they keep for the gradient stays in the cache
+(measured in benchmarks/README.md). Batches up to twice as large are not cut."""
+
 
 class WindowLoss(nn.Module, abc.ABC):
     """A loss of a model on a batch of windows, a number near one before anything is learned."""
 
     @abc.abstractmethod
     def forward(self, model: Predictor, windows: Windows, progress: float) -> Tensor:
-        """The loss, a scalar; ``progress`` is the part of the training that is over, 0 to 1."""
+        """The loss, a scalar; ``progress`` is the part of the training that is over, 0 to 1.
+
+        Of the stacked members of an ensemble it has one entry for each, ``(E,)``.
+        """
 
     @abc.abstractmethod
     def compile_dynamics(self, model: Predictor) -> None:
@@ -74,6 +82,7 @@ class IncrementLoss(WindowLoss):
                 f"curriculum is {curriculum}, expected step counts that increase from at least 1 "
                 f"to the {steps} of the windows (data.steps)"
             )
+        self._compiled = False
         exact_rate = isinstance(model, ContinuousPredictor) and not momentum
         self.exact_coordinates = model.num_coordinates if exact_rate else 0
 
@@ -84,8 +93,23 @@ class IncrementLoss(WindowLoss):
 
     def forward(self, model: Predictor, windows: Windows, progress: float) -> Tensor:
         windows = windows.first(self.steps(progress))
+        batch = windows.q.shape[0]
+        # One model with compiled dynamics, on a CPU: an ensemble's windows have one dimension more.
+        single = windows.q.ndim == 2 and windows.q.device.type == "cpu"
+        if not (self._compiled and single and batch > 2 * CHUNK and torch.is_grad_enabled()):
+            return self._mean(model, windows)
+        parts = [windows[index] for index in torch.arange(batch).split(CHUNK)]
+        losses = [lambda part=part: len(part) / batch * self._mean(model, part) for part in parts]
+        return _SumOfParts.apply(losses, *model.parameters())
+
+    def _mean(self, model: Predictor, windows: Windows) -> Tensor:
+        x0 = windows.start(model.coordinates)
+        if self._compiled:
+            # One compiled function for all stages, though the first needs no gradient in x; and
+            # the batch along memory, as the models compute.
+            x0 = x0.mT.contiguous().mT.requires_grad_(torch.is_grad_enabled())
         predicted = model.increments(
-            windows.start(model.coordinates),
+            x0,
             windows.t,
             windows.u,
             t_input=windows.t_input,
@@ -94,11 +118,44 @@ class IncrementLoss(WindowLoss):
         return self.error(predicted[..., 1:, :], windows.increments(model.coordinates))
 
     def error(self, predicted: Tensor, measured: Tensor) -> Tensor:
-        """The loss of increments over the first k steps, ``(B, k, 2N)``."""
+        """The loss of increments over the first k steps, ``(B, k, 2N)``.
+
+        Increments of an ensemble, ``(E, B, k, 2N)``, give one loss for each member, ``(E,)``.
+        """
         steps = predicted.shape[-2]
         residual = (predicted - measured) / self.scale[:steps]
-        return torch.mean(residual[..., self.exact_coordinates if steps == 1 else 0 :] ** 2)
+        residual = residual[..., self.exact_coordinates if steps == 1 else 0 :]
+        return torch.mean(residual**2, dim=(-3, -2, -1))
 
     def compile_dynamics(self, model: Predictor) -> None:
         if isinstance(model, ContinuousPredictor):
             model.compile_derivative()
+            self._compiled = True
+
+
+class _SumOfParts(torch.autograd.Function):
+    """A sum of losses whose gradients are taken one after another, each with its own loss.
+
+    What a part keeps for its gradient is freed before the next part starts. The backward pass only
+    hands out the gradients, so the sum cannot be differentiated twice.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, parts: list[Callable[[], Tensor]], *parameters: Tensor) -> Tensor:
+        total = parameters[0].new_zeros(())
+        sums: list[Tensor | None] = [None] * len(parameters)
+        for part in parts:
+            with torch.enable_grad():
+                loss = part()
+            gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+            for k, gradient in enumerate(gradients):
+                known = sums[k]
+                sums[k] = gradient if known is None else known + gradient
+            total += loss.detach()
+        ctx.gradients = sums
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (factor,) = upstream
+        return None, *(None if g is None else factor * g for g in ctx.gradients)

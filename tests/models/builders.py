@@ -143,6 +143,14 @@ VARIANTS = {
 }
 """Every kind of head once, with square, wide and tall input matrices."""
 
+TRANSPOSED = dict(
+    n=3,
+    m=3,
+    mass=partial(NetworkCholesky, hidden=[6], transposed=True),
+    damping=partial(NetworkCholesky, hidden=[4], bound=2.0, transposed=True),
+)
+"""M = L^T L, for the Lagrangian network alone."""
+
 
 def random_batch(n, m, batch=6, seed=3, dtype=torch.float64):
     """q, v (or p), a and u, uniform in [-1, 1]."""

@@ -4,16 +4,11 @@ import pytest
 import torch
 
 from tests.models.autodiff import autodiff_derivative, rk4_increment
-from tests.models.builders import VARIANTS, make_structured, random_batch
+from tests.models.builders import TRANSPOSED, VARIANTS, make_structured, random_batch
 from tests.support.finite_differences import assert_near, slope
 
 MODELS = pytest.mark.parametrize("kind", ["lnn", "hnn"])
 STEP = 0.05
-
-
-@pytest.fixture(params=VARIANTS)
-def variant(request):
-    return VARIANTS[request.param]
 
 
 def batch_of(model):
@@ -21,14 +16,22 @@ def batch_of(model):
     return torch.cat([q, second], -1), u, torch.cat([a, q], -1)
 
 
-@MODELS
+ALL_MODELS = pytest.mark.parametrize(
+    ("kind", "variant"),
+    [(kind, VARIANTS[name]) for kind in ("lnn", "hnn") for name in VARIANTS]
+    + [("lnn", TRANSPOSED)],
+    ids=[f"{kind}-{name}" for kind in ("lnn", "hnn") for name in VARIANTS] + ["lnn-transposed"],
+)
+
+
+@ALL_MODELS
 def test_state_derivative_is_that_of_the_scalar_function(kind, variant):
     model = make_structured(kind, **variant)
     x, u, _ = batch_of(model)
     assert_near(model.state_derivative(x, u), autodiff_derivative(model, x, u), 1e-9)
 
 
-@MODELS
+@ALL_MODELS
 def test_a_step_and_its_gradients_are_those_of_the_scalar_function(kind, variant):
     """Second derivatives of the heads: the loss is a function of first derivatives."""
     model = make_structured(kind, **variant)
@@ -86,3 +89,8 @@ def test_gradients_of_single_weights_are_finite_differences(kind):
         assert abs(actual - expected) < 1e-9 * largest + 1e-7 * abs(expected), name
         checked += abs(expected) > 1e-4 * largest
     assert checked > len(parameters) / 2
+
+
+def test_a_transposed_head_is_refused_by_the_hamiltonian_network():
+    with pytest.raises(ValueError, match="transposed is true, expected false"):
+        make_structured("hnn", **TRANSPOSED)

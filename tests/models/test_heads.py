@@ -151,6 +151,17 @@ def test_pullback_is_the_gradient_of_the_factor(head, q):
     assert_near(head.pullback(tape, cotangent), expected, 1e-6, 1 + float(expected.abs().max()))
 
 
+def test_a_transposed_head_has_the_scale_in_its_columns(q):
+    plain, transposed = (
+        make(partial(NetworkCholesky, hidden=[5], epsilon=0.01, transposed=flag))
+        for flag in (False, True)
+    )
+    scale = SCALES["scale"].double()
+    unscaled = plain(q) / scale[:, None]
+    assert_near(transposed(q), unscaled * scale, 1e-12)
+    assert_near(transposed.matrix(q), transposed(q).mT @ transposed(q), 1e-12)
+
+
 @pytest.mark.parametrize("name", ["constant", "fixed"])
 def test_a_constant_does_not_depend_on_q(name, q):
     head = make(CHOLESKY[name])

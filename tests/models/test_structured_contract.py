@@ -3,7 +3,7 @@
 import pytest
 
 from tests.contracts.mechanical_system import MechanicalSystemContract
-from tests.models.builders import VARIANTS, make_structured
+from tests.models.builders import TRANSPOSED, VARIANTS, make_structured
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -18,3 +18,9 @@ class TestHamiltonianNetwork(MechanicalSystemContract):
     @pytest.fixture
     def system(self, variant):
         return make_structured("hnn", **VARIANTS[variant])
+
+
+class TestTransposedMass(MechanicalSystemContract):
+    @pytest.fixture
+    def system(self):
+        return make_structured("lnn", **TRANSPOSED)

@@ -207,3 +207,29 @@ def test_cut_windows_are_windows_of_fewer_steps(interpolation):
     for name, value in vars(whole.first(2)).items():
         wanted = getattr(expected, name)
         assert torch.equal(value, wanted) if isinstance(value, torch.Tensor) else value == wanted
+
+
+def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
+    model = MODELS["lnn"]().double()
+    generator = torch.Generator().manual_seed(0)
+    t = torch.arange(40, dtype=torch.float64) * ONE_STEP.step
+    q, v, u = torch.randn(3, 40, 1, generator=generator, dtype=torch.float64)
+    path = Trajectory(t, q, v, u)
+    windows = draw_windows([path], count=25, steps=2, stride=1, seed=0)
+    found = []
+    for compiled in (False, True):
+        loss = IncrementLoss(STATISTICS, model).double()
+        loss._compiled = compiled  # what cuts a batch into parts; nothing is compiled here
+        monkeypatch.setattr("pinn_dyn.training.losses.CHUNK", 7)
+        value = loss(model, windows, 0.0)
+        gradients = torch.autograd.grad(3 * value, list(model.parameters()), allow_unused=True)
+        found.append((value, gradients))
+    (whole, expected), (parts, actual) = found
+    assert type(whole.grad_fn) is not type(parts.grad_fn)
+    torch.testing.assert_close(parts, whole, rtol=1e-13, atol=0)
+    assert any(gradient is not None for gradient in expected)
+    for a, b in zip(actual, expected, strict=True):
+        if b is None:
+            assert a is None
+        else:
+            torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-14)
