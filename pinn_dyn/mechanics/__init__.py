@@ -1,5 +1,6 @@
 """The equations of mechanics: systems, states, trajectories and their integration."""
 
+from pinn_dyn.mechanics.ensemble import Ensemble
 from pinn_dyn.mechanics.integration import rollout
 from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor, double_copy
 from pinn_dyn.mechanics.system import MechanicalSystem, Terms
@@ -8,6 +9,7 @@ from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation, Trajectory
 __all__ = [
     "ContinuousPredictor",
     "Coordinates",
+    "Ensemble",
     "Interpolation",
     "MechanicalSystem",
     "Predictor",

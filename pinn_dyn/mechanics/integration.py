@@ -10,6 +10,7 @@ from torch import Tensor
 from torchdiffeq import odeint
 
 from pinn_dyn.mechanics.arrays import require_finite
+from pinn_dyn.mechanics.compiled_steps import compiled_rk4
 from pinn_dyn.mechanics.trajectory import Interpolation
 
 Derivative = Callable[[Tensor, Tensor], Tensor]
@@ -58,6 +59,7 @@ def rollout_increments(
     t_input: Tensor | None = None,
     interpolation: Interpolation = "linear",
     substeps: int = 1,
+    compile: bool = False,
 ) -> Tensor:
     """Integrate dx/dt = f(x, u(t)) and return the increments x(t_k) - x(t_0).
 
@@ -76,6 +78,8 @@ def rollout_increments(
         t_input: times of the input samples, ``(K,)``, s; ``t`` if None.
         interpolation: how u moves between its samples.
         substeps: steps of the integrator between two times of ``t``.
+        compile: take each step by one compiled function, without gradients; pays for long
+            roll-outs.
 
     Returns:
         Increments, ``(*batch, T, S)``; those at t_0 are zero.
@@ -116,11 +120,15 @@ def rollout_increments(
         close = (grid - nearest).abs() < 1e-6 * (t[1:] - t[:-1]).min() / substeps
         grid = torch.where(close, nearest, grid)
     # One dtype throughout, so that the solver's times and the input's times compare exactly.
-    signal = SampledInput(t_samples.to(x0.dtype), u.to(x0.dtype), interpolation)
+    t_samples, u, grid = t_samples.to(x0.dtype), u.to(x0.dtype), grid.to(x0.dtype)
+    if compile:
+        increments = compiled_rk4(derivative, x0, grid, t_samples, u, interpolation)
+        return increments[::substeps].movedim(0, -2)
+    signal = SampledInput(t_samples, u, interpolation)
     solution = odeint(
         increment_rate,
         torch.zeros_like(x0),
-        grid.to(x0.dtype),
+        grid,
         method="rk4",
         options={"perturb": interpolation == "hold"},
     )

@@ -74,9 +74,12 @@ class ContinuousPredictor(Predictor):
     Attributes:
         substeps: RK4 steps within a step of the data. One is enough while the data resolve the
             fastest motion; data of a low rate need more.
+        compiled_rollouts: take the steps of roll-outs without gradients by a compiled function;
+            pays for long ones, as compiling takes some 20 s.
     """
 
     substeps: int = 1
+    compiled_rollouts: bool = False
     _compiled: Callable[[Tensor, Tensor], Tensor] | None = None
 
     @abc.abstractmethod
@@ -115,6 +118,7 @@ class ContinuousPredictor(Predictor):
             t_input=t_input,
             interpolation=interpolation,
             substeps=self.substeps,
+            compile=self.compiled_rollouts and not torch.is_grad_enabled(),
         )
 
 

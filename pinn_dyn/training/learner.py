@@ -54,20 +54,35 @@ class DynamicsLearner(L.LightningModule):
         compile: bool,
     ):
         super().__init__()
-        self.save_hyperparameters({"config": config, "statistics": statistics.to_dict()})
+        # For the checkpoint; what the loggers compare is chosen elsewhere.
+        hyperparameters = {"config": config, "statistics": statistics.to_dict()}
+        self.save_hyperparameters(hyperparameters, logger=False)
         self.model = model
         self.loss = loss
         self.validator = validator
         self._optimizer = optimizer
         self._scheduler = scheduler
-        if compile:
-            loss.compile_dynamics(model)
+        self._compile = compile
+        self._losses: list[Tensor] = []  # of this epoch
+
+    def setup(self, stage: str) -> None:
+        """Compile here, in the process that trains: compiled code does not reach another one."""
+        if self._compile and stage == "fit":
+            self.loss.compile_dynamics(self.trained)
+
+    @property
+    def trained(self) -> Predictor:
+        """What the loss is taken of."""
+        return self.model
 
     def training_step(self, batch: Windows, batch_idx: int) -> Tensor:
         """Loss of one batch of windows."""
+        if batch_idx == 0:
+            self._losses.clear()  # of an epoch that was cut short
         # Both counts come back with a checkpoint: a resumed training is as far as it was.
         progress = self.global_step / self.trainer.estimated_stepping_batches
-        loss = self.loss(self.model, batch, progress)
+        losses = self.loss(self.trained, batch, progress)
+        loss = losses.sum()  # a single number, but for the members of an ensemble
         if not torch.isfinite(loss):
             raise NonFiniteLossError(
                 f"the training loss became {float(loss.detach())} at step {self.global_step} "
@@ -75,14 +90,35 @@ class DynamicsLearner(L.LightningModule):
                 "optimizer.lr, shorten the window (data.steps, data.stride) or raise the heads' "
                 "epsilon, then start again"
             )
-        self.log("train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=1)
+        self._losses.append(losses.detach())
+        if self.trainer.is_last_batch:
+            self.log_losses(torch.stack(self._losses).mean(0))
+            self._losses.clear()
         return loss
+
+    def log_losses(self, losses: Tensor) -> None:
+        """Log the mean loss of an epoch.
+
+        Once an epoch: a call of ``log`` at every step takes as long as a small network's step.
+        """
+        self.log(
+            "train/loss",
+            losses.mean(),
+            prog_bar=True,
+            on_step=False,
+            on_epoch=True,
+            batch_size=1,
+            sync_dist=True,  # the mean over processes that share a batch
+        )
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
         """Roll out all validation trajectories."""
         figures = self.validator(self.model, batch)
-        self.log_dict({f"val/{key}": value for key, value in figures.items()}, batch_size=1)
-        self.log("error", figures["error_mean"], prog_bar=True, logger=False, batch_size=1)
+        # Processes that train together all roll out the same; sync_dist says that this is known.
+        named = {f"val/{key}": value for key, value in figures.items()}
+        self.log_dict(named, batch_size=1, sync_dist=True)
+        error = figures["error_mean"]
+        self.log("error", error, prog_bar=True, logger=False, batch_size=1, sync_dist=True)
 
     def configure_optimizers(self) -> Any:
         """The optimizer, with its learning rate scheduled per step."""
@@ -92,5 +128,9 @@ class DynamicsLearner(L.LightningModule):
         )
         return {
             "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+            "lr_scheduler": {
+                "scheduler": scheduler,
+                "interval": "step",
+                "name": "train/learning_rate",  # in the log
+            },
         }

@@ -1,0 +1,149 @@
+"""Ten seeds in one batched training against one seed, side by side.
+
+    python benchmarks/ensemble.py                     # the table in benchmarks/README.md
+    python benchmarks/ensemble.py --quick             # a smoke run
+
+A step is all that a training does at a step, but for the trainer's own loop: pick the batch from
+the windows in memory, loss, backward pass, clip, AdamW, schedule. N = 3, as the one-segment arm,
+head sizes of conf/model, 8,000 windows of one step, float32, dynamics compiled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from long_rollout import make_model
+from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import OneCycleLR
+
+from pinn_dyn.app.runs import provenance
+from pinn_dyn.data.windows import BatchSampler, MemberSampler, WindowLoader, Windows
+from pinn_dyn.mechanics import Ensemble, Predictor
+from pinn_dyn.training import IncrementLoss
+from pinn_dyn.training.ensemble import clip_by_member
+
+HERE = Path(__file__).parent
+N, STEP, PAIRS = 3, 2e-3, 8000
+
+
+def make_windows() -> Windows:
+    generator = torch.Generator().manual_seed(1)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Windows(
+        t=torch.tensor([0.0, STEP]),
+        t_input=torch.tensor([0.0, STEP]),
+        q=0.5 * draw(PAIRS, N),
+        v=draw(PAIRS, N),
+        p=0.05 * draw(PAIRS, N),
+        dq=STEP * draw(PAIRS, 1, N),
+        dv=5 * STEP * draw(PAIRS, 1, N),
+        dp=0.2 * STEP * draw(PAIRS, 1, N),
+        u=0.5 * draw(PAIRS, 2, N),
+        interpolation="linear",
+    )
+
+
+def make_step(kind: str, members: int, batch: int, compiled: bool) -> Callable[[], None]:
+    """One training step of a single model, or of an ensemble."""
+    models: list[Predictor] = [make_model(kind).float().train() for _ in range(members)]
+    windows = make_windows()
+    loss = IncrementLoss(windows.statistics(), models[0])
+    samplers = [
+        BatchSampler(PAIRS, batch_size=batch, batches=100_000, seed=k) for k in range(members)
+    ]
+    if members == 1:
+        model, loader = models[0], WindowLoader(windows, samplers[0])
+    else:
+        model, loader = (
+            Ensemble(models).stack.train(),
+            WindowLoader(windows, MemberSampler(samplers)),
+        )
+    parameters = list(model.parameters())
+    optimizer = AdamW(parameters, lr=1e-4, weight_decay=1e-5)
+    scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000)
+    if compiled:
+        loss.compile_dynamics(model)
+    batches = iter(loader)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        loss(model, next(batches), 0.0).sum().backward()
+        if members == 1:
+            clip_grad_norm_(parameters, 1.0)
+        else:
+            clip_by_member([p.grad for p in parameters if p.grad is not None], 1.0)
+        optimizer.step()
+        scheduler.step()
+
+    return step
+
+
+def seconds(step: Callable[[], None], clock: Callable[[], float]) -> float:
+    start = clock()
+    step()
+    return clock() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--threads", type=int, default=1, help="torch threads (default 1)")
+    parser.add_argument("--models", nargs="+", default=["lnn", "hnn"])
+    parser.add_argument("--members", type=int, default=10)
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--pairs", type=int, default=50, help="measured pairs of steps")
+    parser.add_argument("--cpu-time", action="store_true", help="processor time, on a busy machine")
+    parser.add_argument("--quick", action="store_true", help="smoke run: few, eager, no file")
+    parser.add_argument("--output", type=Path, default=HERE / "results" / "ensemble.csv")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    clock = time.process_time if arguments.cpu_time else time.perf_counter
+    rows = []
+    for kind in arguments.models:
+        steps, first = [], []
+        for members in (1, arguments.members):
+            steps.append(make_step(kind, members, arguments.batch, not arguments.quick))
+            first.append(seconds(steps[-1], time.perf_counter))
+            steps[-1]()
+        times = [
+            [seconds(s, clock) for s in steps]
+            for _ in range(5 if arguments.quick else arguments.pairs)
+        ]
+        one, many = (statistics.median(column) for column in zip(*times, strict=True))
+        rows.append(
+            {
+                "model": kind,
+                "batch": arguments.batch,
+                "members": arguments.members,
+                "one_ms": round(1e3 * one, 2),
+                "ensemble_ms": round(1e3 * many, 2),
+                "ratio": round(statistics.median(b / a for a, b in times), 2),
+                "first_step_one_s": round(first[0], 1),
+                "first_step_ensemble_s": round(first[1], 1),
+                "clock": "processor" if arguments.cpu_time else "wall",
+                "threads": arguments.threads,
+                **provenance(),
+            }
+        )
+        print(rows[-1], flush=True)
+    if not arguments.quick:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        with arguments.output.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+        print(f"wrote {arguments.output}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""An ensemble is its members: one by one, in the mean, on every kind of model."""
+
+import pytest
+import torch
+
+from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, double_copy
+from tests.models.builders import make_model, perturb
+
+KINDS = ("lnn", "hnn", "acceleration", "next_state")
+
+
+def members(kind, count=3):
+    return [perturb(make_model(kind), seed=k, spread=0.1) for k in range(count)]
+
+
+def motion(kind, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    step = 0.02 if kind == "next_state" else 0.002
+    t = step * torch.arange(6, dtype=torch.float64)
+    x0 = 0.3 * torch.randn(4, 4, generator=generator, dtype=torch.float64)
+    return x0, t, torch.randn(4, 6, 2, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_ensemble_predicts_the_mean_of_what_its_members_predict_alone(kind):
+    alone = members(kind)
+    ensemble = Ensemble(alone)
+    x0, t, u = motion(kind)
+    expected = torch.stack([item.predict(x0, t, u, interpolation="hold") for item in alone])
+    assert (expected[0] - expected[1]).abs().max() > 1e-4
+    found = x0[:, None] + ensemble.member_increments(x0, t, u, interpolation="hold")
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    found = ensemble.predict(x0, t, u, interpolation="hold")
+    torch.testing.assert_close(found, expected.mean(0), rtol=0, atol=1e-12)
+    assert ensemble.fixed_step == alone[0].fixed_step
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_member_is_a_model_with_the_weights_it_came_with(kind):
+    alone = members(kind)
+    ensemble = Ensemble(alone)
+    x0, t, u = motion(kind)
+    for index in range(3):
+        member = ensemble.member(index)
+        assert type(member) is type(alone[index])
+        assert member.state_dict().keys() == alone[index].state_dict().keys()
+        assert torch.equal(member.predict(x0, t, u), alone[index].predict(x0, t, u))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gradient_of_a_member_is_that_of_its_own_loss(kind):
+    alone = members(kind)
+    ensemble = Ensemble(alone)
+    x0, t, u = motion(kind)
+    weights = torch.randn(3, 4, 6, 4, generator=torch.Generator().manual_seed(5)).double()
+    (weights * ensemble.member_increments(x0, t, u)).sum().backward()
+    stacked = dict(ensemble.stack.template.model.named_parameters())
+    for index, item in enumerate(alone):
+        (weights[index] * item.increments(x0, t, u)).sum().backward()
+        for name, parameter in item.named_parameters():
+            found = stacked[name].grad
+            if parameter.grad is None:  # a bias of the potential, say
+                assert found is None or not found[index].any(), name
+            else:
+                torch.testing.assert_close(found[index], parameter.grad, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "next_state"])
+def test_weights_are_saved_loaded_and_copied_with_one_copy_of_the_scales(kind):
+    ensemble, other = Ensemble(members(kind)), Ensemble(members(kind, count=3)[::-1])
+    saved = ensemble.state_dict()
+    count = sum(p.numel() for p in ensemble.parameters())
+    assert count == 3 * sum(p.numel() for p in ensemble.member(0).parameters())
+    assert {value.shape[0] for name, value in saved.items() if name.endswith("weight")} == {3}
+    other.load_state_dict(saved)
+    x0, t, u = motion(kind)
+    expected = ensemble.predict(x0, t, u)
+    assert torch.equal(other.predict(x0, t, u), expected)
+    assert torch.equal(double_copy(ensemble).predict(x0, t, u), expected)
+
+
+def test_a_continuous_stack_takes_the_substeps_of_its_members():
+    alone = members("lnn")
+    for item in alone:
+        item.substeps = 3
+    stack = Ensemble(alone).stack
+    assert isinstance(stack, ContinuousPredictor)
+    assert stack.substeps == 3
+
+
+def test_members_that_do_not_belong_together_are_refused():
+    with pytest.raises(ValueError, match="1 members: expected at least two"):
+        Ensemble(members("lnn", count=1))
+    with pytest.raises(ValueError, match="member 1 has other parameters"):
+        Ensemble([make_model("lnn"), make_model("acceleration")])
+    first, second = members("acceleration", count=2)
+    second.scale *= 2
+    with pytest.raises(ValueError, match="member 1 has other scales"):
+        Ensemble([first, second])
+    with pytest.raises(ValueError, match="member is 3, expected one of the 3 members, 0 to 2"):
+        Ensemble(members("lnn")).member(3)

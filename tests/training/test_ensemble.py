@@ -1,0 +1,169 @@
+"""Members trained at once end with the weights that trainings of their own give."""
+
+from functools import partial
+
+import pytest
+import torch
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import LBFGS, AdamW
+from torch.optim.lr_scheduler import ConstantLR, OneCycleLR
+
+from pinn_dyn.data.windows import BatchSampler, WindowLoader
+from pinn_dyn.mechanics import Ensemble
+from pinn_dyn.training import DynamicsLearner, EnsembleLearner, IncrementLoss, NonFiniteLossError
+from pinn_dyn.training.ensemble import clip_by_member
+from tests.models.builders import perturb
+from tests.training.test_learner import MODELS, Oscillators, make_trainer, splits  # noqa: F401
+
+KINDS = ("lnn", "hnn", "acceleration", "next state")
+
+
+@pytest.fixture
+def make_data(splits):  # noqa: F811
+    from pinn_dyn.data import DynamicsData
+
+    def make(members, steps=2):
+        return DynamicsData(
+            Oscillators(splits),
+            pairs=128,
+            steps=steps,
+            stride=2,
+            batch_size=32,
+            batches_per_epoch=20,
+            seed=4,
+            members=members,
+        )
+
+    return make
+
+
+def make_models(kind, data, count):
+    models = []
+    for k in range(count):
+        torch.manual_seed(k)
+        models.append(perturb(MODELS[kind](data.statistics), seed=k, spread=0.2))
+    return models
+
+
+def learn(cls, model, single, data, optimizer=AdamW, compile=False):
+    return cls(
+        model,
+        loss=IncrementLoss(data.statistics, single, curriculum=[1, 2]),
+        optimizer=partial(optimizer, lr=0.01),
+        scheduler=partial(OneCycleLR, max_lr=0.01),
+        validator=lambda model, truth: {"error_mean": 1.0},
+        config={},
+        statistics=data.statistics,
+        compile=compile,
+    )
+
+
+def train(folder, learner, data, **options):
+    trainer = make_trainer(
+        folder, max_epochs=2, enable_checkpointing=False, gradient_clip_val=0.3, **options
+    )
+    trainer.fit(learner, data)
+    return trainer
+
+
+def trained_alone(folder, kind, data, index):
+    """The training of one seed: its own weights, its own order of the same windows."""
+    model = make_models(kind, data, 2)[index]
+    learner = learn(DynamicsLearner, model, model, data)
+    order = BatchSampler(128, batch_size=32, batches=20, seed=4 + index)
+    windows = data.windows.to(torch.device("cpu"), torch.float32)
+    learner.train_dataloader = lambda: WindowLoader(windows, order)
+    trainer = make_trainer(folder, max_epochs=2, enable_checkpointing=False, gradient_clip_val=0.3)
+    trainer.fit(learner)
+    return model, float(trainer.callback_metrics["train/loss"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_ensemble_of_two_ends_with_the_weights_of_two_trainings(tmp_path, make_data, kind):
+    """Forty steps in two epochs, with clipping, a schedule and a curriculum."""
+    data = make_data(members=2)
+    models = make_models(kind, data, 2)
+    ensemble = Ensemble(models)
+    start = [p.detach().clone() for p in models[0].parameters()]
+    learner = learn(EnsembleLearner, ensemble, models[0], data)
+    trainer = train(tmp_path, learner, data)
+    losses = []
+    for index in range(2):
+        alone, loss = trained_alone(tmp_path, kind, make_data(members=1), index)
+        losses.append(loss)
+        member = ensemble.member(index)
+        for name, expected in alone.named_parameters():
+            found = member.get_parameter(name)
+            # Adam divides by the size of a gradient: rounding counts where that is near zero.
+            torch.testing.assert_close(found, expected, rtol=1e-4, atol=2e-5)
+    moved = [
+        (a - b).abs().max() for a, b in zip(start, ensemble.member(0).parameters(), strict=True)
+    ]
+    assert max(moved) > 0.05
+    figures = trainer.callback_metrics
+    assert float(figures["train/loss"]) == pytest.approx(sum(losses) / 2, rel=1e-4)
+    assert float(figures["train/loss_spread"]) > 0
+
+
+def test_each_members_gradient_is_clipped_by_its_own_norm():
+    generator = torch.Generator().manual_seed(0)
+    gradients = [torch.randn(3, *shape, generator=generator) for shape in ((4, 5), (7,), ())]
+    for factor, gradient in zip((0.01, 1.0, 100.0), torch.arange(3), strict=True):
+        for item in gradients:
+            item[gradient] *= factor
+    expected = []
+    for member in range(3):
+        parameters = [torch.nn.Parameter(torch.zeros_like(item[member])) for item in gradients]
+        for parameter, item in zip(parameters, gradients, strict=True):
+            parameter.grad = item[member].clone()
+        clip_grad_norm_(parameters, 0.5)
+        expected.append([parameter.grad for parameter in parameters])
+    clip_by_member(gradients, 0.5)
+    for member in range(3):
+        for found, wanted in zip(gradients, expected[member], strict=True):
+            torch.testing.assert_close(found[member], wanted, rtol=1e-6, atol=0)
+    norms = torch.stack([g.reshape(3, -1).square().sum(1) for g in gradients]).sum(0).sqrt()
+    assert norms[0] < 0.4
+    assert norms[1] == pytest.approx(0.5, rel=1e-4)
+
+
+def test_the_ensemble_is_what_is_validated(tmp_path, make_data):
+    data = make_data(members=2)
+    models = make_models("lnn", data, 2)
+    ensemble, seen = Ensemble(models), []
+    learner = learn(EnsembleLearner, ensemble, models[0], data)
+    learner.validator = lambda model, truth: seen.append(model) or {"error_mean": 1.0}
+    train(tmp_path, learner, data)
+    assert seen
+    assert all(model is ensemble for model in seen)
+
+
+def test_an_optimizer_that_would_mix_the_members_is_refused(tmp_path, make_data):
+    data = make_data(members=2)
+    models = make_models("acceleration", data, 2)
+    learner = learn(EnsembleLearner, Ensemble(models), models[0], data, optimizer=LBFGS)
+    learner._scheduler = lambda optimizer, total_steps: ConstantLR(optimizer)
+    with pytest.raises(ValueError, match="optimizer is LBFGS, which mixes"):
+        train(tmp_path, learner, data)
+
+
+def test_one_member_that_breaks_stops_the_training(tmp_path, make_data):
+    data = make_data(members=2)
+    models = make_models("acceleration", data, 2)
+    with torch.no_grad():
+        next(models[1].parameters()).fill_(float("nan"))
+    learner = learn(EnsembleLearner, Ensemble(models), models[0], data)
+    with pytest.raises(NonFiniteLossError, match="became nan at step 0"):
+        train(tmp_path, learner, data)
+
+
+@pytest.mark.slow
+def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(tmp_path, make_data):
+    data, weights = make_data(members=2), []
+    for compile in (False, True):
+        models = make_models("lnn", data, 2)
+        ensemble = Ensemble(models)
+        train(tmp_path, learn(EnsembleLearner, ensemble, models[0], data, compile=compile), data)
+        weights.append(dict(ensemble.named_parameters()))
+    for name, expected in weights[0].items():
+        torch.testing.assert_close(weights[1][name], expected, rtol=1e-3, atol=2e-4)
