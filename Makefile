@@ -1,4 +1,4 @@
-# make demo | test | lint | bench: each builds what it needs of the environment first.
+# make demo | reproduce | test | test-notebooks | test-slurm | lint | docs | bench: each builds what it needs of the environment first.
 #
 #   PYTHON     the interpreter the environment is made from   (make test PYTHON=python3.11)
 #   VENV       where the environment lies
@@ -15,18 +15,27 @@ INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check $(PIP_FLA
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint bench clean $(VENV)
+.PHONY: help demo reproduce test test-notebooks test-slurm lint docs notebooks bench clean $(VENV)
 
 help:  ## list the targets
-	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-7s %s\n", $$1, $$2 }'
+	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-14s %s\n", $$1, $$2 }'
 
 demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, compare them, control it
 	$(BIN)/python train.py -m 'experiment=soft_arm_1/demo/hnn,soft_arm_1/demo/lnn,soft_arm_1/demo/mlp' hydra.sweep.dir=runs/demo
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' hydra.run.dir=runs/demo-evaluation
 	$(BIN)/python control.py experiment=soft_arm_1/regulation run=runs/demo/1_lnn-seed0 hydra.run.dir=runs/demo-control
 
+reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on where it stopped
+	$(BIN)/python reproduce.py
+
 test: $(VENV)/.installed-dev  ## run the tests
 	$(BIN)/python -m pytest
+
+test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean kernels
+	$(BIN)/python -m pytest tests/notebooks
+
+test-slurm: $(VENV)/.installed-dev  ## test a sweep on a real SLURM; needs root, slurm-wlm and munge
+	$(BIN)/python -m pytest tests/slurm
 
 lint: $(VENV)/.installed-dev  ## check style, types and import order
 	$(BIN)/ruff check
@@ -34,13 +43,19 @@ lint: $(VENV)/.installed-dev  ## check style, types and import order
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+docs: $(VENV)/.installed-docs  ## build the documentation into site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs --quiet build --strict
+
+notebooks: $(VENV)/.installed-notebooks  ## run the notebooks and keep what they show
+	$(BIN)/jupyter execute --inplace --timeout=900 notebooks/*.ipynb
+
 bench: $(VENV)/.installed-bench  ## time a training step and the simulation of the data
 	$(BIN)/python benchmarks/training_step.py
 	$(BIN)/python benchmarks/data_generation.py
 	$(BIN)/python benchmarks/data_generation.py --dataset soft_arm_2
 
 clean:  ## remove the environment and the caches, keep the runs
-	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf $(VENV) build site *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # --- environment: one stamp per set of packages ---------------------------------------------
@@ -64,6 +79,16 @@ $(VENV)/.installed: pyproject.toml setup.py constraints.txt | $(BIN)/python
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "installing the test and lint tools into $(VENV)"
 	@$(INSTALL) -e '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	@echo "installing what builds the documentation into $(VENV)"
+	@$(INSTALL) -e '.[docs]'
+	@touch $@
+
+$(VENV)/.installed-notebooks: $(VENV)/.installed-dev
+	@echo "installing what runs the notebooks into $(VENV)"
+	@$(INSTALL) -e '.[notebooks]'
 	@touch $@
 
 $(VENV)/.installed-bench: $(VENV)/.installed

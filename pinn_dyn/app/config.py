@@ -12,10 +12,12 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from pinn_dyn.app.multirun import how_to_go_on
 from pinn_dyn.data import SimulationError
 from pinn_dyn.training import NonFiniteLossError
 
@@ -61,12 +63,18 @@ def main(task: Callable[[DictConfig], object], config_name: str) -> None:
             return task(cfg)
         except (ConfigError, NonFiniteLossError, SimulationError) as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # Hydra then goes on with the other jobs of the sweep
+                raise  # SweepCallback then goes on with the other jobs
             raise SystemExit(f"Error: {error}") from error
 
     # Warnings about loggers and hardware that a user cannot act on.
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+    try:
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted") from None
+    finally:
+        if hint := how_to_go_on():
+            print(hint, file=sys.stderr)
 
 
 def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
@@ -81,9 +89,13 @@ def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
         for word, parsed in zip(
             words, OverridesParser.create().parse_overrides(words), strict=True
         ):
-            # Of a sweep the first choice stands for all.
-            first = next(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else None
-            overrides.append(word if first is None else f"{word.split('=')[0]}={first}")
+            # Of a sweep the first choice stands for all, of an interval its start.
+            value = parsed.value()
+            if isinstance(value, IntervalSweep):
+                word = f"{word.split('=')[0]}={value.start}"
+            elif parsed.is_sweep_override():
+                word = f"{word.split('=')[0]}={next(parsed.sweep_string_iterator())}"
+            overrides.append(word)
     except OverrideParseException:
         return None
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):

@@ -27,6 +27,7 @@ from pinn_dyn.app.build import (
 )
 from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.control_results import write_results, write_stability
+from pinn_dyn.app.origin import build_origin, command_line, data_hash
 from pinn_dyn.app.runs import load_run, provenance, write_config
 from pinn_dyn.control import (
     ClosedLoopRecord,
@@ -44,7 +45,8 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
-from pinn_dyn.mechanics import MechanicalSystem, double_copy
+from pinn_dyn.evaluation.report import Origin, measured_model_report
+from pinn_dyn.mechanics import Ensemble, MechanicalSystem, Predictor, double_copy
 from pinn_dyn.systems import BulletArm
 
 log = logging.getLogger(__name__)
@@ -64,17 +66,21 @@ def control(cfg: DictConfig) -> float:
     write_config(folder, config)
     torch.set_num_threads(config["threads"])
     run = load_run(Path(config["run"]), config["checkpoint"])
-    if not isinstance(run.model, MechanicalSystem):
+    model = _one_model(run.model, config["member"])
+    if not isinstance(model, MechanicalSystem):
         raise ConfigError(
             f"run: {run.folder} holds a black box ({run.config['model_name']}), which has no terms "
             "M, G and A for a control law: give a run of model=lnn or model=hnn"
         )
-    learned = double_copy(run.model)
+    learned = double_copy(model)
     source = build_source(run.config)
-    record = {"config": config, "run": run.config, **provenance()}
-    (folder / "provenance.json").write_text(json.dumps(record, indent=2))
+    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
+    (folder / "provenance.json").write_text(
+        json.dumps({"config": config, "run": run.config, **record}, indent=2)
+    )
+    origin = build_origin({run.config["name"]: run}, source, record, config)
     if source.system is None:
-        return _report_without_truth(learned, source, folder)
+        return _report_without_truth(learned, source, folder, origin)
 
     robot = build_robot(run.config["dataset"], config["robot"])
     reference = build_reference(config, robot)
@@ -102,13 +108,26 @@ def control(cfg: DictConfig) -> float:
         for index, reason in enumerate(records[name].stopped):
             if reason:
                 log.warning("%s, run %d was stopped: %s", name, index, reason)
+    stability = None
     if config["stability"] is not None:
         with _errors_of("stability"):
-            write_stability(learned, robot, records["learned"], config, folder)
-    return write_results(records, source, robot, reference, config, folder)
+            stability = write_stability(learned, robot, records["learned"], config, folder)
+    return write_results(records, source, robot, reference, config, folder, stability, origin)
 
 
-def _report_without_truth(learned: MechanicalSystem, source: DataSource, folder: Path) -> float:
+def _one_model(model: Predictor, member: int) -> Predictor:
+    """Of an ensemble the member that is asked for; a single model is the only member of itself."""
+    if isinstance(model, Ensemble):
+        with _errors_of("run"):
+            return model.member(member)
+    if member != 0:
+        raise ConfigError(f"member is {member}, but the run holds a single model: leave it out")
+    return model
+
+
+def _report_without_truth(
+    learned: MechanicalSystem, source: DataSource, folder: Path, origin: Origin
+) -> float:
     """Of a model of measured data, what can be said where nobody knows the truth."""
     q = torch.cat([item.q[:: _stride(item.q)] for item in source.load().train]).double()
     with _errors_of("run"):
@@ -116,6 +135,9 @@ def _report_without_truth(learned: MechanicalSystem, source: DataSource, folder:
     text = model_report(check)
     (folder / "stability.md").write_text(text)
     print(text)
+    title = f"{source.name}: learned model of measured data"
+    page = measured_model_report(title=title, report=text, origin=origin)
+    (folder / "report.html").write_text(page, encoding="utf-8")
     log.info(
         "%s is measured data, there is no robot to close the loop with: what can be said of the "
         "model alone is in %s",
@@ -159,7 +181,11 @@ def _export(laws: dict[str, Controller], path: Path) -> Path:
 def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSource) -> Controller:
     """The learned law with an eye on its distance from the training data."""
     law = laws["learned"]
-    assert isinstance(law, ModelBasedLaw)
+    if not isinstance(law, ModelBasedLaw):
+        raise ConfigError(
+            f"guard: controllers.learned is a {type(law).__name__}, expected one of the laws "
+            "alone: leave out its observer, or the guard"
+        )
     train = source.load().train
     fallback = None
     if config["guard"]["fallback"]:

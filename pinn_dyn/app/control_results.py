@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from pinn_dyn.app.runs import CONFIG
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Helix,
@@ -36,6 +37,7 @@ from pinn_dyn.evaluation import (
     tip_path_figure,
     write_table,
 )
+from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import BulletArm, SoftArm
 
@@ -67,8 +69,10 @@ def write_results(
     reference: Reference,
     config: dict[str, Any],
     folder: Path,
+    stability: StabilityResult | None,
+    origin: Origin,
 ) -> float:
-    """Write tables, figures and the animation; returns the RMS error of the first controller."""
+    """Write tables, figures, animation, report; returns the RMS error of the first controller."""
     actuator = config["actuator"]
     metrics = {
         name: closed_loop_metrics(
@@ -82,31 +86,49 @@ def write_results(
     }
     table = comparison_table(metrics)
     write_table(table, folder, "summary")
-    write_table(
-        _together({name: m.per_coordinate() for name, m in metrics.items()}), folder, "coordinates"
-    )
-    write_table(_together({name: m.per_input() for name, m in metrics.items()}), folder, "inputs")
+    coordinates = _together({name: m.per_coordinate() for name, m in metrics.items()})
+    write_table(coordinates, folder, "coordinates")
+    inputs = _together({name: m.per_input() for name, m in metrics.items()})
+    write_table(inputs, folder, "inputs")
 
     figures = _figures(records, source, robot, reference, config)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
     with SummaryWriter(str(folder / "tensorboard")) as writer:
-        writer.add_text("summary", f"<pre>{format_table(table)}</pre>")
+        # A row per figure of merit, to be read without scrolling.
+        text = table.set_index("controller").T.to_string(float_format="{:.4g}".format)
+        writer.add_text("closed_loop/summary", f"<pre>{text}</pre>")
+        writer.add_text("run/configuration", f"```yaml\n{(folder / CONFIG).read_text()}\n```")
         for name, figure in figures.items():
-            writer.add_figure(name, figure)
-        for row in table.to_dict("records"):
-            for key, value in row.items():
-                if isinstance(value, (int, float)):
-                    writer.add_scalar(f"{key}/{row['controller']}", value)
+            writer.add_figure(f"closed_loop/{name.removeprefix('closed_loop_')}", figure)
     first = next(iter(records))
+    animation = folder / f"animation_{first}.gif"
     if config["animate"]:
-        _animate(records[first], robot, config["trajectory"], folder / f"animation_{first}.gif")
+        _animate(records[first], robot, config["trajectory"], animation)
 
     shown = [column for column in table if column.startswith(_SHOWN)]
     duration, runs = f"{config['duration']:g} s", len(records[first].stopped)
     print(f"\n{source.name}: closed loop of {duration}, {runs} run{'s' if runs > 1 else ''}")
     print(format_table(table[shown]))
-    print(f"\ntables, figures and recorded motions are in {folder}")
+    report = control_report(
+        title=f"{source.name}: closed loop on a learned model",
+        summary=table,
+        coordinates=coordinates,
+        inputs=inputs,
+        records=records,
+        run=config["trajectory"],
+        held=config["rate"] is not None,
+        labels=source.labels,
+        input_labels=source.input_labels,
+        animation=animation if config["animate"] and animation.is_file() else None,
+        stability=stability,
+        origin=origin,
+    )
+    (folder / "report.html").write_text(report, encoding="utf-8")
+    print(
+        f"\ntables, figures and recorded motions are in {folder}; open report.html there in a "
+        "browser"
+    )
     return metrics[first].rms_error
 
 
@@ -116,7 +138,7 @@ def write_stability(
     record: ClosedLoopRecord,
     config: dict[str, Any],
     folder: Path,
-) -> None:
+) -> StabilityResult:
     """Proposition 1 over a box, and the predicted steady state of every set point of the runs.
 
     Raises:
@@ -152,6 +174,7 @@ def write_stability(
     )
     save(figure, folder / "steady_state.png")
     log.info("the stability report is in %s", folder / "stability.md")
+    return StabilityResult(text, table)
 
 
 def _figures(

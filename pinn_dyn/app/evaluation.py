@@ -15,24 +15,29 @@ from tqdm import tqdm
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.origin import build_origin, command_line, data_hash
 from pinn_dyn.app.runs import Run, find_runs, load_run, provenance
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
     Prediction,
     RunResult,
+    TermComparison,
     compare_terms,
     error_figure,
     format_table,
     grouped_table,
+    member_metrics,
     predict_trajectories,
     predict_windows,
     rollout_metrics,
     save,
+    spread_figure,
     summary_table,
     terms_figure,
     trajectory_figure,
     write_table,
 )
+from pinn_dyn.evaluation.report import prediction_report
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory, stack
 
 log = logging.getLogger(__name__)
@@ -45,6 +50,9 @@ _SHOWN = (
     "error_worst",
     "diverged",
     "squared_error_mean",
+    "member_error_mean",
+    "member_error_std",
+    "spread_over_error",
 )
 
 
@@ -86,16 +94,17 @@ def evaluate(cfg: DictConfig) -> float:
     write_table(summary, folder, "summary")
     grouped = grouped_table(summary)
     write_table(grouped, folder, "by_model")
+    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
     (folder / "provenance.json").write_text(
-        json.dumps(
-            {"config": config, "dataset": runs[0].config["dataset"], **provenance()}, indent=2
-        )
+        json.dumps({"config": config, "dataset": runs[0].config["dataset"], **record}, indent=2)
     )
-    _draw(evaluations, truth.until(config["horizon"]), source, config, folder)
-    text = _compare_with_truth(evaluations, source, folder)
+    horizon_truth = truth.until(config["horizon"])
+    _draw(evaluations, horizon_truth, source, config, folder)
+    comparisons = _compare_with_truth(evaluations, source, folder)
 
     horizon = f"{config['horizon']:g} s"
     shown = ["run", "seed", "pairs", *_SHOWN, *[c for c in summary if c.startswith("window_")]]
+    text = _terms_text(comparisons)
     print(f"\n{text}" if text else "")
     print(f"{source.name}: {truth.q.shape[0]} unseen test trajectories, {horizon} open loop")
     print(format_table(summary[[name for name in shown if name in summary]]))
@@ -106,7 +115,20 @@ def evaluate(cfg: DictConfig) -> float:
             *[c for c in grouped if c.endswith(("_error_mean", "_error_worst"))],
         ]
         print(f"\nover seeds:\n{format_table(grouped[[c for c in best if c in grouped]])}")
-    print(f"\nfigures and tables are in {folder}")
+    report = prediction_report(
+        title=f"{source.name}: trained models on unseen motions",
+        summary=summary,
+        grouped=grouped,
+        truth=horizon_truth,
+        predictions={item.label: item.prediction for item in evaluations},
+        trajectory=config["trajectory"],
+        labels=source.labels,
+        input_labels=source.input_labels,
+        comparisons=comparisons,
+        origin=build_origin({item.label: item.run for item in evaluations}, source, record, config),
+    )
+    (folder / "report.html").write_text(report, encoding="utf-8")
+    print(f"\nfigures and tables are in {folder}; open report.html there in a browser")
     return float(summary["error_mean"].min())
 
 
@@ -143,6 +165,8 @@ def _evaluate(run: Run, label: str, truth: Trajectory, config: dict[str, Any]) -
     metrics = rollout_metrics(
         prediction.q_hat, prediction.q, prediction.t, thresholds=config["thresholds"]
     ).to_dict()
+    if prediction.members is not None:
+        metrics |= member_metrics(prediction)
     for window in config["windows"]:
         windowed = predict_windows(run.model, horizon, window=window, step=step)
         figures = rollout_metrics(windowed.q_hat, windowed.q, windowed.t, thresholds={})
@@ -174,23 +198,31 @@ def _draw(
     )
     save(figure, folder / "trajectory.png")
     save(error_figure(predictions, title=title), folder / "error.png")
+    for label, prediction in predictions.items():
+        if prediction.members is not None:
+            figure = spread_figure(
+                prediction, title=f"{title}\n{label}, {len(prediction.members)} members"
+            )
+            save(figure, folder / f"spread_{label.replace(' ', '_')}.png")
 
 
-def _compare_with_truth(evaluations: list[Evaluation], source: DataSource, folder: Path) -> str:
-    """Write learned against true terms of each structured model; returns the text of it."""
+def _compare_with_truth(
+    evaluations: list[Evaluation], source: DataSource, folder: Path
+) -> dict[str, TermComparison]:
+    """Write learned against true terms of each structured model; returns them by its label."""
     if source.system is None or not source.configurations:
-        return ""
+        return {}
     names = list(source.configurations)
     q = torch.tensor([source.configurations[name] for name in names], dtype=torch.float64)
-    texts = []
+    comparisons = {}
     for item in evaluations:
         model = item.run.model
         if not isinstance(model, MechanicalSystem):
             continue
         comparison = compare_terms(model, source.system, q, names=names)
+        comparisons[item.label] = comparison
         stem = item.label.replace(" ", "_")
         write_table(comparison.to_frame(), folder, f"terms_{stem}")
-        texts.append(f"{item.label}: learned and true terms\n{comparison.to_text()}")
         for index, name in enumerate(names):
             figure = terms_figure(
                 comparison,
@@ -199,6 +231,11 @@ def _compare_with_truth(evaluations: list[Evaluation], source: DataSource, folde
                 inverse_mass=model.coordinates == "momentum",
             )
             save(figure, folder / f"terms_{stem}_{name}.png")
-    text = "\n\n".join(texts)
-    (folder / "terms.txt").write_text(text + "\n")
-    return text
+    (folder / "terms.txt").write_text(_terms_text(comparisons) + "\n")
+    return comparisons
+
+
+def _terms_text(comparisons: dict[str, TermComparison]) -> str:
+    return "\n\n".join(
+        f"{label}: learned and true terms\n{item.to_text()}" for label, item in comparisons.items()
+    )

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.multirun import ERROR
 from pinn_dyn.app.runs import CONFIG, METRICS
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 
@@ -95,16 +96,16 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _last_words(folder: Path) -> str:
-    """How a job without a record ended: the last line of its log."""
+    """How a job without a record ended: its error, or else the last line of its log."""
+    if (folder / ERROR).is_file():
+        return f"failed: {(folder / ERROR).read_text().splitlines()[0]}"
     lines = []
     for path in sorted(folder.glob("*.log")):
         lines += [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
     if not lines:
         return "running or stopped, without a log"
-    failed = any(line.startswith("Traceback") or "][ERROR]" in line for line in lines)
-    # Without date, module and level, and without the module of an error.
-    last = re.sub(r"^((\[[^]]*\])+ - |([a-z_]\w*\.)+(?=[A-Z]\w*:))", "", lines[-1])
-    return f"failed: {last}" if failed else f"running or stopped, its log ends with: {last}"
+    last = re.sub(r"^(\[[^]]*\])+ - ", "", lines[-1])  # without date, module and level
+    return f"running or stopped, its log ends with: {last}"
 
 
 def _natural(folder: Path) -> list[tuple[int, str]]:

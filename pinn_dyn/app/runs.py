@@ -14,7 +14,7 @@ from typing import Any
 import torch
 import yaml
 
-from pinn_dyn.app.build import CHECKPOINTS, build_model
+from pinn_dyn.app.build import CHECKPOINTS, build_predictor
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
@@ -75,7 +75,7 @@ def load_run(folder: Path, checkpoint: str) -> Run:
         raise ConfigError(f"{path} cannot be read, it may be cut short: {error}") from error
     parameters = saved["hyper_parameters"]
     statistics = Statistics.from_dict(parameters["statistics"])
-    model = build_model(config, statistics)
+    model = build_predictor(config, statistics)
     weights = {
         key.removeprefix("model."): value
         for key, value in saved["state_dict"].items()
@@ -115,19 +115,22 @@ def find_runs(patterns: list[str] | str) -> list[Path]:
 
 
 def provenance() -> dict[str, str]:
-    """Commit, software and hardware, for the records."""
-    commit = subprocess.run(
-        ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    """Commit, whether tracked files differ from it, software and hardware, for the records."""
+    commit = _git("rev-parse", "--short", "HEAD")
+    changed = _git("status", "--porcelain", "--untracked-files=no")
     return {
-        "commit": commit.stdout.strip() or "unknown",
+        "commit": commit or "unknown",
+        "uncommitted_changes": "unknown" if not commit else "yes" if changed else "no",
         "torch": torch.__version__,
         "python": platform.python_version(),
         "hardware": f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
     }
+
+
+def _git(*arguments: str) -> str:
+    """What git says of the code; nothing where there is no repository."""
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def _processor() -> str:

@@ -4,26 +4,31 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import time
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from pinn_dyn.app.build import (
     build_data,
     build_learner,
-    build_model,
+    build_predictor,
     build_trainer,
     build_validator,
+    check_processes,
 )
+from pinn_dyn.app.claims import claimed, recorded_error
 from pinn_dyn.app.config import ConfigError, plain
-from pinn_dyn.app.runs import CHECKPOINTS, METRICS, provenance, read_config, write_config
+from pinn_dyn.app.description import describe
+from pinn_dyn.app.runs import CHECKPOINTS, METRICS, provenance, read_config
 from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation import cleaning_figure, save
-from pinn_dyn.evaluation.sweep_table import flatten
 
 log = logging.getLogger(__name__)
 
@@ -31,12 +36,15 @@ log = logging.getLogger(__name__)
 def train(cfg: DictConfig) -> float:
     """Train one model; returns the last validation error, the figure that a sweep minimizes.
 
+    A folder that holds this very training already is not trained again: a finished one is passed
+    over, one that was interrupted goes on.
+
     Raises:
-        ConfigError: on a configuration that cannot be used, or nothing to resume from.
+        ConfigError: on a configuration that cannot be used, a folder that holds another training,
+            or nothing to resume from.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    last = None
     if cfg.resume is not None:
         others = [word for word in HydraConfig.get().overrides.task if word[:7] != "resume="]
         if others:
@@ -44,13 +52,22 @@ def train(cfg: DictConfig) -> float:
                 f"resume goes on with the run's own configuration: leave out {', '.join(others)}"
             )
         folder = Path(cfg.resume)
-        config = read_config(folder)
-        last = folder / CHECKPOINTS / "last.ckpt"
-        if not last.is_file():
-            raise ConfigError(f"nothing to resume from: {last} does not exist")
-    else:
-        config = plain(cfg)
-        write_config(folder, config)
+    config = plain(cfg) if cfg.resume is None else read_config(folder)
+    last = folder / CHECKPOINTS / "last.ckpt"
+    if cfg.resume is not None and not last.is_file():
+        raise ConfigError(f"nothing to resume from: {last} does not exist")
+    with claimed(folder, config):
+        error = recorded_error(folder)
+        if error is not None and cfg.resume is None:
+            log.info("already trained, to train again delete %s", folder)
+            return error
+        if last.is_file():
+            log.info("going on with the training in %s", folder)
+        return _train(folder, config, last if last.is_file() else None)
+
+
+def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
+    """Train in a folder, from a checkpoint if there is one."""
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
 
@@ -67,7 +84,7 @@ def train(cfg: DictConfig) -> float:
         data.splits.validation[0].until(validator.horizon)
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
-    model = build_model(config, statistics)
+    model = build_predictor(config, statistics)
     if model.coordinates == "momentum" and data.windows.p.shape[-1] == 0:
         raise ConfigError(
             f"model: {config['model_name']} learns from momenta p = M(q) v, and the data set "
@@ -75,13 +92,18 @@ def train(cfg: DictConfig) -> float:
             "model.coordinates=velocity, which learns from (q, v), or use model=lnn"
         )
     learner = build_learner(config, model, statistics, validator)
-    trainer = build_trainer(config, folder, data.source, validator)
+    description = describe(folder, config)
+    trainer = build_trainer(config, folder, data.source, validator, description)
+    check_processes(trainer, config["data"]["batch_size"])
 
-    start, start_cpu = time.perf_counter(), time.process_time()
+    start, start_cpu = time.perf_counter(), _cpu_seconds()
     try:
         trainer.fit(learner, data, ckpt_path=last, weights_only=True)
+        if last is not None and not trainer.callback_metrics:  # ended just before its record
+            trainer.validate(learner, data, verbose=False)
     except SystemExit:  # Lightning's end of an interrupted training
-        log.warning("interrupted; go on with: python train.py resume=%s", folder)
+        if HydraConfig.get().mode == RunMode.RUN:
+            log.warning("interrupted; go on with: python train.py resume=%s", folder)
         raise
     seconds = time.perf_counter() - start
 
@@ -94,18 +116,14 @@ def train(cfg: DictConfig) -> float:
         "pairs": len(data.windows),
         "parameters": parameters,
         "training_seconds": seconds,
-        "training_cpu_seconds": time.process_time() - start_cpu,
-        "steps": trainer.global_step,
+        "training_cpu_seconds": _cpu_seconds() - start_cpu,
+        "steps": trainer.global_step or _saved_steps(folder),
         "validation": metrics,
         **provenance(),
     }
-    (folder / METRICS).write_text(json.dumps(record, indent=2))
-    for logger in trainer.loggers:
-        logger.log_hyperparams(
-            flatten(config),
-            {"val/error_mean": error, "training_seconds": seconds},
-        )
-        logger.finalize("success")
+    partial = folder / f"{METRICS}.partial"
+    partial.write_text(json.dumps(record, indent=2))
+    partial.replace(folder / METRICS)  # a record is whole or absent
     log.info(
         "%s seed %d: validation error %.5f over %g s after %.0f s of training, in %s",
         config["name"],
@@ -116,6 +134,17 @@ def train(cfg: DictConfig) -> float:
         folder,
     )
     return error
+
+
+def _saved_steps(folder: Path) -> int:
+    """Training steps of other processes, whose trainers counted them."""
+    path = folder / CHECKPOINTS / "last.ckpt"
+    return torch.load(path, weights_only=True)["global_step"] if path.is_file() else 0
+
+
+def _cpu_seconds() -> float:
+    """Processor time of this process and of those that it has waited for."""
+    return sum(os.times()[:4])
 
 
 def _write_report(source: LogSource, folder: Path) -> None:

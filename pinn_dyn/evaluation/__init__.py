@@ -12,11 +12,23 @@ from pinn_dyn.evaluation.control_metrics import (
     closed_loop_metrics,
     comparison_table,
 )
-from pinn_dyn.evaluation.figures import error_figure, save, terms_figure, trajectory_figure
+from pinn_dyn.evaluation.figures import (
+    error_figure,
+    save,
+    spread_figure,
+    terms_figure,
+    trajectory_figure,
+)
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
-from pinn_dyn.evaluation.metrics import RolloutMetrics, diverged_trajectories, rollout_metrics
+from pinn_dyn.evaluation.metrics import (
+    RolloutMetrics,
+    diverged_trajectories,
+    member_metrics,
+    rollout_metrics,
+)
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
+from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.evaluation.tables import (
     RunResult,
     format_table,
@@ -32,6 +44,7 @@ __all__ = [
     "RolloutFigures",
     "RolloutMetrics",
     "RolloutValidator",
+    "RunDescription",
     "RunResult",
     "TermComparison",
     "animate_bullet_arm",
@@ -46,11 +59,13 @@ __all__ = [
     "error_figure",
     "format_table",
     "grouped_table",
+    "member_metrics",
     "predict_trajectories",
     "predict_windows",
     "rollout_metrics",
     "save",
     "soft_arm_strip",
+    "spread_figure",
     "steady_state_figure",
     "summary_table",
     "terms_figure",

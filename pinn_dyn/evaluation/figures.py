@@ -137,6 +137,40 @@ def error_figure(
     return figure
 
 
+def spread_figure(prediction: Prediction, *, title: str) -> Figure:
+    """Error of an ensemble beside the spread of its members, over time.
+
+    Both are root mean squares over the trajectories that did not diverge; where the spread lies
+    below the error, the ensemble is surer than it should be.
+
+    Args:
+        prediction: the roll-outs of an ensemble.
+        title: data set, model and horizon.
+    """
+    kept = ~diverged_trajectories(prediction)
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    ax = figure.subplots()
+    t = prediction.t[1:]
+    lines = (
+        ("error of the mean prediction", prediction.error(), _COLOURS[0], "-"),
+        ("spread of the members", prediction.spread(), _COLOURS[1], "--"),
+    )
+    for name, values, colour, style in lines:
+        if kept.any():
+            mean = values[kept][:, 1:].square().mean(dim=0).sqrt()
+            ax.plot(t, mean, style, color=colour, linewidth=1.5, label=name)
+        else:
+            ax.plot([], [], style, color=colour, label=f"{name} (all diverged)")
+    ax.set_yscale("log")
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel(r"root mean square of $\|\hat q - q\|_2$")
+    ax.grid(True, which="major", alpha=0.3)
+    ax.set_xlim(float(prediction.t[0]), float(prediction.t[-1]))
+    figure.legend(loc="outside lower center", ncols=2)
+    figure.suptitle(title)
+    return figure
+
+
 def terms_figure(
     comparison: TermComparison, *, configuration: int, title: str, inverse_mass: bool = False
 ) -> Figure:

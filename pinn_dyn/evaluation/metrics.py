@@ -105,6 +105,46 @@ def rollout_metrics(
     )
 
 
+def member_metrics(prediction: Prediction) -> dict[str, float]:
+    """How good the members of an ensemble are alone, and whether their spread tells the error.
+
+    ``members`` E; ``member_error_mean`` and ``member_error_std``, mean and (sample) standard
+    deviation over the members of the mean error of each; ``member_diverged``, roll-outs of single
+    members that diverged; ``spread_mean``, mean over time of the spread s(t), see
+    :meth:`Prediction.spread`; and the calibration::
+
+        spread_over_error = sqrt((1 + 1/E) mean(s^2) / mean(e^2))
+
+    with e the error of the ensemble. It is 1 if the truth lies among the members as if it were one
+    of them, and below 1 if the spread promises too much: what all members have in common, such as
+    their data, gives no spread. Diverged roll-outs of the ensemble are left out of both means; like
+    an error, a figure that is left with nothing is infinite.
+    Source: Fortin et al. (2014), "Why should ensemble spread match the RMSE of the ensemble mean?"
+
+    Raises:
+        ValueError: if this is not the prediction of an ensemble.
+    """
+    kept = ~diverged_trajectories(prediction)
+    spread, error = prediction.spread()[kept], prediction.error()[kept]
+    assert prediction.members is not None
+    alone = [
+        rollout_metrics(q_hat, prediction.q, prediction.t, thresholds={})
+        for q_hat in prediction.members
+    ]
+    errors = torch.tensor([item.error_mean for item in alone], dtype=torch.float64)
+    ratio = float("inf")
+    if 0 < _mean(error.square()) < float("inf"):
+        ratio = (1 + 1 / len(alone)) * _mean(spread.square()) / _mean(error.square())
+    return {
+        "members": len(alone),
+        "member_error_mean": float(errors.mean()),
+        "member_error_std": float(errors.std()) if errors.isfinite().all() else float("inf"),
+        "member_diverged": sum(item.diverged for item in alone),
+        "spread_mean": _mean(spread),
+        "spread_over_error": ratio**0.5,
+    }
+
+
 def diverged_trajectories(prediction: Prediction) -> Tensor:
     """Which trajectories diverged, ``(K,)``, bool.
 

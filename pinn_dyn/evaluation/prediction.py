@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import Predictor, Trajectory, double_copy
+from pinn_dyn.data.simulation import has_cpp_compiler
+from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, Predictor, Trajectory, double_copy
+
+# Steps times (batch + 300) from which compiling a step takes less time than it saves: it takes some
+# 20 s, and saves 2 ms of a step and 7 us for each trajectory (benchmarks/README.md).
+_WORTH_COMPILING = 4_500_000
 
 
 @dataclass(frozen=True)
@@ -18,15 +24,30 @@ class Prediction:
         t: times, ``(T,)``, s.
         q_hat: predicted configuration, ``(K, T, N)``; NaN where the roll-out broke down.
         q: true configuration, ``(K, T, N)``.
+        members: of an ensemble, what each of its E members predicts, ``(E, K, T, N)``; q_hat is
+            their mean.
     """
 
     t: Tensor
     q_hat: Tensor
     q: Tensor
+    members: Tensor | None = None
 
     def error(self) -> Tensor:
         """e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
         return torch.linalg.vector_norm(self.q_hat - self.q, dim=-1)
+
+    def spread(self) -> Tensor:
+        """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
+
+            s(t)^2 = sum over members i of |q_hat_i(t) - q_hat(t)|^2 / (E - 1)
+
+        Raises:
+            ValueError: if this is not the prediction of an ensemble.
+        """
+        if self.members is None:
+            raise ValueError("a single model has no spread: expected the prediction of an ensemble")
+        return self.members.var(dim=0).sum(-1).sqrt()
 
 
 def predict_trajectories(
@@ -34,8 +55,9 @@ def predict_trajectories(
 ) -> Prediction:
     """Roll the model out from each true initial state under the true input.
 
-    The roll-out runs in float64 on a copy of the model in evaluation mode. Where a trajectory
-    breaks down (a mass matrix that is no longer positive definite), all of its q_hat is NaN.
+    The roll-out runs in float64 on a copy of the model in evaluation mode; a long one takes
+    compiled steps, which changes its numbers by rounding alone. Where a trajectory breaks down (a
+    mass matrix that is no longer positive definite), all of its q_hat is NaN.
 
     Args:
         model: what predicts, with N coordinates and M inputs.
@@ -49,15 +71,17 @@ def predict_trajectories(
     """
     _require_stacked(truth)
     stride = 1 if step is None else _samples_of("step", step, truth.t)
-    prediction = _roll_out(
-        double_copy(model, truth.q.device),
+    paths = _roll_out(
+        model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0]),
         truth.state(model.coordinates, slice(1))[:, 0].double(),
         truth.t.double(),
         truth.u.double(),
         stride,
         truth,
     )
-    return Prediction(truth.t[::stride].double(), prediction, truth.q[:, ::stride].double())
+    return Prediction(
+        truth.t[::stride].double(), paths.mean(0), truth.q[:, ::stride].double(), _members(paths)
+    )
 
 
 def predict_windows(
@@ -97,36 +121,62 @@ def predict_windows(
     # (K, windows, samples + 1, M): neighbouring windows share the sample between them.
     u = truth.u[:, : last + 1].double().unfold(1, samples + 1, samples).movedim(-1, -2)
     ends = _roll_out(
-        double_copy(model, truth.q.device),
+        model_for_roll_outs(model, truth.q.device, samples // stride, x0.shape[:2].numel()),
         x0.flatten(0, 1),
         truth.t[: samples + 1].double(),
         u.flatten(0, 1),
         stride,
         truth,
-    )[:, 1:]
+    )[..., 1:, :]
     q = truth.q[:, : last + 1 : stride].double()
-    q_hat = torch.cat([q[:, :1], ends.reshape(q.shape[0], -1, q.shape[-1])], dim=1)
-    return Prediction(truth.t[: last + 1 : stride].double(), q_hat, q)
+    start = q[:, :1].expand(ends.shape[0], -1, -1, -1)
+    paths = torch.cat([start, ends.reshape(ends.shape[0], q.shape[0], -1, q.shape[-1])], dim=2)
+    return Prediction(truth.t[: last + 1 : stride].double(), paths.mean(0), q, _members(paths))
+
+
+def _members(paths: Tensor) -> Tensor | None:
+    return paths if paths.shape[0] > 1 else None
+
+
+def model_for_roll_outs(
+    model: Predictor, device: torch.device, steps: int, batch: int
+) -> Predictor:
+    """The model in float64, its RK4 step compiled where that pays and a C++ compiler is there."""
+    copy = double_copy(model, device)
+    members, inner = (copy.size, copy.stack) if isinstance(copy, Ensemble) else (1, copy)
+    if isinstance(inner, ContinuousPredictor) and device.type == "cpu":
+        work = steps * inner.substeps * (members * batch + 300)
+        inner.compiled_rollouts = work >= _WORTH_COMPILING and has_cpp_compiler()
+    return copy
 
 
 def _roll_out(
     model: Predictor, x0: Tensor, t: Tensor, u: Tensor, stride: int, truth: Trajectory
 ) -> Tensor:
-    """Predicted q ``(B, T, N)`` at every ``stride``-th sample; NaN rows where it broke down."""
+    """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; NaN rows where it broke down.
+
+    E is 1, but for an ensemble.
+    """
     try:
         with torch.no_grad():
-            states = model.predict(x0, t[::stride], u, t_input=t, interpolation=truth.interpolation)
+            settings: Any = {"t_input": t, "interpolation": truth.interpolation}
+            if isinstance(model, Ensemble):
+                states = x0.unsqueeze(-2) + model.member_increments(x0, t[::stride], u, **settings)
+            else:
+                states = model.predict(x0, t[::stride], u, **settings).unsqueeze(0)
         return states[..., : truth.q.shape[-1]]
     except torch.linalg.LinAlgError:
         # One broken trajectory stops the whole batch: halve it until that one is alone.
         if x0.shape[0] == 1:
-            return x0.new_full((1, t[::stride].shape[0], truth.q.shape[-1]), torch.nan)
+            size = model.size if isinstance(model, Ensemble) else 1
+            return x0.new_full((size, 1, t[::stride].shape[0], truth.q.shape[-1]), torch.nan)
         half = x0.shape[0] // 2
         return torch.cat(
             [
                 _roll_out(model, x0[:half], t, u[:half], stride, truth),
                 _roll_out(model, x0[half:], t, u[half:], stride, truth),
-            ]
+            ],
+            dim=1,
         )
 
 

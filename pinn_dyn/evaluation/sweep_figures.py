@@ -42,7 +42,7 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: list[str], y: str) -> Fig
     groups = [("", finite)]
     if lines:
         groups = [
-            (", ".join(f"{n}={v}" for n, v in zip(lines, key, strict=True) if not pd.isna(v)), rows)
+            (_line_name(lines, key), rows)
             for key, rows in finite.groupby(lines, sort=False, dropna=False)
         ]
     styles = [(colour, marker) for marker in _MARKERS for colour in _COLOURS]
@@ -62,17 +62,29 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: list[str], y: str) -> Fig
             ax.plot(at, rows[y], marker, color=colour, alpha=0.4, markersize=4, linestyle="none")
     if categories:
         ax.set_xticks(range(len(categories)), categories)
-    elif _spans_decades(list(places.values())):
-        ax.set_xscale("log")
-        if len(places) <= _LABELLED:  # the values themselves, not powers of ten
+    else:
+        logarithmic = _spans_decades(list(places.values()))
+        if logarithmic:
+            ax.set_xscale("log")
+        if len(places) <= _LABELLED and (logarithmic or _apart(list(places.values()))):
+            # The values themselves, not powers of ten or numbers between them.
             ax.set_xticks(list(places.values()), [str(value) for value in places])
             ax.minorticks_off()
     if _spans_decades(finite[y].tolist()):
         ax.set_yscale("log")
     _label(ax, x, y, lost=len(known) - len(finite))
     if lines:
-        figure.legend(loc="outside lower center", ncols=2 if len(groups) > 4 else 4)
+        title = lines[0] if len(lines) == 1 else None
+        columns = 2 if len(groups) > 4 else 4
+        figure.legend(loc="outside lower center", ncols=columns, title=title)
     return figure
+
+
+def _line_name(lines: list[str], key: tuple[object, ...]) -> str:
+    """What a line stands for; of a single parameter the value, as the legend bears its name."""
+    if len(lines) == 1:
+        return "-" if pd.isna(key[0]) else str(key[0])
+    return ", ".join(f"{n}={v}" for n, v in zip(lines, key, strict=True) if not pd.isna(v))
 
 
 def _places(values: pd.Series) -> tuple[dict[object, float], list[str]]:
@@ -89,11 +101,17 @@ def _spans_decades(values: list[float]) -> bool:
     return low > 0 and math.isfinite(high) and high >= _DECADE * low
 
 
+def _apart(values: list[float]) -> bool:
+    """Whether there is room for a label at each value of a linear axis."""
+    gaps = np.diff(sorted(values))
+    return bool((gaps > 0.1 * gaps.sum()).all())
+
+
 def _label(ax: Axes, x: str, y: str, *, lost: int) -> None:
     ax.set_xlabel(x)
     ax.set_ylabel(y)
     ax.grid(True, which="major", alpha=0.3)
-    notes = ["dots: seeds, line: their mean"]
+    notes = ["small dots: seeds, line: their mean"]
     if lost:
         notes.append(f"{lost} diverged {'run is' if lost == 1 else 'runs are'} not drawn")
     ax.set_title("; ".join(notes), loc="right", fontsize="small")

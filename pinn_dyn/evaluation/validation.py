@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import compare_terms
-from pinn_dyn.evaluation.metrics import rollout_metrics
+from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
+from pinn_dyn.evaluation.run_log import log_figures
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 
@@ -42,7 +43,11 @@ class RolloutValidator:
         return predict_trajectories(model, truth.until(self.horizon), step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
-        """Error mean, median and worst, diverged count, and the seconds that it took."""
+        """Error mean, median and worst, diverged count, and the seconds that it took.
+
+        Of an ensemble these are of its mean prediction; with them come the mean error and the
+        spread of its members.
+        """
         start = time.perf_counter()
         prediction = self.predict(model, truth)
         metrics = rollout_metrics(
@@ -50,11 +55,14 @@ class RolloutValidator:
         ).to_dict()
         names = ("error_mean", "error_median", "error_worst", "diverged")
         figures = {name: float(metrics[name]) for name in names}
+        if prediction.members is not None:
+            figures["member_error_mean"] = member_metrics(prediction)["member_error_mean"]
+            figures["spread_mean"] = member_metrics(prediction)["spread_mean"]
         return {**figures, "rollout_seconds": time.perf_counter() - start}
 
 
 class RolloutFigures(L.Callback):
-    """Draws a validation roll-out, its error and the learned terms into TensorBoard.
+    """Logs pictures of a validation roll-out, its error and the learned terms.
 
     Args:
         every_n_validations: draw at every n-th validation, and at the end of training.
@@ -125,7 +133,5 @@ class RolloutFigures(L.Callback):
                     title=f"Learned and true terms at {key}",
                     inverse_mass=model.coordinates == "momentum",
                 )
-        for logger in trainer.loggers:
-            if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
-                for key, figure in figures.items():
-                    logger.experiment.add_figure(key, figure, trainer.global_step)
+        # The step at which Lightning logs the errors of the same validation.
+        log_figures(trainer.loggers, figures, trainer.global_step - 1)

@@ -81,7 +81,7 @@ def refused_text(capsys, script, *arguments):
     return text
 
 
-def start_process(script, *arguments, folder, output):
+def start_process(script, *arguments, folder, output, **options):
     """Start an entry script in another process, with its output going to a file."""
     return subprocess.Popen(
         [sys.executable, str(ROOT / script), *arguments],
@@ -89,4 +89,5 @@ def start_process(script, *arguments, folder, output):
         stdout=output,
         stderr=subprocess.STDOUT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
+        **options,
     )

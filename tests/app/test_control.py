@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pinn_dyn.app.config import CONF
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -84,7 +85,13 @@ def test_figures_animation_log_and_provenance_are_written(results):
         assert (results / f"{name}.png").stat().st_size > 10_000
     with Image.open(results / "animation_learned.gif") as animation:
         assert animation.is_animated
-    assert any((results / "tensorboard").iterdir())
+    log = EventAccumulator(str(results / "tensorboard")).Reload()
+    shown = ("learned", "truth", "pd", "comparison", "strip")
+    assert set(log.Tags()["images"]) == {f"closed_loop/{name}" for name in shown}
+    (table,) = log.Tensors("closed_loop/summary/text_summary")[0].tensor_proto.string_val
+    summary = pd.read_csv(results / "summary.csv")
+    (row,) = [line for line in table.decode().splitlines() if line.startswith("rms_error")]
+    assert [float(x) for x in row.split()[1:]] == pytest.approx(summary["rms_error"], rel=1e-3)
     record = json.loads((results / "provenance.json").read_text())
     assert {"config", "run", "commit", "hardware"} <= set(record)
     assert record["config"]["gains"]["position"] == 5
@@ -213,7 +220,8 @@ def test_the_panda_is_controlled_in_bullet(tmp_path, experiment, panda_run):
         f"hydra.run.dir={folder}",
     )
     summary = pd.read_csv(folder / "summary.csv").set_index("controller")
-    assert list(summary.index) == ["learned", "truth", "computed_torque", "gravity_pd", "pd"]
+    names = "learned learned_observer truth computed_torque gravity_pd pd"
+    assert list(summary.index) == names.split()
     assert (summary["stopped"] == 0).all()
     assert summary.loc["truth", "rms_error"] < 1e-4
     assert (folder / "tip_path.png").is_file() == (experiment == "panda/helix")

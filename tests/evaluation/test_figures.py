@@ -9,6 +9,7 @@ from pinn_dyn.evaluation import (
     compare_terms,
     error_figure,
     save,
+    spread_figure,
     terms_figure,
     trajectory_figure,
 )
@@ -102,3 +103,17 @@ def test_terms_are_annotated(inverse_mass, shown, tmp_path):
     assert shown in [text.get_text() for text in figure.axes[0].texts]
     assert len(figure.axes[2].texts) == 3  # G is one column
     assert figure.axes[5].get_xlabel() == "error 20 %"
+
+
+def test_the_spread_of_an_ensemble_is_drawn_beside_its_error(truth, tmp_path):
+    members = torch.stack([truth.q + c * truth.t[:, None] for c in (0.0, 0.1, 0.5)])
+    members[:, 2] = torch.nan
+    prediction = Prediction(truth.t, members.mean(0), truth.q, members)
+    figure = spread_figure(prediction, title="fake")
+    check_picture(figure, tmp_path / "spread.png")
+    (ax,) = figure.axes
+    error, spread = (line.get_ydata() for line in ax.lines)
+    t = truth.t[1:].numpy()
+    # Two coordinates, all off by c t; the third trajectory broke down.
+    np.testing.assert_allclose(error, np.sqrt(2) * 0.2 * t)
+    np.testing.assert_allclose(spread, np.sqrt(2 * np.var([0.0, 0.1, 0.5], ddof=1)) * t)

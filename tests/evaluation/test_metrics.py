@@ -3,8 +3,15 @@ import math
 import pytest
 import torch
 
-from pinn_dyn.evaluation import predict_trajectories, predict_windows, rollout_metrics
-from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
+from pinn_dyn.evaluation import (
+    Prediction,
+    member_metrics,
+    predict_trajectories,
+    predict_windows,
+    rollout_metrics,
+)
+from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, Predictor, Trajectory
 from pinn_dyn.systems import SoftArm
 
 
@@ -239,3 +246,82 @@ def test_the_truth_predicts_itself(arm_motion):
 def test_another_plant_does_not_predict_the_truth(arm_motion):
     prediction = predict_trajectories(SoftArm(damping=0.12), arm_motion, step=0.002)
     assert prediction.error().max() > 1e-3
+
+
+# Ensembles.
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+def test_an_ensemble_is_predicted_with_its_members(windowed):
+    """Point masses of gains 0.8, 1 and 1.5: their mean moves as one of gain 1.1."""
+    gains = (0.8, 1.0, 1.5)
+    truth = ramps()
+
+    def predict(model):
+        if windowed:
+            return predict_windows(model, truth, window=1.0, step=0.5)
+        return predict_trajectories(model, truth, step=0.5)
+
+    found = predict(Ensemble([PointMass(gain).eval() for gain in gains]))
+    assert found.members.shape == (3, *found.q.shape)
+    for member, gain in zip(found.members, gains, strict=True):
+        torch.testing.assert_close(member, predict(PointMass(gain)).q_hat, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.q_hat, predict(PointMass(1.1)).q_hat, rtol=0, atol=1e-6)
+    deviation = found.members.numpy().std(axis=0, ddof=1)[..., 0]
+    torch.testing.assert_close(found.spread(), torch.from_numpy(deviation), rtol=0, atol=1e-12)
+    assert predict(PointMass()).members is None
+
+
+def test_a_single_model_has_no_spread():
+    with pytest.raises(ValueError, match="a single model has no spread"):
+        predict_trajectories(PointMass(), ramps()).spread()
+
+
+def test_a_truth_that_is_like_a_member_is_calibrated_and_a_common_error_is_not():
+    """Members and truth from one distribution; then the truth three times as far off."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randn(6, 40, 500, 2, generator=generator, dtype=torch.float64)
+    t = torch.arange(500, dtype=torch.float64)
+    members, q = drawn[:5], drawn[5]
+
+    def figures(q):
+        return member_metrics(Prediction(t, members.mean(0), q, members))
+
+    found = figures(q)
+    assert found["members"] == 5
+    assert found["spread_over_error"] == pytest.approx(1, abs=0.02)
+    # |x - y| of independent standard normal x, y in the plane has the mean sqrt(pi).
+    assert found["member_error_mean"] == pytest.approx(math.sqrt(math.pi), rel=0.01)
+    # Given the truth the members' errors differ by what 20,000 draws leave over.
+    assert 0 < found["member_error_std"] < 0.02
+    # sqrt(s^2) with s^2 the variance of 5 points in the plane, a gamma variable of shape 4.
+    expected = math.sqrt(2 / 4) * math.gamma(4.5) / math.gamma(4)
+    assert found["spread_mean"] == pytest.approx(expected, rel=0.01)
+    # The error's mean square is 9 + 1/5 in place of 1 + 1/5 for each coordinate.
+    expected = math.sqrt(1.2 / 9.2)
+    assert figures(3 * q)["spread_over_error"] == pytest.approx(expected, rel=0.03)
+
+
+def test_diverged_members_never_give_nan():
+    t, q = torch.arange(5.0), torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(0))
+    members = torch.stack([q * math.nan, q + 0.1])
+    figures = member_metrics(Prediction(t, members.mean(0), q, members))
+    assert not any(math.isnan(value) for value in figures.values())
+    assert figures["member_diverged"] == 2
+
+
+# Which roll-outs are compiled.
+
+
+@pytest.mark.parametrize(
+    ("steps", "batch", "expected"),
+    [(2_500, 10, False), (50_000, 1, True), (5_000, 1000, True), (50, 500, False)],
+)
+def test_only_long_roll_outs_take_compiled_steps(monkeypatch, steps, batch, expected):
+    device = torch.device("cpu")
+    monkeypatch.setattr("pinn_dyn.evaluation.prediction.has_cpp_compiler", lambda: True)
+    model = PointMass()
+    assert model_for_roll_outs(model, device, steps, batch).compiled_rollouts is expected
+    assert not model.compiled_rollouts
+    monkeypatch.setattr("pinn_dyn.evaluation.prediction.has_cpp_compiler", lambda: False)
+    assert not model_for_roll_outs(model, device, steps, batch).compiled_rollouts

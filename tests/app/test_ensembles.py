@@ -1,0 +1,107 @@
+"""Ensembles through the entry points: trained, resumed, evaluated, used by a controller."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from matplotlib.image import imread
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from pinn_dyn.app.runs import load_run
+from pinn_dyn.mechanics import Ensemble
+from pinn_dyn.models import LagrangianNetwork
+from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
+from tests.app.test_control import SET_POINTS
+
+
+@pytest.fixture(scope="module")
+def ensemble_run(tmp_path_factory):
+    """Three members of the seeds 0, 1 and 2."""
+    folder = tmp_path_factory.mktemp("runs") / "ensemble"
+    return train(folder, "model=lnn", "ensemble=3", NO_FIGURES)
+
+
+def weights(run):
+    return torch.load(run / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
+
+
+def test_the_first_member_is_what_a_training_of_that_seed_gives(ensemble_run, lnn_run):
+    """The seed of the windows, their order and the initial weights are those of the run."""
+    alone = load_run(lnn_run, "last").model
+    run = load_run(ensemble_run, "last")
+    assert isinstance(run.model, Ensemble)
+    assert run.model.size == 3
+    first, second = run.model.member(0), run.model.member(1)
+    assert isinstance(first, LagrangianNetwork)
+    for name, expected in alone.state_dict().items():
+        torch.testing.assert_close(first.state_dict()[name], expected, rtol=1e-4, atol=1e-5)
+    pairs = zip(first.parameters(), second.parameters(), strict=True)
+    assert any((a - b).abs().max() > 0.1 for a, b in pairs)
+
+
+def test_a_run_of_an_ensemble_loads_back_with_its_weights(ensemble_run):
+    run = load_run(ensemble_run, "best")
+    saved = weights(ensemble_run)
+    found = run.model.state_dict()
+    assert {f"model.{key}" for key in found} == {key for key in saved if key.startswith("model.")}
+    assert all(torch.equal(value, saved[f"model.{key}"]) for key, value in found.items())
+    record = json.loads((ensemble_run / "metrics.json").read_text())
+    single = sum(p.numel() for p in run.model.member(0).parameters())
+    assert record["parameters"] == 3 * single
+    assert record["validation"]["val/member_error_mean"] > 0
+    log = EventAccumulator(str(ensemble_run / "tensorboard")).Reload()
+    assert {"train/loss_spread", "val/spread_mean"} <= set(log.Tags()["scalars"])
+
+
+def test_an_ensemble_is_evaluated_beside_a_single_model(tmp_path, ensemble_run, lnn_run):
+    run_script(
+        "evaluate.py",
+        f"runs=[{ensemble_run},{lnn_run}]",
+        "horizon=0.1",
+        "windows=[0.02]",
+        f"hydra.run.dir={tmp_path}",
+    )
+    table = pd.read_csv(tmp_path / "summary.csv")
+    both, single = table.iloc[0], table.iloc[1]
+    assert both["members"] == 3
+    assert both["member_error_mean"] > 0
+    figures = both[["member_error_std", "spread_mean", "spread_over_error"]].astype(float)
+    assert np.isfinite(figures).all()
+    assert np.isnan(single["members"])
+    (picture,) = tmp_path.glob("spread_*.png")
+    assert imread(picture).std() > 0
+
+
+def test_a_controller_takes_one_member(tmp_path, capsys, monkeypatch, ensemble_run, lnn_run):
+    monkeypatch.chdir(tmp_path)
+
+    def errors(run, *arguments):
+        folder = tmp_path / f"{run.name}-{len(arguments)}"
+        run_script("control.py", f"run={run}", f"hydra.run.dir={folder}", *SET_POINTS, *arguments)
+        return pd.read_csv(folder / "summary.csv")["rms_error"].tolist()
+
+    first, second = errors(ensemble_run), errors(ensemble_run, "member=1")
+    assert first == pytest.approx(errors(lnn_run), rel=1e-3)
+    assert first[0] != second[0]
+    assert first[1:] == second[1:]
+    wrong = ["hydra.run.dir=out", *SET_POINTS]
+    text = refused_text(capsys, "control.py", f"run={ensemble_run}", "member=3", *wrong)
+    assert "member is 3, expected one of the 3 members, 0 to 2" in text
+    text = refused_text(capsys, "control.py", f"run={lnn_run}", "member=1", *wrong)
+    assert "the run holds a single model" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["ensemble=0"], "ensemble is 0, expected a number of members"),
+        (["ensemble=2", "loss=impulse"], "ImpulseLoss trains one model at a time"),
+    ],
+)
+def test_what_an_ensemble_cannot_do_is_refused(tmp_path, capsys, arguments, message):
+    text = refused_text(
+        capsys, "train.py", *TINY, NO_FIGURES, f"hydra.run.dir={tmp_path}", "model=lnn", *arguments
+    )
+    assert message in text

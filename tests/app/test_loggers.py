@@ -1,0 +1,174 @@
+"""What TensorBoard and MLflow are told about a run, read back from what they store."""
+
+import json
+
+import pytest
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import api_pb2, metadata
+
+from pinn_dyn.app.description import run_settings
+from tests.app.entry import NO_FIGURES, TINY, refused_text, train
+
+FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}
+
+
+def tensorboard(run):
+    return EventAccumulator(str(run / "tensorboard")).Reload()
+
+
+def session(log):
+    """Settings at the start, and whether there is a successful end."""
+    found = log.summary_metadata
+    content = found[metadata.SESSION_START_INFO_TAG].plugin_data.content
+    start = metadata.parse_session_start_info_plugin_data(content)
+    settings = {
+        key: getattr(value, value.WhichOneof("kind")) for key, value in start.hparams.items()
+    }
+    if metadata.SESSION_END_INFO_TAG not in found:
+        return settings, False
+    content = found[metadata.SESSION_END_INFO_TAG].plugin_data.content
+    end = metadata.parse_session_end_info_plugin_data(content)
+    return settings, end.status == api_pb2.STATUS_SUCCESS
+
+
+def text(log, tag):
+    return log.Tensors(f"{tag}/text_summary")[0].tensor_proto.string_val[0].decode()
+
+
+def test_tensorboard_has_few_settings_and_all_that_were_given(hnn_run):
+    log = tensorboard(hnn_run)
+    settings, success = session(log)
+    config = yaml.safe_load((hnn_run / "config.yaml").read_text())
+    assert success
+    assert len(settings) < 25
+    assert settings["model"] == "hnn"
+    assert settings["dataset"] == "soft_arm_1"
+    assert settings["loss"] == "IncrementLoss"
+    assert settings["optimizer.lr"] == config["optimizer"]["lr"]
+    assert settings["dataset.train_inputs"] == config["dataset"]["train_inputs"]
+    assert settings["validator.step"] == "null"
+    assert not [key for key in settings if "callbacks" in key or "_target_" in key]
+
+
+def test_tensorboard_is_left_to_join_the_settings_of_all_runs(hnn_run):
+    """It would show the settings that the experiment of the first run lists, and no others."""
+    assert metadata.EXPERIMENT_TAG not in tensorboard(hnn_run).summary_metadata
+
+
+def test_tensorboard_has_the_configuration_and_where_it_comes_from(hnn_run):
+    log = tensorboard(hnn_run)
+    code = text(log, "run/configuration")
+    assert code.startswith("```yaml\n")
+    assert yaml.safe_load(code.removeprefix("```yaml\n").removesuffix("```")) == yaml.safe_load(
+        (hnn_run / "config.yaml").read_text()
+    )
+    record = json.loads((hnn_run / "metrics.json").read_text())
+    table = text(log, "run/provenance")
+    for key in ("commit", "torch", "hardware", "parameters"):
+        assert f"| {key} | {record[key]} |" in table
+
+
+def test_figures_are_logged_at_the_step_of_the_errors_that_they_explain(hnn_run):
+    log = tensorboard(hnn_run)
+    assert set(log.Tags()["images"]) == FIGURES
+    (last,) = {log.Images(tag)[-1].step for tag in FIGURES}
+    assert last == log.Scalars("val/error_mean")[-1].step == 3
+
+
+def test_the_scalars_that_tensorboard_compares_first_hold_the_validation_error(hnn_run):
+    names = sorted(tensorboard(hnn_run).Tags()["scalars"])
+    assert "wall_time/training_seconds" in names
+    # The learning rate comes with the first hundred steps only.
+    assert "val/error_mean" in sorted({*names, "train/learning_rate"})[:5]
+
+
+def test_a_training_that_fails_is_among_the_others_without_success(tmp_path):
+    run = tmp_path / "run"
+    with pytest.raises(SystemExit):
+        train(run, "model=mlp", "optimizer.lr=1e30", "trainer.max_epochs=3", NO_FIGURES)
+    settings, success = session(tensorboard(run))
+    assert settings["optimizer.lr"] == 1e30
+    assert not success
+
+
+def test_settings_are_those_of_the_command_line_with_their_resolved_values():
+    config = {
+        "model_name": "lnn",
+        "name": "arm/lnn",
+        "seed": 3,
+        "threads": 1,
+        "dataset": {"name": "arm", "root": "/data"},
+        "loss": {"_target_": "pinn_dyn.training.IncrementLoss"},
+        "data": {"pairs": 8},
+        "optimizer": {"lr": 0.1},
+        "trainer": {"max_epochs": 2, "precision": None},
+        "model": {"hidden": [16, 16], "damping": {"epsilon": 0.0}},
+        "callbacks": {"best": {"filename": "best"}},
+    }
+    usual = {
+        "model": "lnn",
+        "dataset": "arm",
+        "loss": "IncrementLoss",
+        "seed": 3,
+        "data.pairs": 8,
+        "optimizer.lr": 0.1,
+        "trainer.max_epochs": 2,
+    }
+    assert run_settings(config, []) == usual
+    overrides = [
+        "model=lnn",
+        "model/damping=constant",
+        "model.hidden=[16,16]",
+        "++trainer.precision=null",
+        "+debug=fast",
+        "seed=3",
+        "threads=1",
+        "name=arm/lnn",
+        "~callbacks.figures",
+        "callbacks.best.filename=best",
+    ]
+    assert run_settings(config, overrides) == usual | {
+        "model/damping": "constant",
+        "model.hidden": "[16, 16]",
+        "trainer.precision": "null",
+        "debug": "fast",
+    }
+
+
+@pytest.mark.slow  # making the data base takes seconds
+def test_mlflow_keeps_settings_errors_figures_and_the_configuration_offline(tmp_path, monkeypatch):
+    pytest.importorskip("mlflow", reason="needs MLflow (the mlflow extra)")
+    from mlflow import MlflowClient
+
+    monkeypatch.chdir(tmp_path)
+    run = train("run", "logger=mlflow", "model=lnn", "trainer.max_epochs=2").resolve()
+    client = MlflowClient("sqlite:///runs/mlflow/mlflow.db")
+    experiment = client.get_experiment_by_name("soft_arm_1")
+    (found,) = client.search_runs([experiment.experiment_id])
+    assert found.info.status == "FINISHED"
+    assert found.info.run_name == "lnn-seed0"
+    assert found.data.tags["folder"] == str(run)
+    assert found.data.params["data.pairs"] == "64"
+    record = json.loads((run / "metrics.json").read_text())
+    error = record["validation"]["val/error_mean"]
+    assert found.data.metrics["val/error_mean"] == pytest.approx(error)
+    assert len(client.get_metric_history(found.info.run_id, "train/loss")) == 2
+    files = tmp_path / "runs" / "mlflow" / "artifacts" / found.info.run_id / "artifacts"
+    assert (files / "config.yaml").read_text() == (run / "config.yaml").read_text()
+    for name in FIGURES:
+        assert (files / name / "step_0000003.png").read_bytes().startswith(b"\x89PNG")
+    # TensorBoard goes on beside it.
+    assert set(tensorboard(run).Tags()["images"]) == FIGURES
+
+
+def test_a_logger_without_its_package_names_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lightning.pytorch.loggers.mlflow._MLFLOW_AVAILABLE", False)
+    said = refused_text(
+        capsys,
+        "train.py",
+        *TINY,
+        "logger=mlflow",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )
+    assert "pip install 'pinn_dyn[mlflow]'" in said

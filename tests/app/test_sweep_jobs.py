@@ -1,0 +1,273 @@
+"""Sweeps that lose jobs, are interrupted, and go on."""
+
+import json
+import os
+import signal
+import time
+
+import hydra
+import pytest
+import torch
+import yaml
+from omegaconf import OmegaConf
+
+from tests.app.entry import (
+    NO_FIGURES,
+    ROOT,
+    STRIDE,
+    TINY,
+    fails,
+    run_script,
+    start_process,
+)
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch, capsys):
+    """Run a sweep of tiny jobs in this process; returns how it ended and the logs of the jobs."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        words = ["-m", *TINY, NO_FIGURES, "hydra.sweep.dir=sweep", *arguments]
+        try:
+            run_script("train.py", *words)
+        except SystemExit as end:
+            return str(end.code)
+        return None
+
+    return run
+
+
+def job(tmp_path, name):
+    return tmp_path / "sweep" / name
+
+
+def record(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_a_failed_job_does_not_end_the_sweep_and_is_listed_with_its_error(sweep, tmp_path):
+    said = sweep("model=lnn", "data.pairs=64,100000,65")
+    assert "1 job failed:\n  sweep/1_lnn-seed0\n    ConfigError: data: 100000 windows" in said
+    assert "hydra.sweep.dir=sweep" in said
+    error = (job(tmp_path, "1_lnn-seed0") / "error.txt").read_text()
+    assert "Traceback" in error
+    assert not (job(tmp_path, "1_lnn-seed0") / "metrics.json").exists()
+    for name in ("0_lnn-seed0", "2_lnn-seed0"):
+        assert record(job(tmp_path, name))["steps"] == 2
+        assert not (job(tmp_path, name) / "error.txt").exists()
+
+
+def test_the_same_sweep_again_skips_what_is_done_and_runs_the_rest(sweep, tmp_path, monkeypatch):
+    choices = ["model=lnn", "seed=0,1", "trainer.max_epochs=2"]
+    assert sweep(*choices) is None
+    first, second = job(tmp_path, "0_lnn-seed0"), job(tmp_path, "1_lnn-seed1")
+    kept, lost = (path / "metrics.json" for path in (first, second))
+    before, expected = kept.stat().st_mtime_ns, record(second)
+    lost.unlink()  # as if it had been killed between its last checkpoint and its record
+    (first / "error.txt").write_text("of an earlier try\n")
+    # The place of the cache does not make another training.
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "elsewhere"))
+    assert sweep(*choices) is None
+    assert kept.stat().st_mtime_ns == before
+    assert not (first / "error.txt").exists()
+    again = record(second)
+    assert again["steps"] == expected["steps"] == 4
+    assert again["validation"]["val/error_mean"] == expected["validation"]["val/error_mean"]
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_another_configuration_in_the_folder_is_refused_with_the_keys_that_differ(
+    sweep, tmp_path, finished
+):
+    assert sweep("model=lnn", "data.pairs=64") is None
+    folder = job(tmp_path, "0_lnn-seed0")
+    if not finished:
+        (folder / "metrics.json").unlink()
+    before = (folder / "config.yaml").read_text()
+    said = sweep("model=lnn", "data.pairs=96", "optimizer.lr=0.001")
+    assert "sweep/0_lnn-seed0 holds a training of another configuration" in said
+    assert "data.pairs=96 (there 64)" in said
+    assert "optimizer.lr=0.001 (there 0.005)" in said
+    assert (folder / "config.yaml").read_text() == before
+    assert (folder / "metrics.json").exists() == finished
+
+
+def test_a_mistake_that_was_mended_is_no_other_training(sweep, tmp_path):
+    assert "ConfigError" in sweep("model=lnn", "data.pairs=100000")
+    assert sweep("model=lnn", "data.pairs=64") is None
+    config = yaml.safe_load((job(tmp_path, "0_lnn-seed0") / "config.yaml").read_text())
+    assert config["data"]["pairs"] == 64
+
+
+def test_a_folder_in_which_another_process_trains_is_refused(tmp_path, monkeypatch):
+    filelock = pytest.importorskip("filelock")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    with filelock.FileLock(tmp_path / "run" / ".lock"):
+        error = fails("train.py", *TINY, NO_FIGURES, "model=lnn", "hydra.run.dir=run")
+    assert "run is in use: another process trains there" in str(error.code)
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+def test_a_single_training_in_a_named_folder_follows_the_same_rules(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["train.py", *TINY, NO_FIGURES, "model=lnn", "hydra.run.dir=run"]
+    run_script(*words)
+    before = (tmp_path / "run" / "metrics.json").stat().st_mtime_ns
+    run_script(*words)
+    assert (tmp_path / "run" / "metrics.json").stat().st_mtime_ns == before
+    error = fails(*words, "seed=1")
+    assert "seed=1 (there 0)" in str(error.code)
+
+
+def test_a_search_goes_past_diverged_trials_and_asks_for_the_same_ones_again(sweep, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    words = [
+        "search=lnn",
+        "hydra.sweeper.n_trials=4",
+        "hydra.sweeper.sampler.n_startup_trials=2",
+        "optimizer.lr=choice(0.005,1e9)",
+        "trainer.max_epochs=1",
+    ]
+    said = sweep(*words)
+    folders = sorted(path.parent for path in (tmp_path / "sweep").glob("*/.hydra"))
+    assert len(folders) == 4
+    errors = {
+        path: record(path)["validation"] for path in folders if (path / "metrics.json").exists()
+    }
+    assert f"{4 - len(errors)} jobs failed" in said.replace("1 job ", "1 jobs ")
+    assert "NonFiniteLossError" in said
+    found = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
+    best = min(value["val/error_mean"] for value in errors.values())
+    assert found["best_value"] == pytest.approx(best, rel=1e-12)
+    before = [yaml.safe_load((path / "config.yaml").read_text()) for path in folders]
+    sweep(*words)
+    assert [yaml.safe_load((path / "config.yaml").read_text()) for path in folders] == before
+    assert len(list((tmp_path / "sweep").glob("*/.hydra"))) == 4
+
+
+@pytest.mark.parametrize("model", ["acceleration", "hnn", "lnn", "mlp"])
+def test_every_search_space_names_keys_of_its_model(model):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    words = [f"search={model}", f"experiment=soft_arm_1/{model}"]
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(ROOT / "conf")):
+        config = hydra.compose("train", words, return_hydra_config=True)
+        assert config.hydra.runtime.choices.model == model
+        for key in config.hydra.sweeper.params:
+            assert OmegaConf.select(config, key) is not None, key
+
+
+SIDE_BY_SIDE = [
+    "-m",
+    "hydra/launcher=joblib",
+    "hydra.launcher.n_jobs=2",
+    *TINY,
+    NO_FIGURES,
+    "hydra.sweep.dir=sweep",
+]
+
+
+def ended(process, log, seconds=300):
+    try:
+        return process.wait(timeout=seconds), log.read_text()
+    finally:
+        process.kill()
+
+
+@pytest.mark.slow
+def test_jobs_side_by_side_simulate_once_lose_one_and_the_others_are_done(tmp_path, monkeypatch):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "cold"))
+    log = tmp_path / "log.txt"
+    with log.open("w") as output:
+        process = start_process(
+            "train.py",
+            *SIDE_BY_SIDE,
+            "model=lnn",
+            "optimizer.lr=0.005,0.01,1e9",
+            folder=tmp_path,
+            output=output,
+        )
+        code, said = ended(process, log)
+    assert code == 1, said
+    assert "1 job failed:\n  sweep/2_lnn-seed0\n    NonFiniteLossError" in said
+    assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 2
+    # The progress bar of a simulation starts once, whichever job came first.
+    assert said.count("[00:00<?") == 1
+    assert len(list((tmp_path / "cold").glob("*.npz"))) == 1
+
+
+def wait_for(process, condition):
+    while not condition() and process.poll() is None:
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = [
+        *("-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"),
+        *(f"hydra/launcher={launcher}", "trainer.max_epochs=20"),
+    ]
+    first = tmp_path / "sweep" / "0_lnn-seed0"
+    log = tmp_path / "log.txt"
+    with log.open("w") as output:
+        at = dict(folder=tmp_path, output=output)
+        process = start_process("train.py", *words, **at, start_new_session=True)
+        wait_for(process, (first / "checkpoints" / "last.ckpt").exists)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        code, said = ended(process, log)
+        assert code not in (0, None), said
+        assert "the sweep is not finished; go on with: python train.py -m " in said
+        assert not (first / "metrics.json").exists()
+        code, said = ended(start_process("train.py", *words, **at), log)
+    assert code == 0, said
+    assert f"going on with the training in {first}" in (first / "train.log").read_text()
+    for seed in (0, 1):
+        folder = tmp_path / "sweep" / f"{seed}_lnn-seed{seed}"
+        assert record(folder)["steps"] == 40
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
+    words = ["-m", *TINY, NO_FIGURES, "model=lnn,mlp", STRIDE, "data.batches_per_epoch=5"]
+    log = tmp_path / "log.txt"
+    with log.open("w") as output:
+        at = dict(folder=tmp_path, output=output)
+        process = start_process("train.py", *words, "trainer=ddp", "hydra.sweep.dir=ddp", **at)
+        try:
+            run_script("train.py", *words, f"hydra.sweep.dir={tmp_path / 'cpu'}")
+        finally:
+            code, said = ended(process, log)
+    assert code == 0, said
+    for name in ("0_lnn-seed0", "1_mlp-seed0"):
+        alone, together = (tmp_path / trainer / name for trainer in ("cpu", "ddp"))
+        one, two = (
+            torch.load(path / "checkpoints" / "last.ckpt", weights_only=True)
+            for path in (alone, together)
+        )
+        assert record(together)["steps"] == two["global_step"] == one["global_step"] == 5
+        for key, value in one["state_dict"].items():
+            assert torch.allclose(two["state_dict"][key], value, rtol=1e-4, atol=1e-6), key
+        errors = [record(path)["validation"]["val/error_mean"] for path in (alone, together)]
+        assert errors[0] == pytest.approx(errors[1], rel=1e-4)
+        assert len(list((together / "tensorboard").glob("events*"))) == len(
+            list((alone / "tensorboard").glob("events*"))
+        )
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["trainer.devices=2"], ["starts the whole program again", "trainer=ddp"]),
+        (["trainer=ddp", "data.batch_size=31"], ["batch_size is 31", "multiple of the 2"]),
+    ],
+)
+def test_what_goes_wrong_on_several_devices_is_refused(tmp_path, monkeypatch, overrides, words):
+    monkeypatch.chdir(tmp_path)
+    error = fails("train.py", *TINY, NO_FIGURES, "model=lnn", *overrides)
+    for word in words:
+        assert word in str(error.code)
