@@ -1,0 +1,197 @@
+"""The configuration reference, made of conf/ and of the docstrings that its classes have.
+
+    python docs/config_reference.py     writes the page to the terminal
+
+Of each option: the comment at the top of its YAML, and a row for each key with its default and
+what the constructor's docstring and the comment beside the key say about it.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+import griffe
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+PROGRAMS = ("train", "evaluate", "control", "gather")
+
+HEAD = """# Configuration reference
+
+Made from `conf/` and from the docstrings of the classes that it names, when this site is built.
+
+- A **group** is a folder of `conf/`, an **option** a file in it: `model=lnn`,
+  `model/damping=constant`.
+- A **key** is changed by its dotted name: `trainer.max_epochs=40`, `model.mass.hidden=[64,64]`. A
+  key that the YAML does not name needs a plus: `+robot.mass=0.36`.
+- `???` has no default and must be given. `${...}` takes the value of another key.
+- `_target_` is the class that is built, its arguments are the keys beside it; the rest of what its
+  constructor takes (scales of the data, the system) comes from the program.
+- The columns of a data set in the logs are mappings: [CSV logs](csv_logs.md) explains them.
+
+`python train.py --cfg job` prints the configuration that a command line makes, `--help` the groups
+and examples.
+"""
+
+
+def config_reference() -> str:
+    """The whole page, Markdown."""
+    logging.getLogger("griffe").setLevel(logging.CRITICAL)
+    package = griffe.load("pinn_dyn", search_paths=[str(ROOT)])
+    parts = [HEAD, "## Programs"]
+    for name in PROGRAMS:
+        parts.append(_option(package, CONF / f"{name}.yaml", f"{name}.py", "", level=3))
+    for folder in sorted(path for path in CONF.rglob("*") if path.is_dir()):
+        group = folder.relative_to(CONF).as_posix()
+        files = sorted(folder.glob("*.yaml"))
+        if not files or group.startswith("experiment"):
+            continue
+        parts.append(f"## {group}")
+        for file in files:
+            choice = f"{'+' if group == 'debug' else ''}{group}={file.stem}"
+            prefix = f"{group.replace('/', '.')}."
+            parts.append(_option(package, file, choice, prefix, level=3))
+    parts.append("## experiment\n")
+    parts.append("Each is a difference from the defaults, `experiment=<name>`.\n")
+    parts.append("| name | what |\n|---|---|")
+    experiments = sorted((CONF / "experiment").rglob("*.yaml"))
+    rows = [
+        f"| `{path.relative_to(CONF / 'experiment').with_suffix('').as_posix()}` "
+        f"| {_cell(_comment(path.read_text().splitlines()))} |"
+        for path in experiments
+    ]
+    return "\n".join([*parts, *rows]) + "\n"
+
+
+def _option(package, path: Path, title: str, prefix: str, level: int) -> str:
+    """One YAML: its heading, comment and table."""
+    lines = path.read_text().splitlines()
+    if any(line.startswith("# @package _global_") for line in lines):
+        prefix = ""
+    rows = _rows(package, lines, yaml.compose(path.read_text()), prefix)
+    text = f"\n{'#' * level} `{title}`\n\n{_cell(_comment(lines))}\n"
+    if rows:
+        text += "\n| key | default | meaning |\n|---|---|---|\n" + "\n".join(rows) + "\n"
+    return text
+
+
+def _rows(package, lines: list[str], node: yaml.Node, prefix: str) -> list[str]:
+    """A row for each key of a mapping, and of the mappings inside."""
+    target = next((v.value for k, v in node.value if k.value == "_target_"), None)
+    described = _arguments(package, target) if target else {}
+    rows = []
+    if target:
+        rows.append(f"| `{prefix}_target_` | {_linked(package, target)} | |")
+    for key, value in node.value:
+        name = key.value
+        if name in ("_target_", "_partial_") or (not prefix and name == "hydra"):
+            continue
+        if name == "defaults":
+            rows.extend(_defaults(value))
+            continue
+        meaning = [described.get(name, ""), _beside(lines, key, value)]
+        text = _cell(" ".join(part.rstrip(".") + "." for part in meaning if part))
+        if isinstance(value, yaml.MappingNode) and value.value and not value.flow_style:
+            rows.append(f"| **`{prefix}{name}`** | | {text} |")
+            rows.extend(_rows(package, lines, value, f"{prefix}{name}."))
+        elif classes := _classes(package, value):
+            rows.append(f"| `{prefix}{name}` | {', '.join(classes)} | {text} |")
+        else:
+            rows.append(f"| `{prefix}{name}` | {_value(value)} | {text} |")
+    return rows
+
+
+def _defaults(value: yaml.SequenceNode) -> list[str]:
+    """The groups that a defaults list chooses from."""
+    rows = []
+    for item in value.value:
+        if isinstance(item, yaml.MappingNode):
+            ((group, option),) = item.value
+            name = group.value.removeprefix("override ").lstrip("/")
+            shown = "none" if option.value == "null" else f"`{option.value}`"
+            rows.append(f"| `{name}=` | {shown} | group |")
+    return rows
+
+
+def _arguments(package, target: str) -> dict[str, str]:
+    """What the docstring of a class of this package says about each argument."""
+    found = _find(package, target)
+    texts: dict[str, str] = {}
+    if found is None or found.docstring is None:
+        return texts
+    for section in found.docstring.parse("google", warnings=False):
+        if section.kind is griffe.DocstringSectionKind.parameters:
+            for entry in section.value:
+                for name in entry.name.split(", "):
+                    texts[name] = " ".join(entry.description.split()).replace("``", "`")
+    return texts
+
+
+def _find(package, target: str):
+    """The class or function of this package that a target names, or None."""
+    if not target.startswith("pinn_dyn."):
+        return None
+    found = package[target.removeprefix("pinn_dyn.")]
+    return found.final_target if found.is_alias else found
+
+
+def _linked(package, target: str) -> str:
+    name = target.rsplit(".", 1)[-1]
+    return f"`{target}`" if _find(package, target) is None else f"[`{name}`][{target}]"
+
+
+def _classes(package, value: yaml.Node) -> list[str]:
+    """The classes of a list of objects."""
+    if not isinstance(value, yaml.SequenceNode):
+        return []
+    items = [item.value for item in value.value if isinstance(item, yaml.MappingNode)]
+    targets = [v.value for item in items for k, v in item if k.value == "_target_"]
+    return [_linked(package, target) for target in targets]
+
+
+def _value(node: yaml.Node) -> str:
+    if isinstance(node, yaml.ScalarNode):
+        return f"`{node.value}`" if node.value else '`""`'
+    text = node.start_mark.buffer[node.start_mark.index : node.end_mark.index].strip("\0")
+    return "`" + " ".join(text.split()) + "`"
+
+
+def _beside(lines: list[str], key: yaml.Node, value: yaml.Node) -> str:
+    """The comments above a key and at the end of its line."""
+    above = []
+    line = key.start_mark.line - 1
+    while line > 0 and lines[line].lstrip().startswith("#"):
+        above.insert(0, lines[line].lstrip("# "))
+        line -= 1
+    if line == 0 and lines[0].startswith("#"):
+        above = []  # that is the comment of the whole file
+    block = isinstance(value, yaml.CollectionNode) and not value.flow_style
+    end = key.end_mark if block else value.end_mark
+    rest = lines[end.line][end.column :].lstrip(": ") if end.line < len(lines) else ""
+    comment = rest.lstrip("# ") if rest.startswith("#") else ""
+    return " ".join([*above, comment]).strip()
+
+
+def _comment(lines: list[str]) -> str:
+    """The comment at the top of a file."""
+    text = []
+    for line in lines:
+        if not line.startswith("#"):
+            break
+        if "@package" not in line:
+            text.append(line[1:].strip())
+    return " ".join(text)
+
+
+def _cell(text: str) -> str:
+    """Text for a table: what Markdown would read as markup is escaped, but for code."""
+    parts = re.split(r"(`[^`]*`)", text)
+    parts[::2] = [re.sub(r"([*_<\[\]])", r"\\\1", part) for part in parts[::2]]
+    return "".join(parts).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    print(config_reference())

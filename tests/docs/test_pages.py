@@ -1,0 +1,74 @@
+"""What the reference pages name exists, and the configuration reference leaves nothing out."""
+
+import ast
+import importlib.util
+import re
+
+import pytest
+import yaml
+
+from pinn_dyn.app.config import CONF
+from tests.docs.blocks import ROOT
+
+EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
+
+
+def definitions(path):
+    """Names of all functions and classes of a file, methods also as Class.method."""
+    names = set()
+    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{x.name}" for x in node.body if isinstance(x, ast.FunctionDef)}
+    return names
+
+
+def test_the_tests_and_the_code_of_every_equation_exist():
+    tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", EQUATIONS)
+    code = re.findall(r"`([\w.]+)`\s+in\s+`(pinn_dyn/[\w/]+\.py)`", EQUATIONS)
+    assert len(tests) > 30
+    assert len(code) > 25
+    for path, name in [*tests, *((path, name) for name, path in code)]:
+        assert name in definitions(path), f"{path} has no {name}"
+
+
+def test_every_equation_has_its_code_or_its_tests():
+    for section in re.split(r"^### ", EQUATIONS, flags=re.MULTILINE)[1:]:
+        if not section.startswith("(loss_LNN_vanilla)"):  # which says that it has none
+            assert "- Tests: `tests/" in section, section.splitlines()[0]
+
+
+def reference():
+    pytest.importorskip("griffe", reason="the configuration reference is made with the docs extra")
+    path = ROOT / "docs" / "config_reference.py"
+    spec = importlib.util.spec_from_file_location("config_reference", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.config_reference()
+
+
+def test_the_configuration_reference_has_every_option_and_every_key():
+    page = reference()
+    for path in CONF.rglob("*.yaml"):
+        name = path.relative_to(CONF).with_suffix("").as_posix()
+        group, _, option = name.rpartition("/")
+        if name.startswith("experiment/"):
+            assert f"| `{name.removeprefix('experiment/')}` |" in page
+        elif group:
+            assert re.search(rf"### `\+?{group}={option}`\n", page), name
+            values = yaml.safe_load(path.read_text()) or {}
+            section = re.split(rf"### `\+?{group}={option}`\n", page)[1].split("\n### ")[0]
+            for key in values.keys() - {"defaults", "_target_", "_partial_", "hydra"}:
+                assert f"{key}`" in section, f"{name}: {key}"
+
+
+def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments():
+    page = reference()
+    # From the docstring of NetworkCholesky.
+    assert "| `model.mass.hidden` | `[32, 32, 32]` | widths of the hidden layers. |" in page
+    # From the comment beside the key.
+    assert "| `gains.position` | `100.0` | K\\_P. |" in page
+    # From the comment above the key.
+    above = "Control instants per second, with the input held in between;"
+    assert f"| `rate` | `1000.0` | {above}" in page
