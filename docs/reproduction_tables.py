@@ -21,7 +21,7 @@ from reproduce import ENTRIES, Entry, read_entries, recorded, training_seconds  
 
 PAGE = ROOT / "docs" / "reproduction.md"
 FIGURE = ROOT / "docs" / "figures" / "sample_efficiency.png"
-PLACE = re.compile(r"(<!-- table: (\w+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
+PLACE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def filled(page: str) -> str:
@@ -36,7 +36,9 @@ def filled(page: str) -> str:
         "sample_efficiency": sample_efficiency_table(),
         "hardware_used": "\n" + yaml.safe_load(ENTRIES.read_text())["hardware"] + ".\n",
     }
-    return PLACE.sub(lambda match: f"{match[1]}{tables[match[2]]}{match[3]}", page)
+    if missing := tables.keys() - {match[2] for match in PLACE.finditer(page)}:
+        raise ValueError(f"the page has no place for the tables {', '.join(sorted(missing))}")
+    return PLACE.sub(lambda match: f"{match[1]}{tables[match[2]]}\n{match[3]}", page)
 
 
 def entries_of(table: str) -> dict[str, Entry]:
@@ -169,7 +171,10 @@ def draw(path: Path) -> None:
     names = {"pairs": "training pairs", "error_mean": "mean error over 5 s, unseen trajectories"}
     runs = sample_efficiency().rename(columns=names)
     figure = sweep_figure(runs, x=names["pairs"], lines=["model"], y=names["error_mean"])
-    figure.axes[0].set_title("one-segment soft arm, 4,000 training steps each", fontsize="small")
+    (ax,) = figure.axes
+    title = "one-segment soft arm, 4,000 training steps each, seed 0"
+    ax.set_title(title, loc="right", fontsize="small")  # in the place of the other one
+    ax.set_yscale("log")
     save(figure, path)
 
 
