@@ -410,11 +410,14 @@ def test_lines_go_through_the_means_and_axes_that_span_decades_are_logarithmic()
     runs = figure_runs([1, 10, 100], [1.0, 0.5, 0.25])
     ax, lines, dots = drawn(sweep_figure(runs, x="x", lines=["model_name"], y="error"))
     assert lines == {
-        "model_name=lnn": {1: 2.0, 10: 1.0, 100: 0.5},
-        "model_name=mlp": {1: 20.0, 10: 10.0, 100: 5.0},
+        "lnn": {1: 2.0, 10: 1.0, 100: 0.5},
+        "mlp": {1: 20.0, 10: 10.0, 100: 5.0},
     }
     assert dots == len(runs)
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["1", "10", "100"]
+    (legend,) = ax.figure.legends
+    assert legend.get_title().get_text() == "model_name"
 
 
 def test_narrow_ranges_are_drawn_on_linear_axes_and_words_side_by_side():
@@ -425,7 +428,7 @@ def test_narrow_ranges_are_drawn_on_linear_axes_and_words_side_by_side():
     runs = figure_runs(["relu", "elu"], [1.0, 0.5])
     ax, lines, _ = drawn(sweep_figure(runs, x="x", lines=["model_name"], y="error"))
     assert [label.get_text() for label in ax.get_xticklabels()] == ["elu", "relu"]
-    assert lines["model_name=lnn"] == {0: 1.0, 1: 2.0}
+    assert lines["lnn"] == {0: 1.0, 1: 2.0}
 
 
 def test_diverged_runs_are_counted_where_they_cannot_be_drawn():
@@ -433,7 +436,7 @@ def test_diverged_runs_are_counted_where_they_cannot_be_drawn():
     runs.loc[0, "error"] = np.inf
     ax, lines, _ = drawn(sweep_figure(runs, x="x", lines=["model_name"], y="error"))
     assert "1 diverged run is not drawn" in ax.get_title(loc="right")
-    assert lines["model_name=lnn"][1] == 3.0
+    assert lines["lnn"][1] == 3.0
 
 
 def test_lines_that_nobody_could_tell_apart_are_refused():

@@ -93,9 +93,14 @@ def call_many(installed, folder, *commands):
     return call(installed, folder, "-c", MANY, json.dumps(commands)).split("=== command")[1:]
 
 
-def test_the_wheel_holds_every_module_and_every_configuration(wheel):
+def test_the_wheel_holds_every_module_template_and_configuration(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
-    modules = {str(p.relative_to(ROOT)) for p in (ROOT / "pinn_dyn").rglob("*.py")}
+    modules = {
+        str(p.relative_to(ROOT))
+        for kind in ("*.py", "*.html")
+        for p in (ROOT / "pinn_dyn").rglob(kind)
+    }
+    assert any(name.endswith(".html") for name in modules)
     configurations = {f"pinn_dyn/{p.relative_to(ROOT)}" for p in (ROOT / "conf").rglob("*.yaml")}
     assert len(configurations) > 50
     assert {name for name in inside if ".dist-info/" not in name} == modules | configurations
