@@ -107,11 +107,11 @@ def build_learner(
         validator=validator,
         config=config,
         statistics=statistics,
-        compile=_compiles(config),
+        compile=compiles(config),
     )
 
 
-def _compiles(config: dict[str, Any]) -> bool:
+def compiles(config: dict[str, Any]) -> bool:
     """Whether to compile the dynamics: as told, or with ``auto`` where it pays.
 
     Raises:

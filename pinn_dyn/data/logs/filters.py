@@ -159,7 +159,34 @@ class Butterworth(Step):
 
 
 @dataclass(frozen=True)
-class SavitzkyGolayVelocity(Step):
+class _SavitzkyGolaySlope(Step):
+    """What needs the slope of a polynomial through ``window`` samples around each sample."""
+
+    window: int = 11
+    order: int = 3
+
+    def __post_init__(self) -> None:
+        if self.window % 2 == 0 or not 1 <= self.order < self.window:
+            raise LogError(
+                f"{type(self).__name__}: window is {self.window} and order {self.order}, expected "
+                "an odd window and an order from 1 to below the window"
+            )
+
+    def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, float]:
+        """The slope of each column of ``values``, and the length of a window in s."""
+        name = type(self).__name__
+        step = sample_time(recording, name)
+        if len(recording) < self.window:
+            raise LogError(
+                f"{recording.place}: {len(recording)} samples are too few for {name}, expected at "
+                f"least {self.window}"
+            )
+        slope = savgol_filter(values, self.window, self.order, deriv=1, delta=step, axis=0)
+        return slope, self.window * step
+
+
+@dataclass(frozen=True)
+class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
     """Velocity as the slope of a polynomial through ``window`` samples of q around each sample.
 
     Within half a window of an end the polynomial of the outermost full window is used.
@@ -169,34 +196,18 @@ class SavitzkyGolayVelocity(Step):
         order: order of the polynomial.
     """
 
-    window: int = 11
-    order: int = 3
-
-    def __post_init__(self) -> None:
-        if self.window % 2 == 0 or not 1 <= self.order < self.window:
-            raise LogError(
-                f"SavitzkyGolayVelocity: window is {self.window} and order {self.order}, expected "
-                "an odd window and an order from 1 to below the window"
-            )
-
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        step = sample_time(recording, "SavitzkyGolayVelocity")
         if recording.v is not None:
             raise LogError(
                 f"{recording.run}: the log has a velocity already, expected none: leave out "
                 "SavitzkyGolayVelocity, or v"
             )
-        if len(recording) < self.window:
-            raise LogError(
-                f"{recording.place}: {len(recording)} samples are too few for "
-                f"SavitzkyGolayVelocity, expected at least {self.window}"
-            )
-        v = savgol_filter(recording.q, self.window, self.order, deriv=1, delta=step, axis=0)
-        return [replace(recording, v=v)], f"v from q in windows of {self.window * step:.3g} s"
+        v, length = self._slope(recording, recording.q)
+        return [replace(recording, v=v)], f"v from q in windows of {length:.3g} s"
 
 
 @dataclass(frozen=True)
-class InputRates(Step):
+class InputRates(_SavitzkyGolaySlope):
     """The rates of the inputs as further inputs: u becomes (u, du/dt), 2 M columns.
 
     For inputs that are positions, such as motor angles of tendons. A tendon that pulls like a
@@ -210,25 +221,9 @@ class InputRates(Step):
         order: order of the polynomial.
     """
 
-    window: int = 11
-    order: int = 3
-
-    def __post_init__(self) -> None:
-        if self.window % 2 == 0 or not 1 <= self.order < self.window:
-            raise LogError(
-                f"InputRates: window is {self.window} and order {self.order}, expected an odd "
-                "window and an order from 1 to below the window"
-            )
-
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        step = sample_time(recording, "InputRates")
-        if len(recording) < self.window:
-            raise LogError(
-                f"{recording.place}: {len(recording)} samples are too few for InputRates, "
-                f"expected at least {self.window}"
-            )
-        rates = savgol_filter(recording.u, self.window, self.order, deriv=1, delta=step, axis=0)
-        text = f"du/dt, in windows of {self.window * step:.3g} s, follows u"
+        rates, length = self._slope(recording, recording.u)
+        text = f"du/dt, in windows of {length:.3g} s, follows u"
         return [replace(recording, u=np.hstack([recording.u, rates]))], text
 
     def input_labels(self, labels: list[str]) -> list[str]:

@@ -1,0 +1,54 @@
+"""When a training compiles its dynamics."""
+
+import pytest
+
+from pinn_dyn.app import build
+from pinn_dyn.app.config import ConfigError
+
+
+@pytest.fixture
+def compiler(monkeypatch):
+    """Says whether this machine has a C++ compiler."""
+
+    def set_compiler(there):
+        monkeypatch.setattr(build, "has_cpp_compiler", lambda: there)
+
+    set_compiler(True)
+    return set_compiler
+
+
+def config(choice, steps=build.STEPS_TO_COMPILE, accelerator="cpu"):
+    return {
+        "compile": choice,
+        "trainer": {"max_epochs": 2, "accelerator": accelerator},
+        "data": {"batches_per_epoch": steps / 2},
+    }
+
+
+@pytest.mark.parametrize("choice", [True, False])
+@pytest.mark.parametrize("steps", [2, build.STEPS_TO_COMPILE])
+def test_a_choice_holds_for_any_length(compiler, choice, steps):
+    assert build.compiles(config(choice, steps)) is choice
+
+
+def test_auto_compiles_long_trainings_alone(compiler):
+    assert build.compiles(config("auto", build.STEPS_TO_COMPILE))
+    assert not build.compiles(config("auto", build.STEPS_TO_COMPILE - 2))
+
+
+def test_auto_compiles_on_a_cpu_with_a_compiler_alone(compiler):
+    assert not build.compiles(config("auto", accelerator="gpu"))
+    compiler(False)
+    assert not build.compiles(config("auto"))
+
+
+def test_true_without_a_compiler_says_what_to_install(compiler):
+    compiler(False)
+    with pytest.raises(ConfigError, match=r"no C\+\+ compiler.*install one, or set compile=false"):
+        build.compiles(config(True))
+
+
+@pytest.mark.parametrize("choice", ["yes", 1, None])
+def test_another_choice_is_refused(compiler, choice):
+    with pytest.raises(ConfigError, match="expected true, false or auto"):
+        build.compiles(config(choice))
