@@ -28,8 +28,8 @@ demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, comp
 reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on where it stopped
 	$(BIN)/python reproduce.py
 
-test: $(VENV)/.installed-dev  ## run the tests
-	$(BIN)/python -m pytest
+test: $(VENV)/.installed-dev  ## run the tests, on all cores
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean kernels
 	$(BIN)/python -m pytest tests/notebooks
