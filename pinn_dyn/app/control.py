@@ -72,6 +72,11 @@ def control(cfg: DictConfig) -> float:
             f"run: {run.folder} holds a black box ({run.config['model_name']}), which has no terms "
             "M, G and A for a control law: give a run of model=lnn or model=hnn"
         )
+    if not model.input_affine:
+        raise ConfigError(
+            f"run: {run.folder} has a force that is not linear in the input (model/input=nonlinear)"
+            ", and the control laws invert A(q): train with model/input=network"
+        )
     learned = double_copy(model)
     source = build_source(run.config)
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}

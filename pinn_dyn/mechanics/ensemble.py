@@ -111,25 +111,24 @@ class Ensemble(Predictor):
 class _Template(nn.Module):
     """One model whose parameters have a leading dimension E; buffers are shared by all members."""
 
-    def __init__(self, members: Sequence[Predictor], method: str):
+    def __init__(self, members: Sequence[Predictor]):
         super().__init__()
-        self.method = method
         self.model = copy.deepcopy(members[0])
         for name, _ in members[0].named_parameters():
             values = torch.stack([item.get_parameter(name).detach() for item in members])
             self._set(self.model, name, values)
 
-    def forward(self, x: Tensor, **arguments: Any) -> Tensor:
-        """The method of the model, with a member's parameters in the place of the stacked ones."""
-        return getattr(self.model, self.method)(x, **arguments)
+    def forward(self, method: str, **arguments: Any) -> Tensor:
+        """A method of the model, with a member's parameters in the place of the stacked ones."""
+        return getattr(self.model, method)(**arguments)
 
-    def mapped(self, x: Tensor, u: Tensor, **shared: Any) -> Tensor:
-        """The method for all members; x and u have a leading dimension E, other arguments not."""
+    def mapped(self, method: str, stacked: dict[str, Tensor], **shared: Any) -> Tensor:
+        """The method for all members; ``stacked`` arguments have a leading dimension E."""
 
-        def one(parameters: dict[str, Tensor], x: Tensor, u: Tensor) -> Tensor:
-            return functional_call(self, parameters, (x,), {"u": u, **shared})
+        def one(parameters: dict[str, Tensor], own: dict[str, Tensor]) -> Tensor:
+            return functional_call(self, parameters, (method,), {**own, **shared})
 
-        return vmap(one)(dict(self.named_parameters()), x, u)
+        return vmap(one)(dict(self.named_parameters()), stacked)
 
     def taken_apart(self, index: int) -> Predictor:
         """One member."""
@@ -154,12 +153,16 @@ class ContinuousStack(ContinuousPredictor):
         first = members[0]
         assert isinstance(first, ContinuousPredictor)
         super().__init__(first.num_coordinates, first.num_inputs, first.coordinates)
-        self.substeps = first.substeps
-        self.template = _Template(members, "state_derivative")
+        self.integrator, self.substeps = first.integrator, first.substeps
+        self.template = _Template(members)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """dx/dt of every member, ``(E, *batch, 2N)``."""
-        return self.template.mapped(x, u)
+        return self.template.mapped("state_derivative", {"x": x, "u": u})
+
+    def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
+        """k of every member, ``(E, *batch, 2N)``."""
+        return self.template.mapped("implicit_rate", {"x": x, "rate": rate}, step=step)
 
 
 class DiscreteStack(Predictor):
@@ -168,7 +171,7 @@ class DiscreteStack(Predictor):
     def __init__(self, members: Sequence[Predictor]):
         first = members[0]
         super().__init__(first.num_coordinates, first.num_inputs, first.coordinates)
-        self.template = _Template(members, "increments")
+        self.template = _Template(members)
 
     def increments(
         self,
@@ -180,4 +183,5 @@ class DiscreteStack(Predictor):
         interpolation: Interpolation = "linear",
     ) -> Tensor:
         """Increments of every member, ``(E, *batch, T, 2N)``."""
-        return self.template.mapped(x0, u, t=t, t_input=t_input, interpolation=interpolation)
+        settings = {"t": t, "t_input": t_input, "interpolation": interpolation}
+        return self.template.mapped("increments", {"x0": x0, "u": u}, **settings)

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
 from pinn_dyn.mechanics.arrays import require_finite
-from pinn_dyn.mechanics.compiled_steps import compiled_rk4
+from pinn_dyn.mechanics.steps import Derivative, Scheme, compiled_scheme, rk4, take_steps
 from pinn_dyn.mechanics.trajectory import Interpolation
-
-Derivative = Callable[[Tensor, Tensor], Tensor]
-"""Maps a state ``(*batch, S)`` and an input ``(*batch, M)`` to dx/dt ``(*batch, S)``."""
 
 
 class SampledInput:
@@ -59,6 +55,7 @@ def rollout_increments(
     t_input: Tensor | None = None,
     interpolation: Interpolation = "linear",
     substeps: int = 1,
+    scheme: Scheme | None = None,
     compile: bool = False,
 ) -> Tensor:
     """Integrate dx/dt = f(x, u(t)) and return the increments x(t_k) - x(t_0).
@@ -78,6 +75,7 @@ def rollout_increments(
         t_input: times of the input samples, ``(K,)``, s; ``t`` if None.
         interpolation: how u moves between its samples.
         substeps: steps of the integrator between two times of ``t``.
+        scheme: another method, with f in it, in the place of RK4.
         compile: take each step by one compiled function, without gradients; pays for long
             roll-outs.
 
@@ -122,7 +120,9 @@ def rollout_increments(
     # One dtype throughout, so that the solver's times and the input's times compare exactly.
     t_samples, u, grid = t_samples.to(x0.dtype), u.to(x0.dtype), grid.to(x0.dtype)
     if compile:
-        increments = compiled_rk4(derivative, x0, grid, t_samples, u, interpolation)
+        scheme = compiled_scheme(scheme or rk4(derivative), x0, u)
+    if scheme is not None:
+        increments = take_steps(scheme, x0, grid, t_samples, u, interpolation)
         return increments[::substeps].movedim(0, -2)
     signal = SampledInput(t_samples, u, interpolation)
     solution = odeint(

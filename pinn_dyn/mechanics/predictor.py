@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar, final
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import require_last_dim
 from pinn_dyn.mechanics.integration import rollout_increments
+from pinn_dyn.mechanics.steps import Integrator, Scheme, rosenbrock
 from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation
 
 
@@ -72,27 +74,45 @@ class ContinuousPredictor(Predictor):
     """A predictor given by a state derivative dx/dt = f(x, u), integrated by RK4.
 
     Attributes:
-        substeps: RK4 steps within a step of the data. One is enough while the data resolve the
-            fastest motion; data of a low rate need more.
+        integrator: ``"rk4"``, or ``"rosenbrock"`` for motions so damped that RK4 would need many
+            substeps (:func:`pinn_dyn.mechanics.steps.rosenbrock`).
+        substeps: steps of the integrator within a step of the data. One is enough while the data
+            resolve the fastest motion; data of a low rate need more.
         compiled_rollouts: take the steps of roll-outs without gradients by a compiled function;
             pays for long ones, as compiling takes some 20 s.
     """
 
+    integrator: Integrator = "rk4"
     substeps: int = 1
     compiled_rollouts: bool = False
-    _compiled: Callable[[Tensor, Tensor], Tensor] | None = None
+    _compiled: Callable[..., Tensor] | None = None
 
     @abc.abstractmethod
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """dx/dt, ``(*batch, 2N)``, of the state x ``(*batch, 2N)`` under u ``(*batch, M)``."""
 
+    def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
+        """k with (1 - s J) k = r, ``(*batch, 2N)``, s the ``step`` and J what is stiff of df/dx.
+
+        Here J = 0: nothing is.
+        """
+        return rate
+
     def compile_derivative(self) -> None:
         """Use a compiled state derivative while the model is in training mode.
 
-        Only the derivative is compiled, not the unrolled integrator: that keeps compilation
-        short. Validation and test run eagerly, as their batch shapes vary.
+        Only the derivative is compiled, or a step of the Rosenbrock method, not the unrolled
+        integrator: that keeps compilation short. Validation and test run eagerly, as their batch
+        shapes vary.
         """
-        self._compiled = torch.compile(self.state_derivative)
+        scheme = self._scheme()
+        self._compiled = torch.compile(scheme.step if scheme else self.state_derivative)
+
+    def _scheme(self) -> Scheme | None:
+        """The method of integration, None for torchdiffeq's RK4."""
+        if self.integrator == "rk4":
+            return None
+        return rosenbrock(self.state_derivative, self.implicit_rate)
 
     def __getstate__(self) -> dict[str, object]:
         # A compiled function belongs to this object: copies and pickles go without it.
@@ -108,16 +128,20 @@ class ContinuousPredictor(Predictor):
         t_input: Tensor | None = None,
         interpolation: Interpolation = "linear",
     ) -> Tensor:
-        """Integrate the state derivative, ``substeps`` RK4 steps per interval of ``t``."""
+        """Integrate the state derivative, ``substeps`` steps per interval of ``t``."""
         compiled = self._compiled if self.training else None
+        scheme = self._scheme()
+        if scheme is not None and compiled is not None:
+            scheme = replace(scheme, step=compiled)
         return rollout_increments(
-            compiled or self.state_derivative,
+            compiled if compiled is not None and scheme is None else self.state_derivative,
             x0,
             t,
             u,
             t_input=t_input,
             interpolation=interpolation,
             substeps=self.substeps,
+            scheme=scheme,
             compile=self.compiled_rollouts and not torch.is_grad_enabled(),
         )
 

@@ -43,9 +43,15 @@ class MechanicalSystem(ContinuousPredictor):
     ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
     force ``(*batch, N)``; SI units and radians.
 
+    A robot that is moved by the positions of its motors may have a force that is not linear in
+    them; then A depends on u, ``input_affine`` is false, and :meth:`input_matrix` is A at some
+    typical input.
+
     A subclass gives the four abstract terms. The ``_``-methods below derive everything else by
     automatic differentiation; a subclass that knows closed formulas may override those.
     """
+
+    input_affine: bool = True
 
     def __init__(
         self, num_coordinates: int, num_inputs: int, coordinates: Coordinates = "velocity"
@@ -85,6 +91,9 @@ class MechanicalSystem(ContinuousPredictor):
 
     def _friction_force(self, v: Tensor) -> Tensor:
         return torch.zeros_like(v)
+
+    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+        return matvec(self.input_matrix(q), u)
 
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """(dH/dq, dH/dp): dH/dp = M^-1 p = v and dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v."""
@@ -150,7 +159,7 @@ class MechanicalSystem(ContinuousPredictor):
     def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """a = M^-1 (A u - C v - G - D v), ``(*batch, N)``; paper eq. (armdynamics)."""
         self._check(q=q, v=v, u=u)
-        force = matvec(self.input_matrix(q), u) - self.dissipative_force(q, v)
+        force = self._input_force(q, u) - self.dissipative_force(q, v)
         return self._acceleration(q, v, force)
 
     @final
@@ -186,7 +195,7 @@ class MechanicalSystem(ContinuousPredictor):
     def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """dE/dt = v^T A u - v^T (D v + F), ``(*batch,)``, W: what enters less what is lost."""
         self._check(q=q, v=v, u=u)
-        supplied = matvec(self.input_matrix(q), u) - self.dissipative_force(q, v)
+        supplied = self._input_force(q, u) - self.dissipative_force(q, v)
         return (v * supplied).sum(-1)
 
     @final
@@ -201,7 +210,7 @@ class MechanicalSystem(ContinuousPredictor):
         q, p = x.chunk(2, dim=-1)
         self._check(q=q, p=p, u=u)
         grad_q, v = self._hamiltonian_gradient(q, p)
-        force = matvec(self.input_matrix(q), u) - self.dissipative_force(q, v)
+        force = self._input_force(q, u) - self.dissipative_force(q, v)
         return torch.cat([v, force - grad_q], dim=-1)
 
     @final
@@ -210,6 +219,26 @@ class MechanicalSystem(ContinuousPredictor):
         if self.coordinates == "momentum":
             return self.momentum_derivative(x, u)
         return self.velocity_derivative(x, u)
+
+    @final
+    def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
+        """k with (1 - s J) k = r, where J holds the damping, the stiff part of the motion::
+
+            (q, v):  J = [[0, 1], [0, -M^-1 D]]        (q, p):  J = [[0, M^-1], [0, -D M^-1]]
+
+        With r = (r_q, r_v) or (r_q, r_p) and E = (M + s D)^-1 that is k_v = E M r_v and
+        k_q = r_q + s k_v, or k_p = M E r_p and k_q = r_q + s E r_p.
+        """
+        q = x[..., : self.num_coordinates]
+        rate_q, rate = rate.chunk(2, dim=-1)
+        mass = self.mass_matrix(q)
+        whole = mass + step * self.damping_matrix(q)
+        if self.coordinates == "velocity":
+            velocity = rate = spd_solve(whole, matvec(mass, rate))
+        else:
+            velocity = spd_solve(whole, rate)
+            rate = matvec(mass, velocity)
+        return torch.cat([rate_q + step * velocity, rate], dim=-1)
 
     def _check(self, **values: Tensor) -> None:
         for name, value in values.items():

@@ -9,7 +9,13 @@ from pinn_dyn.models.cholesky import (
 )
 from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
-from pinn_dyn.models.input_matrix import ConstantInput, FixedInput, InputMatrix, NetworkInput
+from pinn_dyn.models.input_matrix import (
+    ConstantInput,
+    FixedInput,
+    InputMatrix,
+    NetworkInput,
+    NonlinearInput,
+)
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.potential import NetworkPotential
@@ -33,5 +39,6 @@ __all__ = [
     "NetworkPotential",
     "NextStateMLP",
     "NoFriction",
+    "NonlinearInput",
     "Statistics",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -77,9 +78,12 @@ class NetworkCholesky(CholeskyFactor):
         epsilon: smallest diagonal entry in units of the scale; 0 allows a semi-definite matrix.
         bound: b above, or None.
         transposed: use L for L^T L.
+        initial: what epsilon is added to before training; below 1 in the mass matrix of a robot
+            that moves almost without inertia. With a bound b it is 0.63 b.
 
     Raises:
-        ValueError: on an unknown diagonal, a negative epsilon or a bound that is not positive.
+        ValueError: on an unknown diagonal, a negative epsilon, a bound or a start that is not
+            positive, or both of these.
     """
 
     placement: Tensor
@@ -98,6 +102,7 @@ class NetworkCholesky(CholeskyFactor):
         epsilon: float = 1e-3,
         bound: float | None = None,
         transposed: bool = False,
+        initial: float = 1.0,
     ):
         super().__init__()
         if diagonal not in ("softplus", "relu"):
@@ -106,6 +111,12 @@ class NetworkCholesky(CholeskyFactor):
             raise ValueError(f"epsilon is {epsilon}, expected zero or a positive number")
         if bound is not None and not bound > 0:
             raise ValueError(f"bound is {bound}, expected a positive number or none")
+        if bound is not None and initial != 1.0:
+            raise ValueError(
+                f"initial is {initial} and bound {bound}, expected one of them: with a bound b the "
+                "diagonal starts at 0.63 b"
+            )
+        _check_initial(initial)
         self.size = size
         self.diagonal = diagonal
         self.epsilon = epsilon
@@ -117,7 +128,7 @@ class NetworkCholesky(CholeskyFactor):
             # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
-            last.bias[:size] = 0.54 if diagonal == "softplus" else 1.0
+            last.bias[:size] = _softplus_inverse(initial) if diagonal == "softplus" else initial
         # vec(L) = y S, where S holds the scales and says which entry of y goes where.
         row, column = torch.tril_indices(size, size, offset=-1)
         order = torch.cat([torch.arange(size) * (size + 1), row * size + column])
@@ -190,6 +201,15 @@ def _matrices(square: Tensor, like: Tensor) -> Tensor:
     return rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
 
 
+def _check_initial(initial: float) -> None:
+    if not initial > 0:
+        raise ValueError(f"initial is {initial}, expected a positive number")
+
+
+def _softplus_inverse(value: float) -> float:
+    return math.log(math.expm1(value))
+
+
 class _ConstantFactor(CholeskyFactor):
     """An L that is the same at every q."""
 
@@ -211,6 +231,10 @@ class ConstantCholesky(_ConstantFactor):
         scale: typical size of the rows of L, ``(N,)``; from the data.
         mean, std, angles: not used by a constant; every head takes the same arguments.
         epsilon: smallest diagonal entry in units of the scale.
+        initial: what epsilon is added to before training.
+
+    Raises:
+        ValueError: on a start that is not positive.
     """
 
     scale: Tensor
@@ -224,10 +248,12 @@ class ConstantCholesky(_ConstantFactor):
         std: Tensor,
         angles: Sequence[int] = (),
         epsilon: float = 1e-3,
+        initial: float = 1.0,
     ):
         super().__init__()
+        _check_initial(initial)
         self.epsilon = epsilon
-        self.raw_diagonal = nn.Parameter(torch.full((size,), 0.54))
+        self.raw_diagonal = nn.Parameter(torch.full((size,), _softplus_inverse(initial)))
         self.lower = nn.Parameter(torch.zeros(size, size))
         self.register_buffer("scale", scale.float())
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Coordinates
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
@@ -44,7 +45,8 @@ class HamiltonianNetwork(StructuredNetwork):
         statistics: scales of the data.
         inverse_mass, potential, damping, input, friction: builders of the heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
-        substeps: RK4 steps within a step of the data.
+        substeps: steps of the integrator within a step of the data.
+        integrator: "rk4", or "rosenbrock" where damping outweighs inertia.
         coordinates: the state, (q, p) or (q, v); (q, p) needs data with momenta.
 
     Raises:
@@ -61,12 +63,21 @@ class HamiltonianNetwork(StructuredNetwork):
         friction: FrictionHead = NoFriction,
         angles: Sequence[int] = (),
         substeps: int = 1,
+        integrator: Integrator = "rk4",
         coordinates: Coordinates = "momentum",
     ):
         if coordinates not in ("momentum", "velocity"):
             raise ValueError(f"coordinates is {coordinates!r}, expected 'momentum' or 'velocity'")
         super().__init__(
-            statistics, coordinates, potential, damping, friction, input, angles, substeps
+            statistics,
+            coordinates,
+            potential,
+            damping,
+            friction,
+            input,
+            angles,
+            substeps,
+            integrator,
         )
         size = self.num_coordinates
         if coordinates == "momentum":

@@ -1,4 +1,4 @@
-"""Heads for the input matrix, learned or fixed."""
+"""Heads for the input matrix: learned or fixed, or one that depends on the input."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.mlp import MLP
 
 
@@ -17,7 +18,12 @@ class InputMatrix(nn.Module, abc.ABC):
     Args:
         size: N.
         inputs: M.
+
+    Attributes:
+        affine: whether the force is A(q) u, with an A that does not depend on u.
     """
+
+    affine: bool = True
 
     def __init__(self, size: int, inputs: int):
         super().__init__()
@@ -26,6 +32,10 @@ class InputMatrix(nn.Module, abc.ABC):
     @abc.abstractmethod
     def forward(self, q: Tensor) -> Tensor:
         """A(q), ``(*batch, N, M)``."""
+
+    def force(self, q: Tensor, u: Tensor) -> Tensor:
+        """The generalized force A(q) u, ``(*batch, N)``."""
+        return matvec(self(q), u)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
         """Root mean square of each generalized force, ``(N,)``, before anything is learned.
@@ -44,6 +54,7 @@ class NetworkInput(InputMatrix):
         scale: typical size of the entries of each column, ``(M,)``; from the data.
         mean, std: normalization of q, ``(N,)``; from the data.
         angles: which coordinates are angles, and enter the network as sine and cosine.
+        u_mean, u_std: not used; every input head takes the same arguments.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         bound: largest entry in units of the scale (scaled sigmoid), or None for no bound.
@@ -63,6 +74,8 @@ class NetworkInput(InputMatrix):
         mean: Tensor,
         std: Tensor,
         angles: Sequence[int] = (),
+        u_mean: Tensor | None = None,
+        u_std: Tensor | None = None,
         hidden: Sequence[int],
         activation: str = "softplus",
         bound: float | None = None,
@@ -82,6 +95,62 @@ class NetworkInput(InputMatrix):
         return self.scale * y
 
 
+class NonlinearInput(InputMatrix):
+    """tau = A(q, u) u with A(q, u) = scale_i * network(q, u), reshaped to N x M.
+
+    For inputs that are positions, not forces: a tendon that its motor tightens gets stiffer and
+    pulls in another direction. With the motors' rates among the inputs (the step
+    :class:`pinn_dyn.data.logs.InputRates`) the force on the robot is that of springs and dampers
+    between motors and body, none of them linear. The controllers need an A(q) and refuse it.
+
+    Args:
+        size: N.
+        inputs: M.
+        scale: typical size of the entries of each column, ``(M,)``; from the data.
+        mean, std: normalization of q, ``(N,)``; from the data.
+        angles: which coordinates are angles, and enter the network as sine and cosine.
+        u_mean, u_std: normalization of u, ``(M,)``; from the data.
+        hidden: widths of the hidden layers.
+        activation: activation of the hidden layers.
+    """
+
+    affine = False
+    scale: Tensor
+    u_mean: Tensor
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        inputs: int,
+        scale: Tensor,
+        mean: Tensor,
+        std: Tensor,
+        angles: Sequence[int] = (),
+        u_mean: Tensor,
+        u_std: Tensor,
+        hidden: Sequence[int],
+        activation: str = "softplus",
+    ):
+        super().__init__(size, inputs)
+        mean, std = torch.cat([mean, u_mean]), torch.cat([std, u_std])
+        self.network = MLP(size + inputs, size * inputs, hidden, activation, mean, std, angles)
+        self.register_buffer("scale", scale.float())
+        self.register_buffer("u_mean", u_mean.float())
+
+    def forward(self, q: Tensor) -> Tensor:
+        """A(q, u) at the mean input, ``(*batch, N, M)``."""
+        return self._matrix(q, self.u_mean.expand(*q.shape[:-1], -1))
+
+    def force(self, q: Tensor, u: Tensor) -> Tensor:
+        """tau = A(q, u) u, ``(*batch, N)``."""
+        return matvec(self._matrix(q, u), u)
+
+    def _matrix(self, q: Tensor, u: Tensor) -> Tensor:
+        y = self.network.linearize(torch.cat([q, u], dim=-1))[0]
+        return self.scale * y.unflatten(-1, self.shape)
+
+
 class ConstantInput(InputMatrix):
     """A = scale * parameters, the same at every q.
 
@@ -89,7 +158,8 @@ class ConstantInput(InputMatrix):
         size: N.
         inputs: M.
         scale: typical size of the entries of each column, ``(M,)``; from the data.
-        mean, std, angles: not used by a constant; every head takes the same arguments.
+        mean, std, angles, u_mean, u_std: not used by a constant; every input head takes the same
+            arguments.
     """
 
     scale: Tensor
@@ -103,6 +173,8 @@ class ConstantInput(InputMatrix):
         mean: Tensor,
         std: Tensor,
         angles: Sequence[int] = (),
+        u_mean: Tensor | None = None,
+        u_std: Tensor | None = None,
     ):
         super().__init__(size, inputs)
         self.raw = nn.Parameter(torch.eye(size, inputs))
@@ -120,7 +192,8 @@ class FixedInput(InputMatrix):
     Args:
         size: N.
         inputs: M.
-        scale, mean, std, angles: not used; every head takes the same arguments from the model.
+        scale, mean, std, angles, u_mean, u_std: not used; every input head takes the same arguments
+            from the model.
         value: the matrix, ``(N, M)``; the identity if None, which needs N = M.
 
     Raises:
@@ -138,6 +211,8 @@ class FixedInput(InputMatrix):
         mean: Tensor,
         std: Tensor,
         angles: Sequence[int] = (),
+        u_mean: Tensor | None = None,
+        u_std: Tensor | None = None,
         value: Sequence[Sequence[float]] | None = None,
     ):
         super().__init__(size, inputs)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.statistics import Statistics
@@ -37,7 +38,8 @@ class LagrangianNetwork(StructuredNetwork):
         statistics: scales of the data.
         mass, potential, damping, input, friction: builders of the heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
-        substeps: RK4 steps within a step of the data.
+        substeps: steps of the integrator within a step of the data.
+        integrator: "rk4", or "rosenbrock" where damping outweighs inertia.
     """
 
     def __init__(
@@ -50,9 +52,18 @@ class LagrangianNetwork(StructuredNetwork):
         friction: FrictionHead = NoFriction,
         angles: Sequence[int] = (),
         substeps: int = 1,
+        integrator: Integrator = "rk4",
     ):
         super().__init__(
-            statistics, "velocity", potential, damping, friction, input, angles, substeps
+            statistics,
+            "velocity",
+            potential,
+            damping,
+            friction,
+            input,
+            angles,
+            substeps,
+            integrator,
         )
         size = self.num_coordinates
         acceleration = statistics.velocity_increment_std[0, size:] / statistics.step

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import get_args
 
 import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Coordinates, MechanicalSystem
+from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
@@ -19,7 +21,8 @@ CholeskyHead = Callable[..., CholeskyFactor]
 PotentialHead = Callable[..., NetworkPotential]
 """Builds a potential head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
 InputHead = Callable[..., InputMatrix]
-"""Builds an input head from ``size``, ``inputs``, ``scale``, ``mean``, ``std`` and ``angles``."""
+"""Builds an input head from ``size``, ``inputs``, ``scale``, ``mean``, ``std``, ``angles``,
+``u_mean`` and ``u_std``."""
 FrictionHead = Callable[..., Friction]
 """Builds a friction head from ``size``, ``force`` and ``v_std``."""
 
@@ -42,9 +45,15 @@ class StructuredNetwork(MechanicalSystem):
         input: InputHead,
         angles: Sequence[int],
         substeps: int,
+        integrator: Integrator,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, coordinates)
+        if integrator not in get_args(Integrator):
+            raise ValueError(
+                f"integrator is {integrator!r}, expected one of {', '.join(get_args(Integrator))}"
+            )
+        self.integrator: Integrator = integrator
         self.substeps = substeps
         self.angles = tuple(angles)
         mean, std, u_rms = statistics.q_mean, statistics.q_std, statistics.u_rms
@@ -55,7 +64,10 @@ class StructuredNetwork(MechanicalSystem):
             mean=mean,
             std=std,
             angles=angles,
+            u_mean=statistics.u_mean,
+            u_std=statistics.u_std,
         )
+        self.input_affine = self.input.affine
         force = self.input.typical_force(u_rms)
         self.potential = potential(
             size=size,
@@ -83,6 +95,9 @@ class StructuredNetwork(MechanicalSystem):
 
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)
+
+    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+        return self.input.force(q, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.potential.gradient(q)

@@ -53,7 +53,7 @@ class ImpulseLoss(WindowLoss):
 
     Raises:
         TypeError: if the model has no mass matrix, as a black box.
-        ValueError: if the windows have an odd number of steps.
+        ValueError: if the windows have an odd number of steps, or the force is not linear in u.
     """
 
     scale: Tensor
@@ -64,6 +64,11 @@ class ImpulseLoss(WindowLoss):
             raise TypeError(
                 f"model is a {type(model).__name__}, expected a mechanical system with a mass "
                 "matrix, such as model=lnn: use loss=increment for a black box"
+            )
+        if not model.input_affine:
+            raise ValueError(
+                "the force is not linear in the input (model/input=nonlinear), and its impulse "
+                "needs A(q) u: take loss=increment"
             )
         steps = statistics.velocity_increment_std.shape[0]
         if steps % 2:

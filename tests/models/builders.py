@@ -18,6 +18,7 @@ from pinn_dyn.models import (
     NetworkPotential,
     NextStateMLP,
     NoFriction,
+    NonlinearInput,
     Statistics,
 )
 
@@ -76,6 +77,7 @@ def make_structured(
     friction=None,
     angles=(),
     statistics=None,
+    integrator="rk4",
     dtype=torch.float64,
 ):
     """A Lagrangian or Hamiltonian network; a head that is left out is a small network."""
@@ -87,6 +89,7 @@ def make_structured(
         "input": input or partial(NetworkInput, hidden=[5]),
         "friction": friction or NoFriction,
         "angles": angles,
+        "integrator": integrator,
     }
     statistics = statistics or make_statistics(n, m)
     if kind == "lnn":
@@ -150,6 +153,15 @@ TRANSPOSED = dict(
     damping=partial(NetworkCholesky, hidden=[4], bound=2.0, transposed=True),
 )
 """M = L^T L, for the Lagrangian network alone."""
+
+
+NONLINEAR = dict(
+    n=2,
+    m=3,
+    input=partial(NonlinearInput, hidden=[6], activation="tanh"),
+    friction=CoulombFriction,
+)
+"""A force that is not linear in the input."""
 
 
 def random_batch(n, m, batch=6, seed=3, dtype=torch.float64):

@@ -14,6 +14,7 @@ from pinn_dyn.models import (
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
+    NonlinearInput,
 )
 from tests.models.builders import perturb, positive_matrix
 from tests.support.finite_differences import assert_near, partial_derivatives, slope
@@ -199,8 +200,7 @@ def test_a_fixed_matrix_is_reproduced_also_if_singular(value, q):
 def test_a_constant_starts_like_a_network_of_zero_weights(q):
     scales = {**SCALES, "scale": torch.tensor([0.5, 2.0, 3.0])}
     constant = ConstantCholesky(size=3, **scales).double()
-    softplus_of_start = float(F.softplus(torch.tensor(0.54)))
-    expected = torch.diag(scales["scale"].double() * (softplus_of_start + 1e-3))
+    expected = torch.diag(scales["scale"].double() * (1 + 1e-3))
     assert_near(constant(q[0]), expected, 1e-6)
 
 
@@ -267,6 +267,38 @@ def test_the_quadratic_part_is_an_elastic_well(q):
     assert {name.split(".")[0] for name, _ in plain.named_parameters()} == {"network"}
 
 
+@pytest.mark.parametrize("initial", [0.05, 1.0, 3.0])
+@pytest.mark.parametrize(
+    "builder",
+    [
+        partial(NetworkCholesky, hidden=[5], epsilon=0.01),
+        partial(NetworkCholesky, hidden=[5], diagonal="relu", epsilon=0.01),
+        partial(ConstantCholesky, epsilon=0.01),
+    ],
+    ids=["softplus", "relu", "constant"],
+)
+def test_the_diagonal_starts_where_it_is_told(builder, initial):
+    """A network's own part, a tenth of its usual size, comes on top."""
+    head = make(partial(builder, initial=initial), spread=0.0)
+    if hasattr(head, "network"):
+        head.network.linears[-1].weight.data.zero_()
+    diagonal = head(torch.zeros(SIZE).double()).diagonal()
+    assert_near(diagonal, (initial + 0.01) * SCALES["scale"].double(), 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("builder", "message"),
+    [
+        (partial(NetworkCholesky, hidden=[5], initial=0.0), "initial is 0.0, expected a positive"),
+        (partial(ConstantCholesky, initial=-1.0), "initial is -1.0, expected a positive"),
+        (partial(NetworkCholesky, hidden=[5], initial=0.5, bound=1.0), "expected one of them"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(builder, message):
+    with pytest.raises(ValueError, match=message):
+        make(builder)
+
+
 # The input matrix.
 
 
@@ -331,3 +363,26 @@ def test_a_fixed_input_matrix_is_the_given_one(q):
 def test_a_wrong_argument_of_an_input_head_is_refused(builder, message):
     with pytest.raises(ValueError, match=message):
         make_input(builder)
+
+
+def make_nonlinear():
+    scales = {"u_mean": torch.tensor([0.4, -0.2]), "u_std": torch.tensor([0.5, 2.0])}
+    return make_input(partial(NonlinearInput, hidden=[4], activation="tanh", **scales))
+
+
+def test_a_nonlinear_input_is_a_matrix_that_depends_on_the_input(q):
+    head = make_nonlinear()
+    u = torch.randn(40, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    values = head.network(torch.cat([q, u], -1)).reshape(40, SIZE, 2)
+    matrix = values * torch.tensor([0.5, 3.0]).double()
+    assert_near(head.force(q, u), torch.einsum("bij,bj->bi", matrix, u), 1e-12)
+    assert float((head.force(q, 2 * u) - 2 * head.force(q, u)).abs().max()) > 0.1
+
+
+def test_the_matrix_of_a_nonlinear_input_is_that_at_the_mean_input(q):
+    head = make_nonlinear()
+    mean = torch.tensor([0.4, -0.2]).double().expand(40, 2)
+    assert head(q).shape == (40, SIZE, 2)
+    assert_near((head(q) @ mean.unsqueeze(-1)).squeeze(-1), head.force(q, mean), 1e-6)
+    assert not head.affine
+    assert make_input(partial(NetworkInput, hidden=[4])).affine

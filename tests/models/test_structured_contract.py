@@ -1,9 +1,11 @@
 """The contract of a mechanical system, for the learned ones with every kind of head."""
 
 import pytest
+import torch
 
 from tests.contracts.mechanical_system import MechanicalSystemContract
-from tests.models.builders import TRANSPOSED, VARIANTS, make_structured
+from tests.models.builders import NONLINEAR, TRANSPOSED, VARIANTS, make_structured, random_batch
+from tests.support.finite_differences import assert_near
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -24,3 +26,28 @@ class TestTransposedMass(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
         return make_structured("lnn", **TRANSPOSED)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_a_nonlinear_input_moves_the_robot_in_every_form(kind):
+    """Both forms of the dynamics, the inverse dynamics and the power have the head's force."""
+    model = make_structured(kind, **NONLINEAR)
+    q, v, _, u = random_batch(2, 3)
+    force = model.input.force(q, u)
+    assert float((force - (model.input_matrix(q) @ u[..., None])[..., 0]).abs().max()) > 0.05
+    assert not model.input_affine
+    a = model.forward_dynamics(q, v, u)
+    assert_near(model.inverse_dynamics(q, v, a), force, 1e-9)
+    power = (v * (force - model.dissipative_force(q, v))).sum(-1)
+    assert_near(model.power(q, v, u), power, 1e-12)
+    p = model.momentum(q, v)
+    rates = model.momentum_derivative(torch.cat([q, p], -1), u)
+    mass_rate = torch.func.jvp(model.mass_matrix, (q,), (v,))[1]
+    expected = (model.mass_matrix(q) @ a[..., None] + mass_rate @ v[..., None])[..., 0]
+    assert_near(rates, torch.cat([v, expected], -1), 1e-9)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_an_integrator_that_is_not_there_is_refused(kind):
+    with pytest.raises(ValueError, match="integrator is 'euler', expected one of rk4, rosenbrock"):
+        make_structured(kind, integrator="euler")

@@ -1,0 +1,212 @@
+"""One-step methods: RK4 against torchdiffeq's, the Rosenbrock method against exact solutions."""
+
+import pytest
+import torch
+
+from pinn_dyn.mechanics import Ensemble
+from pinn_dyn.mechanics.integration import SampledInput, rollout_increments
+from pinn_dyn.mechanics.steps import stage_inputs
+from tests.models.builders import make_structured, perturb
+from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
+
+RK4_NODES = (0.0, 1 / 3, 2 / 3, 1.0)
+
+
+def samples(batch, count, size, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*batch, count, size, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture
+def uncompiled(monkeypatch):
+    """The same loop, with the step left as it is."""
+    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_stage_inputs_are_those_of_the_sampled_input(interpolation, count):
+    """At random times, inside the samples and beyond both ends."""
+    u = samples((2,), count, 3)
+    t_input = torch.rand(count, generator=torch.Generator().manual_seed(1)).double().cumsum(0)
+    signal = SampledInput(t_input, u, interpolation)
+    grid = torch.linspace(-0.3, float(t_input[-1]) + 0.4, 12, dtype=torch.float64)
+    found = stage_inputs(grid, t_input, u.movedim(-2, 0), interpolation, RK4_NODES)
+    assert found.shape == (11, 4, 2, 3)
+    for k in range(11):
+        h = grid[k + 1] - grid[k]
+        for stage, part in enumerate(RK4_NODES):
+            expected = signal(grid[k] + part * h)
+            torch.testing.assert_close(found[k, stage], expected, rtol=1e-10, atol=1e-10)
+
+
+def test_the_last_stage_of_a_held_input_is_before_the_next_sample():
+    t = torch.tensor([0.0, 0.1, 0.2, 0.3], dtype=torch.float64)
+    u = torch.arange(4.0, dtype=torch.float64)[:, None]
+    found = stage_inputs(t, t, u, "hold", RK4_NODES).squeeze(-1)
+    expected = torch.arange(3.0, dtype=torch.float64)[:, None].expand(3, 4)
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
+    """More steps than a block, an input that jumps, and solution times that skip samples."""
+    system = damped_oscillators().requires_grad_(False)
+    t_input = 0.02 * torch.arange(141, dtype=torch.float64)
+    u = samples(batch, 141, 1)
+    x0 = samples(batch, 1, 4, seed=1).squeeze(-2)
+    options = dict(t_input=t_input, interpolation=interpolation, substeps=substeps)
+    expected, found = (
+        rollout_increments(
+            system.velocity_derivative, x0, t_input[::2], u, compile=compile, **options
+        )
+        for compile in (False, True)
+    )
+    assert found.shape == (*batch, 71, 4)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+# The Rosenbrock method.
+
+
+def overdamped(rate):
+    """A mass that its damper stops in 1/rate seconds, on a spring that takes a second."""
+    return LinearSystem([[1 / rate]], [[1.0]], [[1.0]], [[1.0]]).requires_grad_(False)
+
+
+def rosenbrock_path(system, x0, t, u, interpolation, substeps=1):
+    system.integrator, system.substeps = "rosenbrock", substeps
+    return system.predict(x0, t, u, interpolation=interpolation)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+def test_the_rosenbrock_method_is_of_second_order(interpolation):
+    """Against matrix exponentials, with an input that jumps at every sample."""
+    system = damped_oscillators().requires_grad_(False)
+    t = 0.1 * torch.arange(16, dtype=torch.float64)
+    u, x0 = samples((), 16, 1), samples((), 1, 4, seed=1).squeeze(0)
+    expected = exact_solution(system, x0, t, u, interpolation)
+    errors = [
+        float((rosenbrock_path(system, x0, t, u, interpolation, n) - expected).abs().max())
+        for n in (4, 8, 16)
+    ]
+    assert errors[0] < 0.03
+    assert 3.5 < errors[0] / errors[1] < 4.5
+    assert 3.5 < errors[1] / errors[2] < 4.5
+
+
+@pytest.mark.parametrize("coordinates", ["velocity", "momentum"])
+def test_the_rosenbrock_method_takes_steps_far_longer_than_the_damping(coordinates):
+    """Steps of 0.1 s where the damper acts in 0.1 ms: RK4 would need steps below 0.3 ms."""
+    system = overdamped(rate=1e4)
+    system.coordinates = coordinates
+    t = 0.1 * torch.arange(21, dtype=torch.float64)
+    u = torch.sin(t)[:, None]
+    start = torch.tensor([0.3, 0.5], dtype=torch.float64)
+    expected = exact_solution(system, start, t, u, "linear")[:, 0]
+    x0 = start if coordinates == "velocity" else start * torch.tensor([1.0, 1e-4])
+    found = rosenbrock_path(system, x0, t, u, "linear")[:, 0]
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-3)
+    system.integrator = "rk4"
+    assert not (system.predict(x0, t, u)[:, 0].abs() < 1e3).all()
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_the_rosenbrock_method_and_rk4_find_the_same_motion_of_a_network(kind):
+    t = 0.001 * torch.arange(41, dtype=torch.float64)
+    u, x0 = samples((4,), 41, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
+    model = make_structured(kind).eval().requires_grad_(False)
+    expected = model.predict(x0, t, u)
+    model.integrator = "rosenbrock"
+    found = model.predict(x0, t, u)
+    assert (expected[:, -1] - x0).abs().max() > 0.01
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_the_gradient_through_the_rosenbrock_method_is_that_of_finite_differences(kind):
+    t = 0.02 * torch.arange(4, dtype=torch.float64)
+    u, x0 = samples((4,), 4, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
+    model = make_structured(kind)
+    model.integrator = "rosenbrock"
+    parameter = model.damping.network.linears[0].weight
+
+    def loss():
+        return model.increments(x0, t, u).square().sum()
+
+    loss().backward()
+    with torch.no_grad():
+        found = float(parameter.grad[1, 2])
+        step = 1e-5
+        parameter[1, 2] += step
+        above = loss()
+        parameter[1, 2] -= 2 * step
+        below = loss()
+    assert abs(found) > 1e-6
+    assert found == pytest.approx(float(above - below) / (2 * step), rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_an_ensemble_integrates_as_its_members_do(kind):
+    t = 0.02 * torch.arange(4, dtype=torch.float64)
+    u, x0 = samples((4,), 4, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
+    members = [perturb(make_structured(kind), seed=k, spread=0.1) for k in range(3)]
+    explicit = Ensemble(members).member_increments(x0, t, u)
+    for item in members:
+        item.integrator = "rosenbrock"
+    found = Ensemble(members).member_increments(x0, t, u)
+    expected = torch.stack([item.increments(x0, t, u) for item in members])
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert (found - explicit).abs().max() > 1e-7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", [(4,), ()])
+def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(batch):
+    """In training the step is compiled for gradients; in a long roll-out without them."""
+    t = 0.02 * torch.arange(4, dtype=torch.float64)
+    u, x0 = samples(batch, 4, 3), 0.3 * samples(batch, 1, 6, seed=1).squeeze(-2)
+    model = make_structured("lnn")
+    model.integrator = "rosenbrock"
+    expected = model.increments(x0, t, u)
+    # All but the constant of V, which moves nothing.
+    parameters = [
+        value
+        for name, value in model.named_parameters()
+        if name != "potential.network.layers.2.bias"
+    ]
+    gradients = torch.autograd.grad(expected.square().sum(), parameters)
+    if batch:
+        model.compile_derivative()
+        found = model.increments(x0, t, u)
+        for one, other in zip(
+            torch.autograd.grad(found.square().sum(), parameters), gradients, strict=True
+        ):
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+    else:
+        model.eval().compiled_rollouts = True
+        with torch.no_grad():
+            found = model.increments(x0, t, u)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_a_compiled_roll_out_of_a_network_is_that_of_torchdiffeq(kind):
+    """Two models of one shape in turn: neither may be taken for the other."""
+    t = 0.002 * torch.arange(301, dtype=torch.float64)
+    u, x0 = samples((), 301, 3), 0.3 * samples((), 1, 6, seed=1).squeeze(0)
+    model = make_structured(kind).eval()
+    other = make_structured(kind).eval()
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter *= 0.9
+        for item in (model, other):
+            expected = item.predict(x0, t, u)
+            item.compiled_rollouts = True
+            found = item.predict(x0, t, u)
+            torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+            assert (expected[-1] - x0).abs().max() > 0.01
