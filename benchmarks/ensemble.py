@@ -73,7 +73,7 @@ def make_step(kind: str, members: int, batch: int, compiled: bool) -> Callable[[
     optimizer = AdamW(parameters, lr=1e-4, weight_decay=1e-5)
     scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000)
     if compiled:
-        loss.compile_dynamics(model)
+        loss.compile_dynamics(model, steps=0)
     batches = iter(loader)
 
     def step() -> None:

@@ -50,6 +50,13 @@ class Windows:
         """The windows at the positions ``index``."""
         return self._map(lambda value: value[index])
 
+    def split(self, size: int) -> list[Windows]:
+        """The windows in parts of at least ``size`` that differ by at most one window."""
+        number = len(self) // size
+        if number < 2:
+            return [self]
+        return [self[index] for index in torch.arange(len(self)).tensor_split(number)]
+
     def to(self, device: torch.device, dtype: torch.dtype | None = None) -> Windows:
         """All tensors on a device and, where given, in a dtype."""
         moved = self._map(lambda value: value.to(device, dtype))

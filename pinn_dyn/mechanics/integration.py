@@ -106,17 +106,7 @@ def rollout_increments(
     def increment_rate(time: Tensor, increment: Tensor) -> Tensor:
         return derivative(x0 + increment, signal(time))
 
-    grid = t
-    if substeps > 1:
-        fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
-        inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
-        grid = torch.cat([inner.flatten(), t[-1:]])
-        # A step that ends at a sample ends at that very number: "hold" tells the sides apart.
-        right = torch.searchsorted(t_samples, grid).clamp(1, t_samples.shape[0] - 1)
-        before, after = t_samples[right - 1], t_samples[right]
-        nearest = torch.where(grid - before < after - grid, before, after)
-        close = (grid - nearest).abs() < 1e-6 * (t[1:] - t[:-1]).min() / substeps
-        grid = torch.where(close, nearest, grid)
+    grid = step_grid(t, t_samples, substeps)
     # One dtype throughout, so that the solver's times and the input's times compare exactly.
     t_samples, u, grid = t_samples.to(x0.dtype), u.to(x0.dtype), grid.to(x0.dtype)
     if compile:
@@ -133,6 +123,24 @@ def rollout_increments(
         options={"perturb": interpolation == "hold"},
     )
     return solution[::substeps].movedim(0, -2)
+
+
+def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
+    """Times of the integrator's steps, ``(substeps (T - 1) + 1,)``: ``substeps`` in each interval.
+
+    A step that ends at a sample of the input, within rounding, ends at that very number: "hold"
+    tells the sides apart.
+    """
+    if substeps == 1:
+        return t
+    fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
+    inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
+    grid = torch.cat([inner.flatten(), t[-1:]])
+    right = torch.searchsorted(t_input, grid).clamp(1, t_input.shape[0] - 1)
+    before, after = t_input[right - 1], t_input[right]
+    nearest = torch.where(grid - before < after - grid, before, after)
+    close = (grid - nearest).abs() < 1e-6 * (t[1:] - t[:-1]).min() / substeps
+    return torch.where(close, nearest, grid)
 
 
 def rollout(

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import require_last_dim
 from pinn_dyn.mechanics.integration import rollout_increments
-from pinn_dyn.mechanics.steps import Integrator, Scheme, rosenbrock
+from pinn_dyn.mechanics.steps import Integrator, Scheme, rk4, rosenbrock
 from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation
 
 
@@ -105,13 +105,13 @@ class ContinuousPredictor(Predictor):
         integrator: that keeps compilation short. Validation and test run eagerly, as their batch
         shapes vary.
         """
-        scheme = self._scheme()
-        self._compiled = torch.compile(scheme.step if scheme else self.state_derivative)
+        compiled = self.state_derivative if self.integrator == "rk4" else self.scheme().step
+        self._compiled = torch.compile(compiled)
 
-    def _scheme(self) -> Scheme | None:
-        """The method of integration, None for torchdiffeq's RK4."""
+    def scheme(self) -> Scheme:
+        """The method of integration, with this system in it."""
         if self.integrator == "rk4":
-            return None
+            return rk4(self.state_derivative)
         return rosenbrock(self.state_derivative, self.implicit_rate)
 
     def __getstate__(self) -> dict[str, object]:
@@ -129,12 +129,15 @@ class ContinuousPredictor(Predictor):
         interpolation: Interpolation = "linear",
     ) -> Tensor:
         """Integrate the state derivative, ``substeps`` steps per interval of ``t``."""
+        derivative, scheme = self.state_derivative, None
         compiled = self._compiled if self.training else None
-        scheme = self._scheme()
-        if scheme is not None and compiled is not None:
-            scheme = replace(scheme, step=compiled)
+        if self.integrator == "rk4":
+            derivative = compiled or derivative
+        else:
+            scheme = self.scheme()
+            scheme = replace(scheme, step=compiled or scheme.step)
         return rollout_increments(
-            compiled if compiled is not None and scheme is None else self.state_derivative,
+            derivative,
             x0,
             t,
             u,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.fx.experimental.proxy_tensor import make_fx
 
+from pinn_dyn.mechanics.compilation import compile_graph
 from pinn_dyn.mechanics.trajectory import Interpolation
 
 Integrator = Literal["rk4", "rosenbrock"]
@@ -127,41 +127,7 @@ def compiled_scheme(scheme: Scheme, x0: Tensor, u: Tensor) -> Scheme:
     stages = u[..., 0, :].expand(len(scheme.nodes), *u.shape[:-2], u.shape[-1])
     with torch.no_grad():
         arguments = (torch.zeros_like(x0), x0, stages.contiguous(), x0.new_ones(()))
-        return Scheme(scheme.nodes, _compile(scheme.step, arguments))
-
-
-def _compile(
-    function: Callable[..., Tensor], arguments: tuple[Tensor, ...]
-) -> Callable[..., Tensor]:
-    """The function, compiled for arguments of these shapes alone."""
-    graph = make_fx(function, _COLUMNS_AS_ROWS)(*arguments)
-    options: dict[str, Any] = {
-        # Shapes and model stay the same within a roll-out: nothing to check at each step.
-        "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
-        "cpp_wrapper": True,
-        "post_grad_fusion_options": {"decompose_mm_pass": {}},
-    }
-    # graph.forward is code of its own: nothing compiled for another model is taken for it.
-    return torch.compile(graph.forward, dynamic=False, options=options)
-
-
-def _mm(a: Tensor, b: Tensor) -> Tensor:
-    """W h of a single column h as (h^T W^T)^T."""
-    if b.shape[1] > 1 or a.shape[0] == 1:
-        return NotImplemented
-    return (b.T @ a.T).T
-
-
-def _addmm(bias: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    product = _mm(a, b)
-    return product if product is NotImplemented else bias + product
-
-
-# The compiler turns products with a single row into loops that it fuses with their neighbours.
-_COLUMNS_AS_ROWS: dict[Any, Callable[..., Any]] = {
-    torch.ops.aten.mm.default: _mm,
-    torch.ops.aten.addmm.default: _addmm,
-}
+        return Scheme(scheme.nodes, compile_graph(scheme.step, arguments))
 
 
 def stage_inputs(

@@ -18,7 +18,7 @@ class CholeskyFactor(nn.Module, abc.ABC):
     """A lower triangular L(q) ``(*batch, N, N)``, for a matrix L L^T that is never indefinite.
 
     ``linearize`` returns L and a tape; ``pushforward`` gives dL for a tangent dq, ``pullback``
-    gives the gradient in q for a cotangent of L.
+    gives the gradient in q for a cotangent of L, ``linearize_along`` the first two at once.
 
     Attributes:
         transposed: the matrix is L^T L instead, with L^T the upper triangular factor.
@@ -37,6 +37,11 @@ class CholeskyFactor(nn.Module, abc.ABC):
     @abc.abstractmethod
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
         """Gradient of <cotangent, L(q)> in q, ``(*batch, N)``."""
+
+    def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
+        """L(q), dL for dq, and the tape."""
+        factor, tape = self.linearize(q)
+        return factor, self.pushforward(tape, dq), tape
 
     def forward(self, q: Tensor) -> Tensor:
         """L(q), ``(*batch, N, N)``."""
@@ -143,6 +148,13 @@ class NetworkCholesky(CholeskyFactor):
         y, tape = self.network.linearize(q)
         values, slopes = self._entries(columns(y))
         return _matrices(self._assemble(values), q), (*tape, slopes)
+
+    def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
+        """L(q), dL for dq, and the tape, by one pass through the network."""
+        y, dy, tape = self.network.linearize_along(q, dq)
+        values, slopes = self._entries(columns(y))
+        rate = self._assemble(slopes * columns(dy))
+        return _matrices(self._assemble(values), q), _matrices(rate, q), (*tape, slopes)
 
     def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
         """dL for dq."""

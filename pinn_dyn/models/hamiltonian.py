@@ -144,10 +144,9 @@ class HamiltonianNetwork(StructuredNetwork):
 
     def _factor_and_rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """L, d(p^T W p / 2)/dq and (dW/dt) p, with p = M v and the rate along v."""
-        factor, tape = self.inverse_mass.linearize(q)
+        factor, rate, tape = self.inverse_mass.linearize_along(q, v)
         w = lower_solve(factor, v)
         p = upper_solve(factor, w)
-        rate = self.inverse_mass.pushforward(tape, v)
         rate_p = matvec(rate, w) + matvec(factor, matvec(rate.transpose(-1, -2), p))
         gradient = self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
         return factor, gradient, rate_p

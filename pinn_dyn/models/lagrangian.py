@@ -97,8 +97,8 @@ class LagrangianNetwork(StructuredNetwork):
 
     def _factor_and_coriolis_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq, M = R^T R, with dR along v."""
-        factor, tape = self.mass.linearize(q)
-        root, rate = self._root(factor), self._root(self.mass.pushforward(tape, v))
+        factor, factor_rate, tape = self.mass.linearize_along(q, v)
+        root, rate = self._root(factor), self._root(factor_rate)
         w = matvec(root, v)
         mass_rate_v = matvec(rate.transpose(-1, -2), w)
         mass_rate_v = mass_rate_v + matvec(root.transpose(-1, -2), matvec(rate, v))

@@ -112,34 +112,36 @@ class MLP(nn.Module):
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
         """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
-        tape: list[Tensor] = []
-        column = columns(x)
-        h = (column - self.mean[:, None]) / self.std[:, None]
-        if self._has_angles:
-            # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
-            is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
-            sine, cosine = torch.sin(column), torch.cos(column)
-            slope = (1 / self.std[:, None]).expand_as(column)
-            h = torch.cat([torch.where(is_angle, sine, h), torch.where(is_angle, cosine, zero)])
-            tape.append(
-                torch.cat(
-                    [torch.where(is_angle, cosine, slope), torch.where(is_angle, -sine, zero)]
-                )
-            )
+        h, slopes = self._features(columns(x))
+        tape = [slopes] if slopes is not None else []
         *hidden, last = self.linears
         for layer in hidden:
             h, slope = self._activation(torch.addmm(layer.bias[:, None], layer.weight, h))
             tape.append(slope)
         return rows(torch.addmm(last.bias[:, None], last.weight, h), x), tuple(tape)
 
+    def linearize_along(self, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tape]:
+        """y, J dx and the tape: :meth:`linearize` and :meth:`pushforward` in one pass.
+
+        Both meet every layer side by side, as one product of twice as many columns.
+        """
+        features, slopes = self._features(columns(x))
+        tangent = self._tangent(columns(dx), slopes)
+        tape = [slopes] if slopes is not None else []
+        *hidden, last = self.linears
+        for layer in hidden:
+            z, dz = _side_by_side(layer.weight, features, tangent)
+            features, slope = self._activation(z + layer.bias[:, None])
+            tangent = slope * dz
+            tape.append(slope)
+        y, dy = _side_by_side(last.weight, features, tangent)
+        return rows(y + last.bias[:, None], x), rows(dy, x), tuple(tape)
+
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
         *hidden, last = self.linears
-        h = columns(dx)
-        if self._has_angles:
-            h, tape = torch.cat([h, h]) * tape[0], tape[1:]
-        else:
-            h = h / self.std[:, None]
+        slopes, tape = (tape[0], tape[1:]) if self._has_angles else (None, tape)
+        h = self._tangent(columns(dx), slopes)
         for layer, slope in zip(hidden, tape, strict=True):
             h = (layer.weight @ h) * slope
         return rows(last.weight @ h, dx)
@@ -158,6 +160,30 @@ class MLP(nn.Module):
             return rows(h / self.std[:, None], dy)
         sine_or_linear, cosine = (h * first).chunk(2)
         return rows(sine_or_linear + cosine, dy)
+
+    def _features(self, column: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the first layer sees of x, ``(n, B)``, and its slopes in x where x has angles."""
+        z = (column - self.mean[:, None]) / self.std[:, None]
+        if not self._has_angles:
+            return z, None
+        # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
+        is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
+        sine, cosine = torch.sin(column), torch.cos(column)
+        slope = (1 / self.std[:, None]).expand_as(column)
+        features = [torch.where(is_angle, sine, z), torch.where(is_angle, cosine, zero)]
+        slopes = [torch.where(is_angle, cosine, slope), torch.where(is_angle, -sine, zero)]
+        return torch.cat(features), torch.cat(slopes)
+
+    def _tangent(self, dx: Tensor, slopes: Tensor | None) -> Tensor:
+        """What the first layer sees of a tangent dx, ``(n, B)``."""
+        return dx / self.std[:, None] if slopes is None else torch.cat([dx, dx]) * slopes
+
+
+def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor]:
+    """W h and W dh, each ``(n, B)``, by one product."""
+    both = weight @ torch.stack([h, dh], dim=1).flatten(1)
+    value, tangent = both.unflatten(1, (2, -1)).unbind(1)
+    return value, tangent
 
 
 def columns(x: Tensor) -> Tensor:

@@ -89,7 +89,7 @@ class ImpulseLoss(WindowLoss):
         predicted = self._increment(model, q, v, weights.sum(-1), weights @ windows.u)
         return torch.mean(((predicted - windows.dv[:, -1]) / self.scale) ** 2)
 
-    def compile_dynamics(self, model: Predictor) -> None:
+    def compile_dynamics(self, model: Predictor, steps: int) -> None:
         self._increment = torch.compile(velocity_increment)
 
 

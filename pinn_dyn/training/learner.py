@@ -68,7 +68,7 @@ class DynamicsLearner(L.LightningModule):
     def setup(self, stage: str) -> None:
         """Compile here, in the process that trains: compiled code does not reach another one."""
         if self._compile and stage == "fit":
-            self.loss.compile_dynamics(self.trained)
+            self.loss.compile_dynamics(self.trained, int(self.trainer.estimated_stepping_batches))
 
     @property
     def trained(self) -> Predictor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,10 +13,13 @@ from torch import Tensor, nn
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.training.whole_step import MOST_STAGES, Gradients, WholeStep, stages
 
-CHUNK = 512
+CHUNK = 256
 """Windows that compiled dynamics take at once: what they keep for the gradient stays in the cache
-(measured in benchmarks/README.md). Batches up to twice as large are not cut."""
+(measured in benchmarks/README.md). Batches of less than twice as many are not cut."""
+STEPS_FOR_WHOLE = 20_000
+"""Training steps from which it pays to compile loss and gradient as one program."""
 
 
 class WindowLoss(nn.Module, abc.ABC):
@@ -29,8 +33,8 @@ class WindowLoss(nn.Module, abc.ABC):
         """
 
     @abc.abstractmethod
-    def compile_dynamics(self, model: Predictor) -> None:
-        """From now on train with compiled dynamics of the model."""
+    def compile_dynamics(self, model: Predictor, steps: int) -> None:
+        """From now on train with compiled dynamics of the model, for about ``steps`` steps."""
 
 
 class IncrementLoss(WindowLoss):
@@ -83,6 +87,8 @@ class IncrementLoss(WindowLoss):
                 f"to the {steps} of the windows (data.steps)"
             )
         self._compiled = False
+        self._long_training = False
+        self._whole: WholeStep | None = None
         exact_rate = isinstance(model, ContinuousPredictor) and not momentum
         self.exact_coordinates = model.num_coordinates if exact_rate else 0
 
@@ -92,15 +98,29 @@ class IncrementLoss(WindowLoss):
         return self.curriculum[min(int(progress * stages), stages - 1)]
 
     def forward(self, model: Predictor, windows: Windows, progress: float) -> Tensor:
+        longest = windows
         windows = windows.first(self.steps(progress))
-        batch = windows.q.shape[0]
         # One model with compiled dynamics, on a CPU: an ensemble's windows have one dimension more.
         single = windows.q.ndim == 2 and windows.q.device.type == "cpu"
-        if not (self._compiled and single and batch > 2 * CHUNK and torch.is_grad_enabled()):
+        if not (self._compiled and single and torch.is_grad_enabled()):
             return self._mean(model, windows)
-        parts = [windows[index] for index in torch.arange(batch).split(CHUNK)]
-        losses = [lambda part=part: len(part) / batch * self._mean(model, part) for part in parts]
-        return _SumOfParts.apply(losses, *model.parameters())
+        assert isinstance(model, ContinuousPredictor)
+        whole = self._long_training and stages(model, longest) <= MOST_STAGES
+        if not whole and len(windows) < 2 * CHUNK:
+            return self._mean(model, windows)
+        take: Callable[[Windows], tuple[Tensor, Gradients]]
+        if whole:
+            self._whole = self._whole or WholeStep(model, self.error)
+            parameters, take = self._whole.parameters, self._whole
+        else:
+            parameters, take = list(model.parameters()), partial(self._mean_and_gradients, model)
+        parts = [(len(part) / len(windows), *take(part)) for part in windows.split(CHUNK)]
+        return _KnownGradients.apply(parts, *parameters)
+
+    def _mean_and_gradients(self, model: Predictor, windows: Windows) -> tuple[Tensor, Gradients]:
+        loss = self._mean(model, windows)
+        gradients = torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)
+        return loss.detach(), list(gradients)
 
     def _mean(self, model: Predictor, windows: Windows) -> Tensor:
         x0 = windows.start(model.coordinates)
@@ -127,35 +147,41 @@ class IncrementLoss(WindowLoss):
         residual = residual[..., self.exact_coordinates if steps == 1 else 0 :]
         return torch.mean(residual**2, dim=(-3, -2, -1))
 
-    def compile_dynamics(self, model: Predictor) -> None:
+    def compile_dynamics(self, model: Predictor, steps: int) -> None:
         if isinstance(model, ContinuousPredictor):
             model.compile_derivative()
             self._compiled = True
+            self._long_training = steps >= STEPS_FOR_WHOLE
 
 
-class _SumOfParts(torch.autograd.Function):
-    """A sum of losses whose gradients are taken one after another, each with its own loss.
+class _KnownGradients(torch.autograd.Function):
+    """The weighted sum of losses whose gradients are known: the backward pass hands them out.
 
-    What a part keeps for its gradient is freed before the next part starts. The backward pass only
-    hands out the gradients, so the sum cannot be differentiated twice.
+    So it cannot be differentiated twice.
     """
 
     @staticmethod
-    def forward(ctx: Any, parts: list[Callable[[], Tensor]], *parameters: Tensor) -> Tensor:
-        total = parameters[0].new_zeros(())
-        sums: list[Tensor | None] = [None] * len(parameters)
-        for part in parts:
-            with torch.enable_grad():
-                loss = part()
-            gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-            for k, gradient in enumerate(gradients):
-                known = sums[k]
-                sums[k] = gradient if known is None else known + gradient
-            total += loss.detach()
-        ctx.gradients = sums
-        return total
+    def forward(
+        ctx: Any, parts: list[tuple[float, Tensor, Gradients]], *parameters: Tensor
+    ) -> Tensor:
+        ctx.weights = [weight for weight, _, _ in parts]
+        ctx.gradients = list(zip(*(gradients for _, _, gradients in parts), strict=True))
+        losses = [loss if weight == 1 else weight * loss for weight, loss, _ in parts]
+        return losses[0] if len(losses) == 1 else torch.stack(losses).sum()
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (factor,) = upstream
-        return None, *(None if g is None else factor * g for g in ctx.gradients)
+        weights = [float(upstream[0]) * weight for weight in ctx.weights]
+        return None, *(_weighted(weights, values) for values in ctx.gradients)
+
+
+def _weighted(weights: list[float], values: tuple[Tensor | None, ...]) -> Tensor | None:
+    """The weighted sum; None where the loss does not depend on the parameter."""
+    first, *rest = values
+    if first is None:
+        return None
+    total = first if weights[0] == 1 else weights[0] * first
+    for weight, value in zip(weights[1:], rest, strict=True):
+        assert value is not None
+        total.add_(value, alpha=weight)
+    return total

@@ -6,6 +6,7 @@ import torch
 from pinn_dyn.mechanics import Ensemble
 from pinn_dyn.mechanics.integration import SampledInput, rollout_increments
 from pinn_dyn.mechanics.steps import stage_inputs
+from pinn_dyn.models import ConstantCholesky, ConstantInput
 from tests.models.builders import make_structured, perturb
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
 
@@ -169,8 +170,8 @@ def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(batch)
     """In training the step is compiled for gradients; in a long roll-out without them."""
     t = 0.02 * torch.arange(4, dtype=torch.float64)
     u, x0 = samples(batch, 4, 3), 0.3 * samples(batch, 1, 6, seed=1).squeeze(-2)
-    model = make_structured("lnn")
-    model.integrator = "rosenbrock"
+    constant = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
+    model = make_structured("lnn", **constant, integrator="rosenbrock")
     expected = model.increments(x0, t, u)
     # All but the constant of V, which moves nothing.
     parameters = [

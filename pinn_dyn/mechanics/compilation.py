@@ -1,0 +1,70 @@
+"""Compile a function with all that it calls, gradients included, into one C++ program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
+
+# Products over at most so many numbers are sums that the compiler fuses with their neighbours.
+_SHORT = 8
+
+
+def compile_graph(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    """The function, compiled for arguments of these shapes and types alone.
+
+    It is traced once: numbers and tensors that are not arguments become constants of the program.
+    The program checks nothing when called.
+    """
+    graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
+    options: dict[str, Any] = {
+        "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
+        "cpp_wrapper": True,
+        "post_grad_fusion_options": {"decompose_mm_pass": {}},
+    }
+    # graph.forward is code of its own: nothing compiled for another model is taken for it.
+    return torch.compile(graph.forward, dynamic=False, options=options)
+
+
+def _mm(a: Tensor, b: Tensor) -> Tensor:
+    if b.shape[1] == 1 and a.shape[0] > 1:
+        # The compiler turns products with a single row into loops that it fuses.
+        return (b.T @ a.T).T
+    if a.shape[1] <= _SHORT and b.shape[1] > _SHORT:
+        total = a[:, :1] * b[:1]
+        for k in range(1, a.shape[1]):
+            total = total + a[:, k : k + 1] * b[k : k + 1]
+        return total
+    return NotImplemented
+
+
+def _addmm(bias: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    product = _mm(a, b)
+    return product if product is NotImplemented else bias + product
+
+
+def _softplus(z: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    return z.clamp(min=0) + torch.log(1 + torch.exp(-z.abs()))
+
+
+def _sigmoid(z: Tensor) -> Tensor:
+    # The same exponential as in _softplus: beside it, it costs none.
+    decay = torch.exp(-z.abs())
+    share = 1 / (1 + decay)
+    return torch.where(z >= 0, share, decay * share)
+
+
+def _softplus_backward(gradient: Tensor, z: Tensor, beta: float, threshold: float) -> Tensor:
+    return gradient * _sigmoid(z)
+
+
+_DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
+    torch.ops.aten.mm.default: _mm,
+    torch.ops.aten.addmm.default: _addmm,
+    torch.ops.aten.softplus.default: _softplus,
+    torch.ops.aten.softplus_backward.default: _softplus_backward,
+    torch.ops.aten.sigmoid.default: _sigmoid,
+}

@@ -1,0 +1,128 @@
+"""Loss and gradient as one compiled program, against autograd on the eager model."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from pinn_dyn.data import Windows
+from pinn_dyn.models import (
+    AccelerationMLP,
+    ConstantCholesky,
+    ConstantInput,
+    LagrangianNetwork,
+    NetworkCholesky,
+    NetworkPotential,
+)
+from pinn_dyn.training import IncrementLoss
+from pinn_dyn.training.losses import STEPS_FOR_WHOLE as LONG
+from tests.models.builders import STEP, make_model, make_statistics, make_structured, perturb
+
+
+def make_windows(count, size=1, interpolation="linear", seed=0):
+    """Windows of one step, with an input that jumps within it."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return 0.3 * torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return Windows(
+        t=torch.tensor([0.0, STEP], dtype=torch.float64),
+        t_input=torch.linspace(0, STEP, 3, dtype=torch.float64),
+        q=normal(count, size),
+        v=normal(count, size),
+        p=normal(count, size),
+        dq=STEP * normal(count, 1, size),
+        dv=STEP * normal(count, 1, size),
+        dp=STEP * normal(count, 1, size),
+        u=normal(count, 3, size),
+        interpolation=interpolation,
+    )
+
+
+def one_step(size=1):
+    scales = make_statistics(size, size)
+    return replace(
+        scales,
+        velocity_increment_std=scales.velocity_increment_std[:1],
+        momentum_increment_std=scales.momentum_increment_std[:1],
+    )
+
+
+def value_and_gradients(loss, model, batch, factor=1.0):
+    value = factor * loss(model, batch, 0.0)
+    gradients = torch.autograd.grad(value, list(model.parameters()), allow_unused=True)
+    return value.detach(), gradients
+
+
+def assert_same(found, expected):
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-12, atol=0)
+    assert sum(gradient is not None for gradient in expected[1]) > 3
+    for one, other in zip(found[1], expected[1], strict=True):
+        assert (one is None) == (other is None)
+        if other is not None:
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
+# Compiling is what takes the time here: one coordinate, and the two stages of the other method.
+MODELS = {
+    "lnn": lambda: make_structured(
+        "lnn",
+        n=1,
+        m=1,
+        mass=partial(NetworkCholesky, hidden=[3]),
+        potential=partial(NetworkPotential, hidden=[3]),
+        damping=ConstantCholesky,
+        input=ConstantInput,
+        integrator="rosenbrock",
+    ),
+    "acceleration": lambda: perturb(AccelerationMLP(one_step(), hidden=[6]).double()),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "interpolation"), [("lnn", "hold"), ("acceleration", "linear")])
+def test_loss_and_gradients_are_those_of_the_eager_model(monkeypatch, kind, interpolation):
+    """Also of other data with the same program, and of a batch that is taken in parts."""
+    monkeypatch.setattr("pinn_dyn.training.losses.CHUNK", 6)
+    model = MODELS[kind]()
+    windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
+    eager, compiled = (IncrementLoss(one_step(), model).double() for _ in range(2))
+    compiled.compile_dynamics(model, LONG)
+    batches = [windows(6), windows(6, seed=1), windows(18, seed=2)]
+    for batch in batches:
+        assert_same(
+            value_and_gradients(compiled, model, batch, factor=3.0),
+            value_and_gradients(eager, model, batch, factor=3.0),
+        )
+    assert len(compiled._whole._programs) == 1  # and none was compiled for the parts
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter *= 0.9
+    assert_same(
+        value_and_gradients(compiled, model, batches[0]),
+        value_and_gradients(eager, model, batches[0]),
+    )
+
+
+@pytest.mark.parametrize(
+    "case", ["eager", "short training", "without gradients", "two steps", "ensemble of windows"]
+)
+def test_the_program_is_for_long_trainings_on_short_windows(monkeypatch, case):
+    """Its compilation takes a minute and grows with the window; validation runs eagerly."""
+    model = make_model("lnn")
+    assert isinstance(model, LagrangianNetwork)
+    loss = IncrementLoss(one_step(size=2), model).double()
+    monkeypatch.setattr(model, "compile_derivative", lambda: None)
+    batch = make_windows(4, size=2)
+    if case != "eager":
+        loss.compile_dynamics(model, LONG - (case == "short training"))
+    if case == "two steps":
+        model.substeps = 2
+    if case == "ensemble of windows":
+        batch = batch._map(lambda value: value.expand(3, *value.shape))
+    with torch.set_grad_enabled(case != "without gradients"):
+        value = loss(model, batch, 0.0)
+    assert torch.isfinite(value).all()
+    assert loss._whole is None
