@@ -213,6 +213,16 @@ def timed(step: Step) -> float:
     return time.perf_counter() - start
 
 
+def in_a_row(step: Step, seconds: float = 0.03) -> float:
+    """Seconds of a step among its like, as in a training: the mean after a first one."""
+    step()
+    start, count = time.perf_counter(), 0
+    while count == 0 or time.perf_counter() - start < seconds:
+        step()
+        count += 1
+    return (time.perf_counter() - start) / count
+
+
 def peak_memory(step: Step) -> float:
     """Most memory that a step adds to the process, MiB (Linux); what is cached is freed first."""
 
@@ -228,7 +238,7 @@ def peak_memory(step: Step) -> float:
 
 
 def run_cell(size: int, batch: int, cores: int, seconds: float) -> list[dict[str, object]]:
-    """Rows of one cell; every round runs each way once, for ``seconds`` or 5 rounds."""
+    """Rows of one cell; in every round each way takes its turn, for ``seconds`` or 5 rounds."""
     torch._dynamo.reset()  # one batch size after another would compile for varying sizes
     windows = make_windows(size, batch, torch.float32)
     model, scales = make_model(size, torch.float32)
@@ -253,7 +263,7 @@ def run_cell(size: int, batch: int, cores: int, seconds: float) -> list[dict[str
     while rounds < 5 or time.perf_counter() - start < seconds:
         for name, step in steps.items():
             if rounds < 3 or "hessian" not in name:
-                times[name].append(timed(step))
+                times[name].append(in_a_row(step))
         rounds += 1
     rows: list[dict[str, object]] = []
     for name, values in times.items():
