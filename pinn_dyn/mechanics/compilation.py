@@ -33,7 +33,8 @@ def _mm(a: Tensor, b: Tensor) -> Tensor:
     if b.shape[1] == 1 and a.shape[0] > 1:
         # The compiler turns products with a single row into loops that it fuses.
         return (b.T @ a.T).T
-    if a.shape[1] <= _SHORT and b.shape[1] > _SHORT:
+    # Not for a single row: the compiler would evaluate what it is made of for every column.
+    if a.shape[1] <= _SHORT and b.shape[1] > _SHORT and a.shape[0] > 1:
         total = a[:, :1] * b[:1]
         for k in range(1, a.shape[1]):
             total = total + a[:, k : k + 1] * b[k : k + 1]
@@ -47,10 +48,14 @@ def _addmm(bias: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 
 def _softplus(z: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
+    if z.shape[-1:] == (1,):
+        return NotImplemented
     return z.clamp(min=0) + torch.log(1 + torch.exp(-z.abs()))
 
 
 def _sigmoid(z: Tensor) -> Tensor:
+    if z.shape[-1:] == (1,):
+        return NotImplemented
     # The same exponential as in _softplus: beside it, it costs none.
     decay = torch.exp(-z.abs())
     share = 1 / (1 + decay)
@@ -58,9 +63,10 @@ def _sigmoid(z: Tensor) -> Tensor:
 
 
 def _softplus_backward(gradient: Tensor, z: Tensor, beta: float, threshold: float) -> Tensor:
-    return gradient * _sigmoid(z)
+    return NotImplemented if z.shape[-1:] == (1,) else gradient * _sigmoid(z)
 
 
+# Long vectors gain by these; a single column, evaluated again for each row that needs it, loses.
 _DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     torch.ops.aten.mm.default: _mm,
     torch.ops.aten.addmm.default: _addmm,
