@@ -1,12 +1,14 @@
 """One-step methods: RK4 against torchdiffeq's, the Rosenbrock method against exact solutions."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from pinn_dyn.mechanics import Ensemble
 from pinn_dyn.mechanics.integration import SampledInput, rollout_increments
 from pinn_dyn.mechanics.steps import stage_inputs
-from pinn_dyn.models import ConstantCholesky, ConstantInput
+from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkPotential
 from tests.models.builders import make_structured, perturb
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
 
@@ -169,15 +171,16 @@ def test_an_ensemble_integrates_as_its_members_do(kind):
 def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(batch):
     """In training the step is compiled for gradients; in a long roll-out without them."""
     t = 0.02 * torch.arange(4, dtype=torch.float64)
-    u, x0 = samples(batch, 4, 3), 0.3 * samples(batch, 1, 6, seed=1).squeeze(-2)
+    u, x0 = samples(batch, 4, 1), 0.3 * samples(batch, 1, 2, seed=1).squeeze(-2)
     constant = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
-    model = make_structured("lnn", **constant, integrator="rosenbrock")
+    potential = partial(NetworkPotential, hidden=[3])
+    model = make_structured("lnn", 1, 1, **constant, potential=potential, integrator="rosenbrock")
     expected = model.increments(x0, t, u)
     # All but the constant of V, which moves nothing.
     parameters = [
         value
         for name, value in model.named_parameters()
-        if name != "potential.network.layers.2.bias"
+        if name != "potential.network.layers.1.bias"
     ]
     gradients = torch.autograd.grad(expected.square().sum(), parameters)
     if batch:

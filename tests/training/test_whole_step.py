@@ -12,7 +12,6 @@ from pinn_dyn.models import (
     ConstantCholesky,
     ConstantInput,
     LagrangianNetwork,
-    NetworkCholesky,
     NetworkPotential,
 )
 from pinn_dyn.training import IncrementLoss
@@ -71,7 +70,7 @@ MODELS = {
         "lnn",
         n=1,
         m=1,
-        mass=partial(NetworkCholesky, hidden=[3]),
+        mass=ConstantCholesky,
         potential=partial(NetworkPotential, hidden=[3]),
         damping=ConstantCholesky,
         input=ConstantInput,
