@@ -3,8 +3,16 @@
 import pytest
 import torch
 
+from pinn_dyn.training import ImpulseLoss
 from tests.contracts.mechanical_system import MechanicalSystemContract
-from tests.models.builders import NONLINEAR, TRANSPOSED, VARIANTS, make_structured, random_batch
+from tests.models.builders import (
+    NONLINEAR,
+    TRANSPOSED,
+    VARIANTS,
+    make_statistics,
+    make_structured,
+    random_batch,
+)
 from tests.support.finite_differences import assert_near
 
 
@@ -51,3 +59,9 @@ def test_a_nonlinear_input_moves_the_robot_in_every_form(kind):
 def test_an_integrator_that_is_not_there_is_refused(kind):
     with pytest.raises(ValueError, match="integrator is 'euler', expected one of rk4, rosenbrock"):
         make_structured(kind, integrator="euler")
+
+
+def test_a_nonlinear_input_is_refused_by_the_loss_that_needs_a_matrix():
+    model = make_structured("lnn", **NONLINEAR)
+    with pytest.raises(ValueError, match=r"not linear in the input .* take loss=increment"):
+        ImpulseLoss(make_statistics(2, 3), model)
