@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pinn_dyn.app.config import CONF
 from pinn_dyn.data.simulation import has_cpp_compiler
-from tests.app.entry import NO_FIGURES, STRIDE, TINY_TRAINING, refused_text, run_script
+from tests.app.entry import NO_FIGURES, STRIDE, TINY_TRAINING, refused_text, run_script, train
 
 EXPERIMENTS = sorted(
     str(path.relative_to(CONF / "experiment").with_suffix(""))
@@ -173,6 +173,13 @@ def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
     text = refused(capsys, mlp_run)
     assert "black box" in text
     assert "model=lnn" in text
+
+
+def test_a_force_that_is_not_linear_in_the_input_is_refused(tmp_path, capsys):
+    run = train(tmp_path / "run", "model=lnn", "model/input=nonlinear", NO_FIGURES)
+    text = refused(capsys, run)
+    assert "not linear in the input" in text
+    assert "model/input=network" in text
 
 
 def test_a_run_of_measured_data_gets_a_report_of_the_model_alone(tmp_path, monkeypatch, capsys):
