@@ -40,6 +40,10 @@ def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve ``matrix x = vector`` for a symmetric positive definite matrix, by Cholesky."""
-    factor = torch.linalg.cholesky(matrix)
-    return torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)
+    """Solve ``matrix x = vector`` for a symmetric positive definite matrix, by Cholesky.
+
+    NaN where it is not positive definite, as in a roll-out that diverges: the others go on.
+    """
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    solution = torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)
+    return torch.where(failed.unsqueeze(-1) == 0, solution, torch.nan)

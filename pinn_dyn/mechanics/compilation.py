@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import types
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._dynamo import config as dynamo_config
+from torch._higher_order_ops.scan import scan
 from torch.fx.experimental.proxy_tensor import make_fx
 
 # Products over at most so many numbers are sums that the compiler fuses with their neighbours.
@@ -19,14 +22,52 @@ def compile_graph(function: Callable[..., Any], arguments: tuple[Any, ...]) -> C
     It is traced once: numbers and tensors that are not arguments become constants of the program.
     The program checks nothing when called.
     """
-    graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
+    # graph.forward is code of its own: nothing compiled for another model is taken for it.
+    return _compile(make_fx(function, _DECOMPOSITIONS)(*arguments).forward)
+
+
+def compile_loop(
+    step: Callable[..., Tensor], state: Tensor, constant: Tensor, inputs: tuple[Tensor, ...]
+) -> Callable[..., Tensor]:
+    """The loop x_{k+1} = step(x_k, c, *inputs_k), compiled into one program without gradients.
+
+    Compiled for arguments of these shapes and types alone, as by :func:`compile_graph`.
+
+    Args:
+        step: what is repeated.
+        state: x, ``(...)``.
+        constant: c, the same in all steps.
+        inputs: the inputs of all steps, each ``(T, ...)``.
+
+    Returns:
+        A function of the same four, with the inputs one by one, that gives x_1 to x_T,
+        ``(T, ...)``.
+    """
+    graph = make_fx(step, _DECOMPOSITIONS)(state, constant, *[each[0] for each in inputs])
+
+    def loop(state: Tensor, constant: Tensor, *inputs: Tensor) -> Tensor:
+        def body(state: Tensor, now: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+            following = graph(state, constant, *now)
+            return following, following.clone()
+
+        return scan(body, state, inputs)[1]
+
+    # The compiler keeps its programs with the code of a function, which all loops here share.
+    own = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
+    program = _compile(own)
+    # The counter of the loop is a number that the compiler must not ask for the value of.
+    with dynamo_config.patch(capture_scalar_outputs=True), torch.no_grad():
+        program(state, constant, *inputs)
+    return program
+
+
+def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     options: dict[str, Any] = {
         "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
         "cpp_wrapper": True,
         "post_grad_fusion_options": {"decompose_mm_pass": {}},
     }
-    # graph.forward is code of its own: nothing compiled for another model is taken for it.
-    return torch.compile(graph.forward, dynamic=False, options=options)
+    return torch.compile(function, dynamic=False, options=options)
 
 
 def _mm(a: Tensor, b: Tensor) -> Tensor:
