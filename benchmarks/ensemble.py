@@ -5,7 +5,9 @@
 
 A step is all that a training does at a step, but for the trainer's own loop: pick the batch from
 the windows in memory, loss, backward pass, clip, AdamW, schedule. N = 3, as the one-segment arm,
-head sizes of conf/model, 8,000 windows of one step, float32, dynamics compiled.
+head sizes of conf/model, 8,000 windows of one step, float32, compiled: an ensemble as a whole,
+member by member; one seed its derivative alone in a training of up to 20,000 steps, and as a whole
+in a longer one (compile=auto).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import csv
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -29,6 +32,7 @@ from pinn_dyn.data.windows import BatchSampler, MemberSampler, WindowLoader, Win
 from pinn_dyn.mechanics import Ensemble, Predictor
 from pinn_dyn.training import IncrementLoss
 from pinn_dyn.training.ensemble import clip_by_member
+from pinn_dyn.training.losses import STEPS_FOR_WHOLE
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000
@@ -54,8 +58,10 @@ def make_windows() -> Windows:
     )
 
 
-def make_step(kind: str, members: int, batch: int, compiled: bool) -> Callable[[], None]:
-    """One training step of a single model, or of an ensemble."""
+def make_step(
+    kind: str, members: int, batch: int, compiled: bool, length: int = 0
+) -> Callable[[], None]:
+    """One step of a training of that length, of a single model or of an ensemble."""
     models: list[Predictor] = [make_model(kind).float().train() for _ in range(members)]
     windows = make_windows()
     loss = IncrementLoss(windows.statistics(), models[0])
@@ -70,10 +76,10 @@ def make_step(kind: str, members: int, batch: int, compiled: bool) -> Callable[[
             WindowLoader(windows, MemberSampler(samplers)),
         )
     parameters = list(model.parameters())
-    optimizer = AdamW(parameters, lr=1e-4, weight_decay=1e-5)
+    optimizer = AdamW(parameters, lr=1e-4, weight_decay=1e-5, fused=True)
     scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000)
     if compiled:
-        loss.compile_dynamics(model, steps=0)
+        loss.compile_dynamics(model, length)
     batches = iter(loader)
 
     def step() -> None:
@@ -110,26 +116,30 @@ def main() -> None:
     clock = time.process_time if arguments.cpu_time else time.perf_counter
     rows = []
     for kind in arguments.models:
-        steps, first = [], []
-        for members in (1, arguments.members):
-            steps.append(make_step(kind, members, arguments.batch, not arguments.quick))
-            first.append(seconds(steps[-1], time.perf_counter))
-            steps[-1]()
+        compiled = not arguments.quick
+        make = partial(make_step, kind, batch=arguments.batch, compiled=compiled)
+        steps = [make(1), make(1, length=STEPS_FOR_WHOLE), make(arguments.members)]
+        first = [seconds(step, time.perf_counter) for step in steps]
+        for step in steps:
+            step()
         times = [
-            [seconds(s, clock) for s in steps]
+            [seconds(step, clock) for step in steps]
             for _ in range(5 if arguments.quick else arguments.pairs)
         ]
-        one, many = (statistics.median(column) for column in zip(*times, strict=True))
+        short, long, many = (statistics.median(column) for column in zip(*times, strict=True))
         rows.append(
             {
                 "model": kind,
                 "batch": arguments.batch,
                 "members": arguments.members,
-                "one_ms": round(1e3 * one, 2),
+                "one_short_ms": round(1e3 * short, 2),
+                "one_long_ms": round(1e3 * long, 2),
                 "ensemble_ms": round(1e3 * many, 2),
-                "ratio": round(statistics.median(b / a for a, b in times), 2),
-                "first_step_one_s": round(first[0], 1),
-                "first_step_ensemble_s": round(first[1], 1),
+                "ratio_short": round(statistics.median(many / one for one, _, many in times), 2),
+                "ratio_long": round(statistics.median(many / one for _, one, many in times), 2),
+                "first_step_short_s": round(first[0], 1),
+                "first_step_long_s": round(first[1], 1),
+                "first_step_ensemble_s": round(first[2], 1),
                 "clock": "processor" if arguments.cpu_time else "wall",
                 "threads": arguments.threads,
                 **provenance(),

@@ -15,8 +15,8 @@ same loss and the same gradient.
     python benchmarks/training_step.py                    # 1 core, then 2; the tables of README.md
     python benchmarks/training_step.py --quick            # a smoke run, no file
 
-Each number of cores is a process of its own that may run on so many cores only. Ours takes one
-thread in both, as train.py does; JAX takes what it finds.
+Each number of cores is a process of its own that may run on so many cores only. Ours takes as
+many threads, as train.py with threads=2; JAX takes what it finds.
 """
 
 from __future__ import annotations
@@ -320,7 +320,7 @@ def summary(rows: list[dict[str, object]]) -> str:
 def run(cores: int, sizes: list[int], batches: list[int], seconds: float, output: Path) -> None:
     """All cells in this process, on its first ``cores`` cores."""
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-    torch.set_num_threads(1)
+    torch.set_num_threads(cores)
     for size in sizes:
         print(f"N = {size}: same loss and gradients in float64 up to {check_equal(size):.1e}")
     print(f"cores: {cores}")

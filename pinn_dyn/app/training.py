@@ -26,9 +26,10 @@ from pinn_dyn.app.build import (
 from pinn_dyn.app.claims import claimed, recorded_error
 from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.description import describe
-from pinn_dyn.app.runs import CHECKPOINTS, METRICS, provenance, read_config
+from pinn_dyn.app.runs import CHECKPOINTS, METRICS, load_run, provenance, read_config
 from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation import cleaning_figure, save
+from pinn_dyn.mechanics import Predictor
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +92,8 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
             f"{data.source.name} has none, as they cannot be measured: set "
             "model.coordinates=velocity, which learns from (q, v), or use model=lnn"
         )
+    if config.get("start_from") and last is None:
+        _take_weights(model, Path(config["start_from"]))
     learner = build_learner(config, model, statistics, validator)
     description = describe(folder, config)
     trainer = build_trainer(config, folder, data.source, validator, description)
@@ -134,6 +137,18 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
         folder,
     )
     return error
+
+
+def _take_weights(model: Predictor, folder: Path) -> None:
+    """Give the model the trained weights, and the scales, of another run."""
+    try:
+        model.load_state_dict(load_run(folder, "best").model.state_dict())
+    except RuntimeError as error:
+        raise ConfigError(
+            f"start_from: the run {folder} trained another model than this configuration has, "
+            f"expected the same classes and sizes: {error}"
+        ) from error
+    log.info("starting from the weights of %s", folder)
 
 
 def _saved_steps(folder: Path) -> int:

@@ -20,10 +20,10 @@ def compile_graph(function: Callable[..., Any], arguments: tuple[Any, ...]) -> C
     """The function, compiled for arguments of these shapes and types alone.
 
     It is traced once: numbers and tensors that are not arguments become constants of the program.
-    The program checks nothing when called.
+    The program checks nothing when called, and runs in one thread.
     """
     # graph.forward is code of its own: nothing compiled for another model is taken for it.
-    return _compile(make_fx(function, _DECOMPOSITIONS)(*arguments).forward)
+    return _compile(make_fx(function, _DECOMPOSITIONS)(*arguments).forward, {"cpp.threads": 1})
 
 
 def compile_loop(
@@ -54,15 +54,16 @@ def compile_loop(
 
     # The compiler keeps its programs with the code of a function, which all loops here share.
     own = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
-    program = _compile(own)
+    program = _compile(own, {})
     # The counter of the loop is a number that the compiler must not ask for the value of.
     with dynamo_config.patch(capture_scalar_outputs=True), torch.no_grad():
         program(state, constant, *inputs)
     return program
 
 
-def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
-    options: dict[str, Any] = {
+def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+    options = {
+        **options,
         "guard_filter_fn": torch.compiler.skip_all_guards_unsafe,
         "cpp_wrapper": True,
         "post_grad_fusion_options": {"decompose_mm_pass": {}},

@@ -53,7 +53,7 @@ def fit(
     learner = DynamicsLearner(
         model,
         loss=IncrementLoss(statistics, model) if loss is None else loss,
-        optimizer=partial(AdamW, lr=learning_rate, weight_decay=1e-5),
+        optimizer=partial(AdamW, lr=learning_rate, weight_decay=1e-5, fused=True),
         scheduler=partial(
             OneCycleLR,
             max_lr=learning_rate,

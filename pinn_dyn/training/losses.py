@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,14 +11,13 @@ from torch import Tensor, nn
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
+from pinn_dyn.mechanics.ensemble import ContinuousStack
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.whole_step import MOST_STAGES, Gradients, WholeStep, stages
+from pinn_dyn.training.whole_step import CHUNK, MOST_STAGES, Gradients, WholeStep, stages
 
-CHUNK = 256
-"""Windows that compiled dynamics take at once: what they keep for the gradient stays in the cache
-(measured in benchmarks/README.md). Batches of less than twice as many are not cut."""
 STEPS_FOR_WHOLE = 20_000
-"""Training steps from which it pays to compile loss and gradient as one program."""
+"""Training steps from which it pays to compile loss and gradient as one program; it always does for
+the many members of an ensemble."""
 
 
 class WindowLoss(nn.Module, abc.ABC):
@@ -50,8 +48,10 @@ class IncrementLoss(WindowLoss):
 
     The weight w of the configuration half is 1, as in the paper's Hamiltonian loss; it is 0 for
     windows of one step where dq/dt = v holds by construction, as in the paper's Lagrangian loss.
-    Over several steps it is 1 again: a measured q is better than a velocity derived from it. A
-    window costs four evaluations of the dynamics per step.
+    Over several steps it is 1 again: a measured q is better than a velocity derived from it. The
+    weight of the other half is 1 too, or the ``velocity_weight``: below 1 where the log has no v,
+    and its derivative of q is smoother than the motion. A window costs four evaluations of the
+    dynamics per step.
 
     A curriculum ``[k_1, ... k_S]`` divides the training into S equal stages; stage s rolls out and
     compares the first k_s steps of a window alone. Short roll-outs first are cheap, and keep a
@@ -61,9 +61,11 @@ class IncrementLoss(WindowLoss):
         statistics: scales of the data.
         model: the model that will be trained.
         curriculum: steps in each stage, increasing to the H of the windows; H throughout if None.
+        velocity_weight: w of the velocity half, or of the momentum half.
 
     Raises:
-        ValueError: on a curriculum that does not increase from at least 1 to H.
+        ValueError: on a curriculum that does not increase from at least 1 to H, or a weight that
+            is not positive.
     """
 
     scale: Tensor
@@ -73,11 +75,16 @@ class IncrementLoss(WindowLoss):
         statistics: Statistics,
         model: Predictor,
         curriculum: Sequence[int] | None = None,
+        velocity_weight: float = 1.0,
     ):
         super().__init__()
+        if not velocity_weight > 0:
+            raise ValueError(f"velocity_weight is {velocity_weight}, expected a positive number")
         momentum = model.coordinates == "momentum"
         std = statistics.momentum_increment_std if momentum else statistics.velocity_increment_std
-        self.register_buffer("scale", std.float(), persistent=False)
+        scale = std.float().clone()
+        scale[:, model.num_coordinates :] /= velocity_weight**0.5
+        self.register_buffer("scale", scale, persistent=False)
         steps = std.shape[0]
         self.curriculum = [steps] if curriculum is None else list(curriculum)
         # Strictly increasing from at least 1 to the steps of a window.
@@ -100,22 +107,24 @@ class IncrementLoss(WindowLoss):
     def forward(self, model: Predictor, windows: Windows, progress: float) -> Tensor:
         longest = windows
         windows = windows.first(self.steps(progress))
-        # One model with compiled dynamics, on a CPU: an ensemble's windows have one dimension more.
-        single = windows.q.ndim == 2 and windows.q.device.type == "cpu"
-        if not (self._compiled and single and torch.is_grad_enabled()):
+        on_cpu = windows.q.device.type == "cpu"
+        if not (self._compiled and on_cpu and torch.is_grad_enabled()):
             return self._mean(model, windows)
         assert isinstance(model, ContinuousPredictor)
-        whole = self._long_training and stages(model, longest) <= MOST_STAGES
-        if not whole and len(windows) < 2 * CHUNK:
-            return self._mean(model, windows)
-        take: Callable[[Windows], tuple[Tensor, Gradients]]
-        if whole:
+        ensemble = isinstance(model, ContinuousStack)
+        if (self._long_training or ensemble) and stages(model, longest) <= MOST_STAGES:
             self._whole = self._whole or WholeStep(model, self.error)
-            parameters, take = self._whole.parameters, self._whole
-        else:
-            parameters, take = list(model.parameters()), partial(self._mean_and_gradients, model)
-        parts = [(len(part) / len(windows), *take(part)) for part in windows.split(CHUNK)]
-        return _KnownGradients.apply(parts, *parameters)
+            if ensemble:
+                known = self._whole.of_members(windows)
+                return _MemberGradients.apply(*known, *self._whole.parameters)
+            return _KnownGradients.apply(self._whole(windows), *self._whole.parameters)
+        if ensemble or len(windows) < 2 * CHUNK:
+            return self._mean(model, windows)
+        parts = [
+            (len(part) / len(windows), *self._mean_and_gradients(model, part))
+            for part in windows.split(CHUNK)
+        ]
+        return _KnownGradients.apply(parts, *model.parameters())
 
     def _mean_and_gradients(self, model: Predictor, windows: Windows) -> tuple[Tensor, Gradients]:
         loss = self._mean(model, windows)
@@ -173,6 +182,27 @@ class _KnownGradients(torch.autograd.Function):
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         weights = [float(upstream[0]) * weight for weight in ctx.weights]
         return None, *(_weighted(weights, values) for values in ctx.gradients)
+
+
+class _MemberGradients(torch.autograd.Function):
+    """The losses ``(E,)`` of an ensemble, whose gradients ``(E, ...)`` are known.
+
+    Each loss moves the parameters of its own member alone.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, losses: Tensor, gradients: Gradients, *parameters: Tensor) -> Tensor:
+        ctx.gradients = gradients
+        return losses
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (weights,) = upstream
+        scaled = [
+            None if gradient is None else gradient * weights.reshape(-1, *[1] * (gradient.ndim - 1))
+            for gradient in ctx.gradients
+        ]
+        return None, None, *scaled
 
 
 def _weighted(weights: list[float], values: tuple[Tensor | None, ...]) -> Tensor | None:

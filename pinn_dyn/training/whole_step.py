@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
@@ -12,6 +14,7 @@ from torch.func import functional_call
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor
 from pinn_dyn.mechanics.compilation import compile_graph
+from pinn_dyn.mechanics.ensemble import ContinuousStack
 from pinn_dyn.mechanics.integration import step_grid
 from pinn_dyn.mechanics.steps import take_steps
 
@@ -20,6 +23,9 @@ Gradients = list[Tensor | None]
 MOST_STAGES = 4
 """Evaluations of the dynamics in a window up to which it is compiled as a whole: the time to
 compile grows with them."""
+CHUNK = 256
+"""Windows that compiled dynamics take at once: what they keep for the gradient stays in the cache
+(measured in benchmarks/README.md). Batches of less than twice as many are not cut."""
 
 
 def stages(model: ContinuousPredictor, windows: Windows) -> int:
@@ -43,26 +49,52 @@ class WholeStep:
     """
 
     def __init__(self, model: ContinuousPredictor, error: Callable[[Tensor, Tensor], Tensor]):
-        self._window = _Window(model, error)
+        single = model.template.model if isinstance(model, ContinuousStack) else model
+        assert isinstance(single, ContinuousPredictor)
+        self._window = _Window(single, error)
         self.parameters = list(model.parameters())  # walking through the modules takes its time
         self._programs: dict[tuple[Any, ...], Callable[..., list[Any]]] = {}
 
-    def __call__(self, windows: Windows) -> tuple[Tensor, Gradients]:
-        """The loss and its gradients."""
-        model = self._window.model
-        x0 = windows.start(model.coordinates).mT.contiguous().mT  # the batch along memory
-        arguments = (
-            [value.detach() for value in self.parameters],
-            x0,
-            windows.u,
-            windows.increments(model.coordinates),
-        )
-        key = (windows.dq.shape, x0.dtype)
-        with torch.no_grad():
-            if key not in self._programs:
+    def __call__(self, windows: Windows) -> list[tuple[float, Tensor, Gradients]]:
+        """Share of the batch, loss and gradients of each of its parts."""
+        parts = windows.split(CHUNK)
+        values = [value.detach() for value in self.parameters]
+        taken = self._side_by_side([values] * len(parts), parts)
+        return [
+            (len(part) / len(windows), loss, gradients)
+            for part, (loss, *gradients) in zip(parts, taken, strict=True)
+        ]
+
+    def of_members(self, windows: Windows) -> tuple[Tensor, Gradients]:
+        """Losses ``(E,)`` and gradients ``(E, ...)`` of an ensemble on windows ``(E, B, ...)``."""
+        batches = [windows[index] for index in torch.arange(len(windows))]
+        values = zip(*(value.detach().unbind() for value in self.parameters), strict=True)
+        losses, *gradients = zip(*self._side_by_side(values, batches), strict=True)
+        return torch.stack(losses), [None if g[0] is None else torch.stack(g) for g in gradients]
+
+    def _side_by_side(
+        self, values: Iterable[Sequence[Tensor]], batches: list[Windows]
+    ) -> Iterable[list[Any]]:
+        """Loss and gradients of each batch at the values of the parameters that go with it."""
+        arguments = list(map(self._arguments, values, batches))
+        # A program is compiled here, before the threads call it.
+        programs = list(map(self._program, batches, arguments))
+        threads = min(torch.get_num_threads(), len(batches))
+        run = map if threads == 1 else _pool(threads).map
+        return run(_call, programs, arguments)
+
+    def _arguments(self, values: Sequence[Tensor], windows: Windows) -> tuple[Any, ...]:
+        coordinates = self._window.model.coordinates
+        x0 = windows.start(coordinates).mT.contiguous().mT  # the batch along memory
+        return list(values), x0, windows.u, windows.increments(coordinates)
+
+    def _program(self, windows: Windows, arguments: tuple[Any, ...]) -> Callable[..., list[Any]]:
+        key = (windows.dq.shape, windows.dq.dtype)
+        if key not in self._programs:
+            with torch.no_grad():
                 self._programs[key] = compile_graph(self._traced(windows), arguments)
-            loss, *gradients = self._programs[key](*arguments)
-        return loss, gradients
+                self._programs[key](*arguments)
+        return self._programs[key]
 
     def _traced(self, windows: Windows) -> Callable[..., list[Any]]:
         names = [f"model.{name}" for name, _ in self._window.model.named_parameters()]
@@ -98,3 +130,14 @@ class _Window(nn.Module):
             self.model.scheme(), x0, grid.to(x0), t_input.to(x0), u, windows.interpolation
         )
         return self.error(path[self.model.substeps :: self.model.substeps].movedim(0, -2), measured)
+
+
+def _call(program: Callable[..., list[Any]], arguments: tuple[Any, ...]) -> list[Any]:
+    with torch.no_grad():
+        return program(*arguments)
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads of torch's own one thread each: the programs let go of Python's lock."""
+    return ThreadPoolExecutor(threads, "windows", torch.set_num_threads, (1,))

@@ -9,7 +9,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pinn_dyn.app.runs import load_run
-from tests.app.entry import NO_FIGURES, TINY, run_script, train
+from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
 
 PLAIN = (str, int, float, bool, type(None))
 
@@ -77,6 +77,35 @@ def test_tensorboard_has_losses_errors_figures_and_hyperparameters(hnn_run):
     hparams = str(log.summary_metadata["_hparams_/session_start_info"].plugin_data.content)
     assert "optimizer.lr" in hparams
     assert "data.pairs" in hparams
+
+
+def test_a_training_starts_from_the_weights_of_another_run(tmp_path, hnn_run):
+    """With a learning rate of next to nothing it also ends there; its windows may be longer."""
+    run = train(
+        tmp_path / "run",
+        "model=hnn",
+        f"start_from={hnn_run}",
+        "data.steps=2",
+        "optimizer.lr=1e-9",
+        NO_FIGURES,
+    )
+    before, after = (load_run(folder, "best").model.state_dict() for folder in (hnn_run, run))
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("model=lnn", "start_from: the run .* trained another model than this configuration has"),
+        ("model.inverse_mass.hidden=[5]", "start_from: the run .* expected the same classes and sizes"),
+        ("start_from=nowhere", "nowhere is not a run folder"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(tmp_path, capsys, hnn_run, override, expected):
+    arguments = [*TINY, "model=hnn", f"start_from={hnn_run}", override, NO_FIGURES]
+    text = refused_text(capsys, "train.py", *arguments, f"hydra.run.dir={tmp_path}")
+    assert re.search(expected, " ".join(text.split()))
 
 
 def test_the_last_checkpoint_is_of_the_last_epoch(tmp_path):

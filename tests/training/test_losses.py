@@ -78,6 +78,22 @@ def test_the_loss_equals_a_hand_computation(kind):
 
 
 @pytest.mark.parametrize("kind", MODELS)
+def test_the_velocity_half_has_a_weight(kind):
+    """Which leaves the scales of the data as they are."""
+    loss = IncrementLoss(STATISTICS, MODELS[kind](), velocity_weight=0.25)
+    q_half = (36 + 0 + 4 + 4) / 8
+    expected = q_half + 0.25 * (BY_HAND[kind] - q_half)
+    assert float(loss.error(PREDICTED, MEASURED)) == pytest.approx(expected, rel=1e-6)
+    assert float(STATISTICS.velocity_increment_std[0, 1]) == 2.0
+
+
+@pytest.mark.parametrize("weight", [0.0, -1.0, float("nan")])
+def test_a_velocity_weight_that_is_not_positive_is_refused(weight):
+    with pytest.raises(ValueError, match=r"velocity_weight is .*, expected a positive number"):
+        IncrementLoss(STATISTICS, MODELS["lnn"](), velocity_weight=weight)
+
+
+@pytest.mark.parametrize("kind", MODELS)
 def test_the_loss_of_one_step_equals_a_hand_computation(kind):
     loss = IncrementLoss(ONE_STEP, MODELS[kind]())
     found = float(loss.error(PREDICTED[:, :1], MEASURED[:, :1]))

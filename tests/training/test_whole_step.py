@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pinn_dyn.data import Windows
+from pinn_dyn.mechanics import Ensemble
 from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
@@ -55,8 +56,8 @@ def value_and_gradients(loss, model, batch, factor=1.0):
     return value.detach(), gradients
 
 
-def assert_same(found, expected):
-    torch.testing.assert_close(found[0], expected[0], rtol=1e-12, atol=0)
+def assert_same(found, expected, factor=1.0):
+    torch.testing.assert_close(factor * found[0], expected[0], rtol=1e-12, atol=0)
     assert sum(gradient is not None for gradient in expected[1]) > 3
     for one, other in zip(found[1], expected[1], strict=True):
         assert (one is None) == (other is None)
@@ -83,14 +84,15 @@ MODELS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "interpolation"), [("lnn", "hold"), ("acceleration", "linear")])
 def test_loss_and_gradients_are_those_of_the_eager_model(monkeypatch, kind, interpolation):
-    """Also of other data with the same program, and of a batch that is taken in parts."""
-    monkeypatch.setattr("pinn_dyn.training.losses.CHUNK", 6)
+    """Also of other data with the same program, and of a batch in parts, one thread or three."""
+    monkeypatch.setattr("pinn_dyn.training.whole_step.CHUNK", 6)
     model = MODELS[kind]()
     windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
     eager, compiled = (IncrementLoss(one_step(), model).double() for _ in range(2))
     compiled.compile_dynamics(model, LONG)
     batches = [windows(6), windows(6, seed=1), windows(18, seed=2)]
-    for batch in batches:
+    for batch, threads in zip([*batches, batches[-1]], [1, 1, 1, 3], strict=True):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         assert_same(
             value_and_gradients(compiled, model, batch, factor=3.0),
             value_and_gradients(eager, model, batch, factor=3.0),
@@ -105,9 +107,33 @@ def test_loss_and_gradients_are_those_of_the_eager_model(monkeypatch, kind, inte
     )
 
 
-@pytest.mark.parametrize(
-    "case", ["eager", "short training", "without gradients", "two steps", "ensemble of windows"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2])
+def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(monkeypatch, threads):
+    """Even in a short training: one program serves all members."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    members = [perturb(AccelerationMLP(one_step(), hidden=[6]).double(), seed=k) for k in range(3)]
+    stack = Ensemble(members).stack
+    compiled, eager = (IncrementLoss(one_step(), members[0]).double() for _ in range(2))
+    compiled.compile_dynamics(stack, 0)
+    batches = [make_windows(6, seed=k) for k in range(3)]
+    rows = {
+        name: torch.stack([getattr(batch, name) for batch in batches])
+        for name in ("q", "v", "p", "dq", "dv", "dp", "u")
+    }
+    losses = compiled(stack, replace(batches[0], **rows), 0.0)
+    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    gradients = torch.autograd.grad((weights * losses).sum(), list(stack.parameters()))
+    assert len(compiled._whole._programs) == 1
+    for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
+        assert_same(
+            (losses[k], [gradient[k] for gradient in gradients]),
+            value_and_gradients(eager, member, batch, factor=float(weights[k])),
+            factor=float(weights[k]),
+        )
+
+
+@pytest.mark.parametrize("case", ["eager", "short training", "without gradients", "two steps"])
 def test_the_program_is_for_long_trainings_on_short_windows(monkeypatch, case):
     """Its compilation takes a minute and grows with the window; validation runs eagerly."""
     model = make_model("lnn")
@@ -119,8 +145,6 @@ def test_the_program_is_for_long_trainings_on_short_windows(monkeypatch, case):
         loss.compile_dynamics(model, LONG - (case == "short training"))
     if case == "two steps":
         model.substeps = 2
-    if case == "ensemble of windows":
-        batch = batch._map(lambda value: value.expand(3, *value.shape))
     with torch.set_grad_enabled(case != "without gradients"):
         value = loss(model, batch, 0.0)
     assert torch.isfinite(value).all()
