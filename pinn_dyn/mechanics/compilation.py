@@ -14,6 +14,8 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 # Products over at most so many numbers are sums that the compiler fuses with their neighbours.
 _SHORT = 8
+# A loop over fewer numbers runs in one thread: starting others takes longer than its work.
+_WORTH_THREADS = 1024
 
 
 def compile_graph(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
@@ -54,7 +56,7 @@ def compile_loop(
 
     # The compiler keeps its programs with the code of a function, which all loops here share.
     own = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
-    program = _compile(own, {})
+    program = _compile(own, {"cpp.threads": 1} if state.numel() < _WORTH_THREADS else {})
     # The counter of the loop is a number that the compiler must not ask for the value of.
     with dynamo_config.patch(capture_scalar_outputs=True), torch.no_grad():
         program(state, constant, *inputs)
