@@ -103,7 +103,7 @@ def seconds(step: Callable[[], None], clock: Callable[[], float]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, default=1, help="torch threads (default 1)")
+    parser.add_argument("--threads", type=int, default=2, help="torch threads (default 2)")
     parser.add_argument("--models", nargs="+", default=["lnn", "hnn"])
     parser.add_argument("--members", type=int, default=10)
     parser.add_argument("--batch", type=int, default=256)

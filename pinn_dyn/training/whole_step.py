@@ -79,7 +79,8 @@ class WholeStep:
         arguments = list(map(self._arguments, values, batches))
         # A program is compiled here, before the threads call it.
         programs = list(map(self._program, batches, arguments))
-        threads = min(torch.get_num_threads(), len(batches))
+        # Even a single batch goes to a thread of the pool: its small products gain by one thread.
+        threads = torch.get_num_threads()
         run = map if threads == 1 else _pool(threads).map
         return run(_call, programs, arguments)
 
