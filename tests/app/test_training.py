@@ -98,7 +98,7 @@ def test_a_training_starts_from_the_weights_of_another_run(tmp_path, hnn_run):
     ("override", "expected"),
     [
         ("model=lnn", "start_from: the run .* trained another model than this configuration has"),
-        ("model.inverse_mass.hidden=[5]", "start_from: the run .* expected the same classes and sizes"),
+        ("model.inverse_mass.hidden=[5]", "start_from: .* expected the same classes and sizes"),
         ("start_from=nowhere", "nowhere is not a run folder"),
     ],
 )
