@@ -38,10 +38,11 @@ class WholeStep:
 
     A compiled derivative still leaves some hundred operations around it to Python and autograd,
     which is half of the time of a small batch. Here the roll-out, the loss and the gradient are
-    traced as one graph and compiled for the batch sizes that come.
+    traced as one graph and compiled for the batch sizes that come. The parts of a large batch, or
+    the members of an ensemble, are taken side by side on the threads of torch.
 
     Args:
-        model: the model that is trained.
+        model: the model that is trained, or the stack of an ensemble.
         error: the loss of increments, as :meth:`IncrementLoss.error`.
 
     Attributes:
