@@ -152,8 +152,8 @@ def take_steps(
 def compiled_scheme(scheme: Scheme, x0: Tensor, u: Tensor) -> CompiledScheme:
     """The scheme with its steps as one compiled loop, without gradients, in C++ throughout.
 
-    Without the thousands of small operations of a long roll-out. Compiling takes one to two minutes
-    for a new model, some 10 s for one of the same shape (the compiler's cache on disk).
+    Without the thousands of small operations of a long roll-out. Compiling takes half a minute to a
+    minute for a new model, some 15 s for one of the same shape (the compiler's cache on disk).
 
     Args:
         scheme: the method, with the system in it.
