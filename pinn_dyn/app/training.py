@@ -142,7 +142,11 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
 def _take_weights(model: Predictor, folder: Path) -> None:
     """Give the model the trained weights, and the scales, of another run."""
     try:
-        model.load_state_dict(load_run(folder, "best").model.state_dict())
+        trained = load_run(folder, "best").model
+    except ConfigError as error:
+        raise ConfigError(f"start_from: {error}") from error
+    try:
+        model.load_state_dict(trained.state_dict())
     except RuntimeError as error:
         raise ConfigError(
             f"start_from: the run {folder} trained another model than this configuration has, "

@@ -99,7 +99,7 @@ def test_a_training_starts_from_the_weights_of_another_run(tmp_path, hnn_run):
     [
         ("model=lnn", "start_from: the run .* trained another model than this configuration has"),
         ("model.inverse_mass.hidden=[5]", "start_from: .* expected the same classes and sizes"),
-        ("start_from=nowhere", "nowhere is not a run folder"),
+        ("start_from=nowhere", "start_from: nowhere is not a run folder"),
     ],
 )
 def test_weights_that_do_not_fit_are_refused(tmp_path, capsys, hnn_run, override, expected):
