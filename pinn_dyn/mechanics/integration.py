@@ -76,7 +76,7 @@ def rollout_increments(
         interpolation: how u moves between its samples.
         substeps: steps of the integrator between two times of ``t``.
         scheme: another method, with f in it, in the place of RK4.
-        compile: take each step by one compiled function, without gradients; pays for long
+        compile: take the steps by one compiled loop, without gradients; pays for long
             roll-outs.
 
     Returns:

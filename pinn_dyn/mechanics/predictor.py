@@ -78,8 +78,8 @@ class ContinuousPredictor(Predictor):
             substeps (:func:`pinn_dyn.mechanics.steps.rosenbrock`).
         substeps: steps of the integrator within a step of the data. One is enough while the data
             resolve the fastest motion; data of a low rate need more.
-        compiled_rollouts: take the steps of roll-outs without gradients by a compiled function;
-            pays for long ones, as compiling takes some 20 s.
+        compiled_rollouts: take the steps of roll-outs without gradients by a compiled loop; pays
+            for long ones, as compiling takes half a minute to a minute.
     """
 
     integrator: Integrator = "rk4"
