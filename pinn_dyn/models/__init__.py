@@ -18,12 +18,13 @@ from pinn_dyn.models.input_matrix import (
 )
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.mlp import MLP
-from pinn_dyn.models.potential import NetworkPotential
+from pinn_dyn.models.potential import ChainPotential, NetworkPotential
 from pinn_dyn.models.statistics import Statistics
 
 __all__ = [
     "MLP",
     "AccelerationMLP",
+    "ChainPotential",
     "CholeskyFactor",
     "ConstantCholesky",
     "ConstantInput",

@@ -22,9 +22,11 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     Attributes:
         transposed: the matrix is L^T L instead, with L^T the upper triangular factor.
+        chain: column j of L depends on the coordinates after q_j alone.
     """
 
     transposed: bool = False
+    chain: bool = False
 
     @abc.abstractmethod
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
@@ -68,9 +70,14 @@ class NetworkCholesky(CholeskyFactor):
         L_ii = scale_i (b sigmoid(y_i) + epsilon),   L_ij = scale_i b (2 sigmoid(y_ij) - 1)
 
     In a chain of bodies row i of L in M = L^T L (``transposed``) describes the bodies from joint i
-    to the tip and depends on the joints there alone, so that most entries are simpler functions
-    than those of L in M = L L^T (Featherstone 2005, "Efficient factorization of the joint-space
-    inertia matrix for branched kinematic trees"). The scale is then that of the columns of L.
+    to the tip, so that most entries are simpler functions than those of L in M = L L^T
+    (Featherstone 2005, "Efficient factorization of the joint-space inertia matrix for branched
+    kinematic trees"). The scale is then that of the columns of L.
+
+    In a serial chain of rigid bodies, whose coordinates are the joints from base to tip, M_ij with
+    i >= j depends on the joints after j alone: turning the joints up to j moves all bodies that the
+    two move like one. Then so does column j of L in M = L^T L, and in M^-1 = L L^T. With ``chain``
+    the network cannot say otherwise: its weights are masked.
 
     Args:
         size: N.
@@ -83,12 +90,13 @@ class NetworkCholesky(CholeskyFactor):
         epsilon: smallest diagonal entry in units of the scale; 0 allows a semi-definite matrix.
         bound: b above, or None.
         transposed: use L for L^T L.
+        chain: let column j of L depend on the coordinates after q_j alone.
         initial: what epsilon is added to before training; below 1 in the mass matrix of a robot
             that moves almost without inertia. With a bound b it is 0.63 b.
 
     Raises:
         ValueError: on an unknown diagonal, a negative epsilon, a bound or a start that is not
-            positive, or both of these.
+            positive, or both of these; with ``chain`` on hidden layers of too few units.
     """
 
     placement: Tensor
@@ -107,6 +115,7 @@ class NetworkCholesky(CholeskyFactor):
         epsilon: float = 1e-3,
         bound: float | None = None,
         transposed: bool = False,
+        chain: bool = False,
         initial: float = 1.0,
     ):
         super().__init__()
@@ -127,15 +136,17 @@ class NetworkCholesky(CholeskyFactor):
         self.epsilon = epsilon
         self.bound = bound
         self.transposed = transposed
+        self.chain = chain
+        row, column = torch.tril_indices(size, size, offset=-1)
+        after = [*range(size), *column.tolist()] if chain else None
         outputs = size * (size + 1) // 2
-        self.network = MLP(size, outputs, hidden, activation, mean, std, angles)
+        self.network = MLP(size, outputs, hidden, activation, mean, std, angles, after)
         with torch.no_grad():
             # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
             last.bias[:size] = _softplus_inverse(initial) if diagonal == "softplus" else initial
         # vec(L) = y S, where S holds the scales and says which entry of y goes where.
-        row, column = torch.tril_indices(size, size, offset=-1)
         order = torch.cat([torch.arange(size) * (size + 1), row * size + column])
         placement = torch.zeros(outputs, size * size)
         placement[torch.arange(outputs), order] = scale.float()[

@@ -40,6 +40,9 @@ class LagrangianNetwork(StructuredNetwork):
         angles: which coordinates are angles; the heads see their sine and cosine.
         substeps: steps of the integrator within a step of the data.
         integrator: "rk4", or "rosenbrock" where damping outweighs inertia.
+
+    Raises:
+        ValueError: on a mass head for a chain that is not transposed.
     """
 
     def __init__(
@@ -74,6 +77,11 @@ class LagrangianNetwork(StructuredNetwork):
             std=statistics.q_std,
             angles=angles,
         )
+        if self.mass.chain and not self.mass.transposed:
+            raise ValueError(
+                "mass.chain is true and mass.transposed false, expected both: only in M = L^T L "
+                "does a column of L depend on the joints after it alone"
+            )
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""

@@ -42,6 +42,10 @@ class MLP(nn.Module):
     An entry x_i that is an angle goes in as sin(x_i) and cos(x_i) instead, so that y has its
     period of 2 pi.
 
+    With ``after`` the output y_o depends on the entries x_i, i > after_o, alone: the weights W_k
+    are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on, and
+    more units read many entries than few.
+
     :meth:`linearize` runs the network once and keeps the slopes of its activations; from these
     :meth:`pushforward` gives J dx (tangent pass) and :meth:`pullback` J^T dy (reverse pass), as
     ordinary tensor operations: they can be differentiated again and compiled.
@@ -53,9 +57,11 @@ class MLP(nn.Module):
         activation: one of softplus, tanh, silu.
         mean, std: normalization of x, ``(inputs,)``; none if left out.
         angles: positions of the angles in x.
+        after: for each output the position in x after which it reads; all of x if None.
 
     Raises:
-        ValueError: on an unknown activation, widths below 1, or a position that x does not have.
+        ValueError: on an unknown activation, widths below 1, a position that x does not have, or
+            hidden layers too narrow for units of every kind that ``after`` asks for.
     """
 
     mean: Tensor
@@ -71,6 +77,7 @@ class MLP(nn.Module):
         mean: Tensor | None = None,
         std: Tensor | None = None,
         angles: Sequence[int] = (),
+        after: Sequence[int] | None = None,
     ):
         super().__init__()
         if activation not in ACTIVATIONS:
@@ -91,6 +98,9 @@ class MLP(nn.Module):
         for layer in self.linears:
             nn.init.xavier_normal_(layer.weight)
             nn.init.zeros_(layer.bias)
+        self._masked = after is not None
+        if after is not None:
+            self._mask(inputs, after)
         self.register_buffer("mean", torch.zeros(inputs) if mean is None else mean.float())
         self.register_buffer("std", torch.ones(inputs) if std is None else std.float())
 
@@ -99,26 +109,61 @@ class MLP(nn.Module):
         """The layers, from input to output."""
         return cast("list[nn.Linear]", list(self.layers))
 
+    def _mask(self, inputs: int, after: Sequence[int]) -> None:
+        """Masks for the weights, and initial weights that make up for what the masks take away."""
+        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)  # entry a unit reads from
+        masks = []
+        for layer in self.linears[:-1]:
+            width = layer.out_features
+            # As many units that read from x_i on as there are entries to read.
+            share = torch.arange(inputs - 1, 0, -1).cumsum(0).double()
+            place = (torch.arange(width) + 0.5) / width * inputs * (inputs - 1) / 2
+            below, first = first, 1 + torch.searchsorted(share, place.double())
+            masks.append(below >= first[:, None])
+            if set(first.tolist()) < set(range(1, inputs)):
+                raise ValueError(
+                    f"a hidden layer has {width} units, expected at least "
+                    f"{inputs * (inputs - 1) // 2}, some for each group of the {inputs} entries"
+                )
+        masks.append(first > torch.tensor(after)[:, None])
+        for k, (layer, mask) in enumerate(zip(self.linears, masks, strict=True)):
+            self.register_buffer(f"mask_{k}", mask.float(), persistent=False)
+            with torch.no_grad():
+                read = mask.sum(1, keepdim=True).clamp(min=1)
+                layer.weight.mul_((mask.shape[1] / read).sqrt())
+
+    def _weights(self) -> list[Tensor]:
+        """The weight matrices, masked where there are masks."""
+        weights = [layer.weight for layer in self.linears]
+        if not self._masked:
+            return weights
+        return [weight * self.get_buffer(f"mask_{k}") for k, weight in enumerate(weights)]
+
+    def _layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights ``(a, b)`` and biases ``(a, 1)``, from input to output."""
+        biases = [layer.bias[:, None] for layer in self.linears]
+        return list(zip(self._weights(), biases, strict=True))
+
     def forward(self, x: Tensor) -> Tensor:
         """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
         h = (x - self.mean) / self.std
         if self._has_angles:
             cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
             h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
-        *hidden, last = self.linears
-        for layer in hidden:
-            h, _ = self._activation(layer(h))
-        return last(h)
+        *hidden, last = zip(self._weights(), self.linears, strict=True)
+        for weight, layer in hidden:
+            h, _ = self._activation(F.linear(h, weight, layer.bias))
+        return F.linear(h, last[0], last[1].bias)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
         """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
         h, slopes = self._features(columns(x))
         tape = [slopes] if slopes is not None else []
-        *hidden, last = self.linears
-        for layer in hidden:
-            h, slope = self._activation(torch.addmm(layer.bias[:, None], layer.weight, h))
+        *hidden, (last, last_bias) = self._layers()
+        for weight, bias in hidden:
+            h, slope = self._activation(torch.addmm(bias, weight, h))
             tape.append(slope)
-        return rows(torch.addmm(last.bias[:, None], last.weight, h), x), tuple(tape)
+        return rows(torch.addmm(last_bias, last, h), x), tuple(tape)
 
     def linearize_along(self, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tape]:
         """y, J dx and the tape: :meth:`linearize` and :meth:`pushforward` in one pass.
@@ -128,34 +173,34 @@ class MLP(nn.Module):
         features, slopes = self._features(columns(x))
         tangent = self._tangent(columns(dx), slopes)
         tape = [slopes] if slopes is not None else []
-        *hidden, last = self.linears
-        for layer in hidden:
-            z, dz = _side_by_side(layer.weight, features, tangent)
-            features, slope = self._activation(z + layer.bias[:, None])
+        *hidden, (last, last_bias) = self._layers()
+        for weight, bias in hidden:
+            z, dz = _side_by_side(weight, features, tangent)
+            features, slope = self._activation(z + bias)
             tangent = slope * dz
             tape.append(slope)
-        y, dy = _side_by_side(last.weight, features, tangent)
-        return rows(y + last.bias[:, None], x), rows(dy, x), tuple(tape)
+        y, dy = _side_by_side(last, features, tangent)
+        return rows(y + last_bias, x), rows(dy, x), tuple(tape)
 
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
-        *hidden, last = self.linears
+        *hidden, last = self._weights()
         slopes, tape = (tape[0], tape[1:]) if self._has_angles else (None, tape)
         h = self._tangent(columns(dx), slopes)
-        for layer, slope in zip(hidden, tape, strict=True):
-            h = (layer.weight @ h) * slope
-        return rows(last.weight @ h, dx)
+        for weight, slope in zip(hidden, tape, strict=True):
+            h = (weight @ h) * slope
+        return rows(last @ h, dx)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
-        *hidden, last = self.linears
+        *hidden, last = self._weights()
         first, rest = (tape[0], tape[1:]) if self._has_angles else (None, tape)
         h = columns(dy)
         # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
         # ones(B, 1) @ W to a wrong gradient at some small sizes.
-        h = last.weight.T * h if last.out_features == 1 else last.weight.T @ h
-        for layer, slope in zip(reversed(hidden), reversed(rest), strict=True):
-            h = layer.weight.T @ (h * slope)
+        h = last.T * h if last.shape[0] == 1 else last.T @ h
+        for weight, slope in zip(reversed(hidden), reversed(rest), strict=True):
+            h = weight.T @ (h * slope)
         if first is None:
             return rows(h / self.std[:, None], dy)
         sine_or_linear, cosine = (h * first).chunk(2)

@@ -1,16 +1,29 @@
-"""Head for the potential energy and its force."""
+"""Heads for the potential energy and its force."""
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.mlp import MLP, columns, rows
 
 
-class NetworkPotential(nn.Module):
+class Potential(nn.Module, abc.ABC):
+    """V(q) and its gradient."""
+
+    @abc.abstractmethod
+    def forward(self, q: Tensor) -> Tensor:
+        """V(q), ``(*batch,)``, J."""
+
+    @abc.abstractmethod
+    def gradient(self, q: Tensor) -> Tensor:
+        """G(q) = dV/dq, ``(*batch, N)``."""
+
+
+class NetworkPotential(Potential):
     """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
 
     K = S S^T is a learned constant: an elastic or gravity well is mostly quadratic, and the
@@ -67,3 +80,87 @@ class NetworkPotential(nn.Module):
         """z, with zero in the place of angles."""
         z = (q - self.network.mean) / self.network.std
         return z.masked_fill(self.network.is_angle, 0.0)
+
+
+class ChainPotential(Potential):
+    """V(q) of a serial chain of revolute joints, from base to tip: linear in each sine and cosine.
+
+    ::
+
+        V = scale * e^T w_1,    w_k = (T_k + S_k sin q_k + C_k cos q_k) w_k+1 + h_k
+
+    with w_N+1 = h_N+1, and T, S, C, h and e learned.
+
+    In a chain of rigid bodies w_k is the first moment of mass of the bodies from joint k to the
+    tip, in the frame before joint k: what lies beyond the joint, turned by it, and what the body
+    adds. Three rows are enough to write that potential exactly; more make it easier to learn.
+
+    Args:
+        size: N.
+        scale: typical energy, J; from the data.
+        mean, std: not used; every potential head takes the same arguments from the model.
+        angles: which coordinates are angles: all of them.
+        rank: rows of the vectors w, h and e.
+
+    Raises:
+        ValueError: if a coordinate is no angle, or on a rank below 1.
+    """
+
+    scale: Tensor
+
+    def __init__(
+        self,
+        *,
+        size: int,
+        scale: float,
+        mean: Tensor,
+        std: Tensor,
+        angles: Sequence[int] = (),
+        rank: int = 8,
+    ):
+        super().__init__()
+        if set(angles) != set(range(size)):
+            raise ValueError(
+                f"angles is {list(angles)}, expected all {size} coordinates: the chain potential "
+                "is that of revolute joints"
+            )
+        if rank < 1:
+            raise ValueError(f"rank is {rank}, expected at least 1")
+        self.rank = rank
+
+        def normal(rows: int, columns: int) -> nn.Parameter:
+            return nn.Parameter(torch.randn(rows, columns) / rank**0.5)
+
+        self.turns = nn.ParameterList(normal(3 * rank, rank) for _ in range(size))
+        self.offsets = nn.ParameterList(normal(rank, 1) for _ in range(size + 1))
+        self.base = normal(rank, 1)
+        with torch.no_grad():
+            for turn in self.turns:
+                turn.mul_(0.7)  # w keeps its size along the chain
+        self.register_buffer("scale", torch.tensor(float(scale)))
+
+    def forward(self, q: Tensor) -> Tensor:
+        """V(q), ``(*batch,)``, J."""
+        w, _ = self._moments(columns(q))
+        return self.scale * (self.base * w).sum(0).reshape(q.shape[:-1])
+
+    def gradient(self, q: Tensor) -> Tensor:
+        """G(q) = dV/dq, ``(*batch, N)``, by one pass from the tip and one from the base."""
+        x = columns(q)
+        sine, cosine = torch.sin(x), torch.cos(x)
+        _, turned = self._moments(x)
+        left, force = self.base.expand(-1, x.shape[1]), []
+        for k, (by_sine, by_cosine) in enumerate(turned):
+            force.append((left * (cosine[k] * by_sine - sine[k] * by_cosine)).sum(0))
+            left = self.turns[k].T @ torch.cat([left, sine[k] * left, cosine[k] * left])
+        return self.scale * rows(torch.stack(force), q)
+
+    def _moments(self, x: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """w_1, ``(rank, B)``, and S_k w_k+1 and C_k w_k+1 of each joint."""
+        sine, cosine = torch.sin(x), torch.cos(x)
+        w, turned = self.offsets[-1].expand(-1, x.shape[1]), []
+        for k in reversed(range(len(x))):
+            fixed, by_sine, by_cosine = (self.turns[k] @ w).split(self.rank)
+            w = fixed + sine[k] * by_sine + cosine[k] * by_cosine + self.offsets[k]
+            turned.append((by_sine, by_cosine))
+        return w, turned[::-1]

@@ -13,12 +13,12 @@ from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
-from pinn_dyn.models.potential import NetworkPotential
+from pinn_dyn.models.potential import Potential
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[..., CholeskyFactor]
 """Builds a Cholesky head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
-PotentialHead = Callable[..., NetworkPotential]
+PotentialHead = Callable[..., Potential]
 """Builds a potential head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
 InputHead = Callable[..., InputMatrix]
 """Builds an input head from ``size``, ``inputs``, ``scale``, ``mean``, ``std``, ``angles``,

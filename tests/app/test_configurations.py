@@ -33,8 +33,9 @@ HEADS = sorted(
 )
 # Configurations that leave a value to the user.
 VALUES = {
-    "mass/fixed": "value=[[0.01,0,0],[0,0.01,0],[0,0,0.1]]",
-    "damping/fixed": "value=[[0.1,0,0],[0,0.1,0],[0,0,0.1]]",
+    "mass/fixed": "model.mass.value=[[0.01,0,0],[0,0.01,0],[0,0,0.1]]",
+    "damping/fixed": "model.damping.value=[[0.1,0,0],[0,0.1,0],[0,0,0.1]]",
+    "potential/chain": "model.angles=[0,1,2]",
 }
 
 
@@ -122,7 +123,7 @@ def test_every_model_trains(tmp_path, model):
 @pytest.mark.parametrize("head", HEADS)
 def test_every_head_trains(tmp_path, head):
     group, option = head.split("/")
-    value = [f"model.{group}.{VALUES[head]}"] if head in VALUES else []
+    value = [VALUES[head]] if head in VALUES else []
     folder = train(tmp_path / "run", "model=lnn", f"model/{group}={option}", *value, NO_FIGURES)
     assert_trained(folder)
 

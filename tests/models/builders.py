@@ -6,6 +6,7 @@ import torch
 
 from pinn_dyn.models import (
     AccelerationMLP,
+    ChainPotential,
     ConstantCholesky,
     ConstantInput,
     CoulombFriction,
@@ -153,6 +154,18 @@ TRANSPOSED = dict(
     damping=partial(NetworkCholesky, hidden=[4], bound=2.0, transposed=True),
 )
 """M = L^T L, for the Lagrangian network alone."""
+
+CHAIN = {
+    kind: dict(
+        n=3,
+        m=3,
+        mass=partial(NetworkCholesky, hidden=[6, 5], chain=True, transposed=kind == "lnn"),
+        potential=partial(ChainPotential, rank=4),
+        angles=[0, 1, 2],
+    )
+    for kind in ("lnn", "hnn")
+}
+"""The heads of a serial chain of revolute joints."""
 
 
 NONLINEAR = dict(

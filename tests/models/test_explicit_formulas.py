@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.models.autodiff import autodiff_derivative, rk4_increment
-from tests.models.builders import TRANSPOSED, VARIANTS, make_structured, random_batch
+from tests.models.builders import CHAIN, TRANSPOSED, VARIANTS, make_structured, random_batch
 from tests.support.finite_differences import assert_near, slope
 
 MODELS = pytest.mark.parametrize("kind", ["lnn", "hnn"])
@@ -19,8 +19,9 @@ def batch_of(model):
 ALL_MODELS = pytest.mark.parametrize(
     ("kind", "variant"),
     [(kind, VARIANTS[name]) for kind in ("lnn", "hnn") for name in VARIANTS]
-    + [("lnn", TRANSPOSED)],
-    ids=[f"{kind}-{name}" for kind in ("lnn", "hnn") for name in VARIANTS] + ["lnn-transposed"],
+    + [("lnn", TRANSPOSED), *CHAIN.items()],
+    ids=[f"{kind}-{name}" for kind in ("lnn", "hnn") for name in VARIANTS]
+    + ["lnn-transposed", "lnn-chain", "hnn-chain"],
 )
 
 
