@@ -122,8 +122,8 @@ class MLP(nn.Module):
             masks.append(below >= first[:, None])
             if set(first.tolist()) < set(range(1, inputs)):
                 raise ValueError(
-                    f"a hidden layer has {width} units, expected at least "
-                    f"{inputs * (inputs - 1) // 2}, some for each group of the {inputs} entries"
+                    f"hidden has a layer of {width} units, expected at least "
+                    f"{inputs * (inputs - 1) // 2}, some that read from each of the entries on"
                 )
         masks.append(first > torch.tensor(after)[:, None])
         for k, (layer, mask) in enumerate(zip(self.linears, masks, strict=True)):

@@ -122,7 +122,7 @@ class ChainPotential(Potential):
         if set(angles) != set(range(size)):
             raise ValueError(
                 f"angles is {list(angles)}, expected all {size} coordinates: the chain potential "
-                "is that of revolute joints"
+                "is that of revolute joints; for others take NetworkPotential"
             )
         if rank < 1:
             raise ValueError(f"rank is {rank}, expected at least 1")

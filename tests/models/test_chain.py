@@ -139,7 +139,7 @@ def test_masked_units_start_as_large_as_others():
 
 
 def test_too_few_units_for_a_chain_are_refused():
-    with pytest.raises(ValueError, match="has 2 units, expected at least 6, some for each group"):
+    with pytest.raises(ValueError, match="a layer of 2 units, expected at least 6, some that"):
         NetworkCholesky(size=JOINTS, **SCALES, hidden=[12, 2], chain=True)
 
 
