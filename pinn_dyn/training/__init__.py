@@ -5,12 +5,14 @@ from pinn_dyn.training.fit import fit
 from pinn_dyn.training.impulse import ImpulseLoss
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.losses import IncrementLoss, WindowLoss
+from pinn_dyn.training.midpoint import MidpointLoss
 
 __all__ = [
     "DynamicsLearner",
     "EnsembleLearner",
     "ImpulseLoss",
     "IncrementLoss",
+    "MidpointLoss",
     "NonFiniteLossError",
     "WindowLoss",
     "fit",

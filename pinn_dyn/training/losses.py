@@ -13,7 +13,13 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
 from pinn_dyn.mechanics.ensemble import ContinuousStack
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.whole_step import CHUNK, MOST_STAGES, Gradients, WholeStep, stages
+from pinn_dyn.training.whole_step import (
+    CHUNK,
+    MOST_STAGES,
+    Gradients,
+    WholeStep,
+    rolled_out,
+)
 
 STEPS_FOR_WHOLE = 20_000
 """Training steps from which it pays to compile loss and gradient as one program; it always does for
@@ -112,8 +118,8 @@ class IncrementLoss(WindowLoss):
             return self._mean(model, windows)
         assert isinstance(model, ContinuousPredictor)
         ensemble = isinstance(model, ContinuousStack)
-        if (self._long_training or ensemble) and stages(model, longest) <= MOST_STAGES:
-            self._whole = self._whole or WholeStep(model, self.error)
+        if (self._long_training or ensemble) and self.evaluations(model, longest) <= MOST_STAGES:
+            self._whole = self._whole or WholeStep(model, self._traced)
             if ensemble:
                 known = self._whole.of_members(windows)
                 return _MemberGradients.apply(*known, *self._whole.parameters)
@@ -145,6 +151,15 @@ class IncrementLoss(WindowLoss):
             interpolation=windows.interpolation,
         )
         return self.error(predicted[..., 1:, :], windows.increments(model.coordinates))
+
+    def _traced(
+        self, model: ContinuousPredictor, windows: Windows, x0: Tensor, u: Tensor, measured: Tensor
+    ) -> Tensor:
+        return self.error(rolled_out(model, windows, x0, u), measured)
+
+    def evaluations(self, model: ContinuousPredictor, windows: Windows) -> int:
+        """Evaluations of the dynamics in a window."""
+        return len(model.scheme().nodes) * model.substeps * (len(windows.t) - 1)
 
     def error(self, predicted: Tensor, measured: Tensor) -> Tensor:
         """The loss of increments over the first k steps, ``(B, k, 2N)``.

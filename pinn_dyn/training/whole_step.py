@@ -20,17 +20,14 @@ from pinn_dyn.mechanics.steps import take_steps
 
 Gradients = list[Tensor | None]
 """One entry for each parameter of the model, None where the loss does not depend on it."""
+TracedLoss = Callable[[ContinuousPredictor, Windows, Tensor, Tensor, Tensor], Tensor]
+"""Maps a model, windows, x0, u and the measured increments to the loss."""
 MOST_STAGES = 4
 """Evaluations of the dynamics in a window up to which it is compiled as a whole: the time to
 compile grows with them."""
 CHUNK = 256
 """Windows that compiled dynamics take at once: what they keep for the gradient stays in the cache
 (measured in benchmarks/README.md). Batches of less than twice as many are not cut."""
-
-
-def stages(model: ContinuousPredictor, windows: Windows) -> int:
-    """Evaluations of the dynamics in a window."""
-    return len(model.scheme().nodes) * model.substeps * (len(windows.t) - 1)
 
 
 class WholeStep:
@@ -43,16 +40,18 @@ class WholeStep:
 
     Args:
         model: the model that is trained, or the stack of an ensemble.
-        error: the loss of increments, as :meth:`IncrementLoss.error`.
+        loss: the loss of one model on windows, by operations that can be traced. What differs from
+            batch to batch is given beside the windows: the state at the start ``(B, 2N)``, the
+            input ``(B, K, M)`` and the measured increments ``(B, H, 2N)``.
 
     Attributes:
         parameters: those of the model, in the order of the gradients.
     """
 
-    def __init__(self, model: ContinuousPredictor, error: Callable[[Tensor, Tensor], Tensor]):
+    def __init__(self, model: ContinuousPredictor, loss: TracedLoss):
         single = model.template.model if isinstance(model, ContinuousStack) else model
         assert isinstance(single, ContinuousPredictor)
-        self._window = _Window(single, error)
+        self._window = _Window(single, loss)
         self.parameters = list(model.parameters())  # walking through the modules takes its time
         self._programs: dict[tuple[Any, ...], Callable[..., list[Any]]] = {}
 
@@ -120,18 +119,21 @@ class WholeStep:
 class _Window(nn.Module):
     """The loss of a batch as a function of the parameters and of the data."""
 
-    def __init__(self, model: ContinuousPredictor, error: Callable[[Tensor, Tensor], Tensor]):
+    def __init__(self, model: ContinuousPredictor, loss: TracedLoss):
         super().__init__()
         self.model = model
-        self.error = error
+        self.loss = loss
 
     def forward(self, windows: Windows, x0: Tensor, u: Tensor, measured: Tensor) -> Tensor:
-        t, t_input = windows.t - windows.t[0], windows.t_input - windows.t[0]
-        grid = step_grid(t, t_input, self.model.substeps)
-        path = take_steps(
-            self.model.scheme(), x0, grid.to(x0), t_input.to(x0), u, windows.interpolation
-        )
-        return self.error(path[self.model.substeps :: self.model.substeps].movedim(0, -2), measured)
+        return self.loss(self.model, windows, x0, u, measured)
+
+
+def rolled_out(model: ContinuousPredictor, windows: Windows, x0: Tensor, u: Tensor) -> Tensor:
+    """Increments to each step, ``(B, H, 2N)``, by operations that can be traced."""
+    t, t_input = windows.t - windows.t[0], windows.t_input - windows.t[0]
+    grid = step_grid(t, t_input, model.substeps).to(x0)
+    path = take_steps(model.scheme(), x0, grid, t_input.to(x0), u, windows.interpolation)
+    return path[model.substeps :: model.substeps].movedim(0, -2)
 
 
 def _call(program: Callable[..., list[Any]], arguments: tuple[Any, ...]) -> list[Any]:

@@ -163,6 +163,8 @@ def test_a_curriculum_trains(tmp_path):
     [
         (["loss=impulse", "model=mlp"], "loss: model is a NextStateMLP"),
         (["loss=impulse", "data.steps=3"], "loss: the windows have 3 steps"),
+        (["loss=midpoint", "model=mlp"], "loss: model is a NextStateMLP"),
+        (["loss=midpoint", "data.steps=3"], "loss: the windows have 3 steps"),
         (["data.steps=3", "loss.curriculum=[1,2]"], "loss: curriculum is [1, 2]"),
     ],
 )
@@ -193,7 +195,7 @@ def test_a_hamiltonian_network_on_momenta_is_told_how_to_do_without(tmp_path, mo
 def test_there_are_models_heads_and_experiments_to_test():
     """The lists above come from globs: an empty one would test nothing."""
     assert {"hnn", "lnn", "mlp"} <= set(MODELS)
-    assert {"increment", "impulse"} <= set(LOSSES)
+    assert {"increment", "impulse", "midpoint"} <= set(LOSSES)
     assert {"mass/network", "damping/fixed", "input/network", "friction/coulomb"} <= set(HEADS)
     assert {"soft_arm_1", "soft_arm_2", "panda", "logs", "example_log", "neck", "panda_real"} <= {
         x.split("/")[0] for x in EXPERIMENTS

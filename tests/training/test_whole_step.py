@@ -15,7 +15,7 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkPotential,
 )
-from pinn_dyn.training import IncrementLoss
+from pinn_dyn.training import IncrementLoss, MidpointLoss
 from pinn_dyn.training.losses import STEPS_FOR_WHOLE as LONG
 from tests.models.builders import STEP, make_model, make_statistics, make_structured, perturb
 
@@ -82,13 +82,22 @@ MODELS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "interpolation"), [("lnn", "hold"), ("acceleration", "linear")])
-def test_loss_and_gradients_are_those_of_the_eager_model(monkeypatch, kind, interpolation):
+@pytest.mark.parametrize(
+    ("kind", "interpolation", "kind_of_loss"),
+    [
+        ("lnn", "hold", IncrementLoss),
+        ("acceleration", "linear", IncrementLoss),
+        ("lnn", "linear", MidpointLoss),
+    ],
+)
+def test_loss_and_gradients_are_those_of_the_eager_model(
+    monkeypatch, kind, interpolation, kind_of_loss
+):
     """Also of other data with the same program, and of a batch in parts, one thread or three."""
     monkeypatch.setattr("pinn_dyn.training.whole_step.CHUNK", 6)
     model = MODELS[kind]()
     windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
-    eager, compiled = (IncrementLoss(one_step(), model).double() for _ in range(2))
+    eager, compiled = (kind_of_loss(one_step(), model).double() for _ in range(2))
     compiled.compile_dynamics(model, LONG)
     batches = [windows(6), windows(6, seed=1), windows(18, seed=2)]
     for batch, threads in zip([*batches, batches[-1]], [1, 1, 1, 3], strict=True):
