@@ -98,6 +98,10 @@ class NetworkInput(InputMatrix):
 class NonlinearInput(InputMatrix):
     """tau = A(q, u) u with A(q, u) = scale_i * network(q, u), reshaped to N x M.
 
+    The columns of the ``linear`` inputs are constants instead, and the network does not see those
+    inputs. Of the rates of motors a log often says no more than that, and a network that depends on
+    them finds more than there is.
+
     For inputs that are positions, not forces: a tendon that its motor tightens gets stiffer and
     pulls in another direction. With the motors' rates among the inputs (the step
     :class:`pinn_dyn.data.logs.InputRates`) the force on the robot is that of springs and dampers
@@ -112,6 +116,10 @@ class NonlinearInput(InputMatrix):
         u_mean, u_std: normalization of u, ``(M,)``; from the data.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
+        linear: inputs with a constant column.
+
+    Raises:
+        ValueError: if ``linear`` names an input twice, one that is not there, or all of them.
     """
 
     affine = False
@@ -131,10 +139,21 @@ class NonlinearInput(InputMatrix):
         u_std: Tensor,
         hidden: Sequence[int],
         activation: str = "softplus",
+        linear: Sequence[int] = (),
     ):
         super().__init__(size, inputs)
-        mean, std = torch.cat([mean, u_mean]), torch.cat([std, u_std])
-        self.network = MLP(size + inputs, size * inputs, hidden, activation, mean, std, angles)
+        self.curved = [k for k in range(inputs) if k not in linear]
+        if len(self.curved) + len(linear) != inputs or not self.curved:
+            raise ValueError(
+                f"linear is {list(linear)}, expected some but not all of the {inputs} inputs, 0 to "
+                f"{inputs - 1}, each once"
+            )
+        mean, std = torch.cat([mean, u_mean[self.curved]]), torch.cat([std, u_std[self.curved]])
+        seen = len(self.curved)
+        self.network = MLP(size + seen, size * seen, hidden, activation, mean, std, angles)
+        self.constant = nn.Parameter(torch.zeros(size, len(linear))) if linear else None
+        # Where each column of [curved, linear] belongs.
+        self.order = sorted(range(inputs), key=[*self.curved, *linear].__getitem__)
         self.register_buffer("scale", scale.float())
         self.register_buffer("u_mean", u_mean.float())
 
@@ -147,8 +166,13 @@ class NonlinearInput(InputMatrix):
         return matvec(self._matrix(q, u), u)
 
     def _matrix(self, q: Tensor, u: Tensor) -> Tensor:
-        y = self.network.linearize(torch.cat([q, u], dim=-1))[0]
-        return self.scale * y.unflatten(-1, self.shape)
+        if self.constant is None:
+            y = self.network.linearize(torch.cat([q, u], dim=-1))[0]
+            return self.scale * y.unflatten(-1, self.shape)
+        y = self.network.linearize(torch.cat([q, u[..., self.curved]], dim=-1))[0]
+        curved = y.unflatten(-1, (self.shape[0], len(self.curved)))
+        constant = self.constant.expand(*curved.shape[:-1], -1)
+        return self.scale * torch.cat([curved, constant], dim=-1)[..., self.order]
 
 
 class ConstantInput(InputMatrix):

@@ -379,6 +379,27 @@ def test_a_nonlinear_input_is_a_matrix_that_depends_on_the_input(q):
     assert float((head.force(q, 2 * u) - 2 * head.force(q, u)).abs().max()) > 0.1
 
 
+def test_linear_inputs_of_a_nonlinear_input_have_constant_columns(q):
+    """Whatever their place among the inputs; the others are as they would be alone."""
+    means = torch.tensor([5.0, 0.4, -0.2])
+    builder = partial(NonlinearInput, u_mean=means, u_std=torch.tensor([7.0, 0.5, 2.0]))
+    head = make_input(partial(builder, hidden=[4], activation="tanh", linear=[0]), inputs=3)
+    with torch.no_grad():
+        head.constant.copy_(torch.arange(1.0, SIZE + 1)[:, None])
+    u = torch.randn(40, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    values = head.network(torch.cat([q, u[:, 1:]], -1)).reshape(40, SIZE, 2)
+    expected = torch.einsum("bij,bj->bi", values * torch.tensor([3.0, 2.0]).double(), u[:, 1:])
+    expected = expected + 0.5 * torch.arange(1.0, SIZE + 1).double() * u[:, :1]
+    assert_near(head.force(q, u), expected, 1e-12)
+
+
+@pytest.mark.parametrize("linear", [[0, 1], [2], [1, 1]])
+def test_a_nonlinear_input_refuses_linear_inputs_that_are_not_there(linear):
+    scales = {"u_mean": torch.zeros(2), "u_std": torch.ones(2)}
+    with pytest.raises(ValueError, match="linear is .*expected some but not all of the 2 inputs"):
+        make_input(partial(NonlinearInput, hidden=[4], linear=linear, **scales))
+
+
 def test_the_matrix_of_a_nonlinear_input_is_that_at_the_mean_input(q):
     head = make_nonlinear()
     mean = torch.tensor([0.4, -0.2]).double().expand(40, 2)
