@@ -396,7 +396,7 @@ def test_linear_inputs_of_a_nonlinear_input_have_constant_columns(q):
 @pytest.mark.parametrize("linear", [[0, 1], [2], [1, 1]])
 def test_a_nonlinear_input_refuses_linear_inputs_that_are_not_there(linear):
     scales = {"u_mean": torch.zeros(2), "u_std": torch.ones(2)}
-    with pytest.raises(ValueError, match="linear is .*expected some but not all of the 2 inputs"):
+    with pytest.raises(ValueError, match=r"linear is .*expected some but not all of the 2 inputs"):
         make_input(partial(NonlinearInput, hidden=[4], linear=linear, **scales))
 
 
