@@ -83,7 +83,7 @@ class MidpointLoss(IncrementLoss):
         return 1
 
     def compile_dynamics(self, model: Predictor, steps: int) -> None:
-        # Always as a whole: a single evaluation compiles as fast as the derivative alone.
+        # Always as a whole: there is a quarter of a roll-out to compile.
         self._compiled = self._long_training = True
 
 
