@@ -1,6 +1,7 @@
 """Ten seeds in one batched training against one seed, side by side.
 
     python benchmarks/ensemble.py                     # the table in benchmarks/README.md
+    python benchmarks/ensemble.py --loss midpoint     # one evaluation a step instead of RK4's four
     python benchmarks/ensemble.py --quick             # a smoke run
 
 A step is all that a training does at a step, but for the trainer's own loop: pick the batch from
@@ -30,12 +31,13 @@ from torch.optim.lr_scheduler import OneCycleLR
 from pinn_dyn.app.runs import provenance
 from pinn_dyn.data.windows import BatchSampler, MemberSampler, WindowLoader, Windows
 from pinn_dyn.mechanics import Ensemble, Predictor
-from pinn_dyn.training import IncrementLoss
+from pinn_dyn.training import IncrementLoss, MidpointLoss
 from pinn_dyn.training.ensemble import clip_by_member
 from pinn_dyn.training.losses import STEPS_FOR_WHOLE
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000
+LOSSES = {"increment": IncrementLoss, "midpoint": MidpointLoss}
 
 
 def make_windows() -> Windows:
@@ -59,12 +61,12 @@ def make_windows() -> Windows:
 
 
 def make_step(
-    kind: str, members: int, batch: int, compiled: bool, length: int = 0
+    kind: str, members: int, batch: int, compiled: bool, loss: str, length: int = 0
 ) -> Callable[[], None]:
     """One step of a training of that length, of a single model or of an ensemble."""
     models: list[Predictor] = [make_model(kind).float().train() for _ in range(members)]
     windows = make_windows()
-    loss = IncrementLoss(windows.statistics(), models[0])
+    criterion = LOSSES[loss](windows.statistics(), models[0])
     samplers = [
         BatchSampler(PAIRS, batch_size=batch, batches=100_000, seed=k) for k in range(members)
     ]
@@ -79,12 +81,12 @@ def make_step(
     optimizer = AdamW(parameters, lr=1e-4, weight_decay=1e-5, fused=True)
     scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000)
     if compiled:
-        loss.compile_dynamics(model, length)
+        criterion.compile_dynamics(model, length)
     batches = iter(loader)
 
     def step() -> None:
         optimizer.zero_grad()
-        loss(model, next(batches), 0.0).sum().backward()
+        criterion(model, next(batches), 0.0).sum().backward()
         if members == 1:
             clip_grad_norm_(parameters, 1.0)
         else:
@@ -105,6 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--threads", type=int, default=2, help="torch threads (default 2)")
     parser.add_argument("--models", nargs="+", default=["lnn", "hnn"])
+    parser.add_argument("--loss", choices=LOSSES, default="increment")
     parser.add_argument("--members", type=int, default=10)
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--pairs", type=int, default=50, help="measured pairs of steps")
@@ -117,7 +120,9 @@ def main() -> None:
     rows = []
     for kind in arguments.models:
         compiled = not arguments.quick
-        make = partial(make_step, kind, batch=arguments.batch, compiled=compiled)
+        make = partial(
+            make_step, kind, batch=arguments.batch, compiled=compiled, loss=arguments.loss
+        )
         steps = [make(1), make(1, length=STEPS_FOR_WHOLE), make(arguments.members)]
         first = [seconds(step, time.perf_counter) for step in steps]
         for step in steps:
@@ -130,6 +135,7 @@ def main() -> None:
         rows.append(
             {
                 "model": kind,
+                "loss": arguments.loss,
                 "batch": arguments.batch,
                 "members": arguments.members,
                 "one_short_ms": round(1e3 * short, 2),
