@@ -1,7 +1,7 @@
 """Ten seeds in one batched training against one seed, side by side.
 
     python benchmarks/ensemble.py                     # the table in benchmarks/README.md
-    python benchmarks/ensemble.py --loss midpoint     # one evaluation a step instead of RK4's four
+    python benchmarks/ensemble.py --loss midpoint --output benchmarks/results/ensemble_midpoint.csv
     python benchmarks/ensemble.py --quick             # a smoke run
 
 A step is all that a training does at a step, but for the trainer's own loop: pick the batch from

@@ -29,13 +29,11 @@ class Force(ContinuousPredictor):
 
 
 def relative_error(windows, model):
-    """Root mean square of dv^ - dv, or of that of p, over that of dv."""
+    """Root mean square of dv^ - dv over that of dv."""
     loss = MidpointLoss(windows.statistics(), model).double()
     with torch.no_grad():
         value = float(loss(model, windows, 0.0))
-    halves = 1 if model.coordinates == "velocity" else 2
-    spread = loss.scale[0, -1]
-    return math.sqrt(halves * value) * float(spread / windows.dv.square().mean().sqrt())
+    return math.sqrt(value) * float(loss.scale[0, -1] / windows.dv.square().mean().sqrt())
 
 
 def test_the_middle_is_that_of_a_cubic():
@@ -72,7 +70,6 @@ def test_on_an_oscillation_the_error_is_that_of_the_docstring(coordinates, const
         q, v = torch.cos(rate * t), -rate * torch.sin(rate * t)
         motion = Trajectory(t[:, 0], q, v, torch.zeros_like(q), momentum=lambda q, v: v)
         windows = draw_windows([motion], count=len(t) - 1, steps=1, stride=1, seed=0)
-        # Of a momentum alone: the error of q would be added to it.
         model = Force(rate**2, coordinates)
         loss = MidpointLoss(windows.statistics(), model).double()
         x0, dx = windows.start(coordinates), windows.increments(coordinates)[:, 0]
