@@ -70,6 +70,12 @@ class DynamicsLearner(L.LightningModule):
         if self._compile and stage == "fit":
             self.loss.compile_dynamics(self.trained, int(self.trainer.estimated_stepping_batches))
 
+    def on_train_epoch_start(self) -> None:
+        """See to it that the last epoch ends with a validation, however far apart they are."""
+        trainer = self.trainer
+        if self.current_epoch + 1 == trainer.max_epochs and trainer.check_val_every_n_epoch:
+            trainer.check_val_every_n_epoch = 1
+
     @property
     def trained(self) -> Predictor:
         """What the loss is taken of."""

@@ -122,6 +122,21 @@ def test_the_last_checkpoint_is_of_the_last_epoch(tmp_path):
     assert load(run, "last")["global_step"] == 60
 
 
+def test_a_training_ends_with_a_validation(tmp_path):
+    """Also one that is shorter than the epochs between validations, or no multiple of them."""
+    run = train(
+        tmp_path / "run",
+        "model=lnn",
+        "trainer.max_epochs=5",
+        "trainer.check_val_every_n_epoch=3",
+        "+callbacks.best.save_top_k=-1",
+        "callbacks.best.filename='{step}'",
+        NO_FIGURES,
+    )
+    found = {path.stem for path in (run / "checkpoints").glob("step=*.ckpt")}
+    assert found == {"step=6", "step=10"}
+
+
 def test_a_run_loads_back_with_the_weights_of_its_checkpoint(hnn_run):
     run = load_run(hnn_run, "last")
     saved = load(hnn_run, "last")["state_dict"]
