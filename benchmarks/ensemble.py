@@ -2,11 +2,12 @@
 
     python benchmarks/ensemble.py                     # the table in benchmarks/README.md
     python benchmarks/ensemble.py --loss midpoint --output benchmarks/results/ensemble_midpoint.csv
+    python benchmarks/ensemble.py --optimizer soap --output benchmarks/results/ensemble_soap.csv
     python benchmarks/ensemble.py --quick             # a smoke run
 
 A step is all that a training does at a step, but for the trainer's own loop: pick the batch from
-the windows in memory, loss, backward pass, clip, AdamW, schedule. N = 3, as the one-segment arm,
-head sizes of conf/model, 8,000 windows of one step, float32, compiled: an ensemble as a whole,
+the windows in memory, loss, backward pass, clip, optimizer, schedule. N = 3, as the one-segment
+arm, head sizes of conf/model, 8,000 windows of one step, float32, compiled: an ensemble as a whole,
 member by member; one seed its derivative alone in a training of up to 20,000 steps, and as a whole
 in a longer one (compile=auto).
 """
@@ -23,9 +24,10 @@ from pathlib import Path
 
 import torch
 from long_rollout import make_model
+from pytorch_optimizer import SOAP
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
-from torch.optim import AdamW
+from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
 from pinn_dyn.app.runs import provenance
@@ -34,6 +36,7 @@ from pinn_dyn.mechanics import Ensemble, Predictor
 from pinn_dyn.training import IncrementLoss, MidpointLoss
 from pinn_dyn.training.ensemble import clip_by_member
 from pinn_dyn.training.losses import STEPS_FOR_WHOLE
+from pinn_dyn.training.member_soap import MemberSOAP
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000
@@ -60,8 +63,16 @@ def make_windows() -> Windows:
     )
 
 
+def make_optimizer(name: str, parameters: list[Tensor], members: int) -> Optimizer:
+    """As conf/optimizer; the peak rate is small, as there is nothing to learn."""
+    if name == "adamw":
+        return AdamW(parameters, lr=1e-4, weight_decay=1e-5, fused=True)
+    soap = SOAP(parameters, lr=1e-4, weight_decay=1e-5, precondition_frequency=10)
+    return soap if members == 1 else MemberSOAP(soap)
+
+
 def make_step(
-    kind: str, members: int, batch: int, compiled: bool, loss: str, length: int = 0
+    kind: str, members: int, batch: int, compiled: bool, loss: str, optim: str, length: int = 0
 ) -> Callable[[], None]:
     """One step of a training of that length, of a single model or of an ensemble."""
     models: list[Predictor] = [make_model(kind).float().train() for _ in range(members)]
@@ -78,8 +89,8 @@ def make_step(
             WindowLoader(windows, MemberSampler(samplers)),
         )
     parameters = list(model.parameters())
-    optimizer = AdamW(parameters, lr=1e-4, weight_decay=1e-5, fused=True)
-    scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000)
+    optimizer = make_optimizer(optim, parameters, members)
+    scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000, cycle_momentum=False)
     if compiled:
         criterion.compile_dynamics(model, length)
     batches = iter(loader)
@@ -108,6 +119,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2, help="torch threads (default 2)")
     parser.add_argument("--models", nargs="+", default=["lnn", "hnn"])
     parser.add_argument("--loss", choices=LOSSES, default="increment")
+    parser.add_argument("--optimizer", choices=["adamw", "soap"], default="adamw")
     parser.add_argument("--members", type=int, default=10)
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--pairs", type=int, default=50, help="measured pairs of steps")
@@ -121,7 +133,12 @@ def main() -> None:
     for kind in arguments.models:
         compiled = not arguments.quick
         make = partial(
-            make_step, kind, batch=arguments.batch, compiled=compiled, loss=arguments.loss
+            make_step,
+            kind,
+            batch=arguments.batch,
+            compiled=compiled,
+            loss=arguments.loss,
+            optim=arguments.optimizer,
         )
         steps = [make(1), make(1, length=STEPS_FOR_WHOLE), make(arguments.members)]
         first = [seconds(step, time.perf_counter) for step in steps]
@@ -136,6 +153,7 @@ def main() -> None:
             {
                 "model": kind,
                 "loss": arguments.loss,
+                "optimizer": arguments.optimizer,
                 "batch": arguments.batch,
                 "members": arguments.members,
                 "one_short_ms": round(1e3 * short, 2),

@@ -2,11 +2,12 @@
 
 A step is: one RK4 step of the batch, the increment loss, its gradient; no optimizer. All sides
 share weights, data, integrator (3/8 rule) and loss, and are first checked in float64 to give the
-same loss and the same gradient.
+same loss and the same gradient; the midpoint loss alone is another, for the same job.
 
     ours, compiled    loss and gradient as one program, as a long training with compile=true
     ours, derivative  the compiled state derivative alone, as a shorter one
     ours, eager       compile=false
+    ours, midpoint    another loss, loss=midpoint, compiled: one evaluation of the dynamics
     jax autodiff      the structured formulas in JAX, two spellings, jitted with their gradient
     jax explicit
     jax hessian       the paper's way in JAX: Hessian of L and an explicit inverse, jitted
@@ -47,12 +48,13 @@ from pinn_dyn.models import (
     NetworkPotential,
     Statistics,
 )
-from pinn_dyn.training import IncrementLoss
+from pinn_dyn.training import IncrementLoss, MidpointLoss
 from pinn_dyn.training.losses import STEPS_FOR_WHOLE
 
 STEP = 2e-3
 RESULTS = Path(__file__).parent / "results"
 OURS = "ours, compiled"
+MIDPOINT = "ours, midpoint"
 Step = Callable[[], Any]
 
 
@@ -242,15 +244,18 @@ def run_cell(size: int, batch: int, cores: int, seconds: float) -> list[dict[str
     torch._dynamo.reset()  # one batch size after another would compile for varying sizes
     windows = make_windows(size, batch, torch.float32)
     model, scales = make_model(size, torch.float32)
-    eager_model, short_model = (make_model(size, torch.float32)[0] for _ in range(2))
+    eager_model, short_model, mid_model = (make_model(size, torch.float32)[0] for _ in range(3))
     eager_loss, short_loss, loss = (IncrementLoss(scales, model) for _ in range(3))
+    mid_loss = MidpointLoss(scales, mid_model)
     loss.compile_dynamics(model, STEPS_FOR_WHOLE)
+    mid_loss.compile_dynamics(mid_model, STEPS_FOR_WHOLE)
     short_loss.compile_dynamics(short_model, 0)
     names = ["autodiff", "explicit", "hessian"]
     steps = {
         OURS: torch_step(model, lambda: loss(model, windows, 0.0)),
         "ours, derivative": torch_step(short_model, lambda: short_loss(short_model, windows, 0.0)),
         "ours, eager": torch_step(eager_model, lambda: eager_loss(eager_model, windows, 0.0)),
+        MIDPOINT: torch_step(mid_model, lambda: mid_loss(mid_model, windows, 0.0)),
         **jax_steps(model, loss, windows, names),
         "torch hessian": hessian_step(eager_model, eager_loss, windows, 1024),
     }
@@ -307,6 +312,7 @@ def summary(rows: list[dict[str, object]]) -> str:
     for title, value in (
         ("structured JAX", lambda cell: min(cell["jax autodiff"], cell["jax explicit"])),
         ("Hessian in JAX", lambda cell: cell["jax hessian"]),
+        ("Hessian in JAX, our midpoint loss", lambda cell: cell["jax hessian"] / cell[MIDPOINT]),
         ("Hessian in torch", lambda cell: cell["torch hessian"]),
     ):
         ratios = [value(cell) for cell in cells.values()]

@@ -5,6 +5,7 @@ from pinn_dyn.training.fit import fit
 from pinn_dyn.training.impulse import ImpulseLoss
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.losses import IncrementLoss, WindowLoss
+from pinn_dyn.training.member_soap import MemberSOAP
 from pinn_dyn.training.midpoint import MidpointLoss
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "EnsembleLearner",
     "ImpulseLoss",
     "IncrementLoss",
+    "MemberSOAP",
     "MidpointLoss",
     "NonFiniteLossError",
     "WindowLoss",

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
+from pytorch_optimizer import SOAP
 from torch import Tensor
 from torch.optim import SGD, Adagrad, Adam, Adamax, NAdam, Optimizer, RAdam, RMSprop
 
 from pinn_dyn.mechanics import Ensemble, Predictor
 from pinn_dyn.training.learner import DynamicsLearner
+from pinn_dyn.training.member_soap import MemberSOAP
 
 # Optimizers that treat every number on its own: for them E stacked weights are E trainings.
 _ELEMENTWISE = (Adam, NAdam, RAdam, Adamax, Adagrad, RMSprop, SGD)
@@ -20,8 +20,8 @@ class EnsembleLearner(DynamicsLearner):
 
     A batch of windows has a leading dimension E, one batch for each member. The loss is the sum of
     the members' losses, so that each member's gradient is that of its own loss; gradients are
-    clipped by each member's own norm; the optimizer moves every weight by itself. Validation rolls
-    out the ensemble.
+    clipped by each member's own norm; the optimizer moves every weight by itself, or with the
+    others of its member (:class:`MemberSOAP`). Validation rolls out the ensemble.
 
     Args and errors: as :class:`DynamicsLearner`.
 
@@ -42,16 +42,18 @@ class EnsembleLearner(DynamicsLearner):
         super().log_losses(losses)
         self.log("train/loss_spread", losses.std(), on_step=False, on_epoch=True, batch_size=1)
 
-    def configure_optimizers(self) -> Any:
-        """The optimizer and its schedule."""
-        chosen = super().configure_optimizers()
-        if not isinstance(chosen["optimizer"], _ELEMENTWISE):
+    def built_optimizer(self) -> Optimizer:
+        """The optimizer, SOAP with preconditioners of each member's own."""
+        optimizer = super().built_optimizer()
+        if isinstance(optimizer, SOAP):
+            return MemberSOAP(optimizer)
+        if not isinstance(optimizer, _ELEMENTWISE):
             raise ValueError(
-                f"optimizer is {type(chosen['optimizer']).__name__}, which mixes the weights of a "
-                "tensor, here those of different members: take optimizer=adamw, or train the seeds "
+                f"optimizer is {type(optimizer).__name__}, which mixes the weights of a tensor, "
+                "here those of different members: take optimizer=adamw or soap, or train the seeds "
                 "one by one (train.py -m seed=0,1,2)"
             )
-        return chosen
+        return optimizer
 
     def configure_gradient_clipping(
         self,

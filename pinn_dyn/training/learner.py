@@ -126,9 +126,13 @@ class DynamicsLearner(L.LightningModule):
         error = figures["error_mean"]
         self.log("error", error, prog_bar=True, logger=False, batch_size=1, sync_dist=True)
 
+    def built_optimizer(self) -> Optimizer:
+        """The optimizer of the parameters of the model."""
+        return self._optimizer(self.model.parameters())
+
     def configure_optimizers(self) -> Any:
         """The optimizer, with its learning rate scheduled per step."""
-        optimizer = self._optimizer(self.model.parameters())
+        optimizer = self.built_optimizer()
         scheduler = self._scheduler(
             optimizer, total_steps=int(self.trainer.estimated_stepping_batches)
         )
