@@ -81,10 +81,11 @@ class MemberSOAP(SOAP):
         merge_dims: bool = False,
     ) -> None:
         """Take in G_k G_k^T along each dimension, and turn the bases when it is time."""
+        beta = state["shampoo_beta"]
         for k, average in enumerate(state["GG"]):
             if len(average):
                 rows = grad.movedim(k + 1, 1).flatten(2)
-                average.lerp_(rows @ rows.mT, weight=1.0 - state["shampoo_beta"])
+                average.baddbmm_(rows, rows.mT, beta=beta, alpha=1 - beta)
         if state["Q"] is None:
             state["Q"] = [_eigenvectors(average) if len(average) else [] for average in state["GG"]]
         if step > 0 and step % state["precondition_frequency"] == 0:
@@ -99,12 +100,14 @@ class MemberSOAP(SOAP):
         project_type: str = "forward",
     ) -> Tensor:
         """The gradient in the basis of each dimension, or back from there."""
+        if grad.ndim < 3:
+            return grad
         for basis in state["Q"]:
             # Takes the first dimension to the last place, so that the next one is first.
             grad = grad.movedim(1, -1)
             if len(basis):
                 turn = basis if project_type == "forward" else basis.mT
-                grad = (grad.flatten(1, -2) @ turn).reshape(grad.shape)
+                grad = torch.bmm(grad.flatten(1, -2), turn).view(grad.shape)
         return grad
 
     @staticmethod
