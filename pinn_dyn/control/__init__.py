@@ -24,12 +24,13 @@ from pinn_dyn.control.references import (
     check_limits,
 )
 from pinn_dyn.control.region import DataRegion, Guarded
-from pinn_dyn.control.stability import certify, predict_steady_state, required_gain
+from pinn_dyn.control.stability import certify
 from pinn_dyn.control.stability_report import (
     check_without_truth,
     model_report,
     stability_report,
 )
+from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 
 __all__ = [
     "Actuator",

@@ -10,14 +10,12 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.stability import (
-    MARGIN,
-    SPHERE_POINTS,
     StabilityCertificate,
-    SteadyState,
     per_configuration,
     require_samples,
     require_system,
 )
+from pinn_dyn.control.steady_state import MARGIN, SPHERE_POINTS, SteadyState
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 
 MEASUREMENT_TOLERANCE = 1e-6

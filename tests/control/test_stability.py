@@ -7,8 +7,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from pinn_dyn.control.factor import factor_bounds, fit_factor
-from pinn_dyn.control.stability import certify, predict_steady_state, required_gain
+from pinn_dyn.control.stability import certify
 from pinn_dyn.control.stability_report import check_without_truth, model_report, stability_report
+from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from tests.support.cart_pole import CartPole
