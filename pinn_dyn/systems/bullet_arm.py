@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import spd_solve
 from pinn_dyn.systems.bullet_world import World, import_bullet, open_world
+from pinn_dyn.systems.known_slope import KnownSlope
 from pinn_dyn.systems.urdf import Inertia, find_urdf, read_urdf
 
 
@@ -145,12 +145,12 @@ class BulletArm(MechanicalSystem):
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), ``(*batch, N, N)``, kg m^2."""
         self._check(q=q)
-        return _Known.apply(self._masses, self._mass_slopes, q)
+        return KnownSlope.apply(self._masses, self._mass_slopes, q)
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q) = -sum_i m_i g . r_i(q) with centres of mass r_i, ``(*batch,)``, J."""
         self._check(q=q)
-        return _Known.apply(
+        return KnownSlope.apply(
             lambda q: _each(self._energy, q), lambda q: _each(self._bias, q, 0 * q), q
         )
 
@@ -165,7 +165,7 @@ class BulletArm(MechanicalSystem):
     def tip_position(self, q: Tensor) -> Tensor:
         """Origin of the tip's frame in the frame of the base, ``(*batch, 3)``, m."""
         self._check(q=q)
-        return _Known.apply(
+        return KnownSlope.apply(
             lambda q: _each(self._tip_point, q), lambda q: self.tip_jacobian(q)[..., :3, :], q
         )
 
@@ -362,9 +362,6 @@ def _joint_values(damping: float | Sequence[float], names: list[str], path: Path
     return torch.tensor(np.broadcast_to(values, len(names)).copy())
 
 
-_Batched = Callable[[Tensor], Tensor]
-
-
 def _each(function: Callable[..., np.ndarray], *values: Tensor) -> Tensor:
     """Apply a function of vectors ``(N,)`` to every row of tensors ``(*batch, N)``."""
     if torch.is_grad_enabled() and any(value.requires_grad for value in values):
@@ -376,36 +373,3 @@ def _each(function: Callable[..., np.ndarray], *values: Tensor) -> Tensor:
     rows = [value.detach().double().cpu().reshape(-1, size).numpy() for value in values]
     results = np.array([function(*row) for row in zip(*rows, strict=True)])
     return torch.from_numpy(results.reshape((*batch, *results.shape[1:]))).to(values[0])
-
-
-class _Known(torch.autograd.Function):
-    """A function of q whose first derivative is known: y ``(*batch, ...)``, dy/dq one axis more."""
-
-    @staticmethod
-    def forward(value: _Batched, slope: _Batched, q: Tensor) -> Tensor:
-        return value(q)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        _, ctx.slope, q = inputs
-        ctx.save_for_backward(q)
-        ctx.save_for_forward(q)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, None, Tensor]:
-        (q,) = ctx.saved_tensors
-        slope = _Known.apply(ctx.slope, _no_slope, q)
-        batch, size = q.shape[:-1], q.shape[-1]
-        flat = slope.reshape(*batch, -1, size)
-        return None, None, (gradients[0].reshape(*batch, 1, -1) @ flat).squeeze(-2)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        (q,) = ctx.saved_tensors
-        slope = _Known.apply(ctx.slope, _no_slope, q)
-        ones = (1,) * (slope.ndim - q.ndim)
-        return (slope * tangents[2].reshape(*q.shape[:-1], *ones, -1)).sum(-1)
-
-
-def _no_slope(q: Tensor) -> Tensor:
-    raise RuntimeError("BulletArm: M and V have first derivatives only")
