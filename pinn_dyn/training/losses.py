@@ -118,8 +118,9 @@ class IncrementLoss(WindowLoss):
             return self._mean(model, windows)
         assert isinstance(model, ContinuousPredictor)
         ensemble = isinstance(model, ContinuousStack)
-        if (self._long_training or ensemble) and self.evaluations(model, longest) <= MOST_STAGES:
-            self._whole = self._whole or WholeStep(model, self._traced)
+        evaluations = self.evaluations(model, longest)
+        if (self._long_training or ensemble) and evaluations <= MOST_STAGES:
+            self._whole = self._whole or WholeStep(model, self._traced, evaluations)
             if ensemble:
                 known = self._whole.of_members(windows)
                 return _MemberGradients.apply(*known, *self._whole.parameters)

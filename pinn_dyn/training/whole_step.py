@@ -26,8 +26,9 @@ MOST_STAGES = 4
 """Evaluations of the dynamics in a window up to which it is compiled as a whole: the time to
 compile grows with them."""
 CHUNK = 256
-"""Windows that compiled dynamics take at once: what they keep for the gradient stays in the cache
-(measured in benchmarks/README.md). Batches of less than twice as many are not cut."""
+"""Windows of MOST_STAGES evaluations that compiled dynamics take at once, four times as many of one
+evaluation: what they keep for the gradient stays in the cache (measured in benchmarks/README.md).
+Batches of less than twice as many are not cut."""
 
 
 class WholeStep:
@@ -43,21 +44,23 @@ class WholeStep:
         loss: the loss of one model on windows, by operations that can be traced. What differs from
             batch to batch is given beside the windows: the state at the start ``(B, 2N)``, the
             input ``(B, K, M)`` and the measured increments ``(B, H, 2N)``.
+        evaluations: of the dynamics in a window.
 
     Attributes:
         parameters: those of the model, in the order of the gradients.
     """
 
-    def __init__(self, model: ContinuousPredictor, loss: TracedLoss):
+    def __init__(self, model: ContinuousPredictor, loss: TracedLoss, evaluations: int):
         single = model.template.model if isinstance(model, ContinuousStack) else model
         assert isinstance(single, ContinuousPredictor)
         self._window = _Window(single, loss)
+        self._part = CHUNK * MOST_STAGES // evaluations
         self.parameters = list(model.parameters())  # walking through the modules takes its time
         self._programs: dict[tuple[Any, ...], Callable[..., list[Any]]] = {}
 
     def __call__(self, windows: Windows) -> list[tuple[float, Tensor, Gradients]]:
         """Share of the batch, loss and gradients of each of its parts."""
-        parts = windows.split(CHUNK)
+        parts = windows.split(self._part)
         values = [value.detach() for value in self.parameters]
         taken = self._side_by_side([values] * len(parts), parts)
         return [

@@ -94,12 +94,13 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     monkeypatch, kind, interpolation, kind_of_loss
 ):
     """Also of other data with the same program, and of a batch in parts, one thread or three."""
-    monkeypatch.setattr("pinn_dyn.training.whole_step.CHUNK", 6)
     model = MODELS[kind]()
     windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
     eager, compiled = (kind_of_loss(one_step(), model).double() for _ in range(2))
     compiled.compile_dynamics(model, LONG)
-    batches = [windows(6), windows(6, seed=1), windows(18, seed=2)]
+    batches = [windows(8), windows(8, seed=1), windows(24, seed=2)]
+    evaluations = compiled.evaluations(model, batches[0])
+    monkeypatch.setattr("pinn_dyn.training.whole_step.CHUNK", 2 * evaluations)  # parts of 8
     for batch, threads in zip([*batches, batches[-1]], [1, 1, 1, 3], strict=True):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         assert_same(
