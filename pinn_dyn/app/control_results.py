@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 import torch
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
@@ -99,8 +100,11 @@ def write_results(
         text = table.set_index("controller").T.to_string(float_format="{:.4g}".format)
         writer.add_text("closed_loop/summary", f"<pre>{text}</pre>")
         writer.add_text("run/configuration", f"```yaml\n{(folder / CONFIG).read_text()}\n```")
-        for name, figure in figures.items():
-            writer.add_figure(f"closed_loop/{name.removeprefix('closed_loop_')}", figure)
+        for name in figures:
+            # The saved picture: to draw a figure of seven joints again takes seconds.
+            picture = imread(folder / f"{name}.png")
+            tag = f"closed_loop/{name.removeprefix('closed_loop_')}"
+            writer.add_image(tag, picture, dataformats="HWC")
     first = next(iter(records))
     animation = folder / f"animation_{first}.gif"
     if config["animate"]:

@@ -2,12 +2,13 @@
 
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
 from pinn_dyn.mechanics import Ensemble
 from pinn_dyn.mechanics.integration import SampledInput, rollout_increments
-from pinn_dyn.mechanics.steps import stage_inputs
+from pinn_dyn.mechanics.steps import input_means, stage_inputs
 from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkCholesky, NetworkPotential
 from tests.models.builders import make_structured, perturb
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
@@ -49,6 +50,26 @@ def test_the_last_stage_of_a_held_input_is_before_the_next_sample():
     found = stage_inputs(t, t, u, "hold", RK4_NODES).squeeze(-1)
     expected = torch.arange(3.0, dtype=torch.float64)[:, None].expand(3, 4)
     torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_input_means_are_those_of_the_sampled_input(interpolation, count):
+    """Steps of many samples, within one, and beyond both ends, summed between all knots."""
+    u = samples((2,), count, 3)
+    t_input = torch.rand(count, generator=torch.Generator().manual_seed(1)).double().cumsum(0)
+    signal = SampledInput(t_input, u, interpolation)
+    grid = torch.linspace(-0.3, float(t_input[-1]) + 0.4, 6, dtype=torch.float64)
+    found = input_means(grid, t_input, u.movedim(-2, 0), interpolation)
+    assert found.shape == (5, 2, 3)
+    for k in range(5):
+        start, end = float(grid[k]), float(grid[k + 1])
+        inside = [float(t) for t in t_input if start < t < end]
+        knots = np.array([start, *inside, end])
+        # Between two knots the input is a line, so its mean is that in the middle.
+        middle = torch.stack([signal(t) for t in torch.from_numpy(knots[:-1] + knots[1:]) / 2])
+        expected = np.einsum("i,i...", np.diff(knots), middle.numpy()) / (end - start)
+        np.testing.assert_allclose(found[k], expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.usefixtures("uncompiled")
@@ -115,6 +136,21 @@ def test_the_rosenbrock_method_takes_steps_far_longer_than_the_damping(coordinat
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-3)
     system.integrator = "rk4"
     assert not (system.predict(x0, t, u)[:, 0].abs() < 1e3).all()
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+def test_a_rosenbrock_step_over_many_samples_of_the_input_loses_no_impulse(interpolation):
+    """A body without inertia or spring follows its input: q is the integral of u."""
+    system = LinearSystem([[1e-6]], [[0.0]], [[1.0]], [[1.0]]).requires_grad_(False)
+    system.integrator = "rosenbrock"
+    t = 0.02 * torch.arange(51, dtype=torch.float64)
+    u = samples((), 51, 1)
+    left, right = (u[:-1], u[:-1]) if interpolation == "hold" else (u[:-1], u[1:])
+    moved = torch.cat([torch.zeros(1).double(), ((left + right) / 2 * 0.02).cumsum(0)[:, 0]])
+    x0 = torch.zeros(2, dtype=torch.float64)
+    found = system.predict(x0, t[::10], u, t_input=t, interpolation=interpolation)[:, 0]
+    assert moved[::10].diff().abs().max() > 0.04
+    torch.testing.assert_close(found, moved[::10], rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["lnn", "hnn"])
