@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from pinn_dyn.app.multirun import how_to_go_on
-from pinn_dyn.data import SimulationError
-from pinn_dyn.training import NonFiniteLossError
+
+_MODULES = {"train": "training", "evaluate": "evaluation", "control": "control", "gather": "sweeps"}
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
@@ -47,18 +48,23 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
-def main(task: Callable[[DictConfig], object], config_name: str) -> None:
-    """Run a task on the configuration that the command line asks for.
+def main(command: str) -> None:
+    """Run train, evaluate, control or gather on the configuration that the command line asks for.
 
     A misspelt key ends the program before anything is written, with the keys that were probably
     meant; so does an error that the user can mend, without a traceback.
     """
     completing = {"-sc", "--shell-completion"} & set(sys.argv)  # whose words are no overrides
-    problem = None if completing else misspelt_key(config_name, sys.argv[1:])
+    problem = None if completing else misspelt_key(command, sys.argv[1:])
     if problem:
         raise SystemExit(f"Error: {problem}")
 
     def run(cfg: DictConfig) -> object:
+        # PyTorch and Lightning take seconds to import, which --help and a misspelt key do not need.
+        from pinn_dyn.data import SimulationError
+        from pinn_dyn.training import NonFiniteLossError
+
+        task = getattr(importlib.import_module(f"pinn_dyn.app.{_MODULES[command]}"), command)
         try:
             return task(cfg)
         except (ConfigError, NonFiniteLossError, SimulationError) as error:
@@ -69,7 +75,7 @@ def main(task: Callable[[DictConfig], object], config_name: str) -> None:
     # Warnings about loggers and hardware that a user cannot act on.
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     try:
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
     finally:
