@@ -32,7 +32,7 @@ test: $(VENV)/.installed-dev  ## run the tests, on all cores
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean kernels
-	$(BIN)/python -m pytest tests/notebooks
+	$(BIN)/python -m pytest tests/notebooks --numprocesses auto
 
 test-slurm: $(VENV)/.installed-dev  ## test a sweep on a real SLURM; needs root, slurm-wlm and munge
 	$(BIN)/python -m pytest tests/slurm

@@ -6,6 +6,7 @@ import difflib
 import importlib
 import logging
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -72,8 +73,10 @@ def main(command: str) -> None:
                 raise  # SweepCallback then goes on with the other jobs
             raise SystemExit(f"Error: {error}") from error
 
-    # Warnings about loggers and hardware that a user cannot act on.
+    # What a user cannot act on: loggers and hardware, and our libraries about each other.
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
+    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(run)()
     except KeyboardInterrupt:

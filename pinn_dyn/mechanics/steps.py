@@ -227,16 +227,17 @@ def input_means(
     def beside(times: Tensor) -> Tensor:
         return times.reshape(-1, *[1] * (samples.ndim - 1)).to(samples)
 
+    # The integral up to each time of the grid: whole intervals of samples, and a part of one.
     index = (torch.searchsorted(t_input, grid, right=True) - 1).clamp(min=0)
-    before = samples[index]
+    elapsed = grid - t_input[index]
     if interpolation == "hold":
-        areas, height = samples[:-1], before
+        areas, height = samples[:-1], samples[index]
     else:
         areas = (samples[:-1] + samples[1:]) / 2
         following = (index + 1).clamp(max=t_input.shape[0] - 1)
-        span = (t_input[following] - t_input[index]).clamp(min=torch.finfo(grid.dtype).tiny)
-        share = ((grid - t_input[index]) / span).clamp(min=0) * (following > index)
-        height = torch.lerp(before, samples[following], beside(share) / 2)
-    areas = torch.cat([torch.zeros_like(samples[:1]), areas * beside(t_input.diff())]).cumsum(0)
-    integral = areas[index] + height * beside(grid - t_input[index])
+        span = t_input[following] - t_input[index]
+        share = torch.where(span > 0, elapsed.clamp(min=0) / span, 0.0)
+        height = torch.lerp(samples[index], samples[following], beside(share) / 2)
+    whole = torch.cat([torch.zeros_like(samples[:1]), areas * beside(t_input.diff())]).cumsum(0)
+    integral = whole[index] + height * beside(elapsed)
     return integral.diff(dim=0) / beside(grid.diff())
