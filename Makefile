@@ -11,7 +11,8 @@ BIN       := $(VENV)/bin
 
 # The pins of constraints.txt hold for Python 3.11 and later; 3.10 takes what pip finds.
 PINS    = $$($(BIN)/python -c 'import sys; print("-c constraints.txt" if sys.version_info >= (3, 11) else "")')
-INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check $(PIP_FLAGS) $(PINS)
+# Python compiles what is imported, once; pip would compile all, which takes over a minute.
+INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile $(PIP_FLAGS) $(PINS)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
