@@ -1,4 +1,4 @@
-"""Compare trained models on unseen test trajectories, as evaluate.py does."""
+"""Compare trained models on trajectories that no training saw, as evaluate.py does."""
 
 from __future__ import annotations
 
@@ -55,6 +55,9 @@ _SHOWN = (
     "spread_over_error",
 )
 
+# What each split of the data is called in tables and figures.
+_SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -70,18 +73,22 @@ def evaluate(cfg: DictConfig) -> float:
     """Evaluate runs side by side; returns the smallest mean error.
 
     Raises:
-        ConfigError: on runs that cannot be loaded, or that were trained on different data.
+        ConfigError: on runs that cannot be loaded, or that were trained on different data, and on
+            an unknown split.
     """
     config = plain(cfg)
+    split = config["split"]
+    if split not in _SPLITS:
+        raise ConfigError(f"split: {split!r}, expected one of {', '.join(_SPLITS)}")
     folder = Path(HydraConfig.get().runtime.output_dir)
     torch.set_num_threads(config["threads"])
     runs = [load_run(path, config["checkpoint"]) for path in find_runs(config["runs"])]
     source = build_source(_shared_dataset(runs))
     try:
-        truth = stack(source.load().test)
+        truth = stack(getattr(source.load(), split))
     except ValueError as error:
         raise ConfigError(f"{source.name}: {error}") from error
-    log.info("%d runs on %d test trajectories of %s", len(runs), truth.q.shape[0], source.name)
+    log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], _SPLITS[split], source.name)
 
     labels = _labels(runs)
     evaluations = []
@@ -106,7 +113,8 @@ def evaluate(cfg: DictConfig) -> float:
     shown = ["run", "seed", "pairs", *_SHOWN, *[c for c in summary if c.startswith("window_")]]
     text = _terms_text(comparisons)
     print(f"\n{text}" if text else "")
-    print(f"{source.name}: {truth.q.shape[0]} unseen test trajectories, {horizon} open loop")
+    trajectories = f"{truth.q.shape[0]} {_SPLITS[split]}"
+    print(f"{source.name}: {trajectories}, {horizon} open loop")
     print(format_table(summary[[name for name in shown if name in summary]]))
     if len(grouped) < len(summary):
         best = [
@@ -117,6 +125,7 @@ def evaluate(cfg: DictConfig) -> float:
         print(f"\nover seeds:\n{format_table(grouped[[c for c in best if c in grouped]])}")
     report = prediction_report(
         title=f"{source.name}: trained models on unseen motions",
+        trajectories=trajectories,
         summary=summary,
         grouped=grouped,
         truth=horizon_truth,
@@ -187,12 +196,13 @@ def _draw(
     folder: Path,
 ) -> None:
     predictions = {item.label: item.prediction for item in evaluations}
-    title = f"{source.name}, unseen test trajectories, {config['horizon']:g} s open loop"
+    split = config["split"]
+    title = f"{source.name}, {_SPLITS[split]}, {config['horizon']:g} s open loop"
     figure = trajectory_figure(
         truth,
         predictions,
         trajectory=config["trajectory"],
-        title=f"{source.name}, test trajectory {config['trajectory']}, open loop",
+        title=f"{source.name}, {split} trajectory {config['trajectory']}, open loop",
         labels=source.labels,
         input_labels=source.input_labels,
     )

@@ -82,7 +82,7 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
         _write_report(data.source, folder)
     validator = build_validator(config, statistics.step)
     try:
-        data.splits.validation[0].until(validator.horizon)
+        validator.check(data.splits.validation[0])
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
     model = build_predictor(config, statistics)
@@ -128,11 +128,11 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     partial.write_text(json.dumps(record, indent=2))
     partial.replace(folder / METRICS)  # a record is whole or absent
     log.info(
-        "%s seed %d: validation error %.5f over %g s after %.0f s of training, in %s",
+        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s",
         config["name"],
         config["seed"],
         error,
-        validator.horizon,
+        validator,
         seconds,
         folder,
     )

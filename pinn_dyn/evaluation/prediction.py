@@ -70,7 +70,7 @@ def predict_trajectories(
             time, or a momentum is needed and was not recorded.
     """
     _require_stacked(truth)
-    stride = 1 if step is None else _samples_of("step", step, truth.t)
+    stride = 1 if step is None else samples_of("step", step, truth.t)
     paths = _roll_out(
         model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0]),
         truth.state(model.coordinates, slice(1))[:, 0].double(),
@@ -103,13 +103,7 @@ def predict_windows(
             if the trajectory is shorter than one window.
     """
     _require_stacked(truth)
-    stride = 1 if step is None else _samples_of("step", step, truth.t)
-    samples = _samples_of("window", window, truth.t)
-    if samples % stride:
-        raise ValueError(
-            f"window is {window} s and step is {step} s: expected a window that is an integer "
-            "multiple of the step"
-        )
+    stride, samples = samples_of_window(window, step, truth.t)
     windows = (truth.t.shape[0] - 1) // samples
     if windows < 1:
         raise ValueError(
@@ -188,8 +182,29 @@ def _require_stacked(truth: Trajectory) -> None:
         )
 
 
-def _samples_of(name: str, duration: float, t: Tensor) -> int:
-    """How many sample times a duration holds; an error unless that is a positive integer."""
+def samples_of_window(window: float, step: float | None, t: Tensor) -> tuple[int, int]:
+    """How many sample times a step and a window of such steps hold.
+
+    Raises:
+        ValueError: unless the step is an integer multiple of the sample time of t, ``(T,)``, and
+            the window one of the step.
+    """
+    stride = 1 if step is None else samples_of("step", step, t)
+    samples = samples_of("window", window, t)
+    if samples % stride:
+        raise ValueError(
+            f"window is {window} s and step is {step} s: expected a window that is an integer "
+            "multiple of the step"
+        )
+    return stride, samples
+
+
+def samples_of(name: str, duration: float, t: Tensor) -> int:
+    """How many sample times of t, ``(T,)``, a duration in s holds.
+
+    Raises:
+        ValueError: unless that is a positive integer, and the sample time constant.
+    """
     steps = t.double().diff()
     sample_time = float(steps.mean())
     if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:

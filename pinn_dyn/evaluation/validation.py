@@ -11,36 +11,77 @@ from matplotlib.figure import Figure
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import compare_terms
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
-from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
+from pinn_dyn.evaluation.prediction import (
+    Prediction,
+    predict_trajectories,
+    predict_windows,
+    samples_of,
+    samples_of_window,
+)
 from pinn_dyn.evaluation.run_log import log_figures
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 
 class RolloutValidator:
-    """Figures of merit of open-loop roll-outs on validation trajectories.
+    """Figures of merit of roll-outs on validation trajectories.
 
     Args:
-        horizon: length of the roll-outs, s.
+        horizon: length of the trajectories, s.
+        window: time between two re-sets to the measured state, s; open loop if None.
         step: step of the roll-outs, s; that of the training windows if None.
         training_step: step of the training windows, s.
 
     Raises:
-        ValueError: if the step is longer than the horizon.
+        ValueError: if the step is longer than the horizon, or the window no part of it.
     """
 
-    def __init__(self, *, horizon: float, step: float | None, training_step: float):
+    def __init__(
+        self,
+        *,
+        horizon: float,
+        step: float | None,
+        training_step: float,
+        window: float | None = None,
+    ):
         self.horizon = horizon
+        self.window = window
         self.step = training_step if step is None else step
         if not 0 < self.step <= horizon:
             raise ValueError(
-                f"validator: step is {self.step} s and horizon {horizon} s, expected "
-                "0 < step <= horizon"
+                f"step is {self.step} s and horizon {horizon} s, expected 0 < step <= horizon"
             )
+        if window is not None and not self.step <= window <= horizon:
+            raise ValueError(
+                f"window is {window} s, step {self.step} s and horizon {horizon} s, "
+                "expected step <= window <= horizon, or window=null for open loop"
+            )
+
+    def __str__(self) -> str:
+        """What it measures, in words: ``2 s open loop``."""
+        if self.window is None:
+            return f"{self.horizon:g} s open loop"
+        return f"{self.horizon:g} s, re-set every {self.window:g} s"
+
+    def check(self, truth: Trajectory) -> None:
+        """Refuse data that these roll-outs do not fit, before a training has begun.
+
+        Raises:
+            ValueError: if the trajectory is shorter than the horizon, or the step no multiple of
+                its sample time, or the window none of the step.
+        """
+        t = truth.until(self.horizon).t
+        if self.window is None:
+            samples_of("step", self.step, t)
+        else:
+            samples_of_window(self.window, self.step, t)
 
     def predict(self, model: Predictor, truth: Trajectory) -> Prediction:
         """Roll out the model along the first ``horizon`` seconds of the truth."""
         step = model.fixed_step or self.step
-        return predict_trajectories(model, truth.until(self.horizon), step=step)
+        truth = truth.until(self.horizon)
+        if self.window is None:
+            return predict_trajectories(model, truth, step=step)
+        return predict_windows(model, truth, window=self.window, step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
         """Error mean, median and worst, diverged count, and the seconds that it took.
@@ -108,19 +149,16 @@ class RolloutFigures(L.Callback):
         assert isinstance(model, Predictor)
         name = type(model).__name__
         predictions = {name: self.validator.predict(model, truth)}
-        horizon = self.validator.horizon
         figures: dict[str, Figure] = {
             "rollout/trajectory": trajectory_figure(
-                truth.until(horizon),
+                truth.until(self.validator.horizon),
                 predictions,
                 trajectory=0,
-                title=f"Validation trajectory 0, {horizon:g} s open loop",
+                title=f"Validation trajectory 0, {self.validator}",
                 labels=self.labels,
                 input_labels=self.input_labels,
             ),
-            "rollout/error": error_figure(
-                predictions, title=f"Validation error, {horizon:g} s open loop"
-            ),
+            "rollout/error": error_figure(predictions, title=f"Validation error, {self.validator}"),
         }
         if self.system is not None and isinstance(model, MechanicalSystem) and self.configurations:
             names = list(self.configurations)

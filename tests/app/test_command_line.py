@@ -112,6 +112,7 @@ def test_missing_runs_are_asked_for_by_name(capsys):
         (["model=mlp", "model.activation=gelu"], ["model", "gelu", "softplus"]),
         (["model=lnn", "model/damping=fixed", "model.damping.value=[[1,2],[3,4]]"], ["model"]),
         (["validator.step=0.2"], ["validator: step is 0.2 s and horizon 0.1 s"]),
+        (["validator.window=0.2"], ["validator: window is 0.2 s", "horizon 0.1 s"]),
         (["+data.nonsense=1"], ["data", "nonsense"]),
         (["dataset.system._target_=pinn_dyn.systems.Nothing"], ["dataset", "Nothing"]),
     ],
@@ -129,6 +130,9 @@ def test_a_value_that_a_part_refuses_is_reported_in_its_words(elsewhere, capsys,
     [
         (["data.pairs=100000"], ["100000 windows", "starts"]),
         (["validator.horizon=3"], ["horizon is 3", "lasts only 0.2 s"]),
+        (["validator.step=0.003"], ["validator: step is 0.003 s", "sample time", "0.002 s"]),
+        (["validator.window=0.025"], ["validator: window is 0.025 s", "sample time"]),
+        (["validator.window=0.024"], ["window is 0.024 s and step is 0.01 s", "multiple"]),
     ],
 )
 def test_a_value_that_does_not_fit_the_data_is_reported(elsewhere, capsys, overrides, words):

@@ -93,6 +93,21 @@ def test_the_records_say_what_was_evaluated(evaluation):
     assert {"commit", "torch"} <= record.keys()
 
 
+def test_the_validation_trajectories_are_evaluated_on_request(tmp_path, mlp_run, capsys):
+    """By the same figures that the training logged of them."""
+    evaluate(tmp_path / "out", mlp_run, arguments=["split=validation", "step=0.01"])
+    assert "2 validation trajectories, 0.1 s open loop" in capsys.readouterr().out
+    assert "unseen test" not in (tmp_path / "out" / "report.html").read_text()
+    found = pd.read_csv(tmp_path / "out" / "summary.csv")["error_mean"].item()
+    recorded = json.loads((mlp_run / "metrics.json").read_text())["validation"]
+    assert found == pytest.approx(recorded["val/error_mean"], rel=1e-5)
+
+
+def test_an_unknown_split_is_refused(capsys, mlp_run):
+    text = refused(capsys, mlp_run, arguments=["split=train"])
+    assert "split: 'train', expected one of test, validation" in text
+
+
 def test_seeds_of_a_model_are_grouped_and_globs_find_them(tmp_path, hnn_run, mlp_run, capsys):
     runs = tmp_path / "runs"
     shutil.copytree(hnn_run, runs / "a")

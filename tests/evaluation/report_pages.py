@@ -129,6 +129,7 @@ def prediction_page(names=("hnn", "lnn"), **changes):
     summary = summary_of(found)
     arguments = {
         "title": "an arm",
+        "trajectories": f"{real.q.shape[0]} unseen test trajectories",
         "summary": summary,
         "grouped": grouped_table(summary),
         "truth": real,

@@ -93,6 +93,42 @@ def test_a_velocity_weight_that_is_not_positive_is_refused(weight):
         IncrementLoss(STATISTICS, MODELS["lnn"](), velocity_weight=weight)
 
 
+@pytest.mark.parametrize("huber", [0.3, 5.0])
+def test_the_pseudo_huber_loss_equals_a_hand_computation(huber):
+    """r^2 is the mean over the two components of one window and one step."""
+    loss = IncrementLoss(STATISTICS, MODELS["lnn"](), huber=huber)
+    squares = torch.tensor([(36 + 4) / 2, (0 + 4) / 2, (4 + 0) / 2, (4 + 0.25) / 2])
+    expected = (2 * huber**2 * (torch.sqrt(1 + squares / huber**2) - 1)).mean()
+    assert float(loss.error(PREDICTED, MEASURED)) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_the_pseudo_huber_loss_is_the_squared_error_of_small_errors_and_linear_in_large_ones():
+    loss = IncrementLoss(STATISTICS, MODELS["lnn"](), huber=1.0)
+    squared = IncrementLoss(STATISTICS, MODELS["lnn"]())
+    tiny = MEASURED.double() + 1e-6 * (PREDICTED - MEASURED).double()
+    found, expected = (float(kind.error(tiny, MEASURED.double())) for kind in (loss, squared))
+    assert found == pytest.approx(expected, rel=1e-9)
+    huge, twice = (
+        float(loss.error(MEASURED + factor * (PREDICTED - MEASURED), MEASURED))
+        for factor in (1e4, 2e4)
+    )
+    assert twice == pytest.approx(2 * huge, rel=1e-3)
+
+
+@pytest.mark.parametrize("huber", [None, 0.5])
+def test_each_member_of_an_ensemble_has_its_own_loss(huber):
+    loss = IncrementLoss(STATISTICS, MODELS["lnn"](), huber=huber)
+    both = loss.error(torch.stack([PREDICTED, MEASURED]), MEASURED)
+    alone = loss.error(PREDICTED, MEASURED)
+    torch.testing.assert_close(both, torch.stack([alone, torch.zeros(())]))
+
+
+@pytest.mark.parametrize("huber", [0.0, -1.0, float("nan")])
+def test_a_huber_that_is_not_positive_is_refused(huber):
+    with pytest.raises(ValueError, match=r"huber is .*, expected a positive number, or null"):
+        IncrementLoss(STATISTICS, MODELS["lnn"](), huber=huber)
+
+
 @pytest.mark.parametrize("kind", MODELS)
 def test_the_loss_of_one_step_equals_a_hand_computation(kind):
     loss = IncrementLoss(ONE_STEP, MODELS[kind]())

@@ -1,4 +1,4 @@
-"""The page of an evaluation: trained models on unseen test trajectories."""
+"""The page of an evaluation: trained models on trajectories that no training saw."""
 
 from __future__ import annotations
 
@@ -50,6 +50,7 @@ _GROUP_HEADERS = {
 def prediction_report(
     *,
     title: str,
+    trajectories: str,
     summary: pd.DataFrame,
     grouped: pd.DataFrame,
     truth: Trajectory,
@@ -64,9 +65,10 @@ def prediction_report(
 
     Args:
         title: its heading.
+        trajectories: what they are, and how many, for the line below it.
         summary: one row per run, as :func:`pinn_dyn.evaluation.summary_table` makes it.
         grouped: one row per model, as :func:`pinn_dyn.evaluation.grouped_table` makes it.
-        truth: K test trajectories stacked, q ``(K, T, N)``, over the horizon.
+        truth: the K trajectories stacked, q ``(K, T, N)``, over the horizon.
         predictions: names of runs and their roll-outs of the same K trajectories.
         trajectory: which of the K to show first.
         labels, input_labels: name and unit of each coordinate and input.
@@ -74,7 +76,6 @@ def prediction_report(
             where the truth is not known.
         origin: where the numbers come from.
     """
-    count, horizon = truth.q.shape[0], truth.duration
     sections = [
         Section("Summary", _summary(summary, grouped, labels)),
         Section("Error over time", _errors(predictions, labels)),
@@ -85,8 +86,7 @@ def prediction_report(
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
     ]
-    subtitle = f"{count} unseen test trajectories, {horizon:g} s open loop"
-    return page(title, subtitle, sections)
+    return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
 def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]) -> list[Markup]:
@@ -102,7 +102,7 @@ def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]
             "The error is ‖q̂ − q‖₂"
             + (f", in the units of q ({unit})" if unit else ", in the units of q")
             + ", of roll-outs from the true initial state under the true input, over all times and "
-            "test trajectories that did not diverge. The best figure of a column is bold; a "
+            "trajectories that did not diverge. The best figure of a column is bold; a "
             "number under the pointer shows all its digits."
         ),
         table(summary, headers=headers, best=best, spread={"error_mean": "error_std"}),

@@ -1,0 +1,68 @@
+"""What is measured on validation trajectories during a training."""
+
+import pytest
+import torch
+
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.mechanics import ContinuousPredictor, Trajectory
+
+T = 0.25 * torch.arange(17, dtype=torch.float64)
+
+
+class Drift(ContinuousPredictor):
+    """dq/dt = v + 1: a roll-out errs by the time since its start."""
+
+    def __init__(self):
+        super().__init__(1, 1, "velocity")
+        self.rate = torch.nn.Parameter(torch.tensor(1.0))
+
+    def state_derivative(self, x, u):
+        return torch.cat([x[..., 1:] + self.rate, torch.zeros_like(u)], dim=-1)
+
+
+def truth():
+    """Two points at constant speed, 4 s in steps of 0.25 s."""
+    v = torch.tensor([[[0.5]], [[-1.0]]], dtype=torch.float64).expand(2, 17, 1)
+    return Trajectory(T, v * T[:, None], v, torch.zeros_like(v))
+
+
+def validator(window, horizon=3.0, step=0.5):
+    return RolloutValidator(horizon=horizon, window=window, step=step, training_step=0.25)
+
+
+@pytest.mark.parametrize(
+    ("window", "errors", "text"),
+    [
+        (None, [0, 0.5, 1, 1.5, 2, 2.5, 3], "3 s open loop"),
+        (1.0, [0, 0.5, 1, 0.5, 1, 0.5, 1], "3 s, re-set every 1 s"),
+    ],
+)
+def test_the_error_is_that_of_the_horizon_re_set_every_window(window, errors, text):
+    figures = validator(window)(Drift(), truth())
+    assert figures["error_mean"] == pytest.approx(sum(errors) / len(errors), rel=1e-12)
+    assert figures["diverged"] == 0
+    assert str(validator(window)) == text
+
+
+def test_without_a_step_the_roll_out_takes_that_of_the_training():
+    prediction = validator(None, step=None).predict(Drift(), truth())
+    torch.testing.assert_close(prediction.t, T[:13])
+
+
+@pytest.mark.parametrize(
+    ("window", "horizon", "step", "words"),
+    [
+        (None, 9.0, 0.5, "horizon is 9.0 s, but the trajectory lasts only 4 s"),
+        (None, 3.0, 0.3, "step is 0.3 s and the sample time of the data is 0.25 s"),
+        (1.25, 3.0, 0.5, "window is 1.25 s and step is 0.5 s"),
+    ],
+)
+def test_data_that_it_does_not_fit_are_refused_before_a_training(window, horizon, step, words):
+    with pytest.raises(ValueError, match=words.replace(".", r"\.")):
+        validator(window, horizon, step).check(truth())
+
+
+@pytest.mark.parametrize("window", [0.25, 4.0])
+def test_a_window_between_a_step_and_the_horizon_is_expected(window):
+    with pytest.raises(ValueError, match=r"expected step <= window <= horizon, or window=null"):
+        validator(window)
