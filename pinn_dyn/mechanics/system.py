@@ -92,6 +92,10 @@ class MechanicalSystem(ContinuousPredictor):
     def _friction_force(self, v: Tensor) -> Tensor:
         return torch.zeros_like(v)
 
+    def _friction_slope(self, v: Tensor) -> Tensor:
+        """dF_i/dv_i, ``(*batch, N)``."""
+        return torch.zeros_like(v)
+
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return matvec(self.input_matrix(q), u)
 
@@ -222,17 +226,21 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
-        """k with (1 - s J) k = r, where J holds the damping, the stiff part of the motion::
+        """k with (1 - s J) k = r, where J holds the dissipation, the stiff part of the motion::
 
-            (q, v):  J = [[0, 1], [0, -M^-1 D]]        (q, p):  J = [[0, M^-1], [0, -D M^-1]]
+            (q, v):  J = [[0, 1], [0, -M^-1 D']]       (q, p):  J = [[0, M^-1], [0, -D' M^-1]]
 
-        With r = (r_q, r_v) or (r_q, r_p) and E = (M + s D)^-1 that is k_v = E M r_v and
-        k_q = r_q + s k_v, or k_p = M E r_p and k_q = r_q + s E r_p.
+        D' = D + diag(dF_i/dv_i) has the slope of the dry friction too. With r = (r_q, r_v) or
+        (r_q, r_p) and E = (M + s D')^-1 that is k_v = E M r_v and k_q = r_q + s k_v, or
+        k_p = M E r_p and k_q = r_q + s E r_p.
         """
-        q = x[..., : self.num_coordinates]
+        q, v = x.chunk(2, dim=-1)
+        if self.coordinates == "momentum":
+            v = self._velocity(q, v)
         rate_q, rate = rate.chunk(2, dim=-1)
         mass = self.mass_matrix(q)
-        whole = mass + step * self.damping_matrix(q)
+        resistance = self.damping_matrix(q) + torch.diag_embed(self._friction_slope(v))
+        whole = mass + step * resistance
         if self.coordinates == "velocity":
             velocity = rate = spd_solve(whole, matvec(mass, rate))
         else:

@@ -16,6 +16,10 @@ class Friction(nn.Module, abc.ABC):
     def forward(self, v: Tensor) -> Tensor:
         """F(v), ``(*batch, N)``, at v ``(*batch, N)``."""
 
+    @abc.abstractmethod
+    def slope(self, v: Tensor) -> Tensor:
+        """dF_i/dv_i >= 0, ``(*batch, N)``; F_i depends on v_i alone."""
+
 
 class NoFriction(Friction):
     """F = 0: dissipation is viscous, as in the paper.
@@ -28,6 +32,10 @@ class NoFriction(Friction):
         super().__init__()
 
     def forward(self, v: Tensor) -> Tensor:
+        """Zero."""
+        return torch.zeros_like(v)
+
+    def slope(self, v: Tensor) -> Tensor:
         """Zero."""
         return torch.zeros_like(v)
 
@@ -60,6 +68,16 @@ class CoulombFriction(Friction):
 
     def forward(self, v: Tensor) -> Tensor:
         """F(v)."""
+        force, width = self._constants()
+        return force * torch.tanh(v / width)
+
+    def slope(self, v: Tensor) -> Tensor:
+        """c_i (1 - tanh(v_i / w_i)^2) / w_i."""
+        force, width = self._constants()
+        return force / width * (1 - torch.tanh(v / width) ** 2)
+
+    def _constants(self) -> tuple[Tensor, Tensor]:
+        """c and w, ``(N,)`` each."""
         force = self.force * F.softplus(self.raw_force)
         width = self.v_std * (F.softplus(self.raw_width) + 0.01)
-        return force * torch.tanh(v / width)
+        return force, width

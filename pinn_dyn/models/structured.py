@@ -96,6 +96,9 @@ class StructuredNetwork(MechanicalSystem):
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)
 
+    def _friction_slope(self, v: Tensor) -> Tensor:
+        return self.friction.slope(v)
+
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)
 

@@ -270,22 +270,30 @@ class MechanicalSystemContract:
         expected = (own or system.velocity_derivative)(x, u)
         assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
 
-    def test_the_implicit_rate_solves_for_the_damping(self, system, configurations):
-        """(1 - s J) k = r, with J put together from M and D."""
-        q = configurations.q
+    def test_the_implicit_rate_solves_for_the_dissipation(self, system, configurations):
+        """(1 - s J) k = r, with J put together from M and the slope of the dissipative force."""
+        q, v, _, _ = configurations
         n = q.shape[-1]
         generator = torch.Generator().manual_seed(2)
         rate = torch.randn(*q.shape[:-1], 2 * n, generator=generator, dtype=q.dtype)
-        mass, damping = system.mass_matrix(q), system.damping_matrix(q)
+        mass = system.mass_matrix(q)
+        # By autograd, one column of the slope by v_i at a time.
+        ones = torch.eye(n, dtype=q.dtype)
+        columns = [
+            torch.func.jvp(lambda x: system.dissipative_force(q, x), (v,), (one.expand_as(v),))[1]
+            for one in ones
+        ]
+        damping = torch.stack(columns, dim=-1)
         inverse = torch.linalg.inv(mass)
-        one, zero = torch.eye(n, dtype=q.dtype).expand_as(mass), torch.zeros_like(mass)
+        one, zero = ones.expand_as(mass), torch.zeros_like(mass)
         if system.coordinates == "velocity":
             upper, lower = one, inverse @ damping
         else:
             upper, lower = inverse, damping @ inverse
         jacobian = torch.cat([torch.cat([zero, upper], -1), torch.cat([zero, -lower], -1)], -2)
         step = torch.tensor(0.01, dtype=q.dtype)
-        found = system.implicit_rate(torch.cat([q, q], -1), rate, step)
+        second = system.momentum(q, v) if system.coordinates == "momentum" else v
+        found = system.implicit_rate(torch.cat([q, second], -1), rate, step)
         back = found - step * (jacobian @ found.unsqueeze(-1)).squeeze(-1)
         assert_near(back, rate, self.exact_tolerance)
 

@@ -43,20 +43,37 @@ def test_friction_is_odd_and_reaches_its_level():
     assert_near(friction(fast), level, 1e-12)
 
 
-def test_friction_alone_stops_a_free_mass_and_takes_its_energy():
-    """m v' = -c tanh(v/w): sinh(v/w) = sinh(v0/w) exp(-c t/(m w)), a closed form."""
+def rubbing_mass():
+    """A free mass with friction alone: the model, m, c and w."""
     model = make_structured("lnn", n=1, m=1, friction=CoulombFriction)
     with torch.no_grad():
         for head in (model.potential, model.mass, model.damping):
             for parameter in head.parameters():
                 parameter.zero_()
     model.damping.network.linears[-1].bias.data.fill_(-80.0)
-    q = torch.zeros(1, 1, dtype=torch.float64)
-    mass = float(model.mass_matrix(q).detach())
+    mass = float(model.mass_matrix(torch.zeros(1, 1, dtype=torch.float64)).detach())
     friction = model.friction
     level = float((friction.force * torch.nn.functional.softplus(friction.raw_force)).detach())
     softened = torch.nn.functional.softplus(friction.raw_width) + 0.01
     width = float((friction.v_std * softened).detach())
+    return model, mass, level, width
+
+
+def test_the_rosenbrock_method_takes_steps_far_longer_than_friction():
+    """Near rest the speed decays at c/(m w): steps of 20 of its times come to rest all the same."""
+    model, mass, level, width = rubbing_mass()
+    model.integrator = "rosenbrock"
+    t = 20 * mass * width / level * torch.arange(21, dtype=torch.float64)
+    x0 = torch.tensor([[0.0, 0.2 * width]], dtype=torch.float64)
+    with torch.no_grad():
+        v = model.predict(x0, t, torch.zeros(1, 21, 1, dtype=torch.float64))[0, :, 1]
+    assert (v.abs() <= x0[0, 1]).all()
+    assert v[-1].abs() < 1e-6 * x0[0, 1]
+
+
+def test_friction_alone_stops_a_free_mass_and_takes_its_energy():
+    """m v' = -c tanh(v/w): sinh(v/w) = sinh(v0/w) exp(-c t/(m w)), a closed form."""
+    model, mass, level, width = rubbing_mass()
     t = torch.linspace(0, mass * width / level, 401, dtype=torch.float64)
     v0 = 2 * width
     x0 = torch.tensor([[0.0, v0]], dtype=torch.float64)
