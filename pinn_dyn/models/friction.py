@@ -50,19 +50,34 @@ class CoulombFriction(Friction):
 
     Args:
         size: N.
-        force: typical generalized forces, ``(N,)``; c starts at a tenth of them.
-        v_std: typical speeds, ``(N,)``; w starts at a tenth of them and stays above a hundredth,
-            as a jump in the force could not be integrated.
+        force: typical generalized forces, ``(N,)``.
+        v_std: typical speeds, ``(N,)``.
+        level: c starts at this part of the typical forces.
+        width: w starts at this part of the typical speeds beyond a hundredth, below which it never
+            falls, as a jump in the force could not be integrated.
+
+    Raises:
+        ValueError: if the level or the width is not positive.
     """
 
     force: Tensor
     v_std: Tensor
 
-    def __init__(self, *, size: int, force: Tensor, v_std: Tensor):
+    def __init__(
+        self,
+        *,
+        size: int,
+        force: Tensor,
+        v_std: Tensor,
+        level: float = 0.1,
+        width: float = 0.1,
+    ):
         super().__init__()
-        start = torch.full((size,), 0.1).expm1().log()
-        self.raw_force = nn.Parameter(start.clone())
-        self.raw_width = nn.Parameter(start.clone())
+        for name, value in (("level", level), ("width", width)):
+            if not value > 0:
+                raise ValueError(f"friction: {name} is {value}, expected a positive number")
+        self.raw_force = nn.Parameter(torch.full((size,), level).expm1().log())
+        self.raw_width = nn.Parameter(torch.full((size,), width).expm1().log())
         self.register_buffer("force", force.float().clone())
         self.register_buffer("v_std", v_std.float().clone())
 

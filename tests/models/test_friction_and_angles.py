@@ -34,6 +34,22 @@ def test_friction_opposes_every_velocity(seed):
     assert torch.equal(friction(torch.zeros(1, 3, dtype=torch.float64)), torch.zeros(1, 3).double())
 
 
+def test_friction_starts_at_the_level_and_the_width_asked_for():
+    """c = level times the force and w = (width + 0.01) times the speed."""
+    force, v_std = torch.tensor([2.0, 30.0]), torch.tensor([0.5, 4.0])
+    friction = CoulombFriction(size=2, force=force, v_std=v_std, level=0.05, width=0.03)
+    torch.testing.assert_close(friction(1e3 * v_std), 0.05 * force)
+    width = 0.04 * v_std
+    torch.testing.assert_close(friction(width), 0.05 * force * torch.tanh(torch.ones(2)))
+    torch.testing.assert_close(friction.slope(torch.zeros(2)), 0.05 * force / width)
+
+
+@pytest.mark.parametrize("name", ["level", "width"])
+def test_a_start_of_friction_that_is_not_positive_is_refused(name):
+    with pytest.raises(ValueError, match=f"friction: {name} is 0.0, expected a positive"):
+        CoulombFriction(size=1, force=torch.ones(1), v_std=torch.ones(1), **{name: 0.0})
+
+
 def test_friction_is_odd_and_reaches_its_level():
     friction = make_friction()
     _, v, _, _ = random_batch(3, 3)
