@@ -79,7 +79,7 @@ def test_missing_velocity_is_derived(folder):
     derived = source(folder, v=None)
     (train,) = derived.load().train
     np.testing.assert_allclose(train.v, motion()[["v1", "v2"]][:601], atol=2e-3)
-    assert "velocity: SavitzkyGolayVelocity(window=11, order=3)" in derived.report
+    assert "velocity: SavitzkyGolayVelocity(window=11, order=3, causal=False)" in derived.report
 
 
 def test_borders_are_cut_before_filters_see_them(folder):

@@ -99,6 +99,28 @@ def test_savitzky_golay_velocity_is_the_slope_of_local_polynomials():
     assert done.v[-1, 0] == pytest.approx(end[-2], rel=1e-8)
 
 
+def test_a_causal_velocity_is_the_slope_at_the_end_of_a_polynomial_through_the_past():
+    item = recording(NOISE)
+    done, text = only(SavitzkyGolayVelocity(window=7, order=2, causal=True), item)
+    assert text == "v from q in windows of 0.07 s, from the past alone"
+    for k in (6, 50, 299):
+        past = slice(k - 6, k + 1)
+        for column in range(2):
+            fit = np.polyfit(item.t[past] - item.t[k], NOISE[past, column], 2)
+            assert done.v[k, column] == pytest.approx(fit[-2], rel=1e-8)
+    first = np.polyfit(item.t[:7] - item.t[2], NOISE[:7, 0], 2)
+    assert done.v[2, 0] == pytest.approx(first[-2], rel=1e-8)
+
+
+def test_a_causal_velocity_does_not_know_the_future():
+    later = NOISE.copy()
+    later[101:] += 10.0
+    step = SavitzkyGolayVelocity(window=5, order=2, causal=True)
+    before, after = (only(step, recording(q))[0].v for q in (NOISE, later))
+    np.testing.assert_array_equal(before[:101], after[:101])
+    assert np.all(before[101] != after[101])
+
+
 def test_input_rates_follow_the_inputs_and_are_slopes_of_local_polynomials():
     item = recording(RNG.normal(size=(300, 1)), u=NOISE)
     done, text = only(InputRates(window=7, order=3), item)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import polynomial
-from scipy.signal import butter, savgol_filter, sosfiltfilt
+from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
@@ -191,10 +192,19 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
 
     Within half a window of an end the polynomial of the outermost full window is used.
 
+    The velocity of a sample then knows what q does half a window later, and a prediction that
+    starts there knows it too: a model can read the first half window of its errors from v. With
+    ``causal`` the polynomial goes through the sample and the ``window`` - 1 before it, as a
+    controller has them; only the first ``window`` - 1 samples of a run still share one polynomial.
+    It carries more noise, so a shorter window and a lower order suit it.
+
     Args:
         window: number of samples, odd.
         order: order of the polynomial.
+        causal: whether only the past counts.
     """
+
+    causal: bool = False
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         if recording.v is not None:
@@ -203,7 +213,21 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
                 "SavitzkyGolayVelocity, or v"
             )
         v, length = self._slope(recording, recording.q)
-        return [replace(recording, v=v)], f"v from q in windows of {length:.3g} s"
+        if self.causal:
+            v = self._causal_slope(recording.q, length / self.window)
+        past = ", from the past alone" if self.causal else ""
+        return [replace(recording, v=v)], f"v from q in windows of {length:.3g} s{past}"
+
+    def _causal_slope(self, values: np.ndarray, step: float) -> np.ndarray:
+        def weights(position: int) -> np.ndarray:
+            return savgol_coeffs(
+                self.window, self.order, deriv=1, delta=step, pos=position, use="dot"
+            )
+
+        last = self.window - 1
+        start = [weights(k) @ values[: self.window] for k in range(last)]
+        windows = sliding_window_view(values, self.window, axis=0)
+        return np.vstack([*start, windows @ weights(last)])
 
 
 @dataclass(frozen=True)
