@@ -154,11 +154,16 @@ class ContinuousStack(ContinuousPredictor):
         assert isinstance(first, ContinuousPredictor)
         super().__init__(first.num_coordinates, first.num_inputs, first.coordinates)
         self.integrator, self.substeps = first.integrator, first.substeps
+        self.learns_initial_state = first.learns_initial_state
         self.template = _Template(members)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """dx/dt of every member, ``(E, *batch, 2N)``."""
         return self.template.mapped("state_derivative", {"x": x, "u": u})
+
+    def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
+        """Where each member starts, ``(E, *batch, 2N)``."""
+        return self.template.mapped("initial_state", {"x0": x0, "u0": u0})
 
     def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
         """k of every member, ``(E, *batch, 2N)``."""

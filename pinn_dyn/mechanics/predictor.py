@@ -78,12 +78,15 @@ class ContinuousPredictor(Predictor):
             substeps (:func:`pinn_dyn.mechanics.steps.rosenbrock`).
         substeps: steps of the integrator within a step of the data. One is enough while the data
             resolve the fastest motion; data of a low rate need more.
+        learns_initial_state: whether roll-outs start at another state than the measured one
+            (:meth:`initial_state`).
         compiled_rollouts: take the steps of roll-outs without gradients by a compiled loop; pays
             for long ones, as compiling takes half a minute to a minute.
     """
 
     integrator: Integrator = "rk4"
     substeps: int = 1
+    learns_initial_state: bool = False
     compiled_rollouts: bool = False
     _compiled: Callable[..., Tensor] | None = None
 
@@ -97,6 +100,13 @@ class ContinuousPredictor(Predictor):
         Here J = 0: nothing is.
         """
         return rate
+
+    def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
+        """The state ``(*batch, 2N)`` at which a roll-out from the measured x0 starts, under u0.
+
+        Here it is x0 itself.
+        """
+        return x0
 
     def compile_derivative(self) -> None:
         """Use a compiled state derivative while the model is in training mode.
@@ -128,7 +138,10 @@ class ContinuousPredictor(Predictor):
         t_input: Tensor | None = None,
         interpolation: Interpolation = "linear",
     ) -> Tensor:
-        """Integrate the state derivative, ``substeps`` steps per interval of ``t``."""
+        """Integrate the state derivative, ``substeps`` steps per interval of ``t``.
+
+        Increments count from the measured ``x0``, wherever the roll-out starts.
+        """
         derivative, scheme = self.state_derivative, None
         compiled = self._compiled if self.training else None
         if self.integrator == "rk4":
@@ -136,9 +149,10 @@ class ContinuousPredictor(Predictor):
         else:
             scheme = self.scheme()
             scheme = replace(scheme, step=compiled or scheme.step)
-        return rollout_increments(
+        start = self.initial_state(x0, u[..., 0, :]) if self.learns_initial_state else x0
+        increments = rollout_increments(
             derivative,
-            x0,
+            start,
             t,
             u,
             t_input=t_input,
@@ -147,6 +161,10 @@ class ContinuousPredictor(Predictor):
             scheme=scheme,
             compile=self.compiled_rollouts and not torch.is_grad_enabled(),
         )
+        if not self.learns_initial_state:
+            return increments
+        moved = increments[..., 1:, :] + (start - x0).unsqueeze(-2)
+        return torch.cat([increments[..., :1, :], moved], dim=-2)
 
 
 _Model = TypeVar("_Model", bound=Predictor)

@@ -9,6 +9,7 @@ from pinn_dyn.models.cholesky import (
 )
 from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
+from pinn_dyn.models.initial_velocity import InitialVelocity, LearnedVelocity, MeasuredVelocity
 from pinn_dyn.models.input_matrix import (
     ConstantInput,
     FixedInput,
@@ -33,8 +34,11 @@ __all__ = [
     "FixedInput",
     "Friction",
     "HamiltonianNetwork",
+    "InitialVelocity",
     "InputMatrix",
     "LagrangianNetwork",
+    "LearnedVelocity",
+    "MeasuredVelocity",
     "NetworkCholesky",
     "NetworkInput",
     "NetworkPotential",

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.initial_velocity import MeasuredVelocity
 from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
     FrictionHead,
+    InitialVelocityHead,
     InputHead,
     PotentialHead,
     StructuredNetwork,
@@ -36,7 +39,7 @@ class LagrangianNetwork(StructuredNetwork):
 
     Args:
         statistics: scales of the data.
-        mass, potential, damping, input, friction: builders of the heads.
+        mass, potential, damping, input, friction, initial_velocity: builders of the heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
         substeps: steps of the integrator within a step of the data.
         integrator: "rk4", or "rosenbrock" where damping outweighs inertia.
@@ -53,6 +56,7 @@ class LagrangianNetwork(StructuredNetwork):
         damping: CholeskyHead,
         input: InputHead,
         friction: FrictionHead = NoFriction,
+        initial_velocity: InitialVelocityHead = MeasuredVelocity,
         angles: Sequence[int] = (),
         substeps: int = 1,
         integrator: Integrator = "rk4",
@@ -82,6 +86,14 @@ class LagrangianNetwork(StructuredNetwork):
                 "mass.chain is true and mass.transposed false, expected both: only in M = L^T L "
                 "does a column of L depend on the joints after it alone"
             )
+
+        self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
+        self.learns_initial_state = self.initial_velocity.learned
+
+    def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
+        """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""
+        q, v = x0.chunk(2, dim=-1)
+        return torch.cat([q, self.initial_velocity(q, v, u0)], dim=-1)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""

@@ -12,7 +12,7 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Interpolation, MechanicalSystem, Predictor
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.losses import WindowLoss
+from pinn_dyn.training.losses import WindowLoss, refuse_learned_initial_state
 
 
 class ImpulseLoss(WindowLoss):
@@ -53,7 +53,8 @@ class ImpulseLoss(WindowLoss):
 
     Raises:
         TypeError: if the model has no mass matrix, as a black box.
-        ValueError: if the windows have an odd number of steps, or the force is not linear in u.
+        ValueError: if the windows have an odd number of steps, the force is not linear in u, or the
+            model learns its initial state.
     """
 
     scale: Tensor
@@ -65,6 +66,7 @@ class ImpulseLoss(WindowLoss):
                 f"model is a {type(model).__name__}, expected a mechanical system with a mass "
                 "matrix, such as model=lnn: use loss=increment for a black box"
             )
+        refuse_learned_initial_state(model)
         if not model.input_affine:
             raise ValueError(
                 "the force is not linear in the input (model/input=nonlinear), and its impulse "

@@ -118,7 +118,11 @@ class IncrementLoss(WindowLoss):
         self._compiled = False
         self._long_training = False
         self._whole: WholeStep | None = None
-        exact_rate = isinstance(model, ContinuousPredictor) and not momentum
+        exact_rate = (
+            isinstance(model, ContinuousPredictor)
+            and not momentum
+            and not model.learns_initial_state
+        )
         self.exact_coordinates = model.num_coordinates if exact_rate else 0
 
     def steps(self, progress: float) -> int:
@@ -197,6 +201,19 @@ class IncrementLoss(WindowLoss):
             model.compile_derivative()
             self._compiled = True
             self._long_training = steps >= STEPS_FOR_WHOLE
+
+
+def refuse_learned_initial_state(model: Predictor) -> None:
+    """Refuse to train a model whose initial state no window would teach.
+
+    Raises:
+        ValueError: if it learns its initial state: only a roll-out starts there.
+    """
+    if isinstance(model, ContinuousPredictor) and model.learns_initial_state:
+        raise ValueError(
+            "the model learns the velocity at which roll-outs start, and this loss rolls nothing "
+            "out: take loss=increment, or model/initial_velocity=measured"
+        )
 
 
 class _KnownGradients(torch.autograd.Function):

@@ -8,7 +8,7 @@ from torch import Tensor
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.losses import IncrementLoss
+from pinn_dyn.training.losses import IncrementLoss, refuse_learned_initial_state
 
 
 class MidpointLoss(IncrementLoss):
@@ -51,7 +51,7 @@ class MidpointLoss(IncrementLoss):
 
     Raises:
         TypeError: if the model has no state derivative, as ``model=mlp``.
-        ValueError: if the windows have more than one step.
+        ValueError: if the windows have more than one step, or the model learns its initial state.
     """
 
     def __init__(self, statistics: Statistics, model: Predictor):
@@ -60,6 +60,7 @@ class MidpointLoss(IncrementLoss):
                 f"model is a {type(model).__name__}, expected one with a state derivative, such as "
                 "model=lnn or model=acceleration: take loss=increment"
             )
+        refuse_learned_initial_state(model)
         steps = statistics.velocity_increment_std.shape[0]
         if steps != 1:
             raise ValueError(f"the windows have {steps} steps, expected one: set data.steps=1")

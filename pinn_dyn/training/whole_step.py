@@ -135,8 +135,10 @@ def rolled_out(model: ContinuousPredictor, windows: Windows, x0: Tensor, u: Tens
     """Increments to each step, ``(B, H, 2N)``, by operations that can be traced."""
     t, t_input = windows.t - windows.t[0], windows.t_input - windows.t[0]
     grid = step_grid(t, t_input, model.substeps).to(x0)
-    path = take_steps(model.scheme(), x0, grid, t_input.to(x0), u, windows.interpolation)
-    return path[model.substeps :: model.substeps].movedim(0, -2)
+    start = model.initial_state(x0, u[..., 0, :]) if model.learns_initial_state else x0
+    path = take_steps(model.scheme(), start, grid, t_input.to(x0), u, windows.interpolation)
+    increments = path[model.substeps :: model.substeps].movedim(0, -2)
+    return increments + (start - x0).unsqueeze(-2) if model.learns_initial_state else increments
 
 
 def _call(program: Callable[..., list[Any]], arguments: tuple[Any, ...]) -> list[Any]:

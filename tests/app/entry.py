@@ -27,6 +27,7 @@ TINY_TRAINING = [
     "data.batch_size=32",
     "data.batches_per_epoch=2",
     "validator.horizon=0.1",
+    "validator.window=null",
     "validator.step=null",
     "trainer.max_epochs=1",
     "trainer.check_val_every_n_epoch=1",

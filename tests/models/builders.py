@@ -14,6 +14,7 @@ from pinn_dyn.models import (
     FixedInput,
     HamiltonianNetwork,
     LagrangianNetwork,
+    MeasuredVelocity,
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
@@ -76,6 +77,7 @@ def make_structured(
     damping=None,
     input=None,
     friction=None,
+    initial_velocity=None,
     angles=(),
     statistics=None,
     integrator="rk4",
@@ -94,7 +96,8 @@ def make_structured(
     }
     statistics = statistics or make_statistics(n, m)
     if kind == "lnn":
-        model = LagrangianNetwork(statistics, mass, **heads)
+        start = initial_velocity or MeasuredVelocity
+        model = LagrangianNetwork(statistics, mass, initial_velocity=start, **heads)
     else:
         model = HamiltonianNetwork(statistics, mass, **heads)
     return perturb(model.to(dtype))

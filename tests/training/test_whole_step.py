@@ -13,6 +13,7 @@ from pinn_dyn.models import (
     ConstantCholesky,
     ConstantInput,
     LagrangianNetwork,
+    LearnedVelocity,
     NetworkPotential,
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss
@@ -77,6 +78,16 @@ MODELS = {
         input=ConstantInput,
         integrator="rosenbrock",
     ),
+    "lnn with a learned start": lambda: make_structured(
+        "lnn",
+        n=1,
+        m=1,
+        mass=ConstantCholesky,
+        potential=partial(NetworkPotential, hidden=[3]),
+        damping=ConstantCholesky,
+        input=ConstantInput,
+        initial_velocity=partial(LearnedVelocity, hidden=[3]),
+    ),
     "acceleration": lambda: perturb(AccelerationMLP(one_step(), hidden=[6]).double()),
 }
 
@@ -86,6 +97,7 @@ MODELS = {
     ("kind", "interpolation", "kind_of_loss"),
     [
         ("lnn", "hold", IncrementLoss),
+        ("lnn with a learned start", "linear", IncrementLoss),
         ("acceleration", "linear", IncrementLoss),
         ("lnn", "linear", MidpointLoss),
     ],

@@ -1,0 +1,87 @@
+"""Heads for the velocity at which a roll-out starts: the measured one, or a learned correction."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.statistics import Statistics
+
+
+class InitialVelocity(nn.Module, abc.ABC):
+    """The velocity v_0 ``(*batch, N)`` at which a roll-out from a measured state starts.
+
+    Attributes:
+        learned: whether v_0 is other than the measured velocity.
+    """
+
+    learned: bool
+
+    @abc.abstractmethod
+    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """v_0 at the measured q, v ``(*batch, N)`` and the input u ``(*batch, M)`` there."""
+
+
+class MeasuredVelocity(InitialVelocity):
+    """v_0 = v.
+
+    Args:
+        statistics, angles: not used; every head takes the same arguments from the model.
+    """
+
+    learned = False
+
+    def __init__(self, *, statistics: Statistics, angles: Sequence[int]):
+        super().__init__()
+
+    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """v."""
+        return v
+
+
+class LearnedVelocity(InitialVelocity):
+    """v_0 = v + s_v * network(q, v, u): where the state is estimated, not measured.
+
+    A velocity derived from the last few samples of q carries noise, and damped motion forgets it
+    within a step or two, so that the dynamics cannot average over it. The network knows where
+    noise is likely, as where the motors rest. What follows obeys the equation of motion as before.
+    It starts at v_0 = v, and is trained with the dynamics (an encoder of the initial state, as in
+    Beintema, Schoukens and Toth 2023, "Deep subspace encoders for nonlinear system
+    identification").
+
+    Args:
+        statistics: scales of the data; s_v is the standard deviation of v.
+        angles: which coordinates are angles.
+        hidden: widths of the hidden layers.
+        activation: activation of the hidden layers.
+    """
+
+    learned = True
+    scale: Tensor
+
+    def __init__(
+        self,
+        *,
+        statistics: Statistics,
+        angles: Sequence[int],
+        hidden: Sequence[int] = (64,),
+        activation: str = "tanh",
+    ):
+        super().__init__()
+        size = statistics.num_coordinates
+        mean, std = statistics.network_input(repeat_input=1)
+        self.network = MLP(
+            2 * size + statistics.num_inputs, size, hidden, activation, mean, std, angles
+        )
+        last = self.network.linears[-1]
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.register_buffer("scale", statistics.v_std.float().clone())
+
+    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """v + s_v * network(q, v, u)."""
+        return v + self.scale * self.network(torch.cat([q, v, u], dim=-1))

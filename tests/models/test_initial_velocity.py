@@ -1,0 +1,124 @@
+"""A learned initial velocity: where roll-outs start, how it is trained, and what refuses it."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from pinn_dyn.data import draw_windows
+from pinn_dyn.mechanics import Ensemble, Trajectory, rollout
+from pinn_dyn.models import LearnedVelocity
+from pinn_dyn.training import ImpulseLoss, IncrementLoss, MidpointLoss
+from tests.models.builders import STEP, make_statistics, make_structured, perturb
+from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
+
+
+class Started(LinearSystem):
+    """A linear system that starts at the velocity of a head."""
+
+    learns_initial_state = True
+
+    def __init__(self, system, head):
+        super().__init__(system.mass, system.stiffness, system.damping, system.inputs)
+        self.head = head
+
+    def initial_state(self, x0, u0):
+        q, v = x0.chunk(2, -1)
+        return torch.cat([q, self.head(q, v, u0)], -1)
+
+
+LEARNED = partial(LearnedVelocity, hidden=[5])
+
+
+def motion(seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    t = STEP * torch.arange(4, dtype=torch.float64)
+    x0 = 0.3 * torch.randn(5, 4, generator=generator, dtype=torch.float64)
+    return x0, t, torch.randn(5, 4, 2, generator=generator, dtype=torch.float64)
+
+
+def untrained(model):
+    """With the last layer of the head as it starts, zero."""
+    for parameter in model.initial_velocity.network.linears[-1].parameters():
+        torch.nn.init.zeros_(parameter)
+    return model
+
+
+def test_before_training_roll_outs_start_at_the_measured_velocity():
+    head = LearnedVelocity(statistics=make_statistics(2, 2), angles=[])
+    x0, _, u = (value.float() for value in motion())
+    q, v = x0.chunk(2, -1)
+    assert torch.equal(head(q, v, u[:, 0]), v)
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "rosenbrock"])
+def test_a_roll_out_starts_there_and_counts_from_the_measured_state(integrator):
+    model = make_structured("lnn", 2, 2, initial_velocity=LEARNED, integrator=integrator)
+    plain = untrained(make_structured("lnn", 2, 2, initial_velocity=LEARNED, integrator=integrator))
+    plain.load_state_dict(
+        {k: v for k, v in model.state_dict().items() if "initial_velocity" not in k}, strict=False
+    )
+    x0, t, u = motion()
+    q, v = x0.chunk(2, -1)
+    start = torch.cat([q, model.initial_velocity(q, v, u[:, 0])], -1)
+    assert (start - x0).abs().max() > 0.1
+    found = model.predict(x0, t, u)
+    torch.testing.assert_close(found[:, 1:], plain.predict(start, t, u)[:, 1:])
+    assert torch.equal(found[:, 0], x0)
+    if integrator == "rk4":
+        torch.testing.assert_close(
+            found[:, 1:], rollout(model.state_derivative, start, t, u)[:, 1:]
+        )
+
+
+def test_members_of_an_ensemble_start_where_they_start_alone():
+    alone = [
+        perturb(make_structured("lnn", 2, 2, initial_velocity=LEARNED), seed=k, spread=0.1)
+        for k in range(2)
+    ]
+    x0, t, u = motion()
+    found = x0[:, None] + Ensemble(alone).member_increments(x0, t, u)
+    expected = torch.stack([item.predict(x0, t, u) for item in alone])
+    assert (expected[0] - expected[1]).abs().max() > 1e-3
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+def test_a_wrong_measured_velocity_is_mended():
+    """The true dynamics from 0.6 v: the head alone can lower the loss, and finds v."""
+    system = damped_oscillators()
+    t = torch.linspace(0, 6, 301, dtype=torch.float64)
+    u = torch.sin(2.5 * t[:, None])
+    x = exact_solution(system, torch.tensor([0.4, -0.3, 0.5, 0.8]).double(), t, u, "linear")
+    q, v = x.chunk(2, -1)
+    windows = draw_windows([Trajectory(t, q, 0.6 * v, u)], count=200, steps=3, stride=5, seed=0)
+    statistics = windows.statistics()
+    torch.manual_seed(0)
+    head = LearnedVelocity(statistics=statistics, angles=[], hidden=[8]).double()
+    started = Started(system, head)
+    loss = IncrementLoss(statistics, started, velocity_weight=1e-6).double()
+    optimizer = torch.optim.Adam(head.parameters(), lr=0.02)
+    first = float(loss(started, windows, 0.0))
+    for _ in range(150):
+        optimizer.zero_grad()
+        value = loss(started, windows, 0.0)
+        value.backward()
+        optimizer.step()
+    assert float(value) < 0.01 * first
+    found = head(windows.q, windows.v, windows.u[:, 0])
+    true = windows.v / 0.6
+    assert (found - true).norm() < 0.15 * (windows.v - true).norm()
+
+
+def test_one_step_windows_teach_it_by_their_configuration():
+    """Elsewhere q of one step is left out, as dq/dt = v holds by construction."""
+    model = make_structured("lnn", 1, 1, initial_velocity=LEARNED)
+    statistics = make_statistics(1, 1)
+    assert IncrementLoss(statistics, model).exact_coordinates == 0
+    assert IncrementLoss(statistics, make_structured("lnn", 1, 1)).exact_coordinates == 1
+
+
+@pytest.mark.parametrize("loss", [MidpointLoss, ImpulseLoss])
+def test_losses_without_a_roll_out_refuse_it(loss):
+    model = make_structured("lnn", 2, 2, initial_velocity=LEARNED)
+    with pytest.raises(ValueError, match=r"rolls nothing out.*initial_velocity=measured"):
+        loss(make_statistics(2, 2), model)
