@@ -53,7 +53,8 @@ class IncrementLoss(WindowLoss):
     ||x_{k+1} - x^_{k+1}||^2, normalized; with more it is the multi-step loss.
 
     The weight w of the configuration half is 1, as in the paper's Hamiltonian loss; it is 0 for
-    windows of one step where dq/dt = v holds by construction, as in the paper's Lagrangian loss.
+    windows of one step where dq/dt = v holds by construction, as in the paper's Lagrangian loss,
+    and a roll-out starts at the measured v.
     Over several steps it is 1 again: a measured q is better than a velocity derived from it. The
     weight of the other half is 1 too, or the ``velocity_weight``: below 1 where the log has no v,
     and its derivative of q is smoother than the motion. A window costs four evaluations of the

@@ -67,26 +67,20 @@ def assert_same(found, expected, factor=1.0):
 
 
 # Compiling is what takes the time here: one coordinate, and the two stages of the other method.
+SMALL_LNN = partial(
+    make_structured,
+    "lnn",
+    n=1,
+    m=1,
+    mass=ConstantCholesky,
+    potential=partial(NetworkPotential, hidden=[3]),
+    damping=ConstantCholesky,
+    input=ConstantInput,
+)
 MODELS = {
-    "lnn": lambda: make_structured(
-        "lnn",
-        n=1,
-        m=1,
-        mass=ConstantCholesky,
-        potential=partial(NetworkPotential, hidden=[3]),
-        damping=ConstantCholesky,
-        input=ConstantInput,
-        integrator="rosenbrock",
-    ),
-    "lnn with a learned start": lambda: make_structured(
-        "lnn",
-        n=1,
-        m=1,
-        mass=ConstantCholesky,
-        potential=partial(NetworkPotential, hidden=[3]),
-        damping=ConstantCholesky,
-        input=ConstantInput,
-        initial_velocity=partial(LearnedVelocity, hidden=[3]),
+    "lnn": lambda: SMALL_LNN(integrator="rosenbrock"),
+    "lnn with a learned start": lambda: SMALL_LNN(
+        initial_velocity=partial(LearnedVelocity, hidden=[3])
     ),
     "acceleration": lambda: perturb(AccelerationMLP(one_step(), hidden=[6]).double()),
 }
