@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
@@ -36,10 +37,35 @@ def _build(name: str, config: dict[str, Any], *given: Any, **extra: Any) -> Any:
         # Plain lists and dicts reach the constructors: no room below knows a config object.
         built = instantiate(config, _convert_="all")
         return built(*given, **extra) if given or extra else built
-    except InstantiationException as error:
-        raise ConfigError(f"{name}: {error.__cause__ or error}") from error
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{name}: {error}") from error
+    except (InstantiationException, TypeError, ValueError) as error:
+        # Hydra wraps what a constructor said.
+        wrapped = isinstance(error, InstantiationException) and error.__cause__
+        said = str(wrapped or error)
+        if "unexpected keyword argument" in said:
+            said = _unknown_option(name, config) or said
+        raise ConfigError(f"{name}: {said}") from error
+
+
+def _unknown_option(path: str, config: Any) -> str | None:
+    """What to say of the first option that its class does not take; None if there is none.
+
+    An experiment sets options of the classes that it chooses. They stay behind where the command
+    line chooses another class.
+    """
+    if not isinstance(config, dict):
+        return None
+    if "_target_" in config:
+        target = get_object(config["_target_"])
+        takes = inspect.signature(target).parameters
+        if not any(one.kind is one.VAR_KEYWORD for one in takes.values()):
+            for key in config:
+                if key not in takes and not key.startswith("_"):
+                    return (
+                        f"{target.__name__} takes no {key!r}; if an experiment has it for another "
+                        f"class, remove it by '~{path}.{key}'"
+                    )
+    found = (_unknown_option(f"{path}.{key}", part) for key, part in config.items())
+    return next((said for said in found if said), None)
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
@@ -234,7 +260,7 @@ def build_law(
         raise ConfigError(
             f"controllers.{name}.terms is {part['terms']!r}, expected {' or '.join(models)}"
         )
-    law = _build(f"controllers.{name}", part["law"], models[part["terms"]])
+    law = _build(f"controllers.{name}.law", part["law"], models[part["terms"]])
     if "observer" not in part:
         return law
     return _build(f"controllers.{name}.observer", part["observer"], law)

@@ -1,4 +1,4 @@
-"""When a training compiles its dynamics."""
+"""When a training compiles its dynamics, and options that a class does not take."""
 
 import pytest
 
@@ -52,3 +52,15 @@ def test_true_without_a_compiler_says_what_to_install(compiler):
 def test_another_choice_is_refused(compiler, choice):
     with pytest.raises(ConfigError, match="expected true, false or auto"):
         build.compiles(config(choice))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_an_option_of_another_class_says_how_to_remove_it(nested):
+    config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "statistics": None}
+    key = "hidden"
+    if nested:
+        config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "statistics": config}
+        key = "statistics.hidden"
+    says = rf"model: MeasuredVelocity takes no 'hidden'.*remove it by '~model\.{key}'"
+    with pytest.raises(ConfigError, match=says):
+        build._build("model", config)
