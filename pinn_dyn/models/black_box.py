@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import ContinuousPredictor, Interpolation, Predictor
+from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.statistics import Statistics
 
@@ -99,6 +100,7 @@ class AccelerationMLP(ContinuousPredictor):
         activation: activation of the hidden layers.
         angles: which coordinates are angles; the network sees their sine and cosine.
         substeps: RK4 steps within a step of the data.
+        initial_velocity: builder of the head for the velocity at which roll-outs start.
     """
 
     scale: Tensor
@@ -110,6 +112,7 @@ class AccelerationMLP(ContinuousPredictor):
         activation: str = "softplus",
         angles: Sequence[int] = (),
         substeps: int = 1,
+        initial_velocity: InitialVelocityHead = MeasuredVelocity,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, "velocity")
@@ -118,6 +121,12 @@ class AccelerationMLP(ContinuousPredictor):
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
         self.register_buffer("scale", acceleration.float())
+        self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
+        self.learns_initial_state = self.initial_velocity.learned
+
+    def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
+        """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""
+        return self.initial_velocity.initial_state(x0, u0)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """d(q, v)/dt, ``(*batch, 2N)``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,15 @@ class InitialVelocity(nn.Module, abc.ABC):
     @abc.abstractmethod
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """v_0 at the measured q, v ``(*batch, N)`` and the input u ``(*batch, M)`` there."""
+
+    def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
+        """(q, v_0), ``(*batch, 2N)``, at the measured x0 = (q, v) and the input u0 there."""
+        q, v = x0.chunk(2, dim=-1)
+        return torch.cat([q, self(q, v, u0)], dim=-1)
+
+
+InitialVelocityHead = Callable[..., InitialVelocity]
+"""Builds a head for the velocity at which roll-outs start from ``statistics`` and ``angles``."""
 
 
 class MeasuredVelocity(InitialVelocity):

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.initial_velocity import MeasuredVelocity
+from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
     FrictionHead,
-    InitialVelocityHead,
     InputHead,
     PotentialHead,
     StructuredNetwork,
@@ -92,8 +90,7 @@ class LagrangianNetwork(StructuredNetwork):
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
         """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""
-        q, v = x0.chunk(2, dim=-1)
-        return torch.cat([q, self.initial_velocity(q, v, u0)], dim=-1)
+        return self.initial_velocity.initial_state(x0, u0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""

@@ -12,7 +12,6 @@ from pinn_dyn.mechanics import Coordinates, MechanicalSystem
 from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
-from pinn_dyn.models.initial_velocity import InitialVelocity
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import Potential
 from pinn_dyn.models.statistics import Statistics
@@ -26,8 +25,6 @@ InputHead = Callable[..., InputMatrix]
 ``u_mean`` and ``u_std``."""
 FrictionHead = Callable[..., Friction]
 """Builds a friction head from ``size``, ``force`` and ``v_std``."""
-InitialVelocityHead = Callable[..., InitialVelocity]
-"""Builds a head for the velocity at which roll-outs start from ``statistics`` and ``angles``."""
 
 
 class StructuredNetwork(MechanicalSystem):

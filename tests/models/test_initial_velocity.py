@@ -7,7 +7,7 @@ import torch
 
 from pinn_dyn.data import draw_windows
 from pinn_dyn.mechanics import Ensemble, Trajectory, rollout
-from pinn_dyn.models import LearnedVelocity
+from pinn_dyn.models import AccelerationMLP, LearnedVelocity
 from pinn_dyn.training import ImpulseLoss, IncrementLoss, MidpointLoss
 from tests.models.builders import STEP, make_statistics, make_structured, perturb
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
@@ -37,6 +37,15 @@ def motion(seed=0):
     return x0, t, torch.randn(5, 4, 2, generator=generator, dtype=torch.float64)
 
 
+def started(kind):
+    """A model whose head is as it could be after training."""
+    if kind == "acceleration":
+        torch.manual_seed(7)
+        model = AccelerationMLP(make_statistics(2, 2), hidden=[6], initial_velocity=LEARNED)
+        return perturb(model.double())
+    return make_structured("lnn", 2, 2, initial_velocity=LEARNED, integrator=kind)
+
+
 def untrained(model):
     """With the last layer of the head as it starts, zero."""
     for parameter in model.initial_velocity.network.linears[-1].parameters():
@@ -51,10 +60,9 @@ def test_before_training_roll_outs_start_at_the_measured_velocity():
     assert torch.equal(head(q, v, u[:, 0]), v)
 
 
-@pytest.mark.parametrize("integrator", ["rk4", "rosenbrock"])
-def test_a_roll_out_starts_there_and_counts_from_the_measured_state(integrator):
-    model = make_structured("lnn", 2, 2, initial_velocity=LEARNED, integrator=integrator)
-    plain = untrained(make_structured("lnn", 2, 2, initial_velocity=LEARNED, integrator=integrator))
+@pytest.mark.parametrize("kind", ["rk4", "rosenbrock", "acceleration"])
+def test_a_roll_out_starts_there_and_counts_from_the_measured_state(kind):
+    model, plain = started(kind), untrained(started(kind))
     plain.load_state_dict(
         {k: v for k, v in model.state_dict().items() if "initial_velocity" not in k}, strict=False
     )
@@ -65,7 +73,7 @@ def test_a_roll_out_starts_there_and_counts_from_the_measured_state(integrator):
     found = model.predict(x0, t, u)
     torch.testing.assert_close(found[:, 1:], plain.predict(start, t, u)[:, 1:])
     assert torch.equal(found[:, 0], x0)
-    if integrator == "rk4":
+    if model.integrator == "rk4":
         torch.testing.assert_close(
             found[:, 1:], rollout(model.state_derivative, start, t, u)[:, 1:]
         )
@@ -97,13 +105,13 @@ def test_a_wrong_measured_velocity_is_mended():
     started = Started(system, head)
     loss = IncrementLoss(statistics, started, velocity_weight=1e-6).double()
     optimizer = torch.optim.Adam(head.parameters(), lr=0.02)
-    first = float(loss(started, windows, 0.0))
+    first = loss(started, windows, 0.0).item()
     for _ in range(150):
         optimizer.zero_grad()
         value = loss(started, windows, 0.0)
         value.backward()
         optimizer.step()
-    assert float(value) < 0.01 * first
+    assert value.item() < 0.01 * first
     found = head(windows.q, windows.v, windows.u[:, 0])
     true = windows.v / 0.6
     assert (found - true).norm() < 0.15 * (windows.v - true).norm()

@@ -82,7 +82,11 @@ MODELS = {
     "lnn with a learned start": lambda: SMALL_LNN(
         initial_velocity=partial(LearnedVelocity, hidden=[3])
     ),
-    "acceleration": lambda: perturb(AccelerationMLP(one_step(), hidden=[6]).double()),
+    "acceleration with a learned start": lambda: perturb(
+        AccelerationMLP(
+            one_step(), hidden=[6], initial_velocity=partial(LearnedVelocity, hidden=[3])
+        ).double()
+    ),
 }
 
 
@@ -92,7 +96,7 @@ MODELS = {
     [
         ("lnn", "hold", IncrementLoss),
         ("lnn with a learned start", "linear", IncrementLoss),
-        ("acceleration", "linear", IncrementLoss),
+        ("acceleration with a learned start", "linear", IncrementLoss),
         ("lnn", "linear", MidpointLoss),
     ],
 )
