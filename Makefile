@@ -11,7 +11,9 @@ BIN       := $(VENV)/bin
 
 # The pins of constraints.txt hold for Python 3.11 and later; 3.10 takes what pip finds.
 PINS    = $$($(BIN)/python -c 'import sys; print("-c constraints.txt" if sys.version_info >= (3, 11) else "")')
-# Python compiles what is imported, once; pip would compile all.
+# Python compiles what is imported, once; pip would compile all. Where the caller forbids Python to
+# keep what it compiled, each of the many processes below would compile PyTorch again.
+unexport PYTHONDONTWRITEBYTECODE
 INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile $(PIP_FLAGS) $(PINS)
 
 .DEFAULT_GOAL := help
