@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from pinn_dyn.mechanics import Trajectory
 
 # Okabe and Ito's palette, told apart by colour-blind readers; truth is grey.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_LINES = ("-", "--", ":", "-.")
 _TRUTH = "0.70"
 _MATH = {
     "M": "$M(q)$",
@@ -43,7 +45,7 @@ def trajectory_figure(
     Args:
         truth: K test trajectories stacked, q ``(K, T, N)``.
         predictions: model names and their roll-outs of the same K trajectories; the order of the
-            names fixes their colours.
+            names fixes their colours and lines.
         trajectory: which of the K to draw.
         title: data set and horizon.
         labels: name and unit of each coordinate; None takes q1 ... qN.
@@ -60,12 +62,12 @@ def trajectory_figure(
         ax.plot(t, q[:, k], color=_TRUTH, linewidth=5, label="truth", solid_capstyle="butt")
         low, high = _limits(q[:, k])
         notes = []
-        for (name, prediction), colour in _coloured(predictions):
+        for name, prediction, colour, line in _styled(predictions):
             q_hat = prediction.q_hat[trajectory, :, k]
             outside = ~((q_hat >= low) & (q_hat <= high))
             # Beyond the panel only the way out matters; huge numbers upset the renderer.
             drawn = q_hat.clamp(2 * low - high, 2 * high - low)
-            ax.plot(prediction.t, drawn, color=colour, linewidth=1.3, label=name)
+            ax.plot(prediction.t, drawn, line, color=colour, linewidth=1.3, label=name)
             if torch.isnan(q_hat).all():
                 notes.append(f"{name} broke down, not drawn")
             elif outside.any():
@@ -76,11 +78,11 @@ def trajectory_figure(
         # Above the panel, where no line can hide it.
         ax.set_title("\n".join(notes), loc="right", fontsize="small")
     input_axes = axes[count]
-    style = "steps-post" if truth.interpolation == "hold" else "default"
+    held = "steps-post" if truth.interpolation == "hold" else "default"
     for k, label in enumerate(input_labels):
         shade = str(0.65 * k / max(len(input_labels) - 1, 1))
-        line = ("-", "--", ":", "-.")[k % 4]
-        input_axes.plot(t, u[:, k], line, color=shade, linewidth=1, drawstyle=style, label=label)
+        line = _LINES[k % len(_LINES)]
+        input_axes.plot(t, u[:, k], line, color=shade, linewidth=1, drawstyle=held, label=label)
     input_axes.set_ylabel("input")
     input_axes.set_xlabel("time (s)")
     input_axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize="small")
@@ -108,17 +110,17 @@ def error_figure(
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     ax = figure.subplots()
     floors = []
-    for (name, prediction), colour in _coloured(predictions):
+    for name, prediction, colour, line in _styled(predictions):
         lost = diverged_trajectories(prediction)
         total, count = lost.shape[0], int(lost.sum())
         note = "" if count == 0 else f" ({count} of {total} diverged)"
         t, error = prediction.t[1:], prediction.error()[~lost][:, 1:]
         if count == total:
-            ax.plot([], [], color=colour, label=name + note)
+            ax.plot([], [], line, color=colour, label=name + note)
             continue
         mean = error.mean(dim=0)
         low, high = torch.quantile(error, torch.tensor([0.1, 0.9], dtype=error.dtype), dim=0)
-        ax.plot(t, mean, color=colour, linewidth=1.5, label=name + note)
+        ax.plot(t, mean, line, color=colour, linewidth=1.5, label=name + note)
         ax.fill_between(t, low, high, color=colour, alpha=0.18, linewidth=0)
         floors.append(float(mean.median()))
     ax.set_yscale("log")
@@ -227,9 +229,12 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, format="png", dpi=150)
 
 
-def _coloured(predictions: dict[str, Prediction]) -> list[tuple[tuple[str, Prediction], str]]:
+def _styled(predictions: dict[str, Prediction]) -> list[tuple[str, Prediction, str, str]]:
+    """Each model with a colour of its own; where the colours end, with another kind of line."""
+    styles = itertools.cycle(itertools.product(_LINES, _COLOURS))
     return [
-        (item, _COLOURS[index % len(_COLOURS)]) for index, item in enumerate(predictions.items())
+        (name, prediction, colour, line)
+        for (name, prediction), (line, colour) in zip(predictions.items(), styles, strict=False)
     ]
 
 

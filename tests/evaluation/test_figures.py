@@ -93,6 +93,15 @@ def test_colours_follow_the_order_of_the_models(truth, predictions):
     assert len(set(colours)) == 3
 
 
+def test_no_two_of_many_models_are_drawn_alike(predictions, tmp_path):
+    many = {f"run {k}": predictions["good"] for k in range(9)}
+    figure = error_figure(many, title="fake")
+    check_picture(figure, tmp_path / "error.png")
+    looks = [(line.get_color(), line.get_linestyle()) for line in figure.axes[0].lines]
+    assert len(set(looks)) == 9
+    assert {line for _, line in looks[:6]} == {"-"}
+
+
 @pytest.mark.parametrize(("inverse_mass", "shown"), [(False, "0.00173"), (True, "593")])
 def test_terms_are_annotated(inverse_mass, shown, tmp_path):
     q = torch.tensor([[0.8, 0.2, 0.3], [1.2, -0.2, 0.15]])
