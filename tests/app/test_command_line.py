@@ -62,7 +62,7 @@ def test_a_misspelt_key_ends_the_real_program_with_an_error(elsewhere):
         capture_output=True,
         text=True,
         check=False,
-        timeout=100,
+        timeout=600,
     )
     assert done.returncode != 0
     assert "did you mean data.pairs" in done.stderr

@@ -20,6 +20,6 @@ def load_slowly(folder, barrier, results):
         time.sleep(0.5)
         return {"t": np.array([0.0, 0.5, 1.0])}
 
-    barrier.wait(timeout=100)
+    barrier.wait(timeout=600)
     arrays = load_or_make(folder / "cache", "arm", {"mass": 0.3}, make)
     results.put({key: value.tolist() for key, value in arrays.items()})

@@ -180,9 +180,9 @@ def test_two_processes_at_once_make_the_file_once(tmp_path: Path):
     ]
     for worker in workers:
         worker.start()
-    found = [results.get(timeout=100) for _ in workers]
+    found = [results.get(timeout=600) for _ in workers]
     for worker in workers:
-        worker.join(timeout=30)
+        worker.join(timeout=600)
     assert [worker.exitcode for worker in workers] == [0, 0]
     expected = {"t": [0.0, 0.5, 1.0]}
     assert found == [expected, expected]

@@ -49,7 +49,7 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
         process = start_process("train.py", f"resume={killed}", **at)
         try:
             run_script("train.py", *LONG, f"hydra.run.dir={whole}")
-            assert process.wait(timeout=120) == 0, log.read_text()
+            assert process.wait(timeout=600) == 0, log.read_text()
         finally:
             process.kill()
     first, second = (

@@ -92,18 +92,20 @@ MODELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "interpolation", "kind_of_loss"),
+    ("kind", "interpolation", "kind_of_loss", "built"),
     [
-        ("lnn", "hold", IncrementLoss),
-        ("lnn with a learned start", "linear", IncrementLoss),
-        ("acceleration with a learned start", "linear", IncrementLoss),
-        ("lnn", "linear", MidpointLoss),
+        ("lnn", "hold", IncrementLoss, True),
+        ("lnn with a learned start", "linear", IncrementLoss, False),
+        ("acceleration with a learned start", "linear", IncrementLoss, False),
+        ("lnn", "linear", MidpointLoss, False),
     ],
 )
 def test_loss_and_gradients_are_those_of_the_eager_model(
-    monkeypatch, kind, interpolation, kind_of_loss
+    request, monkeypatch, kind, interpolation, kind_of_loss, built
 ):
     """Also of other data with the same program, and of a batch in parts, one thread or three."""
+    if not built:
+        request.getfixturevalue("traced")
     model = MODELS[kind]()
     windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
     eager, compiled = (kind_of_loss(one_step(), model).double() for _ in range(2))
@@ -128,9 +130,13 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("threads", [1, 2])
-def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(monkeypatch, threads):
+@pytest.mark.parametrize(("threads", "built"), [(1, False), (2, True)])
+def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
+    request, monkeypatch, threads, built
+):
     """Even in a short training: one program serves all members."""
+    if not built:
+        request.getfixturevalue("traced")
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     members = [perturb(AccelerationMLP(one_step(), hidden=[6]).double(), seed=k) for k in range(3)]
     stack = Ensemble(members).stack
