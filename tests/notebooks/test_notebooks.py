@@ -68,6 +68,6 @@ def test_it_runs_from_a_clean_kernel(path):
         cell.outputs = []
     resources = {"metadata": {"path": str(FOLDER)}}
     nbclient.NotebookClient(
-        notebook, timeout=900, kernel_name="python3", resources=resources
+        notebook, timeout=1800, kernel_name="python3", resources=resources
     ).execute()
     assert figures(notebook) == committed

@@ -35,12 +35,12 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 def slurm(tmp_path):
     """A SLURM of one node; gives the environment in which its commands find it."""
     folder = tmp_path / "slurm"
-    subprocess.run([SCRIPT, "start", folder], check=True, timeout=60)
+    subprocess.run([SCRIPT, "start", folder], check=True, timeout=200)
     try:
         # The jobs do not know the folder of train.py, should the package not be installed.
         yield {**os.environ, "SLURM_CONF": str(folder / "slurm.conf"), "PYTHONPATH": str(ROOT)}
     finally:
-        subprocess.run([SCRIPT, "stop", folder], check=True, timeout=60)
+        subprocess.run([SCRIPT, "stop", folder], check=True, timeout=200)
 
 
 def sweep(environment, folder, *arguments):
@@ -55,7 +55,7 @@ def sweep(environment, folder, *arguments):
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=900,
     )
 
 
