@@ -53,10 +53,17 @@ def own_logging():
         root.setLevel(level)
 
 
-def run_script(script, *arguments):
-    """Run an entry script in this process, as ``python <script> <arguments>`` would."""
+def run_script(script, *arguments, checked=False):
+    """Run an entry script in this process, as ``python <script> <arguments>`` would.
+
+    A configuration is composed three times: for its keys, for a mode that ours leave to -m, and to
+    be used. Unless checked, only the last is done: a composition takes as long as a tiny training.
+    """
     with pytest.MonkeyPatch.context() as patch, own_logging():
         patch.setattr(sys, "argv", [script, *arguments])
+        if not checked:
+            patch.setattr("pinn_dyn.app.config.misspelt_key", lambda *_: None)
+            patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
         runpy.run_path(str(ROOT / script), run_name="__main__")
 
 
@@ -69,7 +76,7 @@ def train(folder, *arguments):
 def fails(script, *arguments):
     """Run an entry script that has to end with an error; returns what was raised."""
     with pytest.raises(SystemExit) as caught:
-        run_script(script, *arguments)
+        run_script(script, *arguments, checked=True)
     assert caught.value.code not in (0, None)
     return caught.value
 

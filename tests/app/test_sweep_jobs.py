@@ -210,7 +210,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = [
         *("-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"),
-        *(f"hydra/launcher={launcher}", "trainer.max_epochs=40"),
+        *(f"hydra/launcher={launcher}", "trainer.max_epochs=20"),
     ]
     first = tmp_path / "sweep" / "0_lnn-seed0"
     log = tmp_path / "log.txt"
@@ -228,7 +228,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
     assert f"going on with the training in {first}" in (first / "train.log").read_text()
     for seed in (0, 1):
         folder = tmp_path / "sweep" / f"{seed}_lnn-seed{seed}"
-        assert record(folder)["steps"] == 80
+        assert record(folder)["steps"] == 40
 
 
 @pytest.mark.slow

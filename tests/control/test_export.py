@@ -11,7 +11,7 @@ import torch
 
 from pinn_dyn.control.contracts import Controller
 from pinn_dyn.control.export import export_law, load_law
-from pinn_dyn.control.laws import ProportionalDerivative, Regulation, Tracking
+from pinn_dyn.control.laws import ProportionalDerivative, Tracking
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential
 from tests.models.builders import make_structured
@@ -31,18 +31,18 @@ print(json.dumps({"u": u, "imported": imported}))
 """
 
 
-def make_law(law=Tracking, kind="lnn", m=2):
+def make_law():
     model = make_structured(
-        kind,
+        "lnn",
         2,
-        m,
+        2,
         mass=partial(NetworkCholesky, hidden=[4]),
         potential=partial(NetworkPotential, hidden=[4]),
         damping=partial(NetworkCholesky, hidden=[3], epsilon=0.0),
         input=partial(NetworkInput, hidden=[3]),
         angles=[0],
     )
-    return law(model.eval(), [40.0, 30.0], [4.0, 3.0])
+    return Tracking(model.eval(), [40.0, 30.0], [4.0, 3.0])
 
 
 def states(count=50):
@@ -96,17 +96,6 @@ def test_a_loaded_law_is_the_eager_law_and_says_what_it_is(exported):
     assert loaded.info["inputs"] == ["q", "v", "q_ref", "v_ref", "a_ref"]
     check = loaded.info["check"]
     assert_same(torch.tensor(check["u"]).double(), law, torch.tensor(check["states"]).double())
-
-
-@needs_compiler
-@pytest.mark.slow
-def test_regulation_of_an_underactuated_hamiltonian_network_exports_too(tmp_path):
-    law = make_law(Regulation, kind="hnn", m=1)
-    loaded = load_law(export_law(law, tmp_path / "law.pt2"))
-    at = states(10)
-    found = torch.stack([loaded(*state) for state in at])
-    assert found.shape == (10, 1)
-    assert_same(found, law, at)
 
 
 @needs_compiler

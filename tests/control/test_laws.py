@@ -253,9 +253,12 @@ def test_an_infinite_limit_still_flags_a_matrix_that_is_nan():
 # Deployment.
 
 
-@pytest.mark.parametrize("law", MODEL_BASED)
-def test_the_formula_can_be_exported(law):
-    controller = law(make_model("lnn", 2, 2).requires_grad_(False), 5.0, 1.0)
+@pytest.mark.parametrize(
+    ("law", "kind", "num_inputs"),
+    [*((law, "lnn", 2) for law in MODEL_BASED), (Regulation, "hnn", 1)],
+)
+def test_the_formula_can_be_exported(law, kind, num_inputs):
+    controller = law(make_model(kind, 2, num_inputs).requires_grad_(False), 5.0, 1.0)
     q, v, motion = states(2)
 
     class Formula(torch.nn.Module):

@@ -104,9 +104,9 @@ def test_a_wrong_measured_velocity_is_mended():
     head = LearnedVelocity(statistics=statistics, angles=[], hidden=[8]).double()
     started = Started(system, head)
     loss = IncrementLoss(statistics, started, velocity_weight=1e-6).double()
-    optimizer = torch.optim.Adam(head.parameters(), lr=0.02)
+    optimizer = torch.optim.Adam(head.parameters(), lr=0.04)
     first = loss(started, windows, 0.0).item()
-    for _ in range(150):
+    for _ in range(80):
         optimizer.zero_grad()
         value = loss(started, windows, 0.0)
         value.backward()

@@ -107,6 +107,7 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     if not built:
         request.getfixturevalue("traced")
     model = MODELS[kind]()
+    monkeypatch.setattr(model, "compile_derivative", lambda: None)  # the eager loss stays so
     windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
     eager, compiled = (kind_of_loss(one_step(), model).double() for _ in range(2))
     compiled.compile_dynamics(model, LONG)
