@@ -104,6 +104,7 @@ def test_figures_animation_log_and_provenance_are_written(results):
     assert record["config"]["gains"]["position"] == 5
 
 
+@pytest.mark.slow
 def test_a_law_in_continuous_time_differs_from_a_sampled_one_by_the_sampling_only(
     tmp_path, results, lnn_run, undrawn
 ):

@@ -175,7 +175,6 @@ def ended(process, log, seconds=300):
         process.kill()
 
 
-@pytest.mark.slow
 def test_jobs_side_by_side_simulate_once_lose_one_and_the_others_are_done(tmp_path, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "cold"))
@@ -203,8 +202,7 @@ def wait_for(process, condition):
         time.sleep(0.05)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+@pytest.mark.parametrize("launcher", ["basic", pytest.param("joblib", marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
     if launcher == "joblib":
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -231,7 +229,6 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         assert record(folder)["steps"] == 40
 
 
-@pytest.mark.slow
 def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
     words = ["-m", *TINY, NO_FIGURES, "model=lnn,mlp", STRIDE, "data.batches_per_epoch=5"]
     log = tmp_path / "log.txt"

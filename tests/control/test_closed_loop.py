@@ -335,6 +335,7 @@ def test_ctrl_c_keeps_the_record_so_far(undisturbed):
     assert record.diagnostics["time"].shape == (3, 8)
 
 
+@pytest.mark.slow
 def test_a_copy_that_a_continuous_loop_loses_leaves_the_others_unharmed():
     still, law = Wave(double([0.0])), PD(size=1, k_p=1e-9, k_d=1e-9)
     q0, v0 = double([[0.0], [0.0], [0.1], [0.2], [0.3]]), double([[0.1], [3.0], [0], [-1], [0.4]])

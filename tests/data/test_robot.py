@@ -167,6 +167,7 @@ def test_both_kinds_move_every_joint(splits):
         assert (item.v.std(0) > 1e-3).all()
 
 
+@pytest.mark.slow
 def test_more_test_motions_and_more_processes_change_no_other(source, splits, tmp_path):
     other = build(tmp_path, test=3, workers=2).load()
     assert len(other.test) == 3

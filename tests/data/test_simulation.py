@@ -62,6 +62,7 @@ def test_a_damped_linear_system_under_a_sine_follows_the_matrix_exponential(line
     np.testing.assert_allclose(np.hstack([q[0], v[0]]), exact.numpy(), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
 def test_a_compiled_simulation_is_the_same(linear):
     q0, v0, t = np.ones((2, 2)), np.zeros((2, 2)), np.linspace(0, 1, 5)

@@ -50,7 +50,6 @@ def test_the_trained_models_are_small_and_hold_no_path_of_a_machine():
         assert not re.search(rb"/(home|root|tmp|Users|work)/", file.read_bytes()), file
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
     [

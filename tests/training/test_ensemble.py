@@ -157,6 +157,7 @@ def test_one_member_that_breaks_stops_the_training(tmp_path, make_data):
         train(tmp_path, learner, data)
 
 
+@pytest.mark.slow
 def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(tmp_path, make_data, traced):
     data, weights = make_data(members=2), []
     for compile in (False, True):

@@ -3,7 +3,6 @@
 import signal
 import time
 
-import pytest
 import torch
 
 from tests.app.entry import NO_FIGURES, TINY, run_script, start_process
@@ -28,7 +27,6 @@ def epoch_of(path):
         return -1
 
 
-@pytest.mark.slow
 def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monkeypatch):
     monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "cache"))
     whole, killed = tmp_path / "whole", tmp_path / "killed"

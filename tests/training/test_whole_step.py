@@ -90,11 +90,10 @@ MODELS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "interpolation", "kind_of_loss", "built"),
     [
-        ("lnn", "hold", IncrementLoss, True),
+        pytest.param("lnn", "hold", IncrementLoss, True, marks=pytest.mark.slow),
         ("lnn with a learned start", "linear", IncrementLoss, False),
         ("acceleration with a learned start", "linear", IncrementLoss, False),
         ("lnn", "linear", MidpointLoss, False),
@@ -130,8 +129,9 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("threads", "built"), [(1, False), (2, True)])
+@pytest.mark.parametrize(
+    ("threads", "built"), [(1, False), pytest.param(2, True, marks=pytest.mark.slow)]
+)
 def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
     request, monkeypatch, threads, built
 ):
