@@ -226,7 +226,9 @@ def test_there_are_control_experiments():
 
 
 @pytest.mark.panda
-@pytest.mark.parametrize("experiment", ["panda/tracking", "panda/helix"])
+@pytest.mark.parametrize(
+    "experiment", ["panda/tracking", pytest.param("panda/helix", marks=pytest.mark.slow)]
+)
 def test_the_panda_is_controlled_in_bullet(request, tmp_path, experiment, panda_run):
     if experiment != "panda/helix":  # which has a picture of its own
         request.getfixturevalue("undrawn")
