@@ -34,7 +34,7 @@ reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on wher
 test: $(VENV)/.installed-dev  ## run the tests, on all cores
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
 
-test-slow: $(VENV)/.installed-dev  ## run those that build C++ programs, or simulate for long
+test-slow: $(VENV)/.installed-dev  ## run those that compile models, or simulate for long
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m slow
 
 test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean kernels

@@ -202,6 +202,7 @@ def test_an_ensemble_integrates_as_its_members_do(kind):
     assert (found - explicit).abs().max() > 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [(4,), ()])
 def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
     monkeypatch, batch, traced

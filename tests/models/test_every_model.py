@@ -125,6 +125,7 @@ def loss_and_gradients(model, x0, t, u):
     return increments.detach(), gradients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CONTINUOUS)
 def test_a_compiled_model_has_the_same_increments_and_gradients(monkeypatch, kind):
     """Building takes minutes: tests/training/test_impulse.py does it for a Lagrangian network."""
