@@ -69,7 +69,7 @@ def play(name, words):
     small = [*(PLAYED[name] if script == "train.py" else []), *SMALL[script]]
     if Path("my_conf").is_dir() and not any("--config-dir" in word for word in overrides):
         small.append("--config-dir=my_conf")
-    run_script(script, *overrides, *small)
+    run_script(script, *overrides, *small, checked=True)
 
 
 def module_of_a_block(page, title):
