@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -44,6 +46,15 @@ def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
 
     NaN where it is not positive definite, as in a roll-out that diverges: the others go on.
     """
+    return spd_solver(matrix)(vector)
+
+
+def spd_solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
+    """:func:`spd_solve` for one matrix and many vectors: the matrix is factored once."""
     factor, failed = torch.linalg.cholesky_ex(matrix)
-    solution = torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)
-    return torch.where(failed.unsqueeze(-1) == 0, solution, torch.nan)
+
+    def solve(vector: Tensor) -> Tensor:
+        solution = torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)
+        return torch.where(failed.unsqueeze(-1) == 0, solution, torch.nan)
+
+    return solve

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
 from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor
+from pinn_dyn.mechanics.steps import Scheme
 from pinn_dyn.mechanics.trajectory import Interpolation
 
 
@@ -146,7 +148,7 @@ class _Template(nn.Module):
 class ContinuousStack(ContinuousPredictor):
     """E models given by state derivatives, as one: x ``(E, *batch, 2N)``, u ``(E, *batch, M)``.
 
-    What is compiled for training is the derivative of all members at once.
+    What is compiled for training is the derivative, or a Rosenbrock step, of all members at once.
     """
 
     def __init__(self, members: Sequence[Predictor]):
@@ -165,9 +167,17 @@ class ContinuousStack(ContinuousPredictor):
         """Where each member starts, ``(E, *batch, 2N)``."""
         return self.template.mapped("initial_state", {"x0": x0, "u0": u0})
 
-    def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
-        """k of every member, ``(E, *batch, 2N)``."""
-        return self.template.mapped("implicit_rate", {"x": x, "rate": rate}, step=step)
+    def scheme(self) -> Scheme:
+        """The method of integration of the members; each of its steps is that of all of them."""
+
+        def step(increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor) -> Tensor:
+            # The members of the inputs (stages, E, *batch, M) come second.
+            stacked = {"increment": increment, "start": start, "inputs": inputs.movedim(1, 0)}
+            return self.template.mapped("integration_step", stacked, h=h)
+
+        single = self.template.model
+        assert isinstance(single, ContinuousPredictor)
+        return replace(single.scheme(), step=step)
 
 
 class DiscreteStack(Predictor):

@@ -94,12 +94,12 @@ class ContinuousPredictor(Predictor):
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """dx/dt, ``(*batch, 2N)``, of the state x ``(*batch, 2N)`` under u ``(*batch, M)``."""
 
-    def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
-        """k with (1 - s J) k = r, ``(*batch, 2N)``, s the ``step`` and J what is stiff of df/dx.
+    def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
+        """Maps r to the k with (1 - s J) k = r, both ``(*batch, 2N)``.
 
-        Here J = 0: nothing is.
+        s is the ``step``, and J what is stiff of df/dx at x. Here J = 0: nothing is.
         """
-        return rate
+        return lambda rate: rate
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
         """The state ``(*batch, 2N)`` at which a roll-out from the measured x0 starts, under u0.
@@ -122,7 +122,13 @@ class ContinuousPredictor(Predictor):
         """The method of integration, with this system in it."""
         if self.integrator == "rk4":
             return rk4(self.state_derivative)
-        return rosenbrock(self.state_derivative, self.implicit_rate)
+        return rosenbrock(self.state_derivative, self.implicit_solver)
+
+    def integration_step(
+        self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
+    ) -> Tensor:
+        """One step of the method of integration; arguments as of :attr:`Scheme.step`."""
+        return self.scheme().step(increment, start, inputs, h)
 
     def __getstate__(self) -> dict[str, object]:
         # A compiled function belongs to this object: copies and pickles go without it.

@@ -94,7 +94,7 @@ def rk4(derivative: Derivative) -> Scheme:
 
 
 def rosenbrock(
-    derivative: Derivative, implicit_rate: Callable[[Tensor, Tensor, Tensor], Tensor]
+    derivative: Derivative, implicit_solver: Callable[[Tensor, Tensor], Callable[[Tensor], Tensor]]
 ) -> Scheme:
     """The linearly implicit, second-order method ROS2 with g = 1 - 1/sqrt(2)::
 
@@ -114,15 +114,17 @@ def rosenbrock(
 
     Args:
         derivative: f.
-        implicit_rate: from x, r ``(*batch, S)`` and s the k that solves (1 - s J(x)) k = r.
+        implicit_solver: from x ``(*batch, S)`` and s a function, of r ``(*batch, S)`` the k that
+            solves (1 - s J(x)) k = r.
     """
     gamma = 1 - 1 / math.sqrt(2)
 
     def step(increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor) -> Tensor:
         x = start + increment
-        first = implicit_rate(x, derivative(x, inputs[0]), gamma * h)
+        solve = implicit_solver(x, gamma * h)
+        first = solve(derivative(x, inputs[0]))
         ahead = derivative(start + (increment + h * first), inputs[1])
-        second = implicit_rate(x, ahead - 2 * first, gamma * h)
+        second = solve(ahead - 2 * first)
         return increment + h * (1.5 * first + 0.5 * second)
 
     return Scheme((0.0, 1.0), step, mean_input=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import NamedTuple, final
 
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics.arrays import matvec, require_last_dim, spd_solve
+from pinn_dyn.mechanics.arrays import matvec, require_last_dim, spd_solve, spd_solver
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.trajectory import Coordinates
 
@@ -225,8 +226,8 @@ class MechanicalSystem(ContinuousPredictor):
         return self.velocity_derivative(x, u)
 
     @final
-    def implicit_rate(self, x: Tensor, rate: Tensor, step: Tensor) -> Tensor:
-        """k with (1 - s J) k = r, where J holds the dissipation, the stiff part of the motion::
+    def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
+        """Maps r to the k with (1 - s J) k = r, where J holds the dissipation, the stiff part::
 
             (q, v):  J = [[0, 1], [0, -M^-1 D']]       (q, p):  J = [[0, M^-1], [0, -D' M^-1]]
 
@@ -237,16 +238,20 @@ class MechanicalSystem(ContinuousPredictor):
         q, v = x.chunk(2, dim=-1)
         if self.coordinates == "momentum":
             v = self._velocity(q, v)
-        rate_q, rate = rate.chunk(2, dim=-1)
         mass = self.mass_matrix(q)
         resistance = self.damping_matrix(q) + torch.diag_embed(self._friction_slope(v))
-        whole = mass + step * resistance
-        if self.coordinates == "velocity":
-            velocity = rate = spd_solve(whole, matvec(mass, rate))
-        else:
-            velocity = spd_solve(whole, rate)
-            rate = matvec(mass, velocity)
-        return torch.cat([rate_q + step * velocity, rate], dim=-1)
+        inverse = spd_solver(mass + step * resistance)
+
+        def solve(rate: Tensor) -> Tensor:
+            rate_q, rate = rate.chunk(2, dim=-1)
+            if self.coordinates == "velocity":
+                velocity = rate = inverse(matvec(mass, rate))
+            else:
+                velocity = inverse(rate)
+                rate = matvec(mass, velocity)
+            return torch.cat([rate_q + step * velocity, rate], dim=-1)
+
+        return solve
 
     def _check(self, **values: Tensor) -> None:
         for name, value in values.items():

@@ -23,10 +23,12 @@ class CholeskyFactor(nn.Module, abc.ABC):
     Attributes:
         transposed: the matrix is L^T L instead, with L^T the upper triangular factor.
         chain: column j of L depends on the coordinates after q_j alone.
+        constant: L is the same at every q.
     """
 
     transposed: bool = False
     chain: bool = False
+    constant: bool = False
 
     @abc.abstractmethod
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
@@ -235,6 +237,8 @@ def _softplus_inverse(value: float) -> float:
 
 class _ConstantFactor(CholeskyFactor):
     """An L that is the same at every q."""
+
+    constant = True
 
     def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
         """Zero: L does not depend on q."""

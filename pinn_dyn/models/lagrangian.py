@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec
@@ -114,6 +115,8 @@ class LagrangianNetwork(StructuredNetwork):
 
     def _factor_and_coriolis_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq, M = R^T R, with dR along v."""
+        if self.mass.constant:
+            return self.mass(q), torch.zeros_like(q)
         factor, factor_rate, tape = self.mass.linearize_along(q, v)
         root, rate = self._root(factor), self._root(factor_rate)
         w = matvec(root, v)

@@ -270,7 +270,7 @@ class MechanicalSystemContract:
         expected = (own or system.velocity_derivative)(x, u)
         assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
 
-    def test_the_implicit_rate_solves_for_the_dissipation(self, system, configurations):
+    def test_the_implicit_solver_solves_for_the_dissipation(self, system, configurations):
         """(1 - s J) k = r, with J put together from M and the slope of the dissipative force."""
         q, v, _, _ = configurations
         n = q.shape[-1]
@@ -293,7 +293,7 @@ class MechanicalSystemContract:
         jacobian = torch.cat([torch.cat([zero, upper], -1), torch.cat([zero, -lower], -1)], -2)
         step = torch.tensor(0.01, dtype=q.dtype)
         second = system.momentum(q, v) if system.coordinates == "momentum" else v
-        found = system.implicit_rate(torch.cat([q, second], -1), rate, step)
+        found = system.implicit_solver(torch.cat([q, second], -1), step)(rate)
         back = found - step * (jacobian @ found.unsqueeze(-1)).squeeze(-1)
         assert_near(back, rate, self.exact_tolerance)
 

@@ -237,6 +237,30 @@ def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
 
 
 @pytest.mark.slow
+def test_a_compiled_rosenbrock_step_of_an_ensemble_has_the_same_gradients(monkeypatch):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+    t = 0.02 * torch.arange(3, dtype=torch.float64)
+    u, x0 = samples((2, 4), 3, 1), 0.3 * samples((2, 4), 1, 2, seed=1).squeeze(-2)
+    heads = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
+    heads["potential"] = partial(NetworkPotential, hidden=[3])
+    members = [make_structured("lnn", 1, 1, **heads, integrator="rosenbrock") for _ in range(2)]
+    members = [perturb(item, seed=k, spread=0.1) for k, item in enumerate(members)]
+    stack = Ensemble(members).stack
+    parameters = list(stack.parameters())
+    losses, gradients = [], []
+    for compiled in (False, True):
+        if compiled:
+            stack.compile_derivative()
+        losses.append(stack.increments(x0, t, u).square().sum())
+        gradients.append(torch.autograd.grad(losses[-1], parameters, materialize_grads=True))
+    assert losses[0].item() > 1e-6
+    torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=0)
+    assert max(float(gradient.abs().max()) for gradient in gradients[0]) > 1e-6
+    for found, expected in zip(*reversed(gradients), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "size"), [("acceleration", 1), ("hnn", 2)])
 def test_a_compiled_roll_out_of_a_network_is_that_of_torchdiffeq(request, kind, size):
     """Two models of one shape in turn: neither may be taken for the other."""
