@@ -133,9 +133,11 @@ class DynamicsLearner(L.LightningModule):
     def configure_optimizers(self) -> Any:
         """The optimizer, with its learning rate scheduled per step."""
         optimizer = self.built_optimizer()
-        scheduler = self._scheduler(
-            optimizer, total_steps=int(self.trainer.estimated_stepping_batches)
-        )
+        steps = int(self.trainer.estimated_stepping_batches)
+        try:
+            scheduler = self._scheduler(optimizer, total_steps=steps)
+        except ZeroDivisionError:  # OneCycleLR has no slope for a rise of exactly one step
+            scheduler = self._scheduler(optimizer, total_steps=steps + 1)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {

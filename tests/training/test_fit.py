@@ -52,6 +52,17 @@ def model(data):
     )
 
 
+def test_a_rise_of_exactly_one_step_is_no_error(model):
+    """5 % of 20 steps: torch's one-cycle schedule divides by zero there."""
+    data = DynamicsData(
+        Swings(), pairs=64, steps=1, stride=2, batch_size=16, batches_per_epoch=20, seed=0
+    )
+    before = copy.deepcopy(model.state_dict())
+    (loss,) = fit(model, data, epochs=1, learning_rate=RATE, progress=False)
+    assert math.isfinite(loss)
+    assert any(not torch.equal(before[name], value) for name, value in model.state_dict().items())
+
+
 def plain_loop(model, data):
     """AdamW, the one-cycle rate written out, gradients clipped."""
     loss_of = IncrementLoss(data.statistics, model)
