@@ -61,11 +61,21 @@ CONF
 
 stop() {
     scancel --quiet --user=root 2>/dev/null || true
+    # The steps of a job report to the controller; without it they, and slurmd with them, never end.
+    for _ in $(seq 60); do
+        [ -z "$(squeue --noheader 2>/dev/null)" ] && break
+        sleep 0.5
+    done
+    local name pid status=0
     for name in slurmd slurmctld munged; do
         if [ -f "$folder/$name.pid" ]; then
-            kill "$(cat "$folder/$name.pid")" 2>/dev/null || true
+            pid=$(cat "$folder/$name.pid")
+            kill "$pid" 2>/dev/null || true
+            timeout 20 tail --pid="$pid" --follow /dev/null ||
+                { echo "$name, process $pid, does not end" >&2; status=1; }
         fi
     done
+    return $status
 }
 
 free_port() {
