@@ -27,7 +27,7 @@ from pinn_dyn.app.config import CONF, plain
 from pinn_dyn.app.runs import provenance
 from pinn_dyn.data import SimulatedSource
 from pinn_dyn.evaluation import predict_trajectories
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics import Signal, Trajectory
 
 RESULTS = Path(__file__).parent / "results"
 ROLLOUT_STEP = 0.002  # s
@@ -81,7 +81,8 @@ def main() -> None:
     all_samples = sum(shape[0] * (shape[1] - 1) for shape in shapes)
 
     t, *test = (torch.from_numpy(arrays[key]) for key in ("t", "test_q", "test_v", "test_u"))
-    truth = Trajectory(t[: test[0].shape[1]], *test).until(5.0)
+    q, v, u = test
+    truth = Trajectory(q, v, Signal(t[: q.shape[1]], u)).until(5.0)
     own = predict_trajectories(source.system, truth, step=ROLLOUT_STEP)
     error = float(own.error().mean())
 

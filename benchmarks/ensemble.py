@@ -31,12 +31,16 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
 from pinn_dyn.app.runs import provenance
-from pinn_dyn.data.windows import BatchSampler, MemberSampler, WindowLoader, Windows
-from pinn_dyn.mechanics import Ensemble, Predictor
+from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.ensembles.data import MemberSampler
+from pinn_dyn.ensembles.gradients import CompiledMembers
+from pinn_dyn.ensembles.learner import clip_by_member
+from pinn_dyn.ensembles.member_soap import MemberSOAP
+from pinn_dyn.mechanics import Predictor, Signal
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.training import IncrementLoss, MidpointLoss
-from pinn_dyn.training.ensemble import clip_by_member
-from pinn_dyn.training.losses import STEPS_FOR_WHOLE
-from pinn_dyn.training.member_soap import MemberSOAP
+from pinn_dyn.training.gradients import Compiled, Eager
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000
@@ -51,15 +55,13 @@ def make_windows() -> Windows:
 
     return Windows(
         t=torch.tensor([0.0, STEP]),
-        t_input=torch.tensor([0.0, STEP]),
         q=0.5 * draw(PAIRS, N),
         v=draw(PAIRS, N),
         p=0.05 * draw(PAIRS, N),
         dq=STEP * draw(PAIRS, 1, N),
         dv=5 * STEP * draw(PAIRS, 1, N),
         dp=0.2 * STEP * draw(PAIRS, 1, N),
-        u=0.5 * draw(PAIRS, 2, N),
-        interpolation="linear",
+        input=Signal(torch.tensor([0.0, STEP]), 0.5 * draw(PAIRS, 2, N)),
     )
 
 
@@ -83,21 +85,19 @@ def make_step(
     ]
     if members == 1:
         model, loader = models[0], WindowLoader(windows, samplers[0])
+        engine = Compiled(criterion, model, length) if compiled else Eager(criterion, model)
     else:
-        model, loader = (
-            Ensemble(models).stack.train(),
-            WindowLoader(windows, MemberSampler(samplers)),
-        )
+        model = Ensemble(models).stack.train()
+        loader = WindowLoader(windows, MemberSampler(samplers))
+        engine = CompiledMembers(criterion, model) if compiled else Eager(criterion, model)
     parameters = list(model.parameters())
     optimizer = make_optimizer(optim, parameters, members)
     scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000, cycle_momentum=False)
-    if compiled:
-        criterion.compile_dynamics(model, length)
     batches = iter(loader)
 
     def step() -> None:
         optimizer.zero_grad()
-        criterion(model, next(batches), 0.0).sum().backward()
+        engine(next(batches)).sum().backward()
         if members == 1:
             clip_grad_norm_(parameters, 1.0)
         else:
@@ -140,7 +140,7 @@ def main() -> None:
             loss=arguments.loss,
             optim=arguments.optimizer,
         )
-        steps = [make(1), make(1, length=STEPS_FOR_WHOLE), make(arguments.members)]
+        steps = [make(1), make(1, length=STEPS_FOR_PROGRAM), make(arguments.members)]
         first = [seconds(step, time.perf_counter) for step in steps]
         for step in steps:
             step()

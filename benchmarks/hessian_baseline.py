@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, vmap
 
-from pinn_dyn.mechanics import Interpolation
-from pinn_dyn.mechanics.integration import rollout_increments
+from pinn_dyn.mechanics import Signal, rollout
 from pinn_dyn.models import CholeskyFactor, LagrangianNetwork, NetworkCholesky, NetworkInput
 
 
@@ -57,8 +56,6 @@ class HessianBaseline:
         q, v = x.chunk(2, dim=-1)
         return torch.cat([v, vmap(self.acceleration)(q, v, u)], dim=-1)
 
-    def increments(
-        self, x0: Tensor, t: Tensor, u: Tensor, *, interpolation: Interpolation = "linear"
-    ) -> Tensor:
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """As ``LagrangianNetwork.increments``, by the same integrator."""
-        return rollout_increments(self.state_derivative, x0, t, u, interpolation=interpolation)
+        return rollout(self.state_derivative, x0, t, input) - x0.unsqueeze(-2)

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.app.runs import provenance
-from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics import RK4, MechanicalSystem, Signal
+from pinn_dyn.mechanics.compilation import CompiledLoop, integrated_by
 from pinn_dyn.models import (
     HamiltonianNetwork,
     LagrangianNetwork,
@@ -59,8 +60,8 @@ def make_model(kind: str) -> MechanicalSystem:
         p_std=0.05 * one,
         u_mean=0 * one,
         u_std=0.5 * one,
-        velocity_increment_std=increment,
-        momentum_increment_std=0.1 * increment,
+        qv_increment_std=increment,
+        qp_increment_std=0.1 * increment,
         step=2e-3,
     )
     mass = partial(NetworkCholesky, hidden=[32, 32, 32], epsilon=1e-3)
@@ -94,9 +95,9 @@ def measure(kind: str, case: Case, clock: Callable[[], float]) -> dict[str, obje
     u = 0.3 * torch.sin(2 * t[:, None] + 6 * phase)
 
     def roll_out(steps: int, compiled: bool) -> Tensor:
-        model.compiled_rollouts = compiled
-        with torch.no_grad():
-            return model.predict(x0, t[: steps + 1], u[..., : steps + 1, :])
+        integrator = CompiledLoop(RK4()) if compiled else RK4()
+        with torch.no_grad(), integrated_by(model, integrator):
+            return model.predict(x0, t[: steps + 1], Signal(t[: steps + 1], u[..., : steps + 1, :]))
 
     compile_s, _ = timed(lambda: roll_out(2, compiled=True), time.perf_counter)
     warm_s, _ = timed(lambda: roll_out(2, compiled=True), clock)

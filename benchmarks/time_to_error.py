@@ -111,14 +111,14 @@ def paper(data: DynamicsData, goal: float, clock: Clock, kind: str, options: Any
     import jax_paper
 
     f = {"hnn": jax_paper.hamiltonian, "lnn": jax_paper.lagrangian}[kind]
-    coordinates = "momentum" if kind == "hnn" else "velocity"
+    state = "qp" if kind == "hnn" else "qv"
     windows = data.windows
     size, inputs = windows.q.shape[-1], windows.u.shape[-1]
 
     truth = stack(data.splits.validation).until(HORIZON)
     stride = round(options.roll_out_step / float(truth.t[1] - truth.t[0]))
     h = stride * float(truth.t[1] - truth.t[0])
-    x = np.asarray(truth.state(coordinates, slice(0, None, stride)), np.float32)
+    x = np.asarray(truth.states(state, slice(0, None, stride)), np.float32)
     u = np.asarray(truth.u[:, ::stride], np.float32).swapaxes(0, 1)
     roll_out = jax_paper.make_roll_out(f, h)
 
@@ -127,8 +127,8 @@ def paper(data: DynamicsData, goal: float, clock: Clock, kind: str, options: Any
         distance = np.linalg.norm((path - x)[..., :size], axis=-1)
         return float(np.where(np.isfinite(distance), distance, np.inf).mean())
 
-    start = windows.start(coordinates)
-    after = start + windows.increments(coordinates)[:, 0]
+    start = windows.start(state)
+    after = start + windows.increments(state)[:, 0]
     pairs = [
         jnp.asarray(v.numpy(), jnp.float32)
         for v in (start, windows.u[:, 0], windows.u[:, -1], after)

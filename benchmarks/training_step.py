@@ -41,6 +41,8 @@ from torch import Tensor
 
 from pinn_dyn.app.runs import provenance
 from pinn_dyn.data.windows import Windows
+from pinn_dyn.mechanics import Signal
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkCholesky,
@@ -49,7 +51,7 @@ from pinn_dyn.models import (
     Statistics,
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss
-from pinn_dyn.training.losses import STEPS_FOR_WHOLE
+from pinn_dyn.training.gradients import Compiled
 
 STEP = 2e-3
 RESULTS = Path(__file__).parent / "results"
@@ -88,15 +90,13 @@ def make_windows(size: int, batch: int, dtype: torch.dtype) -> Windows:
     empty = torch.zeros(batch, 0, dtype=torch.float64)
     windows = Windows(
         t=t,
-        t_input=t,
         q=normal(batch, size),
         v=normal(batch, size),
         p=empty,
         dq=STEP * normal(batch, 1, size),
         dv=STEP * normal(batch, 1, size),
         dp=empty[:, None],
-        u=normal(batch, 2, size),
-        interpolation="linear",
+        input=Signal(t, normal(batch, 2, size)),
     )
     return windows.to(torch.device("cpu"), dtype)
 
@@ -124,8 +124,8 @@ def hessian_step(
         total = 0.0
         for index in torch.arange(count).split(chunk):
             part = windows[index]
-            path = baseline.increments(part.start("velocity"), part.t, part.u)
-            value = loss.error(path[:, 1:], part.increments("velocity")) * (len(part) / count)
+            path = baseline.increments(part.start("qv"), part.t, Signal(part.t, part.u))
+            value = loss.error(path[:, 1:], part.increments("qv")) * (len(part) / count)
             value.backward()
             total += float(value.detach())
         return total
@@ -142,9 +142,9 @@ def jax_steps(
 
     network, parameters = jax_networks.Network(model), jax_networks.parameters_of(model)
     batch = {
-        "x0": windows.start("velocity"),
+        "x0": windows.start("qv"),
         "u": windows.u,
-        "measured": windows.increments("velocity")[:, 0],
+        "measured": windows.increments("qv")[:, 0],
     }
     arrays = jax_networks.to_jax(batch)
     steps: dict[str, Step] = {}
@@ -170,7 +170,7 @@ def check_equal(size: int) -> float:
         model, scales = make_model(size, torch.float64)
         loss = IncrementLoss(scales, model).double()
         windows = make_windows(size, 64, torch.float64)
-        value = torch_step(model, lambda: loss(model, windows, 0.0))()
+        value = torch_step(model, lambda: loss(model, windows))()
         expected = gradients(model)
         largest = max(float(g.abs().max()) for g in expected.values())
         others = {"torch hessian": (hessian_step(model, loss, windows, 64)(), gradients(model))}
@@ -247,15 +247,15 @@ def run_cell(size: int, batch: int, cores: int, seconds: float) -> list[dict[str
     eager_model, short_model, mid_model = (make_model(size, torch.float32)[0] for _ in range(3))
     eager_loss, short_loss, loss = (IncrementLoss(scales, model) for _ in range(3))
     mid_loss = MidpointLoss(scales, mid_model)
-    loss.compile_dynamics(model, STEPS_FOR_WHOLE)
-    mid_loss.compile_dynamics(mid_model, STEPS_FOR_WHOLE)
-    short_loss.compile_dynamics(short_model, 0)
+    compiled = Compiled(loss, model, STEPS_FOR_PROGRAM)
+    midpoint = Compiled(mid_loss, mid_model, STEPS_FOR_PROGRAM)
+    short = Compiled(short_loss, short_model, 0)
     names = ["autodiff", "explicit", "hessian"]
     steps = {
-        OURS: torch_step(model, lambda: loss(model, windows, 0.0)),
-        "ours, derivative": torch_step(short_model, lambda: short_loss(short_model, windows, 0.0)),
-        "ours, eager": torch_step(eager_model, lambda: eager_loss(eager_model, windows, 0.0)),
-        MIDPOINT: torch_step(mid_model, lambda: mid_loss(mid_model, windows, 0.0)),
+        OURS: torch_step(model, lambda: compiled(windows)),
+        "ours, derivative": torch_step(short_model, lambda: short(windows)),
+        "ours, eager": torch_step(eager_model, lambda: eager_loss(eager_model, windows)),
+        MIDPOINT: torch_step(mid_model, lambda: midpoint(windows)),
         **jax_steps(model, loss, windows, names),
         "torch hessian": hessian_step(eager_model, eager_loss, windows, 1024),
     }

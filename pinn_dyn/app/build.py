@@ -17,14 +17,14 @@ from pinn_dyn.app.config import ConfigError
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.data.simulation import has_cpp_compiler
+from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutValidator, RunDescription
-from pinn_dyn.mechanics import Ensemble, MechanicalSystem, Predictor
+from pinn_dyn.mechanics import MechanicalSystem, Predictor
+from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
-from pinn_dyn.training import DynamicsLearner, EnsembleLearner, IncrementLoss
+from pinn_dyn.training import DynamicsLearner
 
 CHECKPOINTS = "checkpoints"
-STEPS_TO_COMPILE = 5000
-"""Planned training steps from which ``compile: auto`` compiles; see benchmarks/README.md."""
 
 
 def _build(name: str, config: dict[str, Any], *given: Any, **extra: Any) -> Any:
@@ -77,7 +77,7 @@ def build_data(config: dict[str, Any]) -> DynamicsData:
     """The data module of ``config["data"]`` on the data source."""
     source = build_source(config)
     part = {**config["data"], "_partial_": True}
-    return _build("data", part, source=source, members=ensemble_size(config))
+    return _build("data", part, source=source)
 
 
 def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
@@ -114,17 +114,11 @@ def build_learner(
     """The LightningModule: model, loss, optimizer and schedule.
 
     Raises:
-        ConfigError: if compilation is asked for and there is no C++ compiler, or an ensemble with a
-            loss that knows none.
+        ConfigError: if compilation is asked for and there is no C++ compiler.
     """
     ensemble = isinstance(model, Ensemble)
     single = model.member(0) if isinstance(model, Ensemble) else model
     loss = _build("loss", config["loss"], statistics=statistics, model=single)
-    if ensemble and not isinstance(loss, IncrementLoss):
-        raise ConfigError(
-            f"ensemble is {config['ensemble']}, and {type(loss).__name__} trains one model at a "
-            "time: take loss=increment, or train the seeds one by one (-m seed=0,1,2)"
-        )
     return (EnsembleLearner if ensemble else DynamicsLearner)(
         model,
         loss=loss,
@@ -147,7 +141,7 @@ def compiles(config: dict[str, Any]) -> bool:
     if choice == "auto":
         steps = config["trainer"]["max_epochs"] * config["data"]["batches_per_epoch"]
         on_cpu = config["trainer"]["accelerator"] == "cpu"
-        return on_cpu and steps >= STEPS_TO_COMPILE and has_cpp_compiler()
+        return on_cpu and steps >= STEPS_FOR_DERIVATIVE and has_cpp_compiler()
     if not isinstance(choice, bool):
         raise ConfigError(f"compile is {choice!r}, expected true, false or auto")
     if choice and not has_cpp_compiler():

@@ -45,8 +45,9 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
+from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
-from pinn_dyn.mechanics import Ensemble, MechanicalSystem, Predictor, double_copy
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
 from pinn_dyn.systems import BulletArm
 
 log = logging.getLogger(__name__)

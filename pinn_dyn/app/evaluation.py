@@ -238,7 +238,7 @@ def _compare_with_truth(
                 comparison,
                 configuration=index,
                 title=f"{item.label}: learned and true terms, {name}",
-                inverse_mass=model.coordinates == "momentum",
+                inverse_mass=model.state == "qp",
             )
             save(figure, folder / f"terms_{stem}_{name}.png")
     (folder / "terms.txt").write_text(_terms_text(comparisons) + "\n")

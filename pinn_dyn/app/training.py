@@ -28,6 +28,7 @@ from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.description import describe
 from pinn_dyn.app.runs import CHECKPOINTS, METRICS, load_run, provenance, read_config
 from pinn_dyn.data import LogSource
+from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import cleaning_figure, save
 from pinn_dyn.mechanics import Predictor
 
@@ -86,11 +87,11 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
     model = build_predictor(config, statistics)
-    if model.coordinates == "momentum" and data.windows.p.shape[-1] == 0:
+    if model.state == "qp" and data.windows.p.shape[-1] == 0:
         raise ConfigError(
             f"model: {config['model_name']} learns from momenta p = M(q) v, and the data set "
             f"{data.source.name} has none, as they cannot be measured: set "
-            "model.coordinates=velocity, which learns from (q, v), or use model=lnn"
+            "model.state=qv, which learns from (q, v), or use model=lnn"
         )
     if config.get("start_from") and last is None:
         _take_weights(model, Path(config["start_from"]))
@@ -98,12 +99,13 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     description = describe(folder, config)
     trainer = build_trainer(config, folder, data.source, validator, description)
     check_processes(trainer, config["data"]["batch_size"])
+    batches = EnsembleData(data, model.size) if isinstance(model, Ensemble) else data
 
     start, start_cpu = time.perf_counter(), _cpu_seconds()
     try:
-        trainer.fit(learner, data, ckpt_path=last, weights_only=True)
+        trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
         if last is not None and not trainer.callback_metrics:  # ended just before its record
-            trainer.validate(learner, data, verbose=False)
+            trainer.validate(learner, batches, verbose=False)
     except SystemExit:  # Lightning's end of an interrupted training
         if HydraConfig.get().mode == RunMode.RUN:
             log.warning("interrupted; go on with: python train.py resume=%s", folder)

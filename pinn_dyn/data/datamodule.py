@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import lightning as L
 import torch
-from torch.utils.data import DataLoader
+from torch import Tensor
+from torch.utils.data import DataLoader, Sampler
 
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.data.windows import (
     BatchSampler,
-    MemberSampler,
     WindowLoader,
     Windows,
     draw_windows,
@@ -31,8 +31,6 @@ class DynamicsData(L.LightningDataModule):
         seed: seed of the windows and their order.
         coverage: how evenly the windows cover the configurations, 0 to 1; see
             :func:`~pinn_dyn.data.windows.draw_windows`.
-        members: models that are trained at once; member k sees the same windows in the order of
-            the seed ``seed + k``.
 
     Raises:
         ValueError: on counts below 1, or a batch larger than the number of pairs.
@@ -49,13 +47,11 @@ class DynamicsData(L.LightningDataModule):
         batches_per_epoch: int,
         seed: int,
         coverage: float = 0.0,
-        members: int = 1,
     ):
         super().__init__()
         for name, value in (
             ("batch_size", batch_size),
             ("batches_per_epoch", batches_per_epoch),
-            ("members", members),
         ):
             if value < 1:
                 raise ValueError(f"{name} is {value}, expected at least 1")
@@ -71,7 +67,6 @@ class DynamicsData(L.LightningDataModule):
         self.batches_per_epoch = batches_per_epoch
         self.seed = seed
         self.coverage = coverage
-        self.members = members
         self._splits: Splits | None = None
         self._windows: Windows | None = None
 
@@ -107,27 +102,25 @@ class DynamicsData(L.LightningDataModule):
         return self.windows.statistics()
 
     def train_dataloader(self) -> WindowLoader:
-        """Batches of windows, in single precision; of several processes each gets its share.
+        """Batches of windows, in single precision; of several processes each gets its share."""
+        return self.loader(self.sampler(self.seed))
 
-        The windows are moved to the device that trains once, and batches are picked there.
-        """
+    def sampler(self, seed: int) -> BatchSampler:
+        """The order of the windows by a seed."""
         trainer = self.trainer
-        device = torch.device("cpu") if trainer is None else trainer.strategy.root_device
-        samplers = [
-            BatchSampler(
-                len(self.windows),
-                batch_size=self.batch_size,
-                batches=self.batches_per_epoch,
-                seed=self.seed + member,
-                rank=0 if trainer is None else trainer.global_rank,
-                processes=1 if trainer is None else trainer.world_size,
-            )
-            for member in range(self.members)
-        ]
-        return WindowLoader(
-            self.windows.to(device, torch.float32),
-            samplers[0] if self.members == 1 else MemberSampler(samplers),
+        return BatchSampler(
+            len(self.windows),
+            batch_size=self.batch_size,
+            batches=self.batches_per_epoch,
+            seed=seed,
+            rank=0 if trainer is None else trainer.global_rank,
+            processes=1 if trainer is None else trainer.world_size,
         )
+
+    def loader(self, sampler: Sampler[Tensor]) -> WindowLoader:
+        """The windows, moved once to the device that trains, where batches are picked."""
+        device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
+        return WindowLoader(self.windows.to(device, torch.float32), sampler)
 
     def val_dataloader(self) -> DataLoader[Trajectory]:
         """One batch: all validation trajectories."""

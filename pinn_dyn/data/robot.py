@@ -20,7 +20,7 @@ from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
 from pinn_dyn.data.simulation import SimulationError
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.mechanics import MechanicalSystem, Trajectory
+from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 3
@@ -139,7 +139,8 @@ class RobotSource(DataSource):
             q, v, u = (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
             q, v, u = q[:, :-1], (v[:, :-1] + v[:, 1:]) / 2, u[:, :-1]
             splits[split] = [
-                Trajectory(t, q[k], v[k], u[k], momentum=self._momentum) for k in range(len(q))
+                Trajectory(q[k], v[k], Signal(t, u[k]), momentum=self._momentum)
+                for k in range(len(q))
             ]
         return Splits(splits["train"], splits["validation"], splits["test"])
 

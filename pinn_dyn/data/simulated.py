@@ -15,7 +15,7 @@ from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation
 from pinn_dyn.data.simulation import simulate
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.mechanics import MechanicalSystem, Trajectory
+from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 2
@@ -191,7 +191,7 @@ class SimulatedSource(DataSource):
                 torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
             )
             splits[split] = [
-                Trajectory(t[: q.shape[1]], q[k], v[k], u[k], momentum=self._momentum)
+                Trajectory(q[k], v[k], Signal(t[: q.shape[1]], u[k]), momentum=self._momentum)
                 for k in range(q.shape[0])
             ]
         return Splits(splits["train"], splits["validation"], splits["test"])

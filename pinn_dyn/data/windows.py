@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.utils.data import Sampler
 
-from pinn_dyn.mechanics import Coordinates, Interpolation, Trajectory
+from pinn_dyn.mechanics import Signal, State, Trajectory
+from pinn_dyn.mechanics.signal import stacked
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -23,25 +24,21 @@ class Windows:
 
     Attributes:
         t: times of the steps from the window's start, ``(H + 1,)``, s.
-        t_input: times of the input samples, ``(H * stride + 1,)``, s.
         q, v: state at the start, ``(B, N)``.
         p: momentum at the start, ``(B, N)``; empty ``(B, 0)`` where there is none.
         dq, dv, dp: increments from the start to each step, ``(B, H, N)``; taken in double
             precision, as they are far smaller than the states.
-        u: input, ``(B, H * stride + 1, M)``.
-        interpolation: how u moves between samples.
+        input: u, with samples ``(B, H * stride + 1, M)``.
     """
 
     t: Tensor
-    t_input: Tensor
     q: Tensor
     v: Tensor
     p: Tensor
     dq: Tensor
     dv: Tensor
     dp: Tensor
-    u: Tensor
-    interpolation: Interpolation
+    input: Signal
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -60,30 +57,36 @@ class Windows:
     def to(self, device: torch.device, dtype: torch.dtype | None = None) -> Windows:
         """All tensors on a device and, where given, in a dtype."""
         moved = self._map(lambda value: value.to(device, dtype))
-        return replace(moved, t=self.t.to(device, dtype), t_input=self.t_input.to(device, dtype))
+        return replace(moved, t=self.t.to(device, dtype), input=self.input.to(device, dtype))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Windows:
         """Apply a change to every tensor that has one row per window."""
-        rows = ("q", "v", "p", "dq", "dv", "dp", "u")
+        rows = ("q", "v", "p", "dq", "dv", "dp")
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in rows}
-        return replace(self, **changed)
+        return replace(self, **changed, input=self.input.mapped(change))
 
-    def start(self, coordinates: Coordinates) -> Tensor:
+    @property
+    def u(self) -> Tensor:
+        """Samples of the input, ``(B, H * stride + 1, M)``."""
+        return self.input.u
+
+    def start(self, state: State) -> Tensor:
         """State at the start, ``(B, 2N)``: (q, v) or (q, p)."""
-        return torch.cat([self.q, self.v if coordinates == "velocity" else self.p], dim=-1)
+        return torch.cat([self.q, self.v if state == "qv" else self.p], dim=-1)
 
-    def increments(self, coordinates: Coordinates) -> Tensor:
+    def increments(self, state: State) -> Tensor:
         """Increments to each step, ``(B, H, 2N)``, of (q, v) or (q, p)."""
-        return torch.cat([self.dq, self.dv if coordinates == "velocity" else self.dp], dim=-1)
+        return torch.cat([self.dq, self.dv if state == "qv" else self.dp], dim=-1)
 
     def first(self, steps: int) -> Windows:
         """The windows cut after their first ``steps`` steps."""
-        samples = steps * ((len(self.t_input) - 1) // (len(self.t) - 1)) + 1
+        if steps == len(self.t) - 1:
+            return self
+        samples = steps * ((len(self.input.t) - 1) // (len(self.t) - 1)) + 1
         return replace(
             self,
             t=self.t[: steps + 1],
-            t_input=self.t_input[:samples],
-            u=self.u[..., :samples, :],
+            input=self.input.part(slice(samples)),
             **{name: getattr(self, name)[..., :steps, :] for name in ("dq", "dv", "dp")},
         )
 
@@ -96,7 +99,7 @@ class Windows:
             return torch.where(std > 1e-12, std, torch.ones_like(std))
 
         has_momentum = self.p.shape[-1] > 0
-        velocity_std = spread(self.increments("velocity"))
+        qv_std = spread(self.increments("qv"))
         return Statistics(
             q_mean=self.q.mean(0),
             q_std=spread(self.q),
@@ -104,10 +107,10 @@ class Windows:
             p_std=spread(self.p) if has_momentum else one,
             u_mean=self.u.mean((0, 1)),
             u_std=spread(self.u.flatten(0, 1)),
-            velocity_increment_std=velocity_std,
-            momentum_increment_std=spread(self.increments("momentum"))
+            qv_increment_std=qv_std,
+            qp_increment_std=spread(self.increments("qp"))
             if has_momentum
-            else torch.ones_like(velocity_std),
+            else torch.ones_like(qv_std),
             step=float(self.t[1]),
         )
 
@@ -178,22 +181,20 @@ def draw_windows(
     knots = torch.arange(steps + 1) * stride
     q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(which, offset, strict=True)])
     v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(which, offset, strict=True)])
-    u = torch.stack(
-        [trajectories[i].u[k : k + span + 1] for i, k in zip(which, offset, strict=True)]
-    )
+    inputs = [item.input for item in trajectories]
+    parts = [inputs[i].part(slice(k, k + span + 1)) for i, k in zip(which, offset, strict=True)]
+    t = torch.arange(span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
     p = q.new_zeros((count, steps + 1, 0)) if momentum is None else momentum(q, v)
     return Windows(
         t=knots.double() * sample,
-        t_input=torch.arange(span + 1, dtype=torch.float64) * sample,
         q=q[:, 0],
         v=v[:, 0],
         p=p[:, 0],
         dq=q[:, 1:] - q[:, :1],
         dv=v[:, 1:] - v[:, :1],
         dp=p[:, 1:] - p[:, :1],
-        u=u,
-        interpolation=trajectories[0].interpolation,
+        input=stacked(parts, t),
     )
 
 
@@ -225,12 +226,12 @@ class WindowLoader:
         sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble.
     """
 
-    def __init__(self, windows: Windows, sampler: BatchSampler | MemberSampler):
+    def __init__(self, windows: Windows, sampler: Sampler[Tensor]):
         self.windows = windows
         self.sampler = sampler  # the trainer looks for it here, to tell it the epoch
 
     def __len__(self) -> int:
-        return len(self.sampler)
+        return len(self.sampler)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[Windows]:
         device = self.windows.q.device
@@ -286,25 +287,3 @@ class BatchSampler(Sampler[Tensor]):
                 order = torch.randperm(self.size, generator=generator)
             first = (number % per_pass) * self.batch_size
             yield order[first : first + self.batch_size][self.rank :: self.processes]
-
-
-class MemberSampler(Sampler[Tensor]):
-    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own.
-
-    Args:
-        samplers: the order of each member.
-    """
-
-    def __init__(self, samplers: list[BatchSampler]):
-        self.samplers = samplers
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by the trainer at the start of each epoch."""
-        for sampler in self.samplers:
-            sampler.set_epoch(epoch)
-
-    def __len__(self) -> int:
-        return len(self.samplers[0])
-
-    def __iter__(self) -> Iterator[Tensor]:
-        return map(torch.stack, zip(*self.samplers, strict=True))

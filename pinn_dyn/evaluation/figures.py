@@ -78,7 +78,7 @@ def trajectory_figure(
         # Above the panel, where no line can hide it.
         ax.set_title("\n".join(notes), loc="right", fontsize="small")
     input_axes = axes[count]
-    held = "steps-post" if truth.interpolation == "hold" else "default"
+    held = "steps-post" if truth.input.interpolation == "hold" else "default"
     for k, label in enumerate(input_labels):
         shade = str(0.65 * k / max(len(input_labels) - 1, 1))
         line = _LINES[k % len(_LINES)]

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from pinn_dyn.data.simulation import has_cpp_compiler
-from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, Predictor, Trajectory, double_copy
-
-# Steps times (batch + 300) from which compiling a step takes less time than it saves: it takes some
-# 20 s, and saves 2 ms of a step and 7 us for each trajectory (benchmarks/README.md).
-_WORTH_COMPILING = 4_500_000
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Signal, Trajectory, double_copy
+from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop
 
 
 @dataclass(frozen=True)
@@ -73,11 +70,9 @@ def predict_trajectories(
     stride = 1 if step is None else samples_of("step", step, truth.t)
     paths = _roll_out(
         model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0]),
-        truth.state(model.coordinates, slice(1))[:, 0].double(),
-        truth.t.double(),
-        truth.u.double(),
+        truth.states(model.state, slice(1))[:, 0].double(),
+        truth.input.to(truth.q.device, torch.float64),
         stride,
-        truth,
     )
     return Prediction(
         truth.t[::stride].double(), paths.mean(0), truth.q[:, ::stride].double(), _members(paths)
@@ -111,16 +106,16 @@ def predict_windows(
             "use a shorter window"
         )
     last = windows * samples
-    x0 = truth.state(model.coordinates, slice(0, last, samples)).double()
-    # (K, windows, samples + 1, M): neighbouring windows share the sample between them.
-    u = truth.u[:, : last + 1].double().unfold(1, samples + 1, samples).movedim(-1, -2)
+    x0 = truth.states(model.state, slice(0, last, samples)).double()
+    # (K windows, samples + 1, M): neighbouring windows share the sample between them.
+    input = truth.input.part(slice(last + 1)).to(truth.q.device, torch.float64)
+    pieces = input.mapped(lambda u: u.unfold(1, samples + 1, samples).movedim(-1, -2).flatten(0, 1))
+    pieces = replace(pieces, t=input.t[: samples + 1])
     ends = _roll_out(
         model_for_roll_outs(model, truth.q.device, samples // stride, x0.shape[:2].numel()),
         x0.flatten(0, 1),
-        truth.t[: samples + 1].double(),
-        u.flatten(0, 1),
+        pieces,
         stride,
-        truth,
     )[..., 1:, :]
     q = truth.q[:, : last + 1 : stride].double()
     start = q[:, :1].expand(ends.shape[0], -1, -1, -1)
@@ -139,39 +134,24 @@ def model_for_roll_outs(
     copy = double_copy(model, device)
     members, inner = (copy.size, copy.stack) if isinstance(copy, Ensemble) else (1, copy)
     if isinstance(inner, ContinuousPredictor) and device.type == "cpu":
-        work = steps * inner.substeps * (members * batch + 300)
-        inner.compiled_rollouts = work >= _WORTH_COMPILING and has_cpp_compiler()
+        work = steps * inner.integrator.substeps * (members * batch + 300)
+        if work >= WORK_FOR_LOOP and has_cpp_compiler():
+            inner.integrator = CompiledLoop(inner.integrator)
     return copy
 
 
-def _roll_out(
-    model: Predictor, x0: Tensor, t: Tensor, u: Tensor, stride: int, truth: Trajectory
-) -> Tensor:
+@torch.no_grad()
+def _roll_out(model: Predictor, x0: Tensor, input: Signal, stride: int) -> Tensor:
     """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; NaN rows where it broke down.
 
     E is 1, but for an ensemble.
     """
-    try:
-        with torch.no_grad():
-            settings: Any = {"t_input": t, "interpolation": truth.interpolation}
-            if isinstance(model, Ensemble):
-                states = x0.unsqueeze(-2) + model.member_increments(x0, t[::stride], u, **settings)
-            else:
-                states = model.predict(x0, t[::stride], u, **settings).unsqueeze(0)
-        return states[..., : truth.q.shape[-1]]
-    except torch.linalg.LinAlgError:
-        # One broken trajectory stops the whole batch: halve it until that one is alone.
-        if x0.shape[0] == 1:
-            size = model.size if isinstance(model, Ensemble) else 1
-            return x0.new_full((size, 1, t[::stride].shape[0], truth.q.shape[-1]), torch.nan)
-        half = x0.shape[0] // 2
-        return torch.cat(
-            [
-                _roll_out(model, x0[:half], t, u[:half], stride, truth),
-                _roll_out(model, x0[half:], t, u[half:], stride, truth),
-            ],
-            dim=1,
-        )
+    t = input.t[::stride]
+    if isinstance(model, Ensemble):
+        states = x0.unsqueeze(-2) + model.member_increments(x0, t, input)
+    else:
+        states = model.predict(x0, t, input).unsqueeze(0)
+    return states[..., : model.num_coordinates]
 
 
 def _require_stacked(truth: Trajectory) -> None:

@@ -1,18 +1,22 @@
 """The equations of mechanics: systems, states, trajectories and their integration."""
 
-from pinn_dyn.mechanics.ensemble import Ensemble
-from pinn_dyn.mechanics.integration import rollout
+from pinn_dyn.mechanics.integrators import RK4, Integrator, Rosenbrock
 from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor, double_copy
+from pinn_dyn.mechanics.rollout import rollout
+from pinn_dyn.mechanics.signal import Interpolation, Signal
 from pinn_dyn.mechanics.system import MechanicalSystem, Terms
-from pinn_dyn.mechanics.trajectory import Coordinates, Interpolation, Trajectory, stack
+from pinn_dyn.mechanics.trajectory import State, Trajectory, stack
 
 __all__ = [
+    "RK4",
     "ContinuousPredictor",
-    "Coordinates",
-    "Ensemble",
+    "Integrator",
     "Interpolation",
     "MechanicalSystem",
     "Predictor",
+    "Rosenbrock",
+    "Signal",
+    "State",
     "Terms",
     "Trajectory",
     "double_copy",

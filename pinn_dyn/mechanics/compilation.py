@@ -1,21 +1,119 @@
-"""Compile a function with all that it calls, gradients included, into one C++ program."""
+"""Compiled programs: functions with all that they call, integrators, and when they pay."""
 
 from __future__ import annotations
 
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch._dynamo import config as dynamo_config
 from torch._higher_order_ops.scan import scan
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from pinn_dyn.mechanics.integrators import Dynamics, Integrator
+from pinn_dyn.mechanics.integrators.integrator import BLOCK
+from pinn_dyn.mechanics.predictor import ContinuousPredictor
+from pinn_dyn.mechanics.signal import Signal
+
+# When compiling pays. Each number is from benchmarks/training_step.py or, for roll-outs,
+# benchmarks/long_rollout.py, on two cores; benchmarks/README.md has the tables.
+
+STEPS_FOR_DERIVATIVE = 5_000
+"""Training steps from which it pays to compile: twice what makes up for half a minute."""
+STEPS_FOR_PROGRAM = 20_000
+"""Training steps from which it pays to compile loss and gradient as one program; for the members of
+an ensemble it always does."""
+MOST_EVALUATIONS = 4
+"""Evaluations of the dynamics in a window up to which it is compiled as one program: the time to
+compile grows with them."""
+CHUNK = 256
+"""Windows of MOST_EVALUATIONS that are taken at once, four times as many of one evaluation: what
+they keep for the gradient stays in the cache. Less than twice as many are not cut."""
+WORK_FOR_LOOP = 4_500_000
+"""Steps times (batch + 300) from which a compiled loop pays in a roll-out: it saves 2 ms of a step
+and 7 us for each trajectory, and takes 20 s to compile."""
+
 # Products over at most so many numbers are sums that the compiler fuses with their neighbours.
 _SHORT = 8
 # A loop over fewer numbers runs in one thread: starting others takes longer than its work.
 _WORTH_THREADS = 1024
+
+
+@contextmanager
+def integrated_by(model: ContinuousPredictor, integrator: Integrator) -> Iterator[None]:
+    """The model with another integrator, for a while."""
+    own, model.integrator = model.integrator, integrator
+    try:
+        yield
+    finally:
+        model.integrator = own
+
+
+class _Wrapped(Integrator):
+    """The steps of another integrator."""
+
+    def __init__(self, inner: Integrator):
+        super().__init__(inner.substeps)
+        self.inner = inner
+        self.nodes, self.order, self.mean_input = inner.nodes, inner.order, inner.mean_input
+
+    def step(
+        self, dynamics: Dynamics, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
+    ) -> Tensor:
+        return self.inner.step(dynamics, increment, start, inputs, h)
+
+
+class Unrolled(_Wrapped):
+    """Paths by operations that can be traced: those of the contract, whatever the method has."""
+
+
+class CompiledDynamics(_Wrapped):
+    """Paths of compiled dynamics, with gradients.
+
+    Only the derivative is compiled, or a step, not the unrolled integrator: that keeps compilation
+    short.
+
+    Args:
+        inner: the method.
+        dynamics: what it integrates, from now on at one batch shape.
+    """
+
+    def __init__(self, inner: Integrator, dynamics: Dynamics):
+        super().__init__(inner)
+        # Each is compiled when it is first called: a method calls one of the two.
+        self._compiled = SimpleNamespace(
+            state_derivative=torch.compile(dynamics.state_derivative),
+            integration_step=torch.compile(dynamics.integration_step),
+        )
+
+    def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
+        return self.inner.path(self._compiled, start, grid, signal)
+
+
+class CompiledLoop(_Wrapped):
+    """Paths by one compiled loop, without gradients: for long roll-outs.
+
+    Without the thousands of small operations of a long roll-out. Compiling takes half a minute to a
+    minute for a new model, some 15 s for one of the same shape (the compiler's cache on disk).
+    """
+
+    def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
+        u = signal.u[..., 0, :].expand(BLOCK, len(self.nodes), *signal.batch, signal.num_inputs)
+        arguments = (u.contiguous(), start.new_zeros(BLOCK))
+        loop = compile_loop(dynamics.integration_step, torch.zeros_like(start), start, arguments)
+        blocks = [torch.zeros_like(start)[None]]
+        for inputs, lengths in self.blocks(grid, signal):
+            # The loop has BLOCK steps; the last block is filled up with steps of length zero.
+            lacking = BLOCK - lengths.shape[0]
+            filled = torch.cat([inputs, inputs[-1:].expand(lacking, *inputs.shape[1:])])
+            path = loop(blocks[-1][-1], start, filled, F.pad(lengths, (0, lacking)))
+            blocks.append(path[: lengths.shape[0]])
+        return torch.cat(blocks)
 
 
 def compile_graph(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
@@ -45,7 +143,10 @@ def compile_loop(
         A function of the same four, with the inputs one by one, that gives x_1 to x_T,
         ``(T, ...)``.
     """
-    graph = make_fx(step, _DECOMPOSITIONS)(state, constant, *[each[0] for each in inputs])
+    # make_fx does not see that a method has its first argument already.
+    graph = make_fx(lambda *arguments: step(*arguments), _DECOMPOSITIONS)(
+        state, constant, *[each[0] for each in inputs]
+    )
 
     def loop(state: Tensor, constant: Tensor, *inputs: Tensor) -> Tensor:
         def body(state: Tensor, now: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:

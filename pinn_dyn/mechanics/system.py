@@ -11,7 +11,6 @@ from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import matvec, require_last_dim, spd_solve, spd_solver
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
-from pinn_dyn.mechanics.trajectory import Coordinates
 
 
 class Terms(NamedTuple):
@@ -53,11 +52,6 @@ class MechanicalSystem(ContinuousPredictor):
     """
 
     input_affine: bool = True
-
-    def __init__(
-        self, num_coordinates: int, num_inputs: int, coordinates: Coordinates = "velocity"
-    ):
-        super().__init__(num_coordinates, num_inputs, coordinates)
 
     @abc.abstractmethod
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -220,8 +214,8 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """dx/dt in the system's own coordinates, (q, v) or (q, p)."""
-        if self.coordinates == "momentum":
+        """dx/dt of the system's own state, (q, v) or (q, p)."""
+        if self.state == "qp":
             return self.momentum_derivative(x, u)
         return self.velocity_derivative(x, u)
 
@@ -236,7 +230,7 @@ class MechanicalSystem(ContinuousPredictor):
         k_p = M E r_p and k_q = r_q + s E r_p.
         """
         q, v = x.chunk(2, dim=-1)
-        if self.coordinates == "momentum":
+        if self.state == "qp":
             v = self._velocity(q, v)
         mass = self.mass_matrix(q)
         resistance = self.damping_matrix(q) + torch.diag_embed(self._friction_slope(v))
@@ -244,7 +238,7 @@ class MechanicalSystem(ContinuousPredictor):
 
         def solve(rate: Tensor) -> Tensor:
             rate_q, rate = rate.chunk(2, dim=-1)
-            if self.coordinates == "velocity":
+            if self.state == "qv":
                 velocity = rate = inverse(matvec(mass, rate))
             else:
                 velocity = inverse(rate)

@@ -9,11 +9,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-Coordinates = Literal["velocity", "momentum"]
-"""Which variable completes the state x: (q, v) or (q, p) with p = M(q) v."""
+from pinn_dyn.mechanics.signal import Signal, stacked
 
-Interpolation = Literal["linear", "hold"]
-"""How the input moves between two samples: on a straight line, or held at the earlier one."""
+State = Literal["qv", "qp"]
+"""What a state x is made of: (q, v), or (q, p) with p = M(q) v."""
 
 
 @dataclass(frozen=True)
@@ -21,66 +20,60 @@ class Trajectory:
     """A sampled motion under a sampled input.
 
     Attributes:
-        t: sample times in s, ``(T,)``, strictly increasing.
         q: configuration, ``(*batch, T, N)``.
         v: velocity dq/dt, ``(*batch, T, N)``.
-        u: input, ``(*batch, T, M)``.
-        interpolation: how ``u`` moves between samples.
+        input: u at T times, ``(*batch, T, M)``, and how it moves between them.
         momentum: p = M(q) v where the truth is known, ``(*batch, N), (*batch, N) -> (*batch, N)``
             on the CPU; None for measured data.
 
     Raises:
-        ValueError: on shapes that do not match or times that do not increase.
+        ValueError: on fewer than two samples, or shapes that do not match.
     """
 
-    t: Tensor
     q: Tensor
     v: Tensor
-    u: Tensor
-    interpolation: Interpolation = "linear"
+    input: Signal
     momentum: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
-        samples = self.t.shape[0] if self.t.ndim == 1 else -1
+        samples = self.t.shape[0]
         if samples < 2:
-            raise ValueError(
-                f"t has shape {tuple(self.t.shape)}, expected (T,) with at least 2 samples"
-            )
-        backward = ~(self.t[1:] > self.t[:-1])
-        if backward.any():
-            k = int(backward.nonzero()[0])
-            raise ValueError(
-                f"t must increase strictly, but t[{k}] = {float(self.t[k])} "
-                f"is followed by t[{k + 1}] = {float(self.t[k + 1])}"
-            )
-        for name in ("q", "v", "u"):
-            value = getattr(self, name)
-            width = (value if name == "u" else self.q).shape[-1:]
-            batch = self.q.shape[:-2]
-            if value.ndim < 2 or value.shape != (*batch, samples, *width):
-                sizes = ", ".join(str(size) for size in (samples, *width))
+            raise ValueError(f"t has shape ({samples},), expected (T,) with at least 2 samples")
+        batch, size = self.q.shape[:-2], self.q.shape[-1] if self.q.ndim else 0
+        for name, value, width in (
+            ("q", self.q, size),
+            ("v", self.v, size),
+            ("u", self.u, self.input.num_inputs),
+        ):
+            if value.ndim < 2 or value.shape != (*batch, samples, width):
                 raise ValueError(
-                    f"{name} has shape {tuple(value.shape)}, expected (*batch, {sizes}) with the "
-                    f"batch {tuple(batch)} of q"
+                    f"{name} has shape {tuple(value.shape)}, expected (*batch, {samples}, {width}) "
+                    f"with the batch {tuple(batch)} of q"
                 )
-        if self.interpolation not in ("linear", "hold"):
-            raise ValueError(
-                f"interpolation is {self.interpolation!r}, expected 'linear' or 'hold'"
-            )
+
+    @property
+    def t(self) -> Tensor:
+        """Sample times, ``(T,)``, s."""
+        return self.input.t
+
+    @property
+    def u(self) -> Tensor:
+        """Samples of the input, ``(*batch, T, M)``."""
+        return self.input.u
 
     @property
     def duration(self) -> float:
         """Time from the first to the last sample in s."""
         return float(self.t[-1] - self.t[0])
 
-    def state(self, coordinates: Coordinates, samples: slice = slice(None)) -> Tensor:
-        """Stacked state ``(*batch, T, 2N)`` at the chosen samples: (q, v) or (q, p).
+    def states(self, state: State, samples: slice = slice(None)) -> Tensor:
+        """States ``(*batch, T, 2N)`` at the chosen samples: (q, v) or (q, p).
 
         Raises:
             ValueError: if momenta are asked for and M is not known.
         """
         q, v = self.q[..., samples, :], self.v[..., samples, :]
-        if coordinates == "velocity":
+        if state == "qv":
             return torch.cat([q, v], dim=-1)
         if self.momentum is None:
             raise ValueError(
@@ -91,7 +84,7 @@ class Trajectory:
 
     def to(self, device: torch.device | str) -> Trajectory:
         """The trajectory on another device."""
-        moved = {name: getattr(self, name).to(device) for name in ("t", "q", "v", "u")}
+        moved = {name: getattr(self, name).to(device) for name in ("q", "v", "input")}
         return replace(self, **moved)
 
     def until(self, horizon: float) -> Trajectory:
@@ -108,10 +101,9 @@ class Trajectory:
         count = int(torch.searchsorted(self.t, self.t[0] + horizon + 0.5 * step))
         return replace(
             self,
-            t=self.t[:count],
             q=self.q[..., :count, :],
             v=self.v[..., :count, :],
-            u=self.u[..., :count, :],
+            input=self.input.part(slice(count)),
         )
 
 
@@ -125,10 +117,11 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         raise ValueError("trajectories is empty: expected at least one")
     first = trajectories[0]
     for index, other in enumerate(trajectories):
-        if other.interpolation != first.interpolation:
+        kind, expected = other.input.interpolation, first.input.interpolation
+        if kind != expected:
             raise ValueError(
-                f"trajectory {index} has interpolation {other.interpolation!r}, trajectory 0 "
-                f"{first.interpolation!r}: expected the same"
+                f"trajectory {index} has interpolation {kind!r}, trajectory 0 {expected!r}: "
+                "expected the same"
             )
         # Sample times are compared from each trajectory's own start.
         resolution = 4 * torch.finfo(other.t.dtype).eps * float(other.t.abs().max())
@@ -142,8 +135,7 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
             )
     return replace(
         first,
-        t=first.t - first.t[0],
         q=torch.stack([item.q for item in trajectories]),
         v=torch.stack([item.v for item in trajectories]),
-        u=torch.stack([item.u for item in trajectories]),
+        input=stacked([item.input for item in trajectories], first.t - first.t[0]),
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import ContinuousPredictor, Interpolation, Predictor
+from pinn_dyn.mechanics import RK4, ContinuousPredictor, Integrator, Predictor, Signal
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.statistics import Statistics
@@ -38,10 +38,10 @@ class NextStateMLP(Predictor):
         angles: Sequence[int] = (),
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
-        super().__init__(size, inputs, "velocity")
+        super().__init__(size, inputs)
         mean, std = statistics.network_input(repeat_input=2)
         self.network = MLP(2 * size + 2 * inputs, 2 * size, hidden, activation, mean, std, angles)
-        self.register_buffer("scale", statistics.velocity_increment_std[0].float())
+        self.register_buffer("scale", statistics.qv_increment_std[0].float())
         self.register_buffer("step", torch.tensor(statistics.step, dtype=torch.float64))
 
     @property
@@ -49,22 +49,12 @@ class NextStateMLP(Predictor):
         """The step of the windows that it was trained on, s."""
         return float(self.step)
 
-    def increments(
-        self,
-        x0: Tensor,
-        t: Tensor,
-        u: Tensor,
-        *,
-        t_input: Tensor | None = None,
-        interpolation: Interpolation = "linear",
-    ) -> Tensor:
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """Apply the network step by step.
 
         Raises:
-            ValueError: if ``t`` does not advance by the step the model was trained on, or if its
-                times are not among the sample times of the input.
+            ValueError: if ``t`` does not advance by the step the model was trained on.
         """
-        grid = t if t_input is None else t_input
         step = self.fixed_step
         spacing = (t[1:] - t[:-1]).double()
         if (spacing - step).abs().max() > 1e-3 * step:
@@ -72,17 +62,11 @@ class NextStateMLP(Predictor):
                 f"NextStateMLP predicts in steps of {step:g} s, as it was trained, but t advances "
                 f"by {float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
             )
-        index = torch.searchsorted(grid.double(), t.double() - 0.5 * float(grid[1] - grid[0]))
-        index = index.clamp(max=grid.shape[0] - 1)
-        if (grid[index].double() - t.double()).abs().max() > 1e-3 * step:
-            raise ValueError("the times t are not among the sample times t_input of the input")
-        samples = u[..., index, :]
         x = torch.zeros_like(x0)
         path = [x]
-        for k in range(t.shape[0] - 1):
-            after = samples[..., k if interpolation == "hold" else k + 1, :]
-            features = torch.cat([x0 + x, samples[..., k, :], after], dim=-1)
-            x = x + self.scale * self.network(features)
+        # The input at both ends of each step; of a held one the end still has the step's own.
+        for before, after in input.stages(t, (0.0, 1.0)).to(x0):
+            x = x + self.scale * self.network(torch.cat([x0 + x, before, after], dim=-1))
             path.append(x)
         return torch.stack(path, dim=-2)
 
@@ -99,7 +83,7 @@ class AccelerationMLP(ContinuousPredictor):
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         angles: which coordinates are angles; the network sees their sine and cosine.
-        substeps: RK4 steps within a step of the data.
+        integrator: the method of integration.
         initial_velocity: builder of the head for the velocity at which roll-outs start.
     """
 
@@ -111,16 +95,15 @@ class AccelerationMLP(ContinuousPredictor):
         hidden: Sequence[int],
         activation: str = "softplus",
         angles: Sequence[int] = (),
-        substeps: int = 1,
+        integrator: Integrator | None = None,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
-        super().__init__(size, inputs, "velocity")
-        self.substeps = substeps
+        super().__init__(size, inputs)
+        self.integrator = integrator or RK4()
         mean, std = statistics.network_input(repeat_input=1)
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
-        acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
-        self.register_buffer("scale", acceleration.float())
+        self.register_buffer("scale", statistics.acceleration.float())
         self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
         self.learns_initial_state = self.initial_velocity.learned
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import Coordinates
+from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
@@ -33,7 +32,7 @@ class HamiltonianNetwork(StructuredNetwork):
 
     One reverse pass through the mass head gives the gradient; nothing is solved or inverted.
 
-    Momenta cannot be measured. With ``coordinates="velocity"`` the same equations, in the state
+    Momenta cannot be measured. With ``state="qv"`` the same equations, in the state
     (q, v) with p = W^-1 v, learn and predict from (q, v) alone::
 
         dq/dt = v,    dv/dt = (dW/dt) p + W dp/dt
@@ -45,12 +44,12 @@ class HamiltonianNetwork(StructuredNetwork):
         statistics: scales of the data.
         inverse_mass, potential, damping, input, friction: builders of the heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
-        substeps: steps of the integrator within a step of the data.
-        integrator: "rk4", or "rosenbrock" where damping outweighs inertia.
-        coordinates: the state, (q, p) or (q, v); (q, p) needs data with momenta.
+        integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
+            damping outweighs inertia.
+        state: "qp" for (q, p), which needs data with momenta, or "qv" for (q, v).
 
     Raises:
-        ValueError: on other coordinates, or a transposed head.
+        ValueError: on another state, or a transposed head.
     """
 
     def __init__(
@@ -62,30 +61,26 @@ class HamiltonianNetwork(StructuredNetwork):
         input: InputHead,
         friction: FrictionHead = NoFriction,
         angles: Sequence[int] = (),
-        substeps: int = 1,
-        integrator: Integrator = "rk4",
-        coordinates: Coordinates = "momentum",
+        integrator: Integrator | None = None,
+        state: State = "qp",
     ):
-        if coordinates not in ("momentum", "velocity"):
-            raise ValueError(f"coordinates is {coordinates!r}, expected 'momentum' or 'velocity'")
         super().__init__(
             statistics,
-            coordinates,
+            state,
             potential,
             damping,
             friction,
             input,
             angles,
-            substeps,
             integrator,
         )
         size = self.num_coordinates
-        if coordinates == "momentum":
+        if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std
         else:
             # As in the Lagrangian network: what an acceleration takes, without a momentum.
-            acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
-            inverse_mass_scale = acceleration / self.input.typical_force(statistics.u_rms)
+            force = self.input.typical_force(statistics.u_rms)
+            inverse_mass_scale = statistics.acceleration / force
         self.inverse_mass = inverse_mass(
             size=size,
             scale=inverse_mass_scale.sqrt(),

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.mechanics.steps import Integrator
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import Tape
@@ -40,8 +40,8 @@ class LagrangianNetwork(StructuredNetwork):
         statistics: scales of the data.
         mass, potential, damping, input, friction, initial_velocity: builders of the heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
-        substeps: steps of the integrator within a step of the data.
-        integrator: "rk4", or "rosenbrock" where damping outweighs inertia.
+        integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
+            damping outweighs inertia.
 
     Raises:
         ValueError: on a mass head for a chain that is not transposed.
@@ -57,25 +57,22 @@ class LagrangianNetwork(StructuredNetwork):
         friction: FrictionHead = NoFriction,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
         angles: Sequence[int] = (),
-        substeps: int = 1,
-        integrator: Integrator = "rk4",
+        integrator: Integrator | None = None,
     ):
         super().__init__(
             statistics,
-            "velocity",
+            "qv",
             potential,
             damping,
             friction,
             input,
             angles,
-            substeps,
             integrator,
         )
         size = self.num_coordinates
-        acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
         self.mass = mass(
             size=size,
-            scale=(self.input.typical_force(statistics.u_rms) / acceleration).sqrt(),
+            scale=(self.input.typical_force(statistics.u_rms) / statistics.acceleration).sqrt(),
             mean=statistics.q_mean,
             std=statistics.q_std,
             angles=angles,

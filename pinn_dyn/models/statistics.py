@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pinn_dyn.mechanics import State
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -18,8 +20,8 @@ class Statistics:
         v_std: velocity, ``(N,)``.
         p_std: momentum, ``(N,)``; ones where the data have none.
         u_mean, u_std: input, ``(M,)``.
-        velocity_increment_std: of (q, v) over the 1st ... H-th step of a window, ``(H, 2N)``.
-        momentum_increment_std: the same of (q, p), ``(H, 2N)``.
+        qv_increment_std: of (q, v) over the 1st ... H-th step of a window, ``(H, 2N)``.
+        qp_increment_std: the same of (q, p), ``(H, 2N)``; ones where the data have no momenta.
         step: length of a window's step, s.
     """
 
@@ -29,8 +31,8 @@ class Statistics:
     p_std: Tensor
     u_mean: Tensor
     u_std: Tensor
-    velocity_increment_std: Tensor
-    momentum_increment_std: Tensor
+    qv_increment_std: Tensor
+    qp_increment_std: Tensor
     step: float
 
     @property
@@ -47,6 +49,15 @@ class Statistics:
     def u_rms(self) -> Tensor:
         """Root mean square of each input, ``(M,)``."""
         return (self.u_mean.square() + self.u_std.square()).sqrt()
+
+    def increment_std(self, state: State) -> Tensor:
+        """Of (q, v) or (q, p) over the 1st ... H-th step of a window, ``(H, 2N)``."""
+        return self.qv_increment_std if state == "qv" else self.qp_increment_std
+
+    @property
+    def acceleration(self) -> Tensor:
+        """Standard deviation of the mean acceleration over a step, ``(N,)``."""
+        return self.qv_increment_std[0, self.num_coordinates :] / self.step
 
     def network_input(self, repeat_input: int) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of (q, v, u, ... u), for a black box."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import get_args
 
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import Coordinates, MechanicalSystem
-from pinn_dyn.mechanics.steps import Integrator
+from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
 from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
@@ -38,23 +36,17 @@ class StructuredNetwork(MechanicalSystem):
     def __init__(
         self,
         statistics: Statistics,
-        coordinates: Coordinates,
+        state: State,
         potential: PotentialHead,
         damping: CholeskyHead,
         friction: FrictionHead,
         input: InputHead,
         angles: Sequence[int],
-        substeps: int,
-        integrator: Integrator,
+        integrator: Integrator | None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
-        super().__init__(size, inputs, coordinates)
-        if integrator not in get_args(Integrator):
-            raise ValueError(
-                f"integrator is {integrator!r}, expected one of {', '.join(get_args(Integrator))}"
-            )
-        self.integrator: Integrator = integrator
-        self.substeps = substeps
+        super().__init__(size, inputs, state)
+        self.integrator = integrator or RK4()
         self.angles = tuple(angles)
         mean, std, u_rms = statistics.q_mean, statistics.q_std, statistics.u_rms
         self.input = input(

@@ -6,12 +6,12 @@ from functools import partial
 
 import lightning as L
 from torch.optim import AdamW
-from torch.optim.lr_scheduler import OneCycleLR
 
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.training.learner import DynamicsLearner
 from pinn_dyn.training.losses import IncrementLoss, WindowLoss
+from pinn_dyn.training.schedule import one_cycle
 
 
 def fit(
@@ -54,13 +54,7 @@ def fit(
         model,
         loss=IncrementLoss(statistics, model) if loss is None else loss,
         optimizer=partial(AdamW, lr=learning_rate, weight_decay=1e-5, fused=True),
-        scheduler=partial(
-            OneCycleLR,
-            max_lr=learning_rate,
-            pct_start=0.05,
-            cycle_momentum=False,
-            final_div_factor=1000.0,
-        ),
+        scheduler=partial(one_cycle, peak=learning_rate),
         validator=lambda model, truth: {},
         config={},
         statistics=statistics,

@@ -12,8 +12,9 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data.windows import Windows
-from pinn_dyn.mechanics import Predictor, Trajectory
+from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.losses import WindowLoss
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
@@ -67,19 +68,14 @@ class DynamicsLearner(L.LightningModule):
 
     def setup(self, stage: str) -> None:
         """Compile here, in the process that trains: compiled code does not reach another one."""
-        if self._compile and stage == "fit":
-            self.loss.compile_dynamics(self.trained, int(self.trainer.estimated_stepping_batches))
+        if stage == "fit":
+            self._gradients = self.gradients(int(self.trainer.estimated_stepping_batches))
 
-    def on_train_epoch_start(self) -> None:
-        """See to it that the last epoch ends with a validation, however far apart they are."""
-        trainer = self.trainer
-        if self.current_epoch + 1 == trainer.max_epochs and trainer.check_val_every_n_epoch:
-            trainer.check_val_every_n_epoch = 1
-
-    @property
-    def trained(self) -> Predictor:
-        """What the loss is taken of."""
-        return self.model
+    def gradients(self, steps: int) -> Engine:
+        """How the gradient of the loss is taken, in a training of so many steps."""
+        if self._compile and isinstance(self.model, ContinuousPredictor):
+            return Compiled(self.loss, self.model, steps)
+        return Eager(self.loss, self.model)
 
     def training_step(self, batch: Windows, batch_idx: int) -> Tensor:
         """Loss of one batch of windows."""
@@ -87,7 +83,7 @@ class DynamicsLearner(L.LightningModule):
             self._losses.clear()  # of an epoch that was cut short
         # Both counts come back with a checkpoint: a resumed training is as far as it was.
         progress = self.global_step / self.trainer.estimated_stepping_batches
-        losses = self.loss(self.trained, batch, progress)
+        losses = self._gradients(self.loss.selected(batch, progress))
         loss = losses.sum()  # a single number, but for the members of an ensemble
         if not torch.isfinite(loss):
             raise NonFiniteLossError(
@@ -134,10 +130,7 @@ class DynamicsLearner(L.LightningModule):
         """The optimizer, with its learning rate scheduled per step."""
         optimizer = self.built_optimizer()
         steps = int(self.trainer.estimated_stepping_batches)
-        try:
-            scheduler = self._scheduler(optimizer, total_steps=steps)
-        except ZeroDivisionError:  # OneCycleLR has no slope for a rise of exactly one step
-            scheduler = self._scheduler(optimizer, total_steps=steps + 1)
+        scheduler = self._scheduler(optimizer, total_steps=steps)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {

@@ -13,7 +13,7 @@ import torch
 from scipy.integrate import simpson
 from torch import Tensor
 
-from pinn_dyn.mechanics import MechanicalSystem, rollout
+from pinn_dyn.mechanics import MechanicalSystem, Signal, rollout
 from tests.support.finite_differences import assert_near, partial_derivatives, slope
 
 
@@ -172,7 +172,7 @@ class MechanicalSystemContract:
         values[wrong] = values[wrong][..., :-1]
         t = torch.tensor([0.0, 0.1], dtype=torch.float64)
         with pytest.raises(ValueError, match=rf"^{wrong} has shape"):
-            system.predict(values["x0"], t, values["u"])
+            system.predict(values["x0"], t, Signal(t, values["u"]))
 
     # The four terms.
 
@@ -266,7 +266,7 @@ class MechanicalSystemContract:
     def test_state_derivative_is_that_of_the_systems_own_coordinates(self, system, configurations):
         q, v, _, u = configurations
         x = torch.cat([q, v], -1)
-        own = system.momentum_derivative if system.coordinates == "momentum" else None
+        own = system.momentum_derivative if system.state == "qp" else None
         expected = (own or system.velocity_derivative)(x, u)
         assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
 
@@ -286,13 +286,13 @@ class MechanicalSystemContract:
         damping = torch.stack(columns, dim=-1)
         inverse = torch.linalg.inv(mass)
         one, zero = ones.expand_as(mass), torch.zeros_like(mass)
-        if system.coordinates == "velocity":
+        if system.state == "qv":
             upper, lower = one, inverse @ damping
         else:
             upper, lower = inverse, damping @ inverse
         jacobian = torch.cat([torch.cat([zero, upper], -1), torch.cat([zero, -lower], -1)], -2)
         step = torch.tensor(0.01, dtype=q.dtype)
-        second = system.momentum(q, v) if system.coordinates == "momentum" else v
+        second = system.momentum(q, v) if system.state == "qp" else v
         found = system.implicit_solver(torch.cat([q, second], -1), step)(rate)
         back = found - step * (jacobian @ found.unsqueeze(-1)).squeeze(-1)
         assert_near(back, rate, self.exact_tolerance)
@@ -373,20 +373,20 @@ class MechanicalSystemContract:
         t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
         second = v if derivative == system.velocity_derivative else system.momentum(q, v)
         u = self._input(configurations, t[[0, -1]])
-        return t, rollout(derivative, torch.cat([q, second], -1), t, u, t_input=t[[0, -1]])
+        return t, rollout(derivative, torch.cat([q, second], -1), t, Signal(t[[0, -1]], u))
 
     # Gradients.
 
     def test_gradients_through_an_rk4_step_match_finite_differences(self, system, configurations):
         """Of a scalar of the increments, by the initial state, the input and each parameter."""
         q, v, a, u = configurations
-        second = v if system.coordinates == "velocity" else system.momentum(q, v)
+        second = v if system.state == "qv" else system.momentum(q, v)
         x0, u = torch.cat([q, second], -1), torch.stack([u, -u], -2)
         t = torch.tensor([0.0, self._step(system, configurations)], dtype=torch.float64)
         weights = torch.cat([a, v], -1) / t[-1]
 
         def loss():
-            return (weights * system.increments(x0, t, u)[..., -1, :]).sum()
+            return (weights * system.increments(x0, t, Signal(t, u))[..., -1, :]).sum()
 
         leaves = {"x0": x0, "u": u, **dict(system.named_parameters())}
         with torch.enable_grad():

@@ -23,7 +23,7 @@ from pinn_dyn.data import (
 from pinn_dyn.data.cache import load_or_make
 from pinn_dyn.data.robot_excitation import Plan
 from pinn_dyn.evaluation import predict_trajectories
-from pinn_dyn.mechanics import Trajectory, stack
+from pinn_dyn.mechanics import Signal, Trajectory, stack
 from pinn_dyn.systems import SoftArm
 
 pytestmark = pytest.mark.panda
@@ -107,7 +107,7 @@ def test_velocities_are_those_at_the_time_of_the_configuration(source, splits):
     centred = stack(splits.test).until(0.4)
     q, v, u = (x[:, : len(centred.t)] for x in recorded(source, "test"))
     torch.testing.assert_close(centred.q, q, rtol=0, atol=0)
-    raw = Trajectory(centred.t, q, v, u, interpolation="hold")
+    raw = Trajectory(q, v, Signal(centred.t, u, "hold"))
     errors = [
         predict_trajectories(source.system, item, step=0.01).error().max()
         for item in (centred, raw)

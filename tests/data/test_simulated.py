@@ -120,7 +120,7 @@ def test_trajectories_are_sampled_as_asked(splits):
         torch.testing.assert_close(x.t, t, rtol=0, atol=1e-12)
         assert x.q.shape == x.v.shape == x.u.shape == (21, 3)
         assert x.q.dtype == torch.float64
-        assert x.interpolation == "linear"
+        assert x.input.interpolation == "linear"
 
 
 def test_momenta_are_mass_matrix_times_velocity(splits):

@@ -8,20 +8,21 @@ import torch
 from scipy.stats import kstest
 
 from pinn_dyn.data import DataSource, DynamicsData, Splits, draw_windows
-from pinn_dyn.data.windows import BatchSampler, MemberSampler
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.data.windows import BatchSampler
+from pinn_dyn.mechanics import Signal, Trajectory
 from tests.support.cart_pole import CartPole
 
 STEP = 0.01
 
 
-def make_trajectory(seed, samples=40, step=STEP, **extra):
+def make_trajectory(seed, samples=40, step=STEP, interpolation="linear", **extra):
     """Random samples, so that every one of them is recognized by its value."""
     generator = torch.Generator().manual_seed(seed)
     q, v, u = (
         torch.randn(samples, size, generator=generator, dtype=torch.float64) for size in (2, 2, 1)
     )
-    return Trajectory(torch.arange(samples, dtype=torch.float64) * step, q, v, u, **extra)
+    t = torch.arange(samples, dtype=torch.float64) * step
+    return Trajectory(q, v, Signal(t, u, interpolation), **extra)
 
 
 def draw(trajectories, **changes):
@@ -62,7 +63,7 @@ def test_a_window_holds_the_slices_of_its_trajectory(trajectories, steps, stride
         assert torch.equal(windows.dv[index], item.v[knots] - item.v[k])
         assert torch.equal(windows.u[index], item.u[k : k + span + 1])
     t = torch.arange(span + 1, dtype=torch.float64) * STEP
-    torch.testing.assert_close(windows.t_input, t, rtol=0, atol=1e-15)
+    torch.testing.assert_close(windows.input.t, t, rtol=0, atol=1e-15)
     torch.testing.assert_close(windows.t, t[::stride], rtol=0, atol=1e-15)
 
 
@@ -113,15 +114,15 @@ def test_without_momenta_there_are_none(trajectories):
 
 def test_the_input_keeps_its_interpolation():
     windows = draw([make_trajectory(0, interpolation="hold")], count=10)
-    assert windows.interpolation == "hold"
-    assert windows[torch.tensor([0, 1])].to(torch.device("cpu")).interpolation == "hold"
+    assert windows.input.interpolation == "hold"
+    assert windows[torch.tensor([0, 1])].to(torch.device("cpu")).input.interpolation == "hold"
 
 
 def test_increments_stay_precise_in_single_precision():
     """Increments of 1e-6 on states near 1: subtracted in float32 they would be 6 % off."""
     t = torch.arange(40, dtype=torch.float64) * STEP
     q = 1 + 1e-6 * torch.sin(t)[:, None].repeat(1, 2)
-    slow = Trajectory(t, q, q, torch.zeros(40, 1, dtype=torch.float64))
+    slow = Trajectory(q, q, Signal(t, torch.zeros(40, 1, dtype=torch.float64)))
     windows = draw([slow])
     single = windows.to(torch.device("cpu"), torch.float32)
     assert single.dq.dtype == single.q.dtype == single.t.dtype == torch.float32
@@ -140,8 +141,8 @@ def test_statistics_are_those_of_the_windows(trajectories):
         "p_std": windows.p.std(0, correction=0),
         "u_mean": windows.u.reshape(-1, 1).mean(0),
         "u_std": windows.u.reshape(-1, 1).std(0, correction=0),
-        "velocity_increment_std": torch.cat([windows.dq, windows.dv], -1).std(0, correction=0),
-        "momentum_increment_std": torch.cat([windows.dq, windows.dp], -1).std(0, correction=0),
+        "qv_increment_std": torch.cat([windows.dq, windows.dv], -1).std(0, correction=0),
+        "qp_increment_std": torch.cat([windows.dq, windows.dp], -1).std(0, correction=0),
     }
     for name, value in expected.items():
         torch.testing.assert_close(getattr(statistics, name), value, rtol=1e-12, atol=0)
@@ -169,7 +170,7 @@ def test_a_clock_that_is_not_uniform_is_refused(trajectories, where):
     if where == "within":
         t = trajectories[1].t.clone()
         t[7:] += 0.001
-        odd = Trajectory(t, trajectories[1].q, trajectories[1].v, trajectories[1].u)
+        odd = Trajectory(trajectories[1].q, trajectories[1].v, Signal(t, trajectories[1].u))
     with pytest.raises(ValueError, match="training trajectory 1 has sample times"):
         draw([trajectories[0], odd])
 
@@ -224,20 +225,6 @@ def test_the_shares_of_several_processes_are_the_batch_of_one():
         assert sorted(torch.cat(parts).tolist()) == sorted(batch.tolist())
 
 
-def test_the_members_of_an_ensemble_have_the_orders_of_their_own_seeds():
-    alone = [BatchSampler(64, batch_size=16, batches=6, seed=seed) for seed in (5, 6, 7)]
-    together = MemberSampler(
-        [BatchSampler(64, batch_size=16, batches=6, seed=seed) for seed in (5, 6, 7)]
-    )
-    assert len(together) == 6
-    for epoch in (0, 3):
-        together.set_epoch(epoch)
-        for sampler in alone:
-            sampler.set_epoch(epoch)
-        found = torch.stack(list(together), dim=1)
-        assert torch.equal(found, torch.stack([torch.stack(list(x)) for x in alone]))
-
-
 # The data module.
 
 
@@ -277,24 +264,6 @@ def test_training_batches_have_the_asked_shapes_in_single_precision():
         assert batch.u.shape == (16, 7, 1)
         assert batch.t.shape == (3,)
         assert {batch.q.dtype, batch.u.dtype, batch.t.dtype} == {torch.float32}
-
-
-def test_the_members_of_an_ensemble_get_batches_of_the_same_windows():
-    data, alone = make_data(members=2, seed=3), make_data(seed=3)
-    both, single = list(data.train_dataloader()), list(alone.train_dataloader())
-    assert len(both) == 9
-    for batch, first in zip(both, single, strict=True):
-        assert batch.q.shape == (2, 16, 2)
-        assert batch.u.shape == (2, 16, 7, 1)
-        for name in ("q", "dv", "u", "p"):
-            assert torch.equal(getattr(batch, name)[0], getattr(first, name))
-        short = batch.first(1)
-        assert short.dq.shape == (2, 16, 1, 2)
-        assert torch.equal(short.u, batch.u[:, :, :4])
-    windows = data.windows.q.float()
-    second = torch.cat([batch.q[1] for batch in both])
-    assert (second[:, None] == windows).all(-1).any(-1).all()
-    assert not torch.equal(second, torch.cat([batch.q[0] for batch in both]))
 
 
 def test_batches_are_picked_on_the_device_that_trains():
@@ -346,7 +315,6 @@ def test_the_source_is_asked_once():
     [
         (dict(batch_size=0), "batch_size is 0"),
         (dict(batches_per_epoch=0), "batches_per_epoch is 0"),
-        (dict(members=0), "members is 0"),
         (dict(batch_size=91), "batch_size is 91, expected at most the number of pairs, 90"),
     ],
 )
@@ -363,7 +331,7 @@ def test_more_pairs_than_the_data_have_are_refused():
 def slow_in_the_middle(samples=60_000):
     """q = s^3 over s = -1 to 1: the density of the samples, ~ |q|^(-2/3), peaks at q = 0."""
     s = torch.linspace(-1, 1, samples, dtype=torch.float64).unsqueeze(-1)
-    return Trajectory(torch.arange(samples, dtype=torch.float64) * STEP, s**3, 0 * s, 0 * s)
+    return Trajectory(s**3, 0 * s, Signal(torch.arange(samples, dtype=torch.float64) * STEP, 0 * s))
 
 
 def test_coverage_draws_starts_evenly_over_the_configurations():

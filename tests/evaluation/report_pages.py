@@ -23,7 +23,7 @@ from pinn_dyn.evaluation.report import (
     control_report,
     prediction_report,
 )
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 
 ODD = "<img src=x onerror=alert(1)></script> & 'co'"
@@ -87,7 +87,7 @@ def truth(count=5):
     t = torch.linspace(0, 2, 201, dtype=torch.float64)
     phase = torch.arange(count, dtype=torch.float64)[:, None]
     q = torch.stack([torch.sin(t + phase), torch.cos(2 * t + phase), 0.3 + 0.1 * t + 0 * phase], -1)
-    return Trajectory(t, q, torch.zeros_like(q), torch.cos(3 * q), interpolation="hold")
+    return Trajectory(q, torch.zeros_like(q), Signal(t, torch.cos(3 * q), "hold"))
 
 
 def predictions(real, names=("hnn", "lnn")):

@@ -13,7 +13,7 @@ from pinn_dyn.evaluation import (
     terms_figure,
     trajectory_figure,
 )
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 
 
@@ -22,7 +22,7 @@ def truth():
     t = torch.linspace(0, 2, 41, dtype=torch.float64)
     phase = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)[:, None]
     q = torch.stack([torch.sin(t + phase), torch.cos(2 * t + phase)], dim=-1)
-    return Trajectory(t, q, torch.zeros_like(q), q[..., :1], interpolation="hold")
+    return Trajectory(q, torch.zeros_like(q), Signal(t, q[..., :1], "hold"))
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.mechanics import ContinuousPredictor, Trajectory
+from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 
 T = 0.25 * torch.arange(17, dtype=torch.float64)
 
@@ -23,7 +23,7 @@ class Drift(ContinuousPredictor):
 def truth():
     """Two points at constant speed, 4 s in steps of 0.25 s."""
     v = torch.tensor([[[0.5]], [[-1.0]]], dtype=torch.float64).expand(2, 17, 1)
-    return Trajectory(T, v * T[:, None], v, torch.zeros_like(v))
+    return Trajectory(v * T[:, None], v, Signal(T, torch.zeros_like(v)))
 
 
 def validator(window, horizon=3.0, step=0.5):

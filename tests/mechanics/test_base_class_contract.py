@@ -14,6 +14,6 @@ class TestLinearSystem(MechanicalSystemContract):
 
 
 class TestCartPole(MechanicalSystemContract):
-    @pytest.fixture(params=["velocity", "momentum"])
+    @pytest.fixture(params=["qv", "qp"])
     def system(self, request):
-        return CartPole(coordinates=request.param)
+        return CartPole(state=request.param)

@@ -53,7 +53,7 @@ def hamiltonian_derivative(model, x, u):
 
 def autodiff_derivative(model, x, u):
     """dx/dt in the model's own coordinates."""
-    momentum = model.coordinates == "momentum"
+    momentum = model.state == "qp"
     return (hamiltonian_derivative if momentum else lagrangian_derivative)(model, x, u)
 
 

@@ -39,8 +39,8 @@ def make_statistics(n, m, step=STEP):
         p_std=0.7 + 0.1 * rows,
         u_mean=0.2 * columns - 0.5,
         u_std=0.8 + 0.15 * columns,
-        velocity_increment_std=torch.stack([increment, 2 * increment]),
-        momentum_increment_std=torch.stack([0.7 * increment, 1.4 * increment]),
+        qv_increment_std=torch.stack([increment, 2 * increment]),
+        qp_increment_std=torch.stack([0.7 * increment, 1.4 * increment]),
         step=step,
     )
 
@@ -80,7 +80,7 @@ def make_structured(
     initial_velocity=None,
     angles=(),
     statistics=None,
-    integrator="rk4",
+    integrator=None,
     dtype=torch.float64,
 ):
     """A Lagrangian or Hamiltonian network; a head that is left out is a small network."""

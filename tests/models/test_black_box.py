@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from pinn_dyn.mechanics import Signal
 from tests.models.builders import STEP, make_model, make_statistics, random_batch
 from tests.support.finite_differences import assert_near
 
@@ -33,7 +34,7 @@ def step_by_hand(model, x, u, u_next):
     h = torch.cat([first, (u - s.u_mean) / s.u_std, (u_next - s.u_mean) / s.u_std], -1)
     for k, layer in enumerate(model.network.layers):
         h = layer(torch.nn.functional.softplus(h) if k else h)
-    return x + s.velocity_increment_std[0] * h
+    return x + s.qv_increment_std[0] * h
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
@@ -44,7 +45,7 @@ def test_a_step_takes_the_inputs_at_its_ends(model, start, inputs, interpolation
         after = inputs[:, k if interpolation == "hold" else k + 1]
         x = step_by_hand(model, x, inputs[:, k], after)
         path.append(x)
-    actual = model.predict(start, T, inputs, interpolation=interpolation)
+    actual = model.predict(start, T, Signal(T, inputs, interpolation))
     # The scales are kept in float32.
     assert_near(actual, torch.stack(path, 1), 1e-6)
 
@@ -52,8 +53,8 @@ def test_a_step_takes_the_inputs_at_its_ends(model, start, inputs, interpolation
 def test_a_held_input_does_not_see_the_next_sample(model, start, inputs):
     other = inputs.clone()
     other[:, 4] += 1.0
-    held = [model.predict(start, T, u, interpolation="hold") for u in (inputs, other)]
-    linear = [model.predict(start, T, u, interpolation="linear") for u in (inputs, other)]
+    held = [model.predict(start, T, Signal(T, u, "hold")) for u in (inputs, other)]
+    linear = [model.predict(start, T, Signal(T, u, "linear")) for u in (inputs, other)]
     assert torch.equal(*held)
     assert not torch.equal(*linear)
 
@@ -62,35 +63,29 @@ def test_inputs_may_be_sampled_more_finely_than_the_steps(model, start, inputs):
     fine_times = STEP / 4 * torch.arange(17, dtype=torch.float64)
     fine = torch.full((6, 17, 2), 99.0, dtype=torch.float64)
     fine[:, ::4] = inputs
-    expected = model.predict(start, T, inputs)
-    assert torch.equal(model.predict(start, T, fine, t_input=fine_times), expected)
-    shifted = model.predict(start, T + 7, fine, t_input=fine_times + 7)
-    assert_near(shifted, expected, 1e-12)
-    part = model.predict(start, T[1:3], fine, t_input=fine_times)
-    assert_near(part, model.predict(start, T[:2], inputs[:, 1:3]), 1e-12)
+    expected = model.predict(start, T, Signal(T, inputs))
+    assert torch.equal(model.predict(start, T, Signal(fine_times, fine)), expected)
+    shifted = model.predict(start, T + 7, Signal(fine_times + 7, fine))
+    assert_near(shifted, expected, 1e-9)
+    part = model.predict(start, T[1:3], Signal(fine_times, fine))
+    assert_near(part, model.predict(start, T[:2], Signal(T[:2], inputs[:, 1:3])), 1e-9)
 
 
 def test_a_wrong_step_is_refused_with_the_right_one(model, start, inputs):
     with pytest.raises(ValueError, match=r"in steps of 0\.02 s.*t advances by 0\.04 to 0\.04 s"):
-        model.predict(start, 2 * T, inputs)
+        model.predict(start, 2 * T, Signal(2 * T, inputs))
     uneven = T.clone()
     uneven[2] += 0.3 * STEP
     with pytest.raises(ValueError, match=r"advances by 0\.014 to 0\.026 s"):
-        model.predict(start, uneven, inputs)
+        model.predict(start, uneven, Signal(uneven, inputs))
 
 
 def test_a_step_is_allowed_the_rounding_of_its_times(model, start, inputs):
-    assert_near(model.predict(start, T.float(), inputs), model.predict(start, T, inputs), 1e-12)
-
-
-@pytest.mark.parametrize(
-    "t_input",
-    [T + 0.4 * STEP, 2 * T, T - 10 * STEP],
-    ids=["between samples", "too coarse", "after the last sample"],
-)
-def test_times_that_are_not_sample_times_are_refused(model, start, inputs, t_input):
-    with pytest.raises(ValueError, match="not among the sample times"):
-        model.predict(start, T, inputs, t_input=t_input)
+    assert_near(
+        model.predict(start, T.float(), Signal(T.float(), inputs)),
+        model.predict(start, T, Signal(T, inputs)),
+        1e-12,
+    )
 
 
 def test_acceleration_is_scaled_by_the_data_and_velocity_is_exact(start):
@@ -102,7 +97,7 @@ def test_acceleration_is_scaled_by_the_data_and_velocity_is_exact(start):
     )
     for k, layer in enumerate(model.network.layers):
         features = layer(torch.nn.functional.softplus(features) if k else features)
-    expected = s.velocity_increment_std[0, 2:] / STEP * features
+    expected = s.qv_increment_std[0, 2:] / STEP * features
     rates = model.state_derivative(start, u)
     assert torch.equal(rates[:, :2], start[:, 2:])
     assert_near(rates[:, 2:], expected, 1e-6)

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.mechanics import MechanicalSystem, rollout
+from pinn_dyn.mechanics import MechanicalSystem, Signal, rollout
 from pinn_dyn.models import (
     CholeskyFactor,
     FixedCholesky,
@@ -72,9 +72,9 @@ def paths(lagrangian, hamiltonian, count=4):
     q, v, _, u = random_batch(lagrangian.num_coordinates, lagrangian.num_inputs, count)
     u = u[:, None] * torch.cos(4 * T)[:, None]
     with torch.no_grad():
-        by_velocity = lagrangian.predict(torch.cat([q, v], -1), T, u)
+        by_velocity = lagrangian.predict(torch.cat([q, v], -1), T, Signal(T, u))
         p = lagrangian.momentum(q, v)
-        by_momentum = hamiltonian.predict(torch.cat([q, p], -1), T, u)
+        by_momentum = hamiltonian.predict(torch.cat([q, p], -1), T, Signal(T, u))
     return by_velocity, by_momentum, u
 
 
@@ -99,7 +99,7 @@ def test_both_networks_move_alike(pair):
     by_velocity, by_momentum, _ = paths(lagrangian, hamiltonian)
     q, v = by_velocity.chunk(2, -1)
     assert float((q - q[..., :1, :]).abs().max()) > 0.1
-    # Two integrations of one motion in two coordinates: they differ by the error of RK4, which
+    # Two integrations of one motion in two state: they differ by the error of RK4, which
     # falls with the fourth power of the step.
     error = (by_momentum[..., :3] - q).abs().max()
     assert float(error) < 1e-6
@@ -121,8 +121,8 @@ def test_networks_move_like_the_base_class_in_the_same_coordinates(pair):
     by_velocity, by_momentum, u = paths(lagrangian, hamiltonian)
     system = HandBuilt(lagrangian)
     with torch.no_grad():
-        velocity = rollout(system.velocity_derivative, by_velocity[:, 0], T, u)
-        momentum = rollout(system.momentum_derivative, by_momentum[:, 0], T, u)
+        velocity = rollout(system.velocity_derivative, by_velocity[:, 0], T, Signal(T, u))
+        momentum = rollout(system.momentum_derivative, by_momentum[:, 0], T, Signal(T, u))
     assert_near(by_velocity, velocity, 1e-9)
     assert_near(by_momentum, momentum, 1e-9)
 
@@ -166,6 +166,6 @@ def test_a_network_with_known_terms_is_the_linear_system(kind):
     expected = exact_solution(system, x0 - mean, t, u, "linear") + mean
     start = x0 if kind == "lnn" else torch.cat([q[0], mass @ v[0]])
     with torch.no_grad():
-        path = model.predict(start, t, u)
+        path = model.predict(start, t, Signal(t, u))
     assert float((expected[:, :2] - expected[:1, :2]).abs().max()) > 0.1
     assert_near(path[:, :2], expected[:, :2], 1e-8)

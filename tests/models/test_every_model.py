@@ -8,7 +8,8 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.mechanics import ContinuousPredictor
+from pinn_dyn.mechanics import Signal
+from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
 from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential
 from tests.models.builders import STEP, make_model, make_structured, perturb, random_batch
 from tests.support.finite_differences import assert_near
@@ -35,10 +36,10 @@ def kind(request):
 def test_any_batch_shape_gives_the_same_prediction(kind, batch):
     model = make_model(kind)
     x0, u = windows()
-    expected = model.predict(x0, T, u)
+    expected = model.predict(x0, T, Signal(T, u))
     assert expected.shape == (6, 4, 4)
     if batch == ():
-        actual, expected = model.predict(x0[2], T, u[2]), expected[2]
+        actual, expected = model.predict(x0[2], T, Signal(T, u[2])), expected[2]
     else:
         actual, expected = model.predict(*windows(batch)[:1], T, windows(batch)[1]), expected
         expected = expected.reshape(*batch, 4, 4)
@@ -48,17 +49,17 @@ def test_any_batch_shape_gives_the_same_prediction(kind, batch):
 def test_a_prediction_starts_at_the_initial_state_and_moves(kind):
     x0, u = windows()
     model = make_model(kind)
-    path = model.predict(x0, T, u)
+    path = model.predict(x0, T, Signal(T, u))
     assert torch.equal(path[:, 0], x0)
     assert float((path[:, 1:] - path[:, :-1]).abs().amax((0, 1)).min()) > 1e-3
-    assert_near(model.increments(x0, T, u), path - x0[:, None], 1e-12)
+    assert_near(model.increments(x0, T, Signal(T, u)), path - x0[:, None], 1e-12)
 
 
 def test_float32_is_close_to_float64(kind):
     double, single = make_model(kind), make_model(kind).float()
     expected = double.increments(*windows()[:1], T, windows()[1])
     x0, u = windows(dtype=torch.float32)
-    actual = single.increments(x0, T, u)
+    actual = single.increments(x0, T, Signal(T, u))
     assert actual.dtype == torch.float32
     assert_near(actual.double(), expected, 2e-5)
 
@@ -70,9 +71,9 @@ def test_saved_weights_give_identical_predictions(kind):
     file.seek(0)
     other = perturb(make_model(kind, dtype=torch.float32), seed=1)
     x0, u = windows(dtype=torch.float32)
-    assert not torch.equal(other.predict(x0, T, u), model.predict(x0, T, u))
+    assert not torch.equal(other.predict(x0, T, Signal(T, u)), model.predict(x0, T, Signal(T, u)))
     other.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(other.predict(x0, T, u), model.predict(x0, T, u))
+    assert torch.equal(other.predict(x0, T, Signal(T, u)), model.predict(x0, T, Signal(T, u)))
 
 
 def test_a_saved_model_carries_its_scales(kind):
@@ -87,9 +88,13 @@ def test_a_saved_model_carries_its_scales(kind):
     # A step is one of these scales: the saved black box has learned another one.
     t = 1.25 * T if kind == "next_state" else T
     model_of_other_data.load_state_dict(model.state_dict())
-    assert torch.equal(model_of_other_data.predict(x0, t, u), model.predict(x0, t, u))
+    assert torch.equal(
+        model_of_other_data.predict(x0, t, Signal(t, u)), model.predict(x0, t, Signal(t, u))
+    )
     if kind != "next_state":
-        assert not torch.allclose(make_model(kind).predict(x0, t, u), model.predict(x0, t, u))
+        assert not torch.allclose(
+            make_model(kind).predict(x0, t, Signal(t, u)), model.predict(x0, t, Signal(t, u))
+        )
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
@@ -97,17 +102,17 @@ def test_a_copy_predicts_alike_and_is_independent(kind, copied):
     model = make_model(kind)
     x0, u = windows()
     other = copied(model)
-    before = model.predict(x0, T, u)
-    assert torch.equal(other.predict(x0, T, u), before)
+    before = model.predict(x0, T, Signal(T, u))
+    assert torch.equal(other.predict(x0, T, Signal(T, u)), before)
     perturb(other, seed=2)
-    assert torch.equal(model.predict(x0, T, u), before)
-    assert not torch.equal(other.predict(x0, T, u), before)
+    assert torch.equal(model.predict(x0, T, Signal(T, u)), before)
+    assert not torch.equal(other.predict(x0, T, Signal(T, u)), before)
 
 
 def test_every_parameter_that_moves_the_state_has_a_gradient(kind):
     model = make_model(kind)
     x0, u = windows()
-    model.increments(x0, T, u).square().sum().backward()
+    model.increments(x0, T, Signal(T, u)).square().sum().backward()
     still = {n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()}
     # A constant added to V moves nothing.
     assert still == ({"potential.network.layers.2.bias"} if kind in ("lnn", "hnn") else set())
@@ -117,7 +122,7 @@ def test_every_parameter_that_moves_the_state_has_a_gradient(kind):
 
 
 def loss_and_gradients(model, x0, t, u):
-    increments = model.increments(x0, t, u)
+    increments = model.increments(x0, t, Signal(t, u))
     parameters = list(model.parameters())
     gradients = torch.autograd.grad(
         (increments / STEP).square().mean(), parameters, allow_unused=True, materialize_grads=True
@@ -128,7 +133,7 @@ def loss_and_gradients(model, x0, t, u):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", CONTINUOUS)
 def test_a_compiled_model_has_the_same_increments_and_gradients(monkeypatch, kind):
-    """Building takes minutes: tests/training/test_impulse.py does it for a Lagrangian network."""
+    """Traced and differentiated ahead of time; building the programs would take minutes."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
     # Few small layers: compiling takes longer the more there are.
     heads = {
@@ -143,13 +148,8 @@ def test_a_compiled_model_has_the_same_increments_and_gradients(monkeypatch, kin
         model = make_structured(kind, 2, 2, dtype=torch.float32, **heads)
     x0, u = windows(dtype=torch.float32)
     expected, expected_gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
-    model.compile_derivative()
-    calls = []
-    compiled = model._compiled
-    model._compiled = lambda x, u: calls.append(x.shape) or compiled(x, u)
-    model.train()
-    actual, gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
-    assert len(calls) == 4  # the stages of one step
+    with integrated_by(model, CompiledDynamics(model.integrator, model)):
+        actual, gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
     assert_near(actual, expected, 1e-4)
     overall = max(float(g.abs().max()) for g in expected_gradients)
     assert overall > 1e-3
@@ -158,26 +158,3 @@ def test_a_compiled_model_has_the_same_increments_and_gradients(monkeypatch, kin
     ):
         difference = float((a - e).abs().max())
         assert difference <= 1e-4 * max(float(e.abs().max()), 1e-2 * overall), name
-    model.eval()
-    loss_and_gradients(model, x0, T[:2], u[:, :2])
-    assert len(calls) == 4  # validation runs eagerly
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
-@pytest.mark.parametrize("kind", CONTINUOUS)
-def test_a_copy_goes_without_the_compiled_function(kind, copied):
-    model = make_model(kind)
-    model.compile_derivative()
-    assert model._compiled is not None
-    other = copied(model)
-    assert other._compiled is None
-    assert model._compiled is not None
-    x0, u = windows()
-    assert torch.equal(other.predict(x0, T, u), model.eval().predict(x0, T, u))
-    assert "_compiled" not in model.state_dict()
-
-
-def test_only_a_model_with_a_derivative_can_compile_it(kind):
-    model = make_model(kind)
-    assert hasattr(model, "compile_derivative") == isinstance(model, ContinuousPredictor)
-    assert isinstance(model, ContinuousPredictor) == (kind in CONTINUOUS)

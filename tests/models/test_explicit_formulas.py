@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from pinn_dyn.mechanics import Signal
 from tests.models.autodiff import autodiff_derivative, rk4_increment
 from tests.models.builders import CHAIN, TRANSPOSED, VARIANTS, make_structured, random_batch
 from tests.support.finite_differences import assert_near, slope
@@ -39,7 +40,7 @@ def test_a_step_and_its_gradients_are_those_of_the_scalar_function(kind, variant
     x, u, target = batch_of(model)
     leaves = [*model.parameters(), x.requires_grad_(True), u.requires_grad_(True)]
     t = torch.tensor([0.0, STEP], dtype=torch.float64)
-    own = model.increments(x, t, torch.stack([u, 0.5 * u], -2))[..., -1, :]
+    own = model.increments(x, t, Signal(t, torch.stack([u, 0.5 * u], -2)))[..., -1, :]
     plain = rk4_increment(lambda x, u: autodiff_derivative(model, x, u), x, u, 0.5 * u, STEP)
     assert_near(own, plain, 1e-9)
     gradients = [
@@ -65,7 +66,7 @@ def test_gradients_of_single_weights_are_finite_differences(kind):
     t = torch.tensor([0.0, STEP], dtype=torch.float64)
 
     def loss():
-        increments = model.increments(x, t, torch.stack([u, 0.5 * u], -2))[..., -1, :]
+        increments = model.increments(x, t, Signal(t, torch.stack([u, 0.5 * u], -2)))[..., -1, :]
         return (increments / STEP - target).square().mean()
 
     loss().backward()

@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.integrate import quad
 
+from pinn_dyn.mechanics import Rosenbrock, Signal
 from pinn_dyn.models import (
     MLP,
     AccelerationMLP,
@@ -78,11 +79,11 @@ def rubbing_mass():
 def test_the_rosenbrock_method_takes_steps_far_longer_than_friction():
     """Near rest the speed decays at c/(m w): steps of 20 of its times come to rest all the same."""
     model, mass, level, width = rubbing_mass()
-    model.integrator = "rosenbrock"
+    model.integrator = Rosenbrock()
     t = 20 * mass * width / level * torch.arange(21, dtype=torch.float64)
     x0 = torch.tensor([[0.0, 0.2 * width]], dtype=torch.float64)
     with torch.no_grad():
-        v = model.predict(x0, t, torch.zeros(1, 21, 1, dtype=torch.float64))[0, :, 1]
+        v = model.predict(x0, t, Signal(t, torch.zeros(1, 21, 1, dtype=torch.float64)))[0, :, 1]
     assert (v.abs() <= x0[0, 1]).all()
     assert v[-1].abs() < 1e-6 * x0[0, 1]
 
@@ -94,7 +95,7 @@ def test_friction_alone_stops_a_free_mass_and_takes_its_energy():
     v0 = 2 * width
     x0 = torch.tensor([[0.0, v0]], dtype=torch.float64)
     with torch.no_grad():
-        x = model.predict(x0, t, torch.zeros(1, 401, 1, dtype=torch.float64))
+        x = model.predict(x0, t, Signal(t, torch.zeros(1, 401, 1, dtype=torch.float64)))
     expected = width * torch.asinh(
         torch.sinh(x0[:, 1:] / width) * torch.exp(-level * t / (mass * width))
     )
@@ -125,7 +126,7 @@ def test_black_boxes_see_angles_too(kind):
 
     def increments(q):
         x0 = torch.cat([q, v], -1)
-        return model.increments(x0, t, u[:, None].expand(-1, 2, -1))
+        return model.increments(x0, t, Signal(t, u[:, None].expand(-1, 2, -1)))
 
     turn = torch.tensor([0.0, 2 * torch.pi], dtype=torch.float64)
     assert_near(increments(q + turn), increments(q), 1e-11)

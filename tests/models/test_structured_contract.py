@@ -3,13 +3,11 @@
 import pytest
 import torch
 
-from pinn_dyn.training import ImpulseLoss
 from tests.contracts.mechanical_system import MechanicalSystemContract
 from tests.models.builders import (
     NONLINEAR,
     TRANSPOSED,
     VARIANTS,
-    make_statistics,
     make_structured,
     random_batch,
 )
@@ -53,15 +51,3 @@ def test_a_nonlinear_input_moves_the_robot_in_every_form(kind):
     mass_rate = torch.func.jvp(model.mass_matrix, (q,), (v,))[1]
     expected = (model.mass_matrix(q) @ a[..., None] + mass_rate @ v[..., None])[..., 0]
     assert_near(rates, torch.cat([v, expected], -1), 1e-9)
-
-
-@pytest.mark.parametrize("kind", ["lnn", "hnn"])
-def test_an_integrator_that_is_not_there_is_refused(kind):
-    with pytest.raises(ValueError, match="integrator is 'euler', expected one of rk4, rosenbrock"):
-        make_structured(kind, integrator="euler")
-
-
-def test_a_nonlinear_input_is_refused_by_the_loss_that_needs_a_matrix():
-    model = make_structured("lnn", **NONLINEAR)
-    with pytest.raises(ValueError, match=r"not linear in the input .* take loss=increment"):
-        ImpulseLoss(make_statistics(2, 3), model)

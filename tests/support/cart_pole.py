@@ -14,8 +14,8 @@ class CartPole(MechanicalSystem):
 
     gravity = 9.81
 
-    def __init__(self, coordinates="velocity"):
-        super().__init__(num_coordinates=2, num_inputs=1, coordinates=coordinates)
+    def __init__(self, state="qv"):
+        super().__init__(num_coordinates=2, num_inputs=1, state=state)
         self.cart = nn.Parameter(torch.tensor(1.5, dtype=torch.float64))
         self.bob = nn.Parameter(torch.tensor(0.4, dtype=torch.float64))
         self.rod = nn.Parameter(torch.tensor(0.6, dtype=torch.float64))

@@ -11,9 +11,9 @@ from pinn_dyn.mechanics import MechanicalSystem
 class LinearSystem(MechanicalSystem):
     """M dv/dt + D v + K q = A u with constant matrices, all of them parameters."""
 
-    def __init__(self, mass, stiffness, damping, inputs, coordinates="velocity"):
+    def __init__(self, mass, stiffness, damping, inputs, state="qv"):
         inputs = torch.as_tensor(inputs, dtype=torch.float64)
-        super().__init__(inputs.shape[0], inputs.shape[1], coordinates)
+        super().__init__(inputs.shape[0], inputs.shape[1], state)
         self.mass = nn.Parameter(torch.as_tensor(mass, dtype=torch.float64))
         self.stiffness = nn.Parameter(torch.as_tensor(stiffness, dtype=torch.float64))
         self.damping = nn.Parameter(torch.as_tensor(damping, dtype=torch.float64))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pinn_dyn.data import DataSource, DynamicsData, Splits
-from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import (
     ConstantCholesky,
     ConstantInput,
@@ -29,7 +29,7 @@ class Swings(DataSource):
         for k in range(3):
             angle = t.unsqueeze(-1) * torch.tensor([1.0, 2.0]) + k
             q, v = torch.cos(angle), -torch.sin(angle) * torch.tensor([1.0, 2.0])
-            made.append(Trajectory(t, q.double(), v.double(), torch.zeros_like(q).double()))
+            made.append(Trajectory(q.double(), v.double(), Signal(t, torch.zeros_like(q).double())))
         return Splits(made[:1], made[1:2], made[2:])
 
 
@@ -68,7 +68,7 @@ def plain_loop(model, data):
     loss_of = IncrementLoss(data.statistics, model)
     optimizer = torch.optim.AdamW(model.parameters(), weight_decay=1e-5)
     total, losses = EPOCHS * BATCHES, []
-    rise = 0.05 * total - 1
+    rise = max(0.05 * total, 2) - 1
     loader = data.train_dataloader()
     for epoch in range(EPOCHS):
         loader.sampler.set_epoch(epoch)
@@ -82,7 +82,7 @@ def plain_loop(model, data):
                 start, end, part = RATE, RATE / 25e3, (step - rise) / (total - 1 - rise)
             rate = end + (start - end) * (1 + math.cos(math.pi * part)) / 2
             optimizer.param_groups[0]["lr"] = rate
-            loss = loss_of(model, batch, step / total)
+            loss = loss_of(model, loss_of.selected(batch, step / total))
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import lightning as L
 import numpy as np
 import pytest
 import torch
@@ -10,60 +9,15 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import OneCycleLR
 
-from pinn_dyn.data import DataSource, DynamicsData, Splits, simulate
-from pinn_dyn.mechanics import Trajectory
-from pinn_dyn.models import (
-    AccelerationMLP,
-    ConstantCholesky,
-    ConstantInput,
-    HamiltonianNetwork,
-    LagrangianNetwork,
-    NetworkPotential,
-    NextStateMLP,
-)
+from pinn_dyn.data import DynamicsData
+from pinn_dyn.models import AccelerationMLP
 from pinn_dyn.training import DynamicsLearner, IncrementLoss, NonFiniteLossError, WindowLoss
-from tests.support.linear import damped_oscillators
-
-HEADS = dict(
-    potential=partial(NetworkPotential, hidden=[8]),
-    damping=partial(ConstantCholesky, epsilon=0.0),
-    input=ConstantInput,
-)
-MODELS = {
-    "lnn": lambda statistics: LagrangianNetwork(statistics, ConstantCholesky, **HEADS),
-    "hnn": lambda statistics: HamiltonianNetwork(statistics, ConstantCholesky, **HEADS),
-    "acceleration": lambda statistics: AccelerationMLP(statistics, [16]),
-    "next state": lambda statistics: NextStateMLP(statistics, [16]),
-}
-
-
-class Oscillators(DataSource):
-    """Trajectories of two coupled damped masses."""
-
-    def __init__(self, splits):
-        self.splits = splits
-
-    def load(self):
-        return self.splits
+from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
 
 @pytest.fixture(scope="module")
 def splits():
-    system = damped_oscillators().requires_grad_(False)
-    rng = np.random.default_rng(0)
-    t = np.linspace(0, 2, 101)
-    phase = rng.uniform(0, 6, (6, 1, 1))
-
-    def signal(s):
-        return np.sin(3 * s[:, None] + phase)
-
-    q, v = simulate(system, *rng.uniform(-1, 1, (2, 6, 2)), signal, t)
-    q, v, u = (torch.from_numpy(np.ascontiguousarray(x)) for x in (q, v, signal(t)))
-    made = [
-        Trajectory(torch.from_numpy(t), q[k], v[k], u[k], momentum=system.momentum)
-        for k in range(6)
-    ]
-    return Splits(made[:4], made[4:5], made[5:])
+    return make_splits()
 
 
 @pytest.fixture
@@ -92,24 +46,10 @@ def make_learner(model, data, validator=lambda model, truth: {"error_mean": 1.0}
     )
 
 
-def make_trainer(folder, *, max_epochs, **extra):
-    return L.Trainer(
-        accelerator="cpu",
-        max_epochs=max_epochs,
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        inference_mode=False,
-        default_root_dir=folder,
-        **extra,
-    )
-
-
 def loss_of(learner, data):
     windows = data.windows.to(torch.device("cpu"), torch.float32)
     with torch.no_grad():
-        return float(learner.loss(learner.model, windows, 0.0))
+        return float(learner.loss(learner.model, windows))
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -131,7 +71,7 @@ def test_the_logged_loss_is_that_of_the_batches(tmp_path, data):
     expected = []
     for batch in loader:
         with torch.no_grad():
-            expected.append(float(learner.loss(learner.model, batch, 0.0)))
+            expected.append(float(learner.loss(learner.model, batch)))
     assert len(expected) == 30
     assert float(trainer.callback_metrics["train/loss"]) == pytest.approx(
         np.mean(expected), rel=1e-5
@@ -145,12 +85,12 @@ class Recorder(WindowLoss):
         super().__init__()
         self.seen = []
 
-    def forward(self, model, windows, progress):
+    def selected(self, windows, progress):
         self.seen.append(progress)
-        return sum(p.sum() for p in model.parameters())
+        return windows
 
-    def compile_dynamics(self, model, steps):
-        raise AssertionError("nothing to compile")
+    def forward(self, model, windows):
+        return sum(p.sum() for p in model.parameters())
 
 
 def test_the_loss_is_told_how_far_the_training_is(tmp_path, data):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.mechanics import ContinuousPredictor, Trajectory
+from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
@@ -28,14 +28,14 @@ STATISTICS = Statistics(
     u_mean=torch.zeros(1, dtype=torch.float64),
     u_std=torch.ones(1, dtype=torch.float64),
     # One row per step of a window, (q, v) or (q, p) in the columns.
-    velocity_increment_std=torch.tensor([[0.5, 2.0], [1.0, 4.0]], dtype=torch.float64),
-    momentum_increment_std=torch.tensor([[0.5, 8.0], [1.0, 16.0]], dtype=torch.float64),
+    qv_increment_std=torch.tensor([[0.5, 2.0], [1.0, 4.0]], dtype=torch.float64),
+    qp_increment_std=torch.tensor([[0.5, 8.0], [1.0, 16.0]], dtype=torch.float64),
     step=0.01,
 )
 ONE_STEP = replace(
     STATISTICS,
-    velocity_increment_std=STATISTICS.velocity_increment_std[:1],
-    momentum_increment_std=STATISTICS.momentum_increment_std[:1],
+    qv_increment_std=STATISTICS.qv_increment_std[:1],
+    qp_increment_std=STATISTICS.qp_increment_std[:1],
 )
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[4]),
@@ -84,7 +84,7 @@ def test_the_velocity_half_has_a_weight(kind):
     q_half = (36 + 0 + 4 + 4) / 8
     expected = q_half + 0.25 * (BY_HAND[kind] - q_half)
     assert float(loss.error(PREDICTED, MEASURED)) == pytest.approx(expected, rel=1e-6)
-    assert float(STATISTICS.velocity_increment_std[0, 1]) == 2.0
+    assert float(STATISTICS.qv_increment_std[0, 1]) == 2.0
 
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, float("nan")])
@@ -153,7 +153,7 @@ def test_the_configuration_half_counts_but_in_one_step_where_it_holds_by_constru
     kind, statistics, sees
 ):
     loss = IncrementLoss(statistics, MODELS[kind]())
-    measured = MEASURED[:, : len(statistics.velocity_increment_std)]
+    measured = MEASURED[:, : len(statistics.qv_increment_std)]
     moved = measured.clone()
     moved[..., 0] += 1
     assert (float(loss.error(moved, measured)) > 0) == sees
@@ -177,7 +177,7 @@ class Drift(ContinuousPredictor):
     """dq/dt = v, dv/dt = u, and a count of the evaluations."""
 
     def __init__(self):
-        super().__init__(1, 1, "velocity")
+        super().__init__(1, 1)
         self.calls = 0
 
     def state_derivative(self, x, u):
@@ -190,7 +190,7 @@ def windows():
     generator = torch.Generator().manual_seed(0)
     t = torch.arange(60, dtype=torch.float64) * 0.01
     q, v, u = torch.randn(3, 60, 1, generator=generator, dtype=torch.float64)
-    return draw_windows([Trajectory(t, q, v, u)], count=8, steps=10, stride=2, seed=0)
+    return draw_windows([Trajectory(q, v, Signal(t, u))], count=8, steps=10, stride=2, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -200,17 +200,17 @@ def windows():
 def test_a_curriculum_rolls_out_and_compares_the_first_steps_alone(windows, progress, steps):
     model = Drift()
     loss = IncrementLoss(windows.statistics(), model, curriculum=[1, 2, 5, 10]).double()
-    found = float(loss(model, windows, progress))
+    found = float(loss(model, loss.selected(windows, progress)))
     assert model.calls == 4 * steps
     # By hand: under a linear input the steps are those of the trapezoidal rule in v.
     u = windows.u
     dv = (0.01 * 0.5 * (u[:, 1:] + u[:, :-1])).cumsum(1)[:, 1::2]
-    spread = windows.statistics().velocity_increment_std
+    spread = windows.statistics().qv_increment_std
     residual = ((dv - windows.dv) / spread[:, 1:])[:, :steps]
     if steps == 1:  # q counts from two steps on
         assert found == pytest.approx(float(residual.square().mean()), rel=1e-6)
     else:
-        with_q = model.predict(windows.start("velocity"), windows.t, u, t_input=windows.t_input)
+        with_q = model.predict(windows.start("qv"), windows.t, windows.input)
         dq = (with_q[:, 1:, :1] - windows.q[:, None] - windows.dq) / spread[:, :1]
         both = torch.cat([dq[:, :steps], residual], -1)
         assert found == pytest.approx(float(both.square().mean()), rel=1e-6)
@@ -220,23 +220,15 @@ def test_every_epoch_belongs_to_one_stage(windows):
     """Also where the fraction of the training is not a round number."""
     for epochs in range(1, 60):
         loss = IncrementLoss(windows.statistics(), Drift(), curriculum=list(range(1, 11)))
-        stages = [loss.steps(epoch / epochs) for epoch in range(epochs)]
+        stages = [len(loss.selected(windows, k / epochs).t) - 1 for k in range(epochs)]
         assert stages == [1 + epoch * 10 // epochs for epoch in range(epochs)]
 
 
 def test_without_a_curriculum_all_steps_count_from_the_start(windows):
     model = Drift()
-    IncrementLoss(windows.statistics(), model)(model, windows, 0.0)
+    loss = IncrementLoss(windows.statistics(), model).double()
+    loss(model, loss.selected(windows, 0.0))
     assert model.calls == 40
-
-
-@pytest.mark.parametrize("kind", MODELS)
-def test_what_it_compiles_is_the_state_derivative_where_there_is_one(monkeypatch, kind):
-    compiled = []
-    monkeypatch.setattr(torch, "compile", lambda function: compiled.append(function) or function)
-    model = MODELS[kind]()
-    IncrementLoss(STATISTICS, model).compile_dynamics(model, steps=100)
-    assert compiled == ([] if kind == "next state" else [model.state_derivative])
 
 
 @pytest.mark.parametrize("curriculum", [[], [1, 2], [1, 20], [0, 10], [5, 2, 10], [1, 1, 10]])
@@ -250,38 +242,14 @@ def test_cut_windows_are_windows_of_fewer_steps(interpolation):
     generator = torch.Generator().manual_seed(0)
     t = torch.arange(21, dtype=torch.float64) * 0.01
     q, v, u = torch.randn(3, 21, 2, generator=generator, dtype=torch.float64)
-    trajectory = Trajectory(t, q, v, u, interpolation=interpolation, momentum=lambda q, v: 2 * v)
+    trajectory = Trajectory(q, v, Signal(t, u, interpolation), momentum=lambda q, v: 2 * v)
     # One start each, the first sample.
     whole = draw_windows([trajectory], count=1, steps=5, stride=4, seed=0)
-    short = Trajectory(t[:9], q[:9], v[:9], u[:9], interpolation=interpolation)
+    short = Trajectory(q[:9], v[:9], Signal(t[:9], u[:9], interpolation))
     short = replace(short, momentum=trajectory.momentum)
     expected = draw_windows([short], count=1, steps=2, stride=4, seed=0)
-    for name, value in vars(whole.first(2)).items():
-        wanted = getattr(expected, name)
-        assert torch.equal(value, wanted) if isinstance(value, torch.Tensor) else value == wanted
-
-
-def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
-    model = MODELS["lnn"]().double()
-    generator = torch.Generator().manual_seed(0)
-    t = torch.arange(40, dtype=torch.float64) * ONE_STEP.step
-    q, v, u = torch.randn(3, 40, 1, generator=generator, dtype=torch.float64)
-    path = Trajectory(t, q, v, u)
-    windows = draw_windows([path], count=25, steps=2, stride=1, seed=0)
-    found = []
-    for compiled in (False, True):
-        loss = IncrementLoss(STATISTICS, model).double()
-        loss._compiled = compiled  # what cuts a batch into parts; nothing is compiled here
-        monkeypatch.setattr("pinn_dyn.training.losses.CHUNK", 7)
-        value = loss(model, windows, 0.0)
-        gradients = torch.autograd.grad(3 * value, list(model.parameters()), allow_unused=True)
-        found.append((value, gradients))
-    (whole, expected), (parts, actual) = found
-    assert type(whole.grad_fn) is not type(parts.grad_fn)
-    torch.testing.assert_close(parts, whole, rtol=1e-13, atol=0)
-    assert any(gradient is not None for gradient in expected)
-    for a, b in zip(actual, expected, strict=True):
-        if b is None:
-            assert a is None
-        else:
-            torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-14)
+    found = whole.first(2)
+    for name in ("t", "q", "v", "p", "dq", "dv", "dp", "u"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    assert torch.equal(found.input.t, expected.input.t)
+    assert found.input.interpolation == interpolation

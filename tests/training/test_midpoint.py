@@ -9,18 +9,19 @@ import torch
 from numpy.polynomial import Polynomial
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, Trajectory
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 from pinn_dyn.training import MidpointLoss
-from pinn_dyn.training.midpoint import midpoint
+from pinn_dyn.training.losses.midpoint import midpoint
 from tests.models.builders import make_model, perturb
-from tests.training.test_whole_step import make_windows, one_step
+from tests.support.windows import for_members, make_windows, one_step
 
 
 class Force(ContinuousPredictor):
     """dq/dt = v, dv/dt = -k q + u; or, with momenta, the same for a unit mass."""
 
-    def __init__(self, stiffness, coordinates="velocity"):
-        super().__init__(1, 1, coordinates)
+    def __init__(self, stiffness, state="qv"):
+        super().__init__(1, 1, state)
         self.stiffness = stiffness
 
     def state_derivative(self, x, u):
@@ -32,8 +33,8 @@ def relative_error(windows, model):
     """Root mean square of dv^ - dv over that of dv."""
     loss = MidpointLoss(windows.statistics(), model).double()
     with torch.no_grad():
-        value = float(loss(model, windows, 0.0))
-    return math.sqrt(value) * float(loss.scale[0, -1] / windows.dv.square().mean().sqrt())
+        value = float(loss(model, windows))
+    return math.sqrt(value) * float(loss.scale[-1] / windows.dv.square().mean().sqrt())
 
 
 def test_the_middle_is_that_of_a_cubic():
@@ -55,31 +56,33 @@ def test_the_input_is_its_mean_over_the_step(interpolation, expected):
     windows = make_windows(5, interpolation=interpolation)
     h = float(windows.t[1])
     u = torch.tensor([[1.0], [3.0], [2.0]], dtype=torch.float64).expand(5, 3, 1)
-    windows = replace(windows, u=u, dv=torch.full_like(windows.dv, expected * h))
+    windows = replace(
+        windows, input=windows.input.with_samples(u), dv=torch.full_like(windows.dv, expected * h)
+    )
     assert relative_error(windows, Force(0.0)) < 1e-7
     wrong = replace(windows, dv=1.1 * windows.dv)
     assert relative_error(wrong, Force(0.0)) == pytest.approx(0.1 / 1.1, rel=1e-5)
 
 
-@pytest.mark.parametrize(("coordinates", "constant"), [("velocity", 24), ("momentum", 12)])
-def test_on_an_oscillation_the_error_is_that_of_the_docstring(coordinates, constant):
+@pytest.mark.parametrize(("state", "constant"), [("qv", 24), ("qp", 12)])
+def test_on_an_oscillation_the_error_is_that_of_the_docstring(state, constant):
     """(r h)^2/24 for r rad/s, from the exact motion q = cos(r t)."""
     rate, errors = 7.0, []
     for h in (0.02, 0.01):
         t = torch.arange(0, 40, h, dtype=torch.float64)[:, None]
         q, v = torch.cos(rate * t), -rate * torch.sin(rate * t)
-        motion = Trajectory(t[:, 0], q, v, torch.zeros_like(q), momentum=lambda q, v: v)
+        motion = Trajectory(q, v, Signal(t[:, 0], torch.zeros_like(q)), momentum=lambda q, v: v)
         windows = draw_windows([motion], count=len(t) - 1, steps=1, stride=1, seed=0)
-        model = Force(rate**2, coordinates)
+        model = Force(rate**2, state)
         loss = MidpointLoss(windows.statistics(), model).double()
-        x0, dx = windows.start(coordinates), windows.increments(coordinates)[:, 0]
+        x0, dx = windows.start(state), windows.increments(state)[:, 0]
         middle = midpoint(torch.tensor(h), x0, dx) if constant == 24 else x0 + dx / 2
         residual = h * model.state_derivative(middle, windows.u[:, 0]) - dx
         errors.append(float(residual[:, 1].norm() / dx[:, 1].norm()))
         assert errors[-1] == pytest.approx((rate * h) ** 2 / constant, rel=0.01)
-        by_hand = (residual / windows.statistics().velocity_increment_std[0]).square()
+        by_hand = (residual / windows.statistics().qv_increment_std[0]).square()
         by_hand = by_hand[:, 1].mean() if constant == 24 else by_hand.mean()
-        assert float(loss(model, windows, 0.0)) == pytest.approx(float(by_hand), rel=1e-4)
+        assert float(loss(model, windows)) == pytest.approx(float(by_hand), rel=1e-4)
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.02)
 
 
@@ -89,19 +92,16 @@ def test_a_window_costs_one_evaluation():
     derivative = model.state_derivative
     model.state_derivative = lambda x, u: calls.append(x.shape) or derivative(x, u)
     loss = MidpointLoss(one_step(size=2), model).double()
-    loss(model, make_windows(4, size=2), 0.0)
+    loss(model, make_windows(4, size=2))
     assert calls == [(4, 4)]
-    assert loss.evaluations(model, make_windows(4, size=2)) == 1
 
 
 def test_members_of_an_ensemble_have_the_losses_they_have_alone():
     members = [perturb(make_model("lnn"), seed=k) for k in range(3)]
     batches = [make_windows(4, size=2, seed=k) for k in range(3)]
     loss = MidpointLoss(one_step(size=2), members[0]).double()
-    names = ("q", "v", "p", "dq", "dv", "dp", "u")
-    rows = {name: torch.stack([getattr(x, name) for x in batches]) for name in names}
-    found = loss(Ensemble(members).stack, replace(batches[0], **rows), 0.0)
-    alone = [loss(model, batch, 0.0) for model, batch in zip(members, batches, strict=True)]
+    found = loss(Ensemble(members).stack, for_members(batches))
+    alone = [loss(model, batch) for model, batch in zip(members, batches, strict=True)]
     torch.testing.assert_close(found, torch.stack(alone), rtol=1e-10, atol=0)
     assert len({float(value) for value in alone}) == 3
 
@@ -109,6 +109,6 @@ def test_members_of_an_ensemble_have_the_losses_they_have_alone():
 def test_it_refuses_a_model_without_a_derivative_and_windows_of_several_steps():
     with pytest.raises(TypeError, match=r"NextStateMLP, expected .*take loss=increment"):
         MidpointLoss(one_step(size=2), make_model("next_state"))
-    two = replace(one_step(size=2), velocity_increment_std=torch.ones(2, 4))
+    two = replace(one_step(size=2), qv_increment_std=torch.ones(2, 4))
     with pytest.raises(ValueError, match=r"have 2 steps, expected one: set data.steps=1"):
         MidpointLoss(two, make_model("lnn"))

@@ -26,7 +26,7 @@ from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.splits import Part, split
 from pinn_dyn.data.logs.step import Step, sample_time
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.mechanics import Interpolation, Trajectory
+from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
 
 @dataclass(frozen=True)
@@ -317,13 +317,12 @@ class LogSource(DataSource):
         return [self._trajectory(piece, step) for piece in pieces]
 
     def _trajectory(self, recording: Recording, step: float) -> Trajectory:
-        return Trajectory(
-            t=torch.arange(len(recording), dtype=torch.float64) * step,
-            q=torch.from_numpy(np.ascontiguousarray(recording.q)),
-            v=torch.from_numpy(np.ascontiguousarray(recording.v)),
-            u=torch.from_numpy(np.ascontiguousarray(recording.u)),
-            interpolation=self.interpolation,
+        q, v, u = (
+            torch.from_numpy(np.ascontiguousarray(values))
+            for values in (recording.q, recording.v, recording.u)
         )
+        t = torch.arange(len(recording), dtype=torch.float64) * step
+        return Trajectory(q, v, Signal(t, u, self.interpolation))
 
 
 def _summary(recordings: list[Recording], step: float) -> str:

@@ -148,7 +148,7 @@ def _trajectories(
         for index, (name, item) in enumerate(predictions.items())
     ]
     panels.append(Panel(_with_unit("‖q̂ − q‖₂", labels), distances, log=True))
-    held = truth.interpolation == "hold"
+    held = truth.input.interpolation == "hold"
     for k, label in enumerate(input_labels):
         line = Line("input", truth.t, truth.u[..., k], DARK, held=held, always=True)
         panels.append(Panel(label, [line]))

@@ -1,69 +1,19 @@
 """Members trained at once end with the weights that trainings of their own give."""
 
-from functools import partial
-
 import pytest
 import torch
 from torch.nn.utils import clip_grad_norm_
-from torch.optim import LBFGS, AdamW
-from torch.optim.lr_scheduler import ConstantLR, OneCycleLR
+from torch.optim import LBFGS
+from torch.optim.lr_scheduler import ConstantLR
 
 from pinn_dyn.data.windows import BatchSampler, WindowLoader
-from pinn_dyn.mechanics import Ensemble
-from pinn_dyn.training import DynamicsLearner, EnsembleLearner, IncrementLoss, NonFiniteLossError
-from pinn_dyn.training.ensemble import clip_by_member
-from tests.models.builders import perturb
-from tests.training.test_learner import MODELS, Oscillators, make_trainer, splits  # noqa: F401
+from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.ensembles.learner import clip_by_member
+from pinn_dyn.training import DynamicsLearner, NonFiniteLossError
+from tests.support.ensembles import learn, make_data, make_models, train
+from tests.support.training import make_trainer
 
 KINDS = ("lnn", "hnn", "acceleration", "next state")
-
-
-@pytest.fixture
-def make_data(splits):  # noqa: F811
-    from pinn_dyn.data import DynamicsData
-
-    def make(members, steps=2):
-        return DynamicsData(
-            Oscillators(splits),
-            pairs=128,
-            steps=steps,
-            stride=2,
-            batch_size=32,
-            batches_per_epoch=20,
-            seed=4,
-            members=members,
-        )
-
-    return make
-
-
-def make_models(kind, data, count):
-    models = []
-    for k in range(count):
-        torch.manual_seed(k)
-        models.append(perturb(MODELS[kind](data.statistics), seed=k, spread=0.2))
-    return models
-
-
-def learn(cls, model, single, data, optimizer=AdamW, compile=False):
-    return cls(
-        model,
-        loss=IncrementLoss(data.statistics, single, curriculum=[1, 2]),
-        optimizer=partial(optimizer, lr=0.01),
-        scheduler=partial(OneCycleLR, max_lr=0.01),
-        validator=lambda model, truth: {"error_mean": 1.0},
-        config={},
-        statistics=data.statistics,
-        compile=compile,
-    )
-
-
-def train(folder, learner, data, **options):
-    trainer = make_trainer(
-        folder, max_epochs=2, enable_checkpointing=False, gradient_clip_val=0.3, **options
-    )
-    trainer.fit(learner, data)
-    return trainer
 
 
 def trained_alone(folder, kind, data, index):
@@ -79,17 +29,17 @@ def trained_alone(folder, kind, data, index):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_ensemble_of_two_ends_with_the_weights_of_two_trainings(tmp_path, make_data, kind):
+def test_an_ensemble_of_two_ends_with_the_weights_of_two_trainings(tmp_path, kind):
     """Forty steps in two epochs, with clipping, a schedule and a curriculum."""
-    data = make_data(members=2)
+    data = make_data()
     models = make_models(kind, data, 2)
     ensemble = Ensemble(models)
     start = [p.detach().clone() for p in models[0].parameters()]
     learner = learn(EnsembleLearner, ensemble, models[0], data)
-    trainer = train(tmp_path, learner, data)
+    trainer = train(tmp_path, learner, EnsembleData(data, 2))
     losses = []
     for index in range(2):
-        alone, loss = trained_alone(tmp_path, kind, make_data(members=1), index)
+        alone, loss = trained_alone(tmp_path, kind, make_data(), index)
         losses.append(loss)
         member = ensemble.member(index)
         for name, expected in alone.named_parameters():
@@ -127,43 +77,47 @@ def test_each_members_gradient_is_clipped_by_its_own_norm():
     assert norms[1] == pytest.approx(0.5, rel=1e-4)
 
 
-def test_the_ensemble_is_what_is_validated(tmp_path, make_data):
-    data = make_data(members=2)
+def test_the_ensemble_is_what_is_validated(tmp_path):
+    data = make_data()
     models = make_models("lnn", data, 2)
     ensemble, seen = Ensemble(models), []
     learner = learn(EnsembleLearner, ensemble, models[0], data)
     learner.validator = lambda model, truth: seen.append(model) or {"error_mean": 1.0}
-    train(tmp_path, learner, data)
+    train(tmp_path, learner, EnsembleData(data, 2))
     assert seen
     assert all(model is ensemble for model in seen)
 
 
-def test_an_optimizer_that_would_mix_the_members_is_refused(tmp_path, make_data):
-    data = make_data(members=2)
+def test_an_optimizer_that_would_mix_the_members_is_refused(tmp_path):
+    data = make_data()
     models = make_models("acceleration", data, 2)
     learner = learn(EnsembleLearner, Ensemble(models), models[0], data, optimizer=LBFGS)
     learner._scheduler = lambda optimizer, total_steps: ConstantLR(optimizer)
     with pytest.raises(ValueError, match="optimizer is LBFGS, which mixes"):
-        train(tmp_path, learner, data)
+        train(tmp_path, learner, EnsembleData(data, 2))
 
 
-def test_one_member_that_breaks_stops_the_training(tmp_path, make_data):
-    data = make_data(members=2)
+def test_one_member_that_breaks_stops_the_training(tmp_path):
+    data = make_data()
     models = make_models("acceleration", data, 2)
     with torch.no_grad():
         next(models[1].parameters()).fill_(float("nan"))
     learner = learn(EnsembleLearner, Ensemble(models), models[0], data)
     with pytest.raises(NonFiniteLossError, match="became nan at step 0"):
-        train(tmp_path, learner, data)
+        train(tmp_path, learner, EnsembleData(data, 2))
 
 
 @pytest.mark.slow
-def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(tmp_path, make_data, traced):
-    data, weights = make_data(members=2), []
+def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(tmp_path, traced):
+    data, weights = make_data(), []
     for compile in (False, True):
         models = make_models("lnn", data, 2)
         ensemble = Ensemble(models)
-        train(tmp_path, learn(EnsembleLearner, ensemble, models[0], data, compile=compile), data)
+        train(
+            tmp_path,
+            learn(EnsembleLearner, ensemble, models[0], data, compile=compile),
+            EnsembleData(data, 2),
+        )
         weights.append(dict(ensemble.named_parameters()))
     for name, expected in weights[0].items():
         torch.testing.assert_close(weights[1][name], expected, rtol=1e-3, atol=2e-4)

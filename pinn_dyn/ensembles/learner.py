@@ -7,9 +7,12 @@ from pytorch_optimizer import SOAP
 from torch import Tensor
 from torch.optim import SGD, Adagrad, Adam, Adamax, NAdam, Optimizer, RAdam, RMSprop
 
-from pinn_dyn.mechanics import Ensemble, Predictor
-from pinn_dyn.training.learner import DynamicsLearner
-from pinn_dyn.training.member_soap import MemberSOAP
+from pinn_dyn.ensembles.ensemble import Ensemble
+from pinn_dyn.ensembles.gradients import CompiledMembers
+from pinn_dyn.ensembles.member_soap import MemberSOAP
+from pinn_dyn.ensembles.stack import ContinuousStack
+from pinn_dyn.training import DynamicsLearner
+from pinn_dyn.training.gradients import Eager, Engine
 
 # Optimizers that treat every number on its own: for them E stacked weights are E trainings.
 _ELEMENTWISE = (Adam, NAdam, RAdam, Adamax, Adagrad, RMSprop, SGD)
@@ -32,10 +35,12 @@ class EnsembleLearner(DynamicsLearner):
 
     model: Ensemble
 
-    @property
-    def trained(self) -> Predictor:
-        """The members as one model."""
-        return self.model.stack
+    def gradients(self, steps: int) -> Engine:
+        """Those of the members, each in its own parameters."""
+        stack = self.model.stack
+        if self._compile and isinstance(stack, ContinuousStack):
+            return CompiledMembers(self.loss, stack)
+        return Eager(self.loss, stack)
 
     def log_losses(self, losses: Tensor) -> None:
         """Log mean and standard deviation over the members."""

@@ -2,18 +2,21 @@
 
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.mechanics import Ensemble
-from pinn_dyn.mechanics.integration import SampledInput, rollout_increments
-from pinn_dyn.mechanics.steps import input_means, stage_inputs
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
+from pinn_dyn.mechanics.compilation import (
+    CompiledDynamics,
+    CompiledLoop,
+    Unrolled,
+    integrated_by,
+)
+from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkCholesky, NetworkPotential
 from tests.models.builders import make_model, make_structured, perturb
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
-
-RK4_NODES = (0.0, 1 / 3, 2 / 3, 1.0)
 
 
 def samples(batch, count, size, seed=0):
@@ -27,51 +30,6 @@ def uncompiled(monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda function, **_: function)
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "hold"])
-@pytest.mark.parametrize("count", [1, 2, 7])
-def test_stage_inputs_are_those_of_the_sampled_input(interpolation, count):
-    """At random times, inside the samples and beyond both ends."""
-    u = samples((2,), count, 3)
-    t_input = torch.rand(count, generator=torch.Generator().manual_seed(1)).double().cumsum(0)
-    signal = SampledInput(t_input, u, interpolation)
-    grid = torch.linspace(-0.3, float(t_input[-1]) + 0.4, 12, dtype=torch.float64)
-    found = stage_inputs(grid, t_input, u.movedim(-2, 0), interpolation, RK4_NODES)
-    assert found.shape == (11, 4, 2, 3)
-    for k in range(11):
-        h = grid[k + 1] - grid[k]
-        for stage, part in enumerate(RK4_NODES):
-            expected = signal(grid[k] + part * h)
-            torch.testing.assert_close(found[k, stage], expected, rtol=1e-10, atol=1e-10)
-
-
-def test_the_last_stage_of_a_held_input_is_before_the_next_sample():
-    t = torch.tensor([0.0, 0.1, 0.2, 0.3], dtype=torch.float64)
-    u = torch.arange(4.0, dtype=torch.float64)[:, None]
-    found = stage_inputs(t, t, u, "hold", RK4_NODES).squeeze(-1)
-    expected = torch.arange(3.0, dtype=torch.float64)[:, None].expand(3, 4)
-    torch.testing.assert_close(found, expected)
-
-
-@pytest.mark.parametrize("interpolation", ["linear", "hold"])
-@pytest.mark.parametrize("count", [1, 2, 9])
-def test_input_means_are_those_of_the_sampled_input(interpolation, count):
-    """Steps of many samples, within one, and beyond both ends, summed between all knots."""
-    u = samples((2,), count, 3)
-    t_input = torch.rand(count, generator=torch.Generator().manual_seed(1)).double().cumsum(0)
-    signal = SampledInput(t_input, u, interpolation)
-    grid = torch.linspace(-0.3, float(t_input[-1]) + 0.4, 6, dtype=torch.float64)
-    found = input_means(grid, t_input, u.movedim(-2, 0), interpolation)
-    assert found.shape == (5, 2, 3)
-    for k in range(5):
-        start, end = float(grid[k]), float(grid[k + 1])
-        inside = [float(t) for t in t_input if start < t < end]
-        knots = np.array([start, *inside, end])
-        # Between two knots the input is a line, so its mean is that in the middle.
-        middle = torch.stack([signal(t) for t in torch.from_numpy(knots[:-1] + knots[1:]) / 2])
-        expected = np.einsum("i,i...", np.diff(knots), middle.numpy()) / (end - start)
-        np.testing.assert_allclose(found[k], expected, rtol=0, atol=1e-12)
-
-
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
 @pytest.mark.parametrize("batch", [(), (2, 3)])
@@ -82,15 +40,14 @@ def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
     t_input = 0.02 * torch.arange(141, dtype=torch.float64)
     u = samples(batch, 141, 1)
     x0 = samples(batch, 1, 4, seed=1).squeeze(-2)
-    options = dict(t_input=t_input, interpolation=interpolation, substeps=substeps)
-    expected, found = (
-        rollout_increments(
-            system.velocity_derivative, x0, t_input[::2], u, compile=compile, **options
-        )
-        for compile in (False, True)
+    signal, plain = Signal(t_input, u, interpolation), RK4(substeps)
+    expected, unrolled, looped = (
+        path_between(system, integrator, x0, t_input[::2], signal)
+        for integrator in (plain, Unrolled(plain), CompiledLoop(plain))
     )
-    assert found.shape == (*batch, 71, 4)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert expected.shape == (*batch, 71, 4)
+    torch.testing.assert_close(unrolled, expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(looped, expected, rtol=0, atol=1e-12)
 
 
 # The Rosenbrock method.
@@ -102,8 +59,8 @@ def overdamped(rate):
 
 
 def rosenbrock_path(system, x0, t, u, interpolation, substeps=1):
-    system.integrator, system.substeps = "rosenbrock", substeps
-    return system.predict(x0, t, u, interpolation=interpolation)
+    system.integrator = Rosenbrock(substeps)
+    return system.predict(x0, t, Signal(t, u, interpolation))
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
@@ -122,33 +79,33 @@ def test_the_rosenbrock_method_is_of_second_order(interpolation):
     assert 3.5 < errors[1] / errors[2] < 4.5
 
 
-@pytest.mark.parametrize("coordinates", ["velocity", "momentum"])
-def test_the_rosenbrock_method_takes_steps_far_longer_than_the_damping(coordinates):
+@pytest.mark.parametrize("state", ["qv", "qp"])
+def test_the_rosenbrock_method_takes_steps_far_longer_than_the_damping(state):
     """Steps of 0.1 s where the damper acts in 0.1 ms: RK4 would need steps below 0.3 ms."""
     system = overdamped(rate=1e4)
-    system.coordinates = coordinates
+    system.state = state
     t = 0.1 * torch.arange(21, dtype=torch.float64)
     u = torch.sin(t)[:, None]
     start = torch.tensor([0.3, 0.5], dtype=torch.float64)
     expected = exact_solution(system, start, t, u, "linear")[:, 0]
-    x0 = start if coordinates == "velocity" else start * torch.tensor([1.0, 1e-4])
+    x0 = start if state == "qv" else start * torch.tensor([1.0, 1e-4])
     found = rosenbrock_path(system, x0, t, u, "linear")[:, 0]
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-3)
-    system.integrator = "rk4"
-    assert not (system.predict(x0, t, u)[:, 0].abs() < 1e3).all()
+    system.integrator = RK4()
+    assert not (system.predict(x0, t, Signal(t, u))[:, 0].abs() < 1e3).all()
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
 def test_a_rosenbrock_step_over_many_samples_of_the_input_loses_no_impulse(interpolation):
     """A body without inertia or spring follows its input: q is the integral of u."""
     system = LinearSystem([[1e-6]], [[0.0]], [[1.0]], [[1.0]]).requires_grad_(False)
-    system.integrator = "rosenbrock"
+    system.integrator = Rosenbrock()
     t = 0.02 * torch.arange(51, dtype=torch.float64)
     u = samples((), 51, 1)
     left, right = (u[:-1], u[:-1]) if interpolation == "hold" else (u[:-1], u[1:])
     moved = torch.cat([torch.zeros(1).double(), ((left + right) / 2 * 0.02).cumsum(0)[:, 0]])
     x0 = torch.zeros(2, dtype=torch.float64)
-    found = system.predict(x0, t[::10], u, t_input=t, interpolation=interpolation)[:, 0]
+    found = system.predict(x0, t[::10], Signal(t, u, interpolation))[:, 0]
     assert moved[::10].diff().abs().max() > 0.04
     torch.testing.assert_close(found, moved[::10], rtol=0, atol=1e-4)
 
@@ -158,9 +115,9 @@ def test_the_rosenbrock_method_and_rk4_find_the_same_motion_of_a_network(kind):
     t = 0.001 * torch.arange(41, dtype=torch.float64)
     u, x0 = samples((4,), 41, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
     model = make_structured(kind).eval().requires_grad_(False)
-    expected = model.predict(x0, t, u)
-    model.integrator = "rosenbrock"
-    found = model.predict(x0, t, u)
+    expected = model.predict(x0, t, Signal(t, u))
+    model.integrator = Rosenbrock()
+    found = model.predict(x0, t, Signal(t, u))
     assert (expected[:, -1] - x0).abs().max() > 0.01
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
 
@@ -170,11 +127,11 @@ def test_the_gradient_through_the_rosenbrock_method_is_that_of_finite_difference
     t = 0.02 * torch.arange(4, dtype=torch.float64)
     u, x0 = samples((4,), 4, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
     model = make_structured(kind)
-    model.integrator = "rosenbrock"
+    model.integrator = Rosenbrock()
     parameter = model.damping.network.linears[0].weight
 
     def loss():
-        return model.increments(x0, t, u).square().sum()
+        return model.increments(x0, t, Signal(t, u)).square().sum()
 
     loss().backward()
     with torch.no_grad():
@@ -193,11 +150,11 @@ def test_an_ensemble_integrates_as_its_members_do(kind):
     t = 0.02 * torch.arange(4, dtype=torch.float64)
     u, x0 = samples((4,), 4, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
     members = [perturb(make_structured(kind), seed=k, spread=0.1) for k in range(3)]
-    explicit = Ensemble(members).member_increments(x0, t, u)
+    explicit = Ensemble(members).member_increments(x0, t, Signal(t, u))
     for item in members:
-        item.integrator = "rosenbrock"
-    found = Ensemble(members).member_increments(x0, t, u)
-    expected = torch.stack([item.increments(x0, t, u) for item in members])
+        item.integrator = Rosenbrock()
+    found = Ensemble(members).member_increments(x0, t, Signal(t, u))
+    expected = torch.stack([item.increments(x0, t, Signal(t, u)) for item in members])
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
     assert (found - explicit).abs().max() > 1e-7
 
@@ -213,8 +170,8 @@ def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
     u, x0 = samples(batch, 4, 1), 0.3 * samples(batch, 1, 2, seed=1).squeeze(-2)
     constant = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
     potential = partial(NetworkPotential, hidden=[3])
-    model = make_structured("lnn", 1, 1, **constant, potential=potential, integrator="rosenbrock")
-    expected = model.increments(x0, t, u)
+    model = make_structured("lnn", 1, 1, **constant, potential=potential, integrator=Rosenbrock())
+    expected = model.increments(x0, t, Signal(t, u))
     # All but the constant of V, which moves nothing.
     parameters = [
         value
@@ -223,16 +180,15 @@ def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
     ]
     gradients = torch.autograd.grad(expected.square().sum(), parameters)
     if batch:
-        model.compile_derivative()
-        found = model.increments(x0, t, u)
+        with integrated_by(model, CompiledDynamics(model.integrator, model)):
+            found = model.increments(x0, t, Signal(t, u))
         for one, other in zip(
             torch.autograd.grad(found.square().sum(), parameters), gradients, strict=True
         ):
             torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
     else:
-        model.eval().compiled_rollouts = True
-        with torch.no_grad():
-            found = model.increments(x0, t, u)
+        with torch.no_grad(), integrated_by(model, CompiledLoop(model.integrator)):
+            found = model.increments(x0, t, Signal(t, u))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
@@ -243,15 +199,15 @@ def test_a_compiled_rosenbrock_step_of_an_ensemble_has_the_same_gradients(monkey
     u, x0 = samples((2, 4), 3, 1), 0.3 * samples((2, 4), 1, 2, seed=1).squeeze(-2)
     heads = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
     heads["potential"] = partial(NetworkPotential, hidden=[3])
-    members = [make_structured("lnn", 1, 1, **heads, integrator="rosenbrock") for _ in range(2)]
+    members = [make_structured("lnn", 1, 1, **heads, integrator=Rosenbrock()) for _ in range(2)]
     members = [perturb(item, seed=k, spread=0.1) for k, item in enumerate(members)]
     stack = Ensemble(members).stack
     parameters = list(stack.parameters())
     losses, gradients = [], []
     for compiled in (False, True):
         if compiled:
-            stack.compile_derivative()
-        losses.append(stack.increments(x0, t, u).square().sum())
+            stack.integrator = CompiledDynamics(stack.integrator, stack)
+        losses.append(stack.increments(x0, t, Signal(t, u)).square().sum())
         gradients.append(torch.autograd.grad(losses[-1], parameters, materialize_grads=True))
     assert losses[0].item() > 1e-6
     torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=0)
@@ -282,8 +238,8 @@ def test_a_compiled_roll_out_of_a_network_is_that_of_torchdiffeq(request, kind, 
         for parameter in other.parameters():
             parameter *= 0.9
         for item in (model, other):
-            expected = item.predict(x0, t, u)
-            item.compiled_rollouts = True
-            found = item.predict(x0, t, u)
+            expected = item.predict(x0, t, Signal(t, u))
+            item.integrator = CompiledLoop(item.integrator)
+            found = item.predict(x0, t, Signal(t, u))
             torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
             assert (expected[-1] - x0).abs().max() > 0.01

@@ -8,10 +8,10 @@ from torch import Tensor
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.losses import IncrementLoss, refuse_learned_initial_state
+from pinn_dyn.training.losses.window_loss import WindowLoss
 
 
-class MidpointLoss(IncrementLoss):
+class MidpointLoss(WindowLoss):
     """Mean squared error of the increment of the state in one step, by the midpoint rule.
 
     A step of length h leads from measured (q_0, v_0) to measured (q_1, v_1). The cubic through
@@ -33,13 +33,12 @@ class MidpointLoss(IncrementLoss):
     momenta): a hundredth of a for an oscillation of r rad/s with r h = 0.5, and 1/2400 with
     r h = 0.1. The terms learn it with the motion: halve ``data.stride`` to see whether it matters.
 
-    One evaluation of the dynamics per window, where the roll-out of one step in
-    :class:`IncrementLoss` costs four; no roll-out and no stiffness, so ``integrator`` and
-    ``substeps`` are for validation and test alone.
+    One evaluation of the dynamics per window, where the roll-out of one step by RK4 costs four; no
+    roll-out and no stiffness, so ``integrator`` is for validation and test alone.
 
     Assumptions: q and v are measured or simulated with little noise. Noise in v is divided by a
     short h, as in a loss on accelerations by finite differences; for noisy logs take longer
-    windows and :class:`IncrementLoss`.
+    windows and the increment loss.
 
     Source: not in the paper, whose losses roll out. Midpoint quadrature of the equation of motion
     along a Hermite interpolant, as in direct collocation (Betts 2010, "Practical Methods for
@@ -54,45 +53,37 @@ class MidpointLoss(IncrementLoss):
         ValueError: if the windows have more than one step, or the model learns its initial state.
     """
 
+    scale: Tensor
+
     def __init__(self, statistics: Statistics, model: Predictor):
+        super().__init__()
         if not isinstance(model, ContinuousPredictor):
             raise TypeError(
                 f"model is a {type(model).__name__}, expected one with a state derivative, such as "
                 "model=lnn or model=acceleration: take loss=increment"
             )
-        refuse_learned_initial_state(model)
-        steps = statistics.velocity_increment_std.shape[0]
-        if steps != 1:
-            raise ValueError(f"the windows have {steps} steps, expected one: set data.steps=1")
-        super().__init__(statistics, model)
+        if model.learns_initial_state:
+            raise ValueError(
+                "the model learns the velocity at which roll-outs start, and this loss rolls "
+                "nothing out: take loss=increment, or model/initial_velocity=measured"
+            )
+        scale = statistics.increment_std(model.state)
+        if scale.shape[0] != 1:
+            raise ValueError(
+                f"the windows have {scale.shape[0]} steps, expected one: set data.steps=1"
+            )
+        # Of (q, v) the first half holds by construction.
+        self.compared = slice(model.num_coordinates if model.state == "qv" else 0, None)
+        self.register_buffer("scale", scale[0, self.compared].float(), persistent=False)
 
-    def _mean(self, model: Predictor, windows: Windows) -> Tensor:
+    def forward(self, model: Predictor, windows: Windows) -> Tensor:
         assert isinstance(model, ContinuousPredictor)
-        x0, measured = windows.start(model.coordinates), windows.increments(model.coordinates)
-        return self._traced(model, windows, x0, windows.u, measured)
-
-    def _traced(
-        self, model: ContinuousPredictor, windows: Windows, x0: Tensor, u: Tensor, measured: Tensor
-    ) -> Tensor:
-        h, dx = (windows.t[1] - windows.t[0]).to(x0), measured.squeeze(-2)
-        middle = midpoint(h, x0, dx) if model.coordinates == "velocity" else x0 + 0.5 * dx
-        rate = model.state_derivative(middle, _mean_input(windows, u))
-        return self.error((h * rate).unsqueeze(-2), measured)
-
-    def evaluations(self, model: ContinuousPredictor, windows: Windows) -> int:
-        """Evaluations of the dynamics in a window."""
-        return 1
-
-    def compile_dynamics(self, model: Predictor, steps: int) -> None:
-        # Always as a whole: there is a quarter of a roll-out to compile.
-        self._compiled = self._long_training = True
-
-
-def _mean_input(windows: Windows, u: Tensor) -> Tensor:
-    """The mean of u ``(*batch, K, M)`` over the step, ``(*batch, M)``."""
-    if windows.interpolation == "hold":
-        return u[..., :-1, :].mean(-2)
-    return (0.5 * (u[..., 1:, :] + u[..., :-1, :])).mean(-2)
+        x0, dx = windows.start(model.state), windows.increments(model.state).squeeze(-2)
+        h = (windows.t[1] - windows.t[0]).to(x0)
+        middle = midpoint(h, x0, dx) if model.state == "qv" else x0 + 0.5 * dx
+        (mean_input,) = windows.input.means(windows.t).to(x0)
+        residual = h * model.state_derivative(middle, mean_input) - dx
+        return torch.mean((residual[..., self.compared] / self.scale) ** 2, dim=(-2, -1))
 
 
 def midpoint(h: Tensor, x0: Tensor, increment: Tensor) -> Tensor:

@@ -6,11 +6,9 @@ import pytest
 import torch
 from pytorch_optimizer import SOAP
 
-from pinn_dyn.mechanics import Ensemble
-from pinn_dyn.training import EnsembleLearner
-from pinn_dyn.training.member_soap import MemberSOAP
-from tests.training.test_ensemble import learn, make_data, make_models, train  # noqa: F401
-from tests.training.test_learner import splits  # noqa: F401
+from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.ensembles.member_soap import MemberSOAP
+from tests.support.ensembles import learn, make_data, make_models, train
 
 MEMBERS = 3
 SHAPES = {"square": (5, 5), "wide": (3, 7), "tall": (6, 2), "cube": (3, 4, 2), "vector": (6,)}
@@ -93,14 +91,14 @@ def test_what_would_not_be_each_members_own_is_refused(option):
         MemberSOAP(SOAP([stacked], **{option: True}))
 
 
-def test_an_ensemble_learns_by_it(tmp_path, make_data):  # noqa: F811
-    data = make_data(members=2)
+def test_an_ensemble_learns_by_it(tmp_path):
+    data = make_data()
     models = make_models("lnn", data, 2)
     ensemble = Ensemble(models)
     losses = []
     learner = learn(EnsembleLearner, ensemble, models[0], data, optimizer=SOAP)
     report = learner.log_losses
     learner.log_losses = lambda values: losses.append(values.clone()) or report(values)
-    trainer = train(tmp_path, learner, data)
+    trainer = train(tmp_path, learner, EnsembleData(data, 2))
     assert [type(optimizer) for optimizer in trainer.optimizers] == [MemberSOAP]
     assert (losses[-1] < 0.5 * losses[0]).all()

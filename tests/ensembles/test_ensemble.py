@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, double_copy
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.mechanics import RK4, ContinuousPredictor, Signal, double_copy
 from tests.models.builders import make_model, perturb
 
 KINDS = ("lnn", "hnn", "acceleration", "next_state")
@@ -26,11 +27,11 @@ def test_an_ensemble_predicts_the_mean_of_what_its_members_predict_alone(kind):
     alone = members(kind)
     ensemble = Ensemble(alone)
     x0, t, u = motion(kind)
-    expected = torch.stack([item.predict(x0, t, u, interpolation="hold") for item in alone])
+    expected = torch.stack([item.predict(x0, t, Signal(t, u, "hold")) for item in alone])
     assert (expected[0] - expected[1]).abs().max() > 1e-4
-    found = x0[:, None] + ensemble.member_increments(x0, t, u, interpolation="hold")
+    found = x0[:, None] + ensemble.member_increments(x0, t, Signal(t, u, "hold"))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-    found = ensemble.predict(x0, t, u, interpolation="hold")
+    found = ensemble.predict(x0, t, Signal(t, u, "hold"))
     torch.testing.assert_close(found, expected.mean(0), rtol=0, atol=1e-12)
     assert ensemble.fixed_step == alone[0].fixed_step
 
@@ -44,7 +45,9 @@ def test_a_member_is_a_model_with_the_weights_it_came_with(kind):
         member = ensemble.member(index)
         assert type(member) is type(alone[index])
         assert member.state_dict().keys() == alone[index].state_dict().keys()
-        assert torch.equal(member.predict(x0, t, u), alone[index].predict(x0, t, u))
+        assert torch.equal(
+            member.predict(x0, t, Signal(t, u)), alone[index].predict(x0, t, Signal(t, u))
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -53,10 +56,10 @@ def test_the_gradient_of_a_member_is_that_of_its_own_loss(kind):
     ensemble = Ensemble(alone)
     x0, t, u = motion(kind)
     weights = torch.randn(3, 4, 6, 4, generator=torch.Generator().manual_seed(5)).double()
-    (weights * ensemble.member_increments(x0, t, u)).sum().backward()
+    (weights * ensemble.member_increments(x0, t, Signal(t, u))).sum().backward()
     stacked = dict(ensemble.stack.template.model.named_parameters())
     for index, item in enumerate(alone):
-        (weights[index] * item.increments(x0, t, u)).sum().backward()
+        (weights[index] * item.increments(x0, t, Signal(t, u))).sum().backward()
         for name, parameter in item.named_parameters():
             found = stacked[name].grad
             if parameter.grad is None:  # a bias of the potential, say
@@ -74,18 +77,18 @@ def test_weights_are_saved_loaded_and_copied_with_one_copy_of_the_scales(kind):
     assert {value.shape[0] for name, value in saved.items() if name.endswith("weight")} == {3}
     other.load_state_dict(saved)
     x0, t, u = motion(kind)
-    expected = ensemble.predict(x0, t, u)
-    assert torch.equal(other.predict(x0, t, u), expected)
-    assert torch.equal(double_copy(ensemble).predict(x0, t, u), expected)
+    expected = ensemble.predict(x0, t, Signal(t, u))
+    assert torch.equal(other.predict(x0, t, Signal(t, u)), expected)
+    assert torch.equal(double_copy(ensemble).predict(x0, t, Signal(t, u)), expected)
 
 
 def test_a_continuous_stack_takes_the_substeps_of_its_members():
     alone = members("lnn")
     for item in alone:
-        item.substeps = 3
+        item.integrator = RK4(substeps=3)
     stack = Ensemble(alone).stack
     assert isinstance(stack, ContinuousPredictor)
-    assert stack.substeps == 3
+    assert stack.integrator.substeps == 3
 
 
 def test_members_that_do_not_belong_together_are_refused():

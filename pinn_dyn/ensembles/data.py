@@ -1,0 +1,64 @@
+"""Batches for the members of an ensemble."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Sampler
+
+from pinn_dyn.data import DynamicsData
+from pinn_dyn.data.windows import BatchSampler, WindowLoader
+from pinn_dyn.mechanics import Trajectory
+
+
+class EnsembleData(L.LightningDataModule):
+    """The windows of a data module, for each member in an order of its own.
+
+    Args:
+        data: the windows; member k has them in the order of the seed ``data.seed + k``.
+        members: E.
+    """
+
+    def __init__(self, data: DynamicsData, members: int):
+        super().__init__()
+        self.data = data
+        self.members = members
+
+    def prepare_data(self) -> None:
+        """Simulate or convert the data once, before other processes read them."""
+        self.data.prepare_data()
+
+    def train_dataloader(self) -> WindowLoader:
+        """Batches ``(E, B, ...)``."""
+        self.data.trainer = self.trainer  # knows the device and the processes
+        seeds = range(self.data.seed, self.data.seed + self.members)
+        return self.data.loader(MemberSampler([self.data.sampler(seed) for seed in seeds]))
+
+    def val_dataloader(self) -> DataLoader[Trajectory]:
+        """One batch: all validation trajectories."""
+        return self.data.val_dataloader()
+
+
+class MemberSampler(Sampler[Tensor]):
+    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own.
+
+    Args:
+        samplers: the order of each member.
+    """
+
+    def __init__(self, samplers: list[BatchSampler]):
+        self.samplers = samplers
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by the trainer at the start of each epoch."""
+        for sampler in self.samplers:
+            sampler.set_epoch(epoch)
+
+    def __len__(self) -> int:
+        return len(self.samplers[0])
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return map(torch.stack, zip(*self.samplers, strict=True))

@@ -1,0 +1,7 @@
+"""One-step methods: a file each, and the loop that takes their steps."""
+
+from pinn_dyn.mechanics.integrators.integrator import Dynamics, Integrator
+from pinn_dyn.mechanics.integrators.rk4 import RK4
+from pinn_dyn.mechanics.integrators.rosenbrock import Rosenbrock
+
+__all__ = ["RK4", "Dynamics", "Integrator", "Rosenbrock"]

@@ -1,0 +1,110 @@
+"""Roll-outs: integrate a state derivative under a sampled input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics.arrays import require_finite
+from pinn_dyn.mechanics.integrators import RK4, Dynamics, Integrator
+from pinn_dyn.mechanics.signal import Signal
+
+
+def rollout(
+    derivative: Callable[[Tensor, Tensor], Tensor],
+    x0: Tensor,
+    t: Tensor,
+    input: Signal,
+    *,
+    substeps: int = 1,
+) -> Tensor:
+    """States x(t_k), ``(*batch, T, S)``, of dx/dt = f(x, u(t)) from ``x0``, by RK4.
+
+    Args:
+        derivative: f, maps x ``(*batch, S)`` and u ``(*batch, M)`` to ``(*batch, S)``.
+        x0: initial state, ``(*batch, S)``.
+        t: times of the solution, ``(T,)``, s.
+        input: u.
+        substeps: steps of the integrator between two times of ``t``.
+
+    Raises:
+        ValueError: as :func:`require_start`, and on substeps below 1.
+    """
+    require_start(x0, t, input)
+    path = path_between(_Flow(derivative), RK4(substeps), x0, t, input)
+    return x0.unsqueeze(-2) + path
+
+
+def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
+    """Check what a roll-out starts from.
+
+    Raises:
+        ValueError: on fewer than 2 times, times that do not increase, an input of another batch
+            than the initial state, or a state that is not finite.
+    """
+    if t.ndim != 1 or t.shape[0] < 2:
+        raise ValueError(f"t has shape {tuple(t.shape)}, expected (T,) with at least 2 times")
+    if not bool((t.diff() > 0).all()):
+        raise ValueError("t must increase strictly; sort it and drop repeated times")
+    if input.batch != x0.shape[:-1]:
+        raise ValueError(
+            f"u has batch shape {tuple(input.batch)}, x0 has {tuple(x0.shape[:-1])}: "
+            "expected the same batch"
+        )
+    require_finite("the initial state x0", x0)
+
+
+def path_between(
+    dynamics: Dynamics, integrator: Integrator, x0: Tensor, t: Tensor, input: Signal
+) -> Tensor:
+    """Increments x(t_k) - x(t_0), ``(*batch, T, S)``, unchecked: for what is called in a training.
+
+    Args:
+        dynamics: what is integrated.
+        integrator: the method, with its substeps between two times of ``t``.
+        x0: initial state, ``(*batch, S)``.
+        t: times of the solution, ``(T,)``, s.
+        input: u, of the same batch.
+    """
+    # Times count from the start, in the recording's own precision, and are cast only then: one
+    # dtype throughout, so that the solver's times and the input's times compare exactly.
+    input = input.since(t[0])
+    grid = step_grid(t - t[0], input.t, integrator.substeps).to(x0.dtype)
+    path = integrator.path(dynamics, x0, grid, input.to(x0.device, x0.dtype))
+    return path[:: integrator.substeps].movedim(0, -2)
+
+
+def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
+    """Times of the integrator's steps, ``(substeps (T - 1) + 1,)``: ``substeps`` in each interval.
+
+    A step that ends at a sample of the input, within rounding, ends at that very number: a held
+    input tells the sides apart.
+    """
+    if substeps == 1:
+        return t
+    fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
+    inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
+    grid = torch.cat([inner.flatten(), t[-1:]])
+    right = torch.searchsorted(t_input, grid).clamp(1, t_input.shape[0] - 1)
+    before, after = t_input[right - 1], t_input[right]
+    nearest = torch.where(grid - before < after - grid, before, after)
+    close = (grid - nearest).abs() < 1e-6 * (t[1:] - t[:-1]).min() / substeps
+    return torch.where(close, nearest, grid)
+
+
+@dataclass(frozen=True)
+class _Flow:
+    """A state derivative of which nothing else is known."""
+
+    state_derivative: Callable[[Tensor, Tensor], Tensor]
+
+    def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
+        return lambda rate: rate
+
+    def integration_step(
+        self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
+    ) -> Tensor:
+        return RK4().step(self, increment, start, inputs, h)

@@ -1,0 +1,109 @@
+"""Gradients by compiled programs."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.data.windows import Windows
+from pinn_dyn.mechanics import ContinuousPredictor
+from pinn_dyn.mechanics.compilation import (
+    CHUNK,
+    MOST_EVALUATIONS,
+    STEPS_FOR_PROGRAM,
+    CompiledDynamics,
+    integrated_by,
+)
+from pinn_dyn.training.gradients.known import Gradients, KnownGradients
+from pinn_dyn.training.gradients.program import LossProgram
+from pinn_dyn.training.gradients.state_windows import StateWindows
+from pinn_dyn.training.losses import WindowLoss
+
+
+class Compiled:
+    """The loss of a model with compiled dynamics, or with all of it compiled, gradient included.
+
+    One program for loss and gradient is fastest, and takes longest to compile: it is made where
+    the training is long and a window costs few evaluations of the dynamics, on a CPU. Elsewhere
+    the dynamics alone are compiled. Large batches are taken in parts that fit into the cache.
+
+    Args:
+        loss: of the model.
+        model: what is trained; anything but its training goes on uncompiled.
+        steps: of the training, about.
+    """
+
+    def __init__(self, loss: WindowLoss, model: ContinuousPredictor, steps: int):
+        self.loss = loss
+        self.model = model
+        self.steps = steps
+        self._integrator = CompiledDynamics(model.integrator, model)
+        self._program = LossProgram(loss, model)
+        self.evaluations = EvaluationCount(loss, model)
+        # Walking through the modules takes its time.
+        self._parameters = list(model.parameters())
+
+    def __call__(self, windows: Windows) -> Tensor:
+        """The loss; its backward pass may hand out gradients that are known already."""
+        evaluations = self.evaluations(windows)
+        on_cpu = windows.q.device.type == "cpu"
+        if on_cpu and worth_a_program(evaluations, self.steps):
+            part = CHUNK * MOST_EVALUATIONS // evaluations
+            return KnownGradients.apply(self._program(windows, part), *self._parameters)
+        if not on_cpu or len(windows) < 2 * CHUNK:
+            return self._loss(windows)
+        parts = [
+            (len(part) / len(windows), *self._loss_and_gradients(part))
+            for part in windows.split(CHUNK)
+        ]
+        return KnownGradients.apply(parts, *self._parameters)
+
+    def _loss(self, windows: Windows) -> Tensor:
+        with integrated_by(self.model, self._integrator):
+            laid_out = StateWindows.of(windows, self.model.state)
+            # One compiled function for all stages, though the first needs no gradient in x.
+            laid_out.x0.requires_grad_()
+            return self.loss(self.model, laid_out)
+
+    def _loss_and_gradients(self, windows: Windows) -> tuple[Tensor, Gradients]:
+        loss = self._loss(windows)
+        gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
+        return loss.detach(), list(gradients)
+
+
+def worth_a_program(evaluations: int, steps: int) -> bool:
+    """Whether so many evaluations in a window, over so many steps, pay for one program."""
+    return evaluations == 1 or (evaluations <= MOST_EVALUATIONS and steps >= STEPS_FOR_PROGRAM)
+
+
+class EvaluationCount:
+    """How often the loss of a model evaluates the state derivative in a window: counted, once."""
+
+    def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
+        self._loss = loss
+        self._model = model
+        self._found: dict[int, int] = {}
+
+    def __call__(self, windows: Windows) -> int:
+        """The number for windows of as many steps as these."""
+        steps = len(windows.t)
+        if steps not in self._found:
+            two = torch.arange(min(2, len(windows)), device=windows.q.device)
+            self._found[steps] = self._count(windows[two])
+        return self._found[steps]
+
+    def _count(self, windows: Windows) -> int:
+        derivative, count = self._model.state_derivative, 0
+
+        def counted(x: Tensor, u: Tensor) -> Tensor:
+            nonlocal count
+            count += 1
+            return derivative(x, u)
+
+        self._model.state_derivative = counted  # type: ignore[method-assign]
+        try:
+            with torch.no_grad():
+                self._loss(self._model, windows)
+        finally:
+            del self._model.state_derivative
+        return count

@@ -1,0 +1,36 @@
+"""Windows as a compiled program takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from torch import Tensor
+
+from pinn_dyn.data.windows import Windows
+from pinn_dyn.mechanics import State
+
+
+@dataclass(frozen=True)
+class StateWindows(Windows):
+    """Windows with the states of one model at hand.
+
+    Attributes:
+        x0: state at the start, ``(B, 2N)``, with the batch along memory, as the models compute.
+        dx: increments to each step, ``(B, H, 2N)``.
+    """
+
+    x0: Tensor
+    dx: Tensor
+
+    @classmethod
+    def of(cls, windows: Windows, state: State) -> StateWindows:
+        """These windows, for a model of this state."""
+        values = {item.name: getattr(windows, item.name) for item in fields(Windows)}
+        x0 = windows.start(state).mT.contiguous().mT
+        return cls(**values, x0=x0, dx=windows.increments(state))
+
+    def start(self, state: State) -> Tensor:
+        return self.x0
+
+    def increments(self, state: State) -> Tensor:
+        return self.dx

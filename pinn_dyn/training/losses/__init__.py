@@ -1,0 +1,7 @@
+"""Losses: how far predicted windows are from measured ones."""
+
+from pinn_dyn.training.losses.increment import IncrementLoss
+from pinn_dyn.training.losses.midpoint import MidpointLoss
+from pinn_dyn.training.losses.window_loss import WindowLoss
+
+__all__ = ["IncrementLoss", "MidpointLoss", "WindowLoss"]

@@ -1,0 +1,148 @@
+"""The input between its samples, against NumPy and SciPy."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+from scipy.interpolate import CubicHermiteSpline
+
+from pinn_dyn.mechanics import RK4, Signal
+from pinn_dyn.mechanics.signal import stacked
+
+KINDS = ("hold", "linear", "cubic")
+
+
+def make_signal(kind, count=7, batch=(2,), size=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.randn(*batch, count, size, generator=generator, dtype=torch.float64)
+    t = (0.2 + torch.rand(count, generator=generator, dtype=torch.float64)).cumsum(0)
+    return Signal(t, u, kind)
+
+
+def expected_value(signal, time, side="right"):
+    """By the definition, in NumPy; the end samples hold outside."""
+    t, u = signal.t.numpy(), signal.u.numpy()
+    inside = np.clip(time, t[0], t[-1])
+    if signal.interpolation == "hold":
+        index = np.searchsorted(t, time, side=side) - 1
+        return u[..., np.clip(index, 0, len(t) - 1), :]
+    if signal.interpolation == "linear" or len(t) == 1:
+        flat = u.swapaxes(-1, -2).reshape(-1, len(t))
+        values = np.array([np.interp(inside, t, row) for row in flat])
+        return values.reshape(*u.shape[:-2], u.shape[-1])
+    slopes = np.gradient(u, t, axis=-2, edge_order=2 if len(t) > 2 else 1)
+    return CubicHermiteSpline(t, u, slopes, axis=-2)(inside)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_values_are_those_of_the_definition(kind, count):
+    """At random times, at the samples, and beyond both ends."""
+    signal = make_signal(kind, count)
+    times = [*np.linspace(-0.3, float(signal.t[-1]) + 0.4, 12), *signal.t.tolist()]
+    for time in times:
+        found = signal(time).numpy()
+        np.testing.assert_allclose(found, expected_value(signal, time), atol=1e-12, rtol=0)
+
+
+def test_a_held_input_jumps_at_its_samples_seen_from_either_side():
+    signal = make_signal("hold")
+    now = float(signal.t[3])
+    assert torch.equal(signal(now), signal.u[:, 3])
+    assert torch.equal(signal(now, side="left"), signal.u[:, 2])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_the_stages_of_a_step_see_the_signal_from_within_it(kind, count):
+    signal = make_signal(kind, count)
+    grid = torch.linspace(-0.3, float(signal.t[-1]) + 0.4, 12, dtype=torch.float64)
+    grid[5] = signal.t[-1]  # a step that ends at a sample
+    grid = grid.sort().values
+    found = signal.stages(grid, RK4.nodes)
+    assert found.shape == (11, 4, 2, 3)
+    for k in range(11):
+        for stage, node in enumerate(RK4.nodes):
+            side = "left" if node == 1 else "right"
+            time = float(torch.lerp(grid[k], grid[k + 1], node))
+            expected = expected_value(signal, time, side)
+            np.testing.assert_allclose(found[k, stage], expected, atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_means_over_steps_are_integrals_by_quadrature(kind, count):
+    """Steps of many samples, within one, and beyond both ends."""
+    signal = make_signal(kind, count, batch=(), size=1)
+    grid = torch.linspace(-0.3, float(signal.t[-1]) + 0.4, 6, dtype=torch.float64)
+    found = signal.means(grid)[:, 0]
+    for k in range(5):
+        start, end = float(grid[k]), float(grid[k + 1])
+        knots = [float(t) for t in signal.t if start < t < end]
+        edges = [start, *knots, end]
+        area = sum(
+            quad(lambda s: expected_value(signal, s)[0], a, b)[0]
+            for a, b in itertools.pairwise(edges)
+        )
+        assert float(found[k]) == pytest.approx(area / (end - start), abs=1e-9)
+
+
+def test_cubics_follow_a_sine_of_eight_samples_a_period_where_lines_cut_corners():
+    t = torch.arange(0, 20, np.pi / 4, dtype=torch.float64)
+    times = torch.linspace(2, 17, 400, dtype=torch.float64)
+    exact = torch.sin(times)
+    errors = {}
+    for kind in KINDS:
+        signal = Signal(t, torch.sin(t)[:, None], kind)
+        found = torch.stack([signal(float(time)) for time in times])[:, 0]
+        errors[kind] = float((found - exact).abs().max())
+    assert errors["cubic"] < 0.2 * errors["linear"] < 0.1 * errors["hold"]
+
+
+def test_a_part_of_a_cubic_is_the_cubic_of_the_whole():
+    """A window does not know its neighbours, its rates do."""
+    whole = make_signal("cubic", count=9)
+    part = whole.part(slice(3, 6))
+    for time in np.linspace(float(part.t[0]), float(part.t[-1]), 7):
+        torch.testing.assert_close(part(time), whole(time), rtol=0, atol=1e-14)
+    again = Signal(part.t, part.u, "cubic")
+    middle = float(part.t[:2].mean())
+    assert (again(middle) - whole(middle)).abs().max() > 1e-3
+
+
+def test_stacked_cubics_keep_their_rates():
+    signals = [make_signal("cubic", count=9, seed=k).part(slice(2, 5)) for k in range(2)]
+    t = torch.arange(3, dtype=torch.float64)
+    both = stacked(signals, t)
+    assert both.u.shape == (2, 2, 3, 3)
+    for k, one in enumerate(signals):
+        assert torch.equal(both.rate[k], one.rate)
+    assert both.interpolation == "cubic"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_linear_in_its_samples_also_for_autograd(kind):
+    signal = make_signal(kind, batch=(), size=1)
+    u = signal.u.clone().requires_grad_()
+    time = float(signal.t[3:5].mean())
+    (slope,) = torch.autograd.grad(Signal(signal.t, u, kind)(time).sum(), u)
+    assert float((slope * u).sum()) == pytest.approx(float(signal(time)), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"u": torch.zeros(5, 1)}, r"u has shape \(5, 1\), expected \(\*batch, 4, M\)"),
+        ({"u": torch.zeros(4)}, r"u has shape \(4,\)"),
+        ({"t": torch.zeros(4, 1)}, r"expected \(\*batch, 4, M\)"),
+        ({"t": torch.tensor([0.0, 2.0, 1.0, 3.0])}, r"t\[1\] = 2.0 is followed by t\[2\] = 1.0"),
+        ({"t": torch.tensor([0.0, torch.nan, 1.0, 3.0])}, "t must increase strictly"),
+        ({"interpolation": "spline"}, "interpolation is 'spline', expected 'hold', 'linear'"),
+    ],
+)
+def test_bad_input_is_refused_by_name(change, message):
+    values = {"t": torch.arange(4.0), "u": torch.zeros(4, 1), "interpolation": "linear"} | change
+    with pytest.raises(ValueError, match=message):
+        Signal(**values)

@@ -1,0 +1,50 @@
+"""Random windows of one step, and the scales that go with them."""
+
+from dataclasses import fields, replace
+
+import torch
+
+from pinn_dyn.data import Windows
+from pinn_dyn.mechanics import Signal
+from pinn_dyn.mechanics.signal import stacked
+from tests.models.builders import STEP, make_statistics
+
+
+def make_windows(count, size=1, interpolation="linear", seed=0):
+    """Windows of one step, with an input that jumps within it."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return 0.3 * torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    t = torch.linspace(0, STEP, 3, dtype=torch.float64)
+    return Windows(
+        t=torch.tensor([0.0, STEP], dtype=torch.float64),
+        q=normal(count, size),
+        v=normal(count, size),
+        p=normal(count, size),
+        dq=STEP * normal(count, 1, size),
+        dv=STEP * normal(count, 1, size),
+        dp=STEP * normal(count, 1, size),
+        input=Signal(t, normal(count, 3, size), interpolation),
+    )
+
+
+def one_step(size=1):
+    scales = make_statistics(size, size)
+    return replace(
+        scales,
+        qv_increment_std=scales.qv_increment_std[:1],
+        qp_increment_std=scales.qp_increment_std[:1],
+    )
+
+
+def for_members(batches):
+    """Windows ``(E, B, ...)``, a batch for each member of an ensemble."""
+    first = batches[0]
+    rows = {
+        item.name: torch.stack([getattr(batch, item.name) for batch in batches])
+        for item in fields(Windows)
+        if item.name not in ("t", "input")
+    }
+    return replace(first, **rows, input=stacked([batch.input for batch in batches], first.input.t))
