@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import importlib
-import logging
-import sys
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException, OverrideParseException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-
-from pinn_dyn.app.multirun import how_to_go_on
-
-_MODULES = {"train": "training", "evaluate": "evaluation", "control": "control", "gather": "sweeps"}
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
@@ -47,43 +37,6 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     values = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
-
-
-def main(command: str) -> None:
-    """Run train, evaluate, control or gather on the configuration that the command line asks for.
-
-    A misspelt key ends the program before anything is written, with the keys that were probably
-    meant; so does an error that the user can mend, without a traceback.
-    """
-    completing = {"-sc", "--shell-completion"} & set(sys.argv)  # whose words are no overrides
-    problem = None if completing else misspelt_key(command, sys.argv[1:])
-    if problem:
-        raise SystemExit(f"Error: {problem}")
-
-    def run(cfg: DictConfig) -> object:
-        # PyTorch and Lightning take seconds to import, which --help and a misspelt key do not need.
-        from pinn_dyn.data import SimulationError
-        from pinn_dyn.training import NonFiniteLossError
-
-        task = getattr(importlib.import_module(f"pinn_dyn.app.{_MODULES[command]}"), command)
-        try:
-            return task(cfg)
-        except (ConfigError, NonFiniteLossError, SimulationError) as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # SweepCallback then goes on with the other jobs
-            raise SystemExit(f"Error: {error}") from error
-
-    # What a user cannot act on: loggers and hardware, and our libraries about each other.
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
-    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
-    try:
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(run)()
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted") from None
-    finally:
-        if hint := how_to_go_on():
-            print(hint, file=sys.stderr)
 
 
 def misspelt_key(config_name: str, arguments: list[str]) -> str | None:

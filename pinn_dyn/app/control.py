@@ -27,8 +27,8 @@ from pinn_dyn.app.build import (
 )
 from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.control_results import write_results, write_stability
-from pinn_dyn.app.origin import build_origin, command_line, data_hash
-from pinn_dyn.app.runs import load_run, provenance, write_config
+from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
+from pinn_dyn.app.run_folder import load_run, write_config
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Controller,

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from pinn_dyn.app.runs import CONFIG
+from pinn_dyn.app.run_folder import CONFIG
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Helix,

@@ -15,8 +15,8 @@ from typing import Any
 import yaml
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.multirun import ERROR
-from pinn_dyn.app.runs import CONFIG, METRICS
+from pinn_dyn.app.run_folder import CONFIG, METRICS
+from pinn_dyn.app.sweep import ERROR
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 
 _HYDRA_CONFIG = Path(".hydra") / "config.yaml"

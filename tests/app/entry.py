@@ -62,7 +62,7 @@ def run_script(script, *arguments, checked=False):
     with pytest.MonkeyPatch.context() as patch, own_logging():
         patch.setattr(sys, "argv", [script, *arguments])
         if not checked:
-            patch.setattr("pinn_dyn.app.config.misspelt_key", lambda *_: None)
+            patch.setattr("pinn_dyn.app.command.misspelt_key", lambda *_: None)
             patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
         runpy.run_path(str(ROOT / script), run_name="__main__")
 

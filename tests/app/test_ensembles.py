@@ -9,7 +9,7 @@ import torch
 from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pinn_dyn.app.runs import load_run
+from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.mechanics import Ensemble
 from pinn_dyn.models import LagrangianNetwork
 from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train

@@ -7,7 +7,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from pinn_dyn.app.description import run_settings
+from pinn_dyn.app.train import run_settings
 from tests.app.entry import NO_FIGURES, TINY, refused_text, train
 
 FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}

@@ -336,7 +336,7 @@ def test_everything_else_imports_without_pybullet():
     """In a process where importing PyBullet fails."""
     code = (
         "import sys; sys.modules['pybullet'] = sys.modules['pybullet_data'] = None\n"
-        "import pinn_dyn.app.training, pinn_dyn.data, pinn_dyn.evaluation\n"
+        "import pinn_dyn.app.train, pinn_dyn.data, pinn_dyn.evaluation\n"
         "from pinn_dyn.systems import BulletArm, SoftArm\n"
         "SoftArm()\n"
         "try:\n    BulletArm('franka_panda/panda.urdf')\n"

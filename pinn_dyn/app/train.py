@@ -11,6 +11,7 @@ from typing import Any
 
 import lightning as L
 import torch
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -23,15 +24,38 @@ from pinn_dyn.app.build import (
     build_validator,
     check_processes,
 )
-from pinn_dyn.app.claims import claimed, recorded_error
 from pinn_dyn.app.config import ConfigError, plain
-from pinn_dyn.app.description import describe
-from pinn_dyn.app.runs import CHECKPOINTS, METRICS, load_run, provenance, read_config
+from pinn_dyn.app.provenance import provenance
+from pinn_dyn.app.run_folder import (
+    CHECKPOINTS,
+    CONFIG,
+    METRICS,
+    claimed,
+    load_run,
+    read_config,
+    recorded_error,
+)
 from pinn_dyn.data import LogSource
-from pinn_dyn.evaluation import cleaning_figure, save
+from pinn_dyn.evaluation import RunDescription, cleaning_figure, save
+from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
 
 log = logging.getLogger(__name__)
+
+_OVERRIDES = Path(".hydra") / "overrides.yaml"
+
+# Compared among all runs, chosen on the command line or not.
+_ALWAYS = (
+    "seed",
+    "data.pairs",
+    "data.steps",
+    "data.stride",
+    "data.batch_size",
+    "optimizer.lr",
+    "trainer.max_epochs",
+)
+# Not about what is learned.
+_IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "resume", "search")
 
 
 def train(cfg: DictConfig) -> float:
@@ -177,3 +201,35 @@ def _write_report(source: LogSource, folder: Path) -> None:
     )
     save(figure, folder / "log_cleaning.png")
     log.info("what was done to the log is in %s and log_cleaning.png", folder / "log_report.md")
+
+
+def describe(folder: Path, config: dict[str, Any]) -> RunDescription:
+    """The description of the run in a folder."""
+    path = folder / _OVERRIDES
+    overrides = yaml.safe_load(path.read_text()) if path.is_file() else []
+    return RunDescription(
+        settings=run_settings(config, overrides),
+        configuration=(folder / CONFIG).read_text(),
+        provenance=provenance(),
+    )
+
+
+def run_settings(config: dict[str, Any], overrides: list[str]) -> dict[str, Cell]:
+    """The settings to compare with those of other runs.
+
+    The whole configuration has some hundred values that hardly ever differ. So these are: model,
+    data set, the usual ones, and every value or group that was given on the command line, in a
+    sweep too, such as ``model.substeps=2`` and ``model/damping=constant``.
+    """
+    flat = flatten(config)
+    settings = {
+        "model": flat["model_name"],
+        "dataset": flat["dataset.name"],
+        "loss": flat["loss._target_"],
+        **{key: flat[key] for key in _ALWAYS if key in flat},
+    }
+    for override in overrides:
+        key, _, value = override.lstrip("+").partition("=")
+        if not key.startswith("~") and key.split(".")[0] not in _IGNORED:
+            settings.setdefault(key, flat.get(key, value))
+    return settings

@@ -1,26 +1,30 @@
-"""Run folders: what a training leaves behind, and how it is loaded back."""
+"""Run folders: their layout, whose they are, and how a trained model is loaded back."""
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import json
 import os
-import platform
-import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
+from filelock import FileLock, Timeout
 
 from pinn_dyn.app.build import CHECKPOINTS, build_predictor
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.evaluation.sweep_table import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
+
+_PLACES = ("dataset.cache",)  # where things lie does not change what is learned
 
 
 @dataclass(frozen=True)
@@ -114,28 +118,45 @@ def find_runs(patterns: list[str] | str) -> list[Path]:
     return found
 
 
-def provenance() -> dict[str, str]:
-    """Commit, whether tracked files differ from it, software and hardware, for the records."""
-    commit = _git("rev-parse", "--short", "HEAD")
-    changed = _git("status", "--porcelain", "--untracked-files=no")
-    return {
-        "commit": commit or "unknown",
-        "uncommitted_changes": "unknown" if not commit else "yes" if changed else "no",
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "hardware": f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
-    }
+@contextlib.contextmanager
+def claimed(folder: Path, config: dict[str, Any]) -> Iterator[None]:
+    """Work in a run folder, alone in it and with the configuration that it was made for.
 
-
-def _git(*arguments: str) -> str:
-    """What git says of the code; nothing where there is no repository."""
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-
-def _processor() -> str:
+    Raises:
+        ConfigError: if another process works there, or the folder was made for another
+            configuration; it names the keys that differ.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(x.split(":")[1].strip() for x in lines if x.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+        with FileLock(folder / ".lock", timeout=0):
+            # A training that failed before its first checkpoint leaves nothing to be mixed up.
+            if (folder / METRICS).is_file() or (folder / CHECKPOINTS / "last.ckpt").is_file():
+                _refuse_another(folder, config)
+            else:
+                write_config(folder, config)
+            yield
+    except Timeout as error:
+        raise ConfigError(f"{folder} is in use: another process trains there") from error
+
+
+def _refuse_another(folder: Path, config: dict[str, Any]) -> None:
+    here, there = flatten(config), flatten(read_config(folder))
+    differing = [
+        f"{key}={here.get(key, 'absent')} (there {there.get(key, 'absent')})"
+        for key in dict.fromkeys([*here, *there])
+        if here.get(key) != there.get(key) and key not in _PLACES
+    ]
+    if differing:
+        shown = differing[:5] + (["..."] if len(differing) > 5 else [])
+        raise ConfigError(
+            f"{folder} holds a training of another configuration: {', '.join(shown)}; choose "
+            "another folder, or delete this one"
+        )
+
+
+def recorded_error(folder: Path) -> float | None:
+    """The validation error that a finished training recorded; None if it has not finished."""
+    path = folder / METRICS
+    if not path.is_file():
+        return None
+    return json.loads(path.read_text())["validation"].get("val/error_mean", float("nan"))

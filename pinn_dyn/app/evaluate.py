@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, plain
-from pinn_dyn.app.origin import build_origin, command_line, data_hash
-from pinn_dyn.app.runs import Run, find_runs, load_run, provenance
+from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
+from pinn_dyn.app.run_folder import Run, find_runs, load_run
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
     Prediction,
