@@ -17,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from pinn_dyn.app.config import CONF, ConfigError, misspelt_key
+from pinn_dyn.app.config import ConfigError, completed, config_folder
 from pinn_dyn.app.sweep import how_to_go_on
 
 
@@ -27,10 +27,11 @@ def main(command: str) -> None:
     A misspelt key ends the program before anything is written, with the keys that were probably
     meant; so does an error that the user can mend, without a traceback.
     """
-    completing = {"-sc", "--shell-completion"} & set(sys.argv)  # whose words are no overrides
-    problem = None if completing else misspelt_key(command, sys.argv[1:])
-    if problem:
-        raise SystemExit(f"Error: {problem}")
+    if not {"-sc", "--shell-completion"} & set(sys.argv):  # whose words are no overrides
+        try:
+            sys.argv[1:] = completed(command, sys.argv[1:])
+        except ConfigError as error:
+            raise SystemExit(f"Error: {error}") from error
 
     def run(cfg: DictConfig) -> object:
         # PyTorch and Lightning take seconds to import, which --help and a misspelt key do not need.
@@ -50,7 +51,8 @@ def main(command: str) -> None:
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
     warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
     try:
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(run)()
+        folder = str(config_folder(command))
+        hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
     finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,18 @@ from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
+from pinn_dyn.app.schema import KEYS, ConfigError, check, did_you_mean
+from pinn_dyn.app.schema import arguments as arguments_of
+
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
-class ConfigError(ValueError):
-    """The configuration cannot be used as it is; the message says what to change."""
+def config_folder(command: str) -> Path:
+    """Where the configuration of a command and its groups are: control has a folder of its own."""
+    own = CONF / command
+    return own if own.is_dir() else CONF
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -39,12 +44,61 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
-def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
-    """What is wrong with a key among command-line overrides, and what was probably meant.
+def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
+    """The configuration of a command as plain values, of the right types and in range.
 
-    None if every key exists, or if Hydra itself will explain the error (a group's wrong option,
-    say, for which it lists the right ones).
+    Raises:
+        ConfigError: naming the key that is missing, unknown or of the wrong kind.
     """
+    config = plain(cfg)
+    check(command, config)
+    return config
+
+
+def completed(command: str, arguments: list[str]) -> list[str]:
+    """Command-line arguments, with a ``++`` before keys that exist but stand in no YAML.
+
+    A YAML names the arguments that are usually changed. What else a class takes may be given as
+    well, as in ``loss.huber=0.01``, and so may the optional keys of a command, as ``resume=...``.
+
+    Raises:
+        ConfigError: on a key that does not exist, with those that were probably meant. What Hydra
+            itself explains, a group's wrong option say, is left to it.
+    """
+    arguments = list(arguments)
+    while True:
+        unknown = _unknown_key(command, arguments)
+        if unknown is None:
+            return arguments
+        key, known = unknown
+        path, name = key.rpartition(".")[::2]
+        if name not in _takes(command, known, path):
+            keys = list(_keys(known))
+            close = did_you_mean(key, keys)
+            if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
+                close = f": did you mean {' or '.join(same[:3])}?"
+            raise ConfigError(
+                f"the configuration has no key '{key}'{close or ': no key is like it.'} See all "
+                f"keys with 'python {command}.py --cfg job'."
+            )
+        index = next(k for k, word in enumerate(arguments) if re.match(rf"{key}[.=]", word))
+        arguments[index] = f"++{arguments[index]}"
+
+
+def _takes(command: str, known: dict[str, Any], path: str) -> dict[str, Any]:
+    """What may be set at a place of the configuration, besides what is there."""
+    if not path:
+        return KEYS[command]
+    part: Any = known
+    for name in path.split("."):
+        part = part.get(name) if isinstance(part, dict) else None
+    if isinstance(part, dict) and "_target_" in part:
+        return arguments_of(part["_target_"], path)
+    return {}
+
+
+def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any]] | None:
+    """The first key of the overrides that is in no YAML, and the configuration without it."""
     words = [word for word in arguments if "=" in word and not word.startswith("-")]
     try:
         overrides = []
@@ -60,37 +114,28 @@ def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
             overrides.append(word)
     except OverrideParseException:
         return None
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(command))):
         try:
-            hydra.compose(config_name, overrides=overrides)
+            hydra.compose(command, overrides=overrides)
         except ConfigCompositionException as error:
             key = getattr(error.__cause__, "full_key", None)
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
-            groups = [o for o in overrides if "." not in o.split("=")[0] and _is_group(o)]
-            known = _keys(hydra.compose(config_name, overrides=groups))
-            close = difflib.get_close_matches(key, known, n=3, cutoff=0.6) or [
-                name for name in known if name.split(".")[-1] == key.split(".")[-1]
-            ]
-            hint = f"did you mean {' or '.join(close[:3])}?" if close else "no key is like it."
-            return (
-                f"the configuration has no key '{key}': {hint} See all keys with "
-                f"'python {config_name}.py --cfg job'."
-            )
+            folder = config_folder(command)
+            groups = [o for o in overrides if _is_group(folder, o)]
+            known = OmegaConf.to_container(hydra.compose(command, overrides=groups))
+            assert isinstance(known, dict)
+            return key, {str(name): value for name, value in known.items()}
     return None
 
 
-def _is_group(override: str) -> bool:
-    return (CONF / override.split("=")[0].lstrip("+~")).is_dir()
+def _is_group(folder: Path, override: str) -> bool:
+    name = override.split("=")[0].lstrip("+~").split("@")[0]
+    return "." not in name and (folder / name).is_dir()
 
 
-def _keys(cfg: DictConfig) -> list[str]:
-    def walk(values: dict[Any, Any], prefix: str) -> Iterator[str]:
-        for key, value in values.items():
-            yield f"{prefix}{key}"
-            if isinstance(value, dict):
-                yield from walk(value, f"{prefix}{key}.")
-
-    values = OmegaConf.to_container(cfg)
-    assert isinstance(values, dict)
-    return list(walk(values, ""))
+def _keys(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _keys(value, f"{prefix}{key}.")

@@ -80,8 +80,8 @@ def write_results(
             record,
             settle_fraction=config["settle_fraction"],
             settled_after=config["settled_after"] if _at_rest(record) else None,
-            u_low=actuator["low"],
-            u_high=actuator["high"],
+            u_low=actuator.get("low"),
+            u_high=actuator.get("high"),
         )
         for name, record in records.items()
     }

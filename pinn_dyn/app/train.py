@@ -17,14 +17,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from pinn_dyn.app.build import (
+    VALIDATION_ERROR,
     build_data,
     build_learner,
     build_predictor,
     build_trainer,
     build_validator,
     check_processes,
+    epochs,
 )
-from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.config import ConfigError, check, checked
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -35,6 +37,7 @@ from pinn_dyn.app.run_folder import (
     read_config,
     recorded_error,
 )
+from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation import RunDescription, cleaning_figure, save
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
@@ -52,7 +55,7 @@ _ALWAYS = (
     "data.stride",
     "data.batch_size",
     "optimizer.lr",
-    "trainer.max_epochs",
+    "trainer.steps",
 )
 # Not about what is learned.
 _IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "resume", "search")
@@ -70,28 +73,39 @@ def train(cfg: DictConfig) -> float:
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if cfg.resume is not None:
-        others = [word for word in HydraConfig.get().overrides.task if word[:7] != "resume="]
+    if cfg.get("resume") is None:
+        config = checked("train", cfg)
+        trust = packages(config.get("trust"))
+    else:
+        folder, trust = Path(cfg.resume), packages(cfg.get("trust"))
+        others = [
+            word
+            for word in HydraConfig.get().overrides.task
+            if not word.lstrip("+").startswith(("resume=", "trust="))
+        ]
         if others:
             raise ConfigError(
                 f"resume goes on with the run's own configuration: leave out {', '.join(others)}"
             )
-        folder = Path(cfg.resume)
-    config = plain(cfg) if cfg.resume is None else read_config(folder)
+        config = read_config(folder, trust)
+        epochs(config)  # an old run says so
+        check("train", config)
     last = folder / CHECKPOINTS / "last.ckpt"
-    if cfg.resume is not None and not last.is_file():
+    if cfg.get("resume") is not None and not last.is_file():
         raise ConfigError(f"nothing to resume from: {last} does not exist")
     with claimed(folder, config):
         error = recorded_error(folder)
-        if error is not None and cfg.resume is None:
+        if error is not None and cfg.get("resume") is None:
             log.info("already trained, to train again delete %s", folder)
             return error
         if last.is_file():
             log.info("going on with the training in %s", folder)
-        return _train(folder, config, last if last.is_file() else None)
+        return _train(folder, config, last if last.is_file() else None, trust)
 
 
-def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
+def _train(
+    folder: Path, config: dict[str, Any], last: Path | None, trust: tuple[str, ...]
+) -> float:
     """Train in a folder, from a checkpoint if there is one."""
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
@@ -117,7 +131,7 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
             "model.coordinates=velocity, which learns from (q, v), or use model=lnn"
         )
     if config.get("start_from") and last is None:
-        _take_weights(model, Path(config["start_from"]))
+        _take_weights(model, Path(config["start_from"]), trust)
     learner = build_learner(config, model, statistics, validator)
     description = describe(folder, config)
     trainer = build_trainer(config, folder, data.source, validator, description)
@@ -135,7 +149,7 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     seconds = time.perf_counter() - start
 
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
-    error = metrics.get("val/error_mean", float("nan"))
+    error = metrics.get(VALIDATION_ERROR, float("nan"))
     parameters = sum(p.numel() for p in model.parameters())
     record = {
         "name": config["name"],
@@ -163,10 +177,10 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     return error
 
 
-def _take_weights(model: Predictor, folder: Path) -> None:
+def _take_weights(model: Predictor, folder: Path, trust: tuple[str, ...]) -> None:
     """Give the model the trained weights, and the scales, of another run."""
     try:
-        trained = load_run(folder, "best").model
+        trained = load_run(folder, "best", trust).model
     except ConfigError as error:
         raise ConfigError(f"start_from: {error}") from error
     try:

@@ -7,6 +7,7 @@ from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.losses import IncrementLoss, WindowLoss
 from pinn_dyn.training.member_soap import MemberSOAP
 from pinn_dyn.training.midpoint import MidpointLoss
+from pinn_dyn.training.schedule import one_cycle
 
 __all__ = [
     "DynamicsLearner",
@@ -18,4 +19,5 @@ __all__ = [
     "NonFiniteLossError",
     "WindowLoss",
     "fit",
+    "one_cycle",
 ]

@@ -20,8 +20,7 @@ def compiler(monkeypatch):
 def config(choice, steps=build.STEPS_TO_COMPILE, accelerator="cpu"):
     return {
         "compile": choice,
-        "trainer": {"max_epochs": 2, "accelerator": accelerator},
-        "data": {"batches_per_epoch": steps / 2},
+        "trainer": {"steps": steps, "accelerator": accelerator},
     }
 
 
