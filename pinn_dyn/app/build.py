@@ -21,7 +21,7 @@ from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.evaluation import RolloutValidator, RunDescription
 from pinn_dyn.mechanics import Ensemble, MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
-from pinn_dyn.training import DynamicsLearner, EnsembleLearner, IncrementLoss
+from pinn_dyn.training import DynamicsLearner, EnsembleLearner, IncrementLoss, WholeCheckpoints
 
 CHECKPOINTS = "checkpoints"
 LONGEST_EPOCH = 1000
@@ -231,6 +231,7 @@ def build_trainer(
         check_val_every_n_epoch=every,
         callbacks=[*callbacks, description],
         logger=loggers,
+        plugins=[WholeCheckpoints()],
         default_root_dir=str(folder),
         inference_mode=False,  # validation needs derivatives
         num_sanity_val_steps=0,

@@ -12,6 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.schema import KEYS, ConfigError, check, did_you_mean
 from pinn_dyn.app.schema import arguments as arguments_of
@@ -31,7 +32,7 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as nested dicts, lists and values, all interpolations resolved.
 
     Raises:
-        ConfigError: naming every value that is still missing.
+        ConfigError: naming every value that is still missing, or one that cannot be computed.
     """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
@@ -39,7 +40,11 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
             f"no value for {', '.join(missing)}: give it on the command line, as in "
             f"'{missing[0]}=...'"
         )
-    values = OmegaConf.to_container(cfg, resolve=True)
+    try:
+        values = OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException as error:
+        said = str(error).splitlines()[0]
+        raise ConfigError(f"{getattr(error, 'full_key', '')}: {said}") from error
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 

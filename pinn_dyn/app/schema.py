@@ -140,6 +140,7 @@ GIVEN = {
     "trainer.callbacks": "callbacks",
     "trainer.logger": "logger",
     "trainer.default_root_dir": "hydra.run.dir",
+    "trainer.plugins": "trainer.precision and trainer.strategy",
 }
 
 
@@ -287,6 +288,8 @@ _MAPPINGS = (dict, collections.abc.Mapping, collections.abc.MutableMapping)
 
 def _fits(value: Any, hint: Any) -> bool:
     origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
     if hint is None or hint is type(None):
         return value is None
     if origin is Annotated:
@@ -331,7 +334,8 @@ def words(hint: Any) -> str:
 
 def _words(hint: Any) -> str:
     origin, inner = get_origin(hint), get_args(hint)
-    plain = {
+    plain: dict[Any, str] = {
+        Any: "any value",
         None: "null",
         type(None): "null",
         bool: "true or false",

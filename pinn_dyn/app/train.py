@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -142,10 +143,12 @@ def _train(
         trainer.fit(learner, data, ckpt_path=last, weights_only=True)
         if last is not None and not trainer.callback_metrics:  # ended just before its record
             trainer.validate(learner, data, verbose=False)
-    except SystemExit:  # Lightning's end of an interrupted training
+    except (
+        SystemExit
+    ) as stop:  # Lightning's end of an interrupted training, of SIGTERM without a status
         if HydraConfig.get().mode == RunMode.RUN:
             log.warning("interrupted; go on with: python train.py resume=%s", folder)
-        raise
+        raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
     seconds = time.perf_counter() - start
 
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}

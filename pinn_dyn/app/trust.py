@@ -74,6 +74,7 @@ _PLACES: dict[str, tuple[Any, ...]] = {
 }
 
 MOST_BYTES = 1_000_000
+MOST_DEPTH = 30
 MOST_NODES = 50_000
 """A configuration of this program has some hundred values, 10 kB."""
 
@@ -118,7 +119,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
                 f"{path} has {path.stat().st_size} bytes, expected a configuration of at most "
                 f"{MOST_BYTES}"
             )
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        _check_depth(path, text)
+        values = yaml.safe_load(text)
         count = _size(values, {})
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
         if isinstance(error, ConfigError):
@@ -133,6 +136,19 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise ConfigError(f"{path} holds no configuration: expected a mapping of names to values")
     return values
+
+
+def _check_depth(path: Path, text: str) -> None:
+    """Refuse mappings in mappings in mappings without end, which take the parser for ever."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > MOST_DEPTH:
+            raise ConfigError(
+                f"{path} has values more than {MOST_DEPTH} levels deep, expected a configuration "
+                "that train.py wrote"
+            )
 
 
 def _size(value: Any, known: dict[int, int]) -> int:

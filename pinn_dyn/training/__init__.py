@@ -1,5 +1,6 @@
 """Training: the LightningModule, losses and callbacks."""
 
+from pinn_dyn.training.checkpoints import WholeCheckpoints
 from pinn_dyn.training.ensemble import EnsembleLearner
 from pinn_dyn.training.fit import fit
 from pinn_dyn.training.impulse import ImpulseLoss
@@ -17,6 +18,7 @@ __all__ = [
     "MemberSOAP",
     "MidpointLoss",
     "NonFiniteLossError",
+    "WholeCheckpoints",
     "WindowLoss",
     "fit",
     "one_cycle",

@@ -60,6 +60,6 @@ def test_an_option_of_another_class_says_how_to_remove_it(nested):
     if nested:
         config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "statistics": config}
         key = "statistics.hidden"
-    says = rf"model: MeasuredVelocity takes no 'hidden'.*remove it by '~model\.{key}'"
+    says = rf"model.*: MeasuredVelocity takes no 'hidden'.*remove it by '~model\.{key}'"
     with pytest.raises(ConfigError, match=says):
         build._build("model", config)
