@@ -22,6 +22,9 @@ _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
+_CONFIG_DIR = re.compile(r"(?:--config-dir|-cd)[ =](\S+)")  # a user's own groups
+
+
 def config_folder(command: str) -> Path:
     """Where the configuration of a command and its groups are: control has a folder of its own."""
     own = CONF / command
@@ -105,6 +108,8 @@ def _takes(command: str, known: dict[str, Any], path: str) -> dict[str, Any]:
 def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any]] | None:
     """The first key of the overrides that is in no YAML, and the configuration without it."""
     words = [word for word in arguments if "=" in word and not word.startswith("-")]
+    if folders := _CONFIG_DIR.findall(" ".join(arguments)):
+        words.append(f"hydra.searchpath=[file://{Path(folders[0]).resolve()}]")
     try:
         overrides = []
         for word, parsed in zip(

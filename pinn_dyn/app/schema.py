@@ -217,9 +217,10 @@ def arguments(target: Any, path: str = "_target_") -> dict[str, Any]:
         ConfigError: if there is no such class or function.
     """
     found = find(target, path)
-    function = found.__init__ if isinstance(found, type) else found
+    described: Any = found
+    if isinstance(found, type) and not dataclasses.is_dataclass(found):
+        described = found.__init__  # type: ignore[misc]
     try:
-        described = found if dataclasses.is_dataclass(found) else function
         hints = get_type_hints(described, include_extras=True)
     except Exception:  # names that exist for type checkers only, in other packages
         hints = {}

@@ -143,9 +143,7 @@ def _train(
         trainer.fit(learner, data, ckpt_path=last, weights_only=True)
         if last is not None and not trainer.callback_metrics:  # ended just before its record
             trainer.validate(learner, data, verbose=False)
-    except (
-        SystemExit
-    ) as stop:  # Lightning's end of an interrupted training, of SIGTERM without a status
+    except SystemExit as stop:  # Lightning's end of an interrupted training; SIGTERM has no status
         if HydraConfig.get().mode == RunMode.RUN:
             log.warning("interrupted; go on with: python train.py resume=%s", folder)
         raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
