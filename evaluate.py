@@ -1,6 +1,6 @@
 """Compare trained models on unseen test trajectories: python evaluate.py --help"""
 
-from pinn_dyn.app.config import main
+from pinn_dyn.app.command import evaluate
 
 if __name__ == "__main__":
-    main("evaluate")
+    evaluate()

@@ -1,6 +1,6 @@
 """Train a learned dynamics model: python train.py --help"""
 
-from pinn_dyn.app.config import main
+from pinn_dyn.app.command import train
 
 if __name__ == "__main__":
-    main("train")
+    train()

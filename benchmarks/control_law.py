@@ -29,7 +29,8 @@ from hydra import compose, initialize_config_dir
 
 from pinn_dyn.app.build import build_model
 from pinn_dyn.app.config import CONF, plain
-from pinn_dyn.app.runs import load_run, provenance
+from pinn_dyn.app.provenance import provenance
+from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.control import Tracking, export_law, load_law
 from pinn_dyn.control.export import INPUTS
 from pinn_dyn.mechanics import MechanicalSystem

@@ -30,7 +30,7 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
-from pinn_dyn.app.runs import provenance
+from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.ensembles.data import MemberSampler

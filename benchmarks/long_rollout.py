@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pinn_dyn.app.runs import provenance
+from pinn_dyn.app.provenance import provenance
 from pinn_dyn.mechanics import RK4, MechanicalSystem, Signal
 from pinn_dyn.mechanics.compilation import CompiledLoop, integrated_by
 from pinn_dyn.models import (

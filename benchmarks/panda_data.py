@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import CONF, plain
-from pinn_dyn.app.runs import provenance
+from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data import RobotSource
 
 

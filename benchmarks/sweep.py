@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from pinn_dyn.app.runs import provenance
+from pinn_dyn.app.provenance import provenance
 
 HERE = Path(__file__).parent
 TRAIN = HERE.parent / "train.py"
@@ -34,8 +34,7 @@ DATA = [
     "data.pairs=4000",
 ]
 SETTINGS = [
-    "trainer.max_epochs=2",
-    "trainer.check_val_every_n_epoch=2",
+    "trainer.validations=1",
     "trainer.enable_progress_bar=false",
     "validator.horizon=0.5",
     "~callbacks.figures",
@@ -77,12 +76,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a smoke run of shorter trainings")
     parser.add_argument("--processes", type=int, default=2, help="trainings side by side")
     arguments = parser.parse_args()
-    words = [*JOBS, *DATA, *SETTINGS, f"data.batches_per_epoch={20 if arguments.quick else 700}"]
+    words = [*JOBS, *DATA, *SETTINGS, f"trainer.steps={40 if arguments.quick else 1400}"]
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         # The data are simulated before anything is timed.
-        timed(folder / "warm", *DATA, *SETTINGS, "model=mlp", "data.batches_per_epoch=1")
+        timed(folder / "warm", *DATA, *SETTINGS, "model=mlp", "trainer.steps=1")
         for launcher, choice in (
             ("one after another", []),
             (

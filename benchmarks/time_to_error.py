@@ -5,8 +5,8 @@ error of q over 5 s open loop, on the validation trajectories that training neve
 the paper's: 0.022 with a Hamiltonian network, 0.171 with a Lagrangian one. The clock holds
 compiling and training, not the roll-outs that measure the error. One core.
 
-    ours    experiment=soft_arm_1/hnn and /lnn with optimizer=soap trainer.max_epochs=2
-            compile=false (2,000 steps), through the Lightning trainer
+    ours    experiment=soft_arm_1/hnn and /lnn with optimizer=soap trainer.steps=2000
+            trainer.validations=2 compile=false, through the Lightning trainer
     paper   jax_paper.py: pairs of neighbouring samples, the paper's networks, loss and optimizer
 
     python benchmarks/time_to_error.py                    # at most 10 min for each of the four
@@ -29,9 +29,9 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.build import build_data, build_learner, build_model, build_validator
+from pinn_dyn.app.build import build_data, build_learner, build_model, build_validator, epochs
 from pinn_dyn.app.config import CONF, plain
-from pinn_dyn.app.runs import provenance
+from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Predictor, Trajectory, stack
@@ -92,7 +92,7 @@ def ours(config: dict[str, Any], data: DynamicsData, goal: float, clock: Clock) 
     trainer = L.Trainer(
         accelerator="cpu",
         devices=1,
-        max_epochs=config["trainer"]["max_epochs"],
+        max_epochs=epochs(config)[0],
         gradient_clip_val=config["trainer"]["gradient_clip_val"],
         limit_val_batches=0,
         inference_mode=False,
@@ -163,7 +163,12 @@ def main() -> None:
         goal = PAPER_ERROR[kind]
         with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
             # The paper's error takes a short training: compiling would not pay.
-            short = ["optimizer=soap", "trainer.max_epochs=2", "compile=false"]
+            short = [
+                "optimizer=soap",
+                "trainer.steps=2000",
+                "trainer.validations=2",
+                "compile=false",
+            ]
             words = [f"experiment=soft_arm_1/{kind}", f"model_name={kind}", *short]
             config = plain(compose("train", overrides=words))
         found = {}

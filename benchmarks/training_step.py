@@ -39,7 +39,7 @@ import torch
 from hessian_baseline import HessianBaseline
 from torch import Tensor
 
-from pinn_dyn.app.runs import provenance
+from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Signal
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM

@@ -15,6 +15,8 @@ from pathlib import Path
 import griffe
 import yaml
 
+from pinn_dyn.app.schema import KEYS, ConfigError, arguments, words
+
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
 PROGRAMS = ("train", "evaluate", "control", "gather")
@@ -25,8 +27,8 @@ Made from `conf/` and from the docstrings of the classes that it names, when thi
 
 - A **group** is a folder of `conf/`, an **option** a file in it: `model=lnn`,
   `model/damping=constant`.
-- A **key** is changed by its dotted name: `trainer.max_epochs=40`, `model.mass.hidden=[64,64]`. A
-  key that the YAML does not name needs a plus: `+robot.mass=0.36`.
+- A **key** is changed by its dotted name: `trainer.steps=40000`, `model.mass.hidden=[64,64]`. What
+  a class takes besides the keys of its YAML can be given as well: `loss.huber=0.01`.
 - `???` has no default and must be given. `${...}` takes the value of another key.
 - `_target_` is the class that is built, its arguments are the keys beside it; the rest of what its
   constructor takes (scales of the data, the system) comes from the program.
@@ -43,48 +45,50 @@ def config_reference() -> str:
     package = griffe.load("pinn_dyn", search_paths=[str(ROOT)])
     parts = [HEAD, "## Programs"]
     for name in PROGRAMS:
-        parts.append(_option(package, CONF / f"{name}.yaml", f"{name}.py", "", level=3))
+        own = CONF / name / f"{name}.yaml"
+        path = own if own.is_file() else CONF / f"{name}.yaml"
+        parts.append(_option(package, path, f"{name}.py", "", level=3, types=KEYS[name]))
     for folder in sorted(path for path in CONF.rglob("*") if path.is_dir()):
-        group = folder.relative_to(CONF).as_posix()
+        group = folder.relative_to(CONF).as_posix().removeprefix("control/")
         files = sorted(folder.glob("*.yaml"))
-        if not files or group.startswith("experiment"):
+        if not files or group.startswith("experiment") or folder == CONF / "control":
             continue
         parts.append(f"## {group}")
         for file in files:
             choice = f"{'+' if group == 'debug' else ''}{group}={file.stem}"
             prefix = f"{group.replace('/', '.')}."
             parts.append(_option(package, file, choice, prefix, level=3))
-    parts.append("## experiment\n")
-    parts.append("Each is a difference from the defaults, `experiment=<name>`.\n")
-    parts.append("| name | what |\n|---|---|")
-    experiments = sorted((CONF / "experiment").rglob("*.yaml"))
-    rows = [
-        f"| `{path.relative_to(CONF / 'experiment').with_suffix('').as_posix()}` "
-        f"| {_cell(_comment(path.read_text().splitlines()))} |"
-        for path in experiments
-    ]
-    return "\n".join([*parts, *rows]) + "\n"
+    for program, folder in (("train", CONF), ("control", CONF / "control")):
+        parts.append(f"## experiment of {program}.py\n")
+        parts.append("Each is a difference from the defaults, `experiment=<name>`.\n")
+        parts.append("| name | what |\n|---|---|")
+        for path in sorted((folder / "experiment").rglob("*.yaml")):
+            name = path.relative_to(folder / "experiment").with_suffix("").as_posix()
+            parts.append(f"| `{name}` | {_cell(_comment(path.read_text().splitlines()))} |")
+        parts.append("")
+    return "\n".join(parts)
 
 
-def _option(package, path: Path, title: str, prefix: str, level: int) -> str:
+def _option(package, path: Path, title: str, prefix: str, level: int, types=None) -> str:
     """One YAML: its heading, comment and table."""
     lines = path.read_text().splitlines()
     if any(line.startswith("# @package _global_") for line in lines):
         prefix = ""
-    rows = _rows(package, lines, yaml.compose(path.read_text()), prefix)
+    rows = _rows(package, lines, yaml.compose(path.read_text()), prefix, types or {})
     text = f"\n{'#' * level} `{title}`\n\n{_cell(_comment(lines))}\n"
     if rows:
-        text += "\n| key | default | meaning |\n|---|---|---|\n" + "\n".join(rows) + "\n"
+        text += "\n| key | default | type | meaning |\n|---|---|---|---|\n" + "\n".join(rows) + "\n"
     return text
 
 
-def _rows(package, lines: list[str], node: yaml.Node, prefix: str) -> list[str]:
+def _rows(package, lines: list[str], node: yaml.Node, prefix: str, types) -> list[str]:
     """A row for each key of a mapping, and of the mappings inside."""
     target = next((v.value for k, v in node.value if k.value == "_target_"), None)
     described = _arguments(package, target) if target else {}
+    types = _types(target, prefix) if target else types
     rows = []
     if target:
-        rows.append(f"| `{prefix}_target_` | {_linked(package, target)} | |")
+        rows.append(f"| `{prefix}_target_` | {_linked(package, target)} | | |")
     for key, value in node.value:
         name = key.value
         if name in ("_target_", "_partial_") or (not prefix and name == "hydra"):
@@ -94,13 +98,15 @@ def _rows(package, lines: list[str], node: yaml.Node, prefix: str) -> list[str]:
             continue
         meaning = [described.get(name, ""), _beside(lines, key, value)]
         text = _cell(" ".join(part.rstrip(".") + "." for part in meaning if part))
+        kind = _cell(words(types[name])) if name in types else ""
+        kind = "" if kind == "any value" else f"{kind} "
         if isinstance(value, yaml.MappingNode) and value.value and not value.flow_style:
-            rows.append(f"| **`{prefix}{name}`** | | {text} |")
-            rows.extend(_rows(package, lines, value, f"{prefix}{name}."))
+            rows.append(f"| **`{prefix}{name}`** | | | {text} |")
+            rows.extend(_rows(package, lines, value, f"{prefix}{name}.", {}))
         elif classes := _classes(package, value):
-            rows.append(f"| `{prefix}{name}` | {', '.join(classes)} | {text} |")
+            rows.append(f"| `{prefix}{name}` | {', '.join(classes)} | {kind}| {text} |")
         else:
-            rows.append(f"| `{prefix}{name}` | {_value(value)} | {text} |")
+            rows.append(f"| `{prefix}{name}` | {_value(value)} | {kind}| {text} |")
     return rows
 
 
@@ -112,8 +118,16 @@ def _defaults(value: yaml.SequenceNode) -> list[str]:
             ((group, option),) = item.value
             name = group.value.removeprefix("override ").lstrip("/")
             shown = "none" if option.value == "null" else f"`{option.value}`"
-            rows.append(f"| `{name}=` | {shown} | group |")
+            rows.append(f"| `{name}=` | {shown} | group | |")
     return rows
+
+
+def _types(target: str, prefix: str):
+    """Types of the arguments of a class, as the program checks them."""
+    try:
+        return arguments(target, prefix.rstrip("."))
+    except ConfigError:  # of a package that need not be installed
+        return {}
 
 
 def _arguments(package, target: str) -> dict[str, str]:

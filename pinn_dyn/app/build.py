@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import inspect
+import os
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 from hydra.errors import InstantiationException
-from hydra.utils import get_object, instantiate
-from lightning.pytorch.callbacks import TQDMProgressBar
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.schema import Part, arguments, check_value
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -22,17 +23,23 @@ from pinn_dyn.evaluation import RolloutValidator, RunDescription
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
-from pinn_dyn.training import DynamicsLearner
+from pinn_dyn.training import DynamicsLearner, WholeCheckpoints
 
 CHECKPOINTS = "checkpoints"
+LONGEST_EPOCH = 1000
+"""Steps after which the last checkpoint is written anew, at the latest."""
+VALIDATION_ERROR = "val/error_mean"
+"""The figure by which the best checkpoint is chosen."""
 
 
-def _build(name: str, config: dict[str, Any], *given: Any, **extra: Any) -> Any:
+def _build(name: str, config: dict[str, Any], /, *given: Any, **extra: Any) -> Any:
     """Instantiate a part of the configuration; its own error message comes first.
 
     Raises:
-        ConfigError: naming the part, with what its constructor said.
+        ConfigError: naming the part, if its keys are not arguments of its constructor, or with what
+            its constructor said.
     """
+    check_value(name, config, Part)
     try:
         # Plain lists and dicts reach the constructors: no room below knows a config object.
         built = instantiate(config, _convert_="all")
@@ -41,43 +48,54 @@ def _build(name: str, config: dict[str, Any], *given: Any, **extra: Any) -> Any:
         # Hydra wraps what a constructor said.
         wrapped = isinstance(error, InstantiationException) and error.__cause__
         said = str(wrapped or error)
-        if "unexpected keyword argument" in said:
-            said = _unknown_option(name, config) or said
         raise ConfigError(f"{name}: {said}") from error
-
-
-def _unknown_option(path: str, config: Any) -> str | None:
-    """What to say of the first option that its class does not take; None if there is none.
-
-    An experiment sets options of the classes that it chooses. They stay behind where the command
-    line chooses another class.
-    """
-    if not isinstance(config, dict):
-        return None
-    if "_target_" in config:
-        target = get_object(config["_target_"])
-        takes = inspect.signature(target).parameters
-        if not any(one.kind is one.VAR_KEYWORD for one in takes.values()):
-            for key in config:
-                if key not in takes and not key.startswith("_"):
-                    return (
-                        f"{target.__name__} takes no {key!r}; if an experiment has it for another "
-                        f"class, remove it by '~{path}.{key}'"
-                    )
-    found = (_unknown_option(f"{path}.{key}", part) for key, part in config.items())
-    return next((said for said in found if said), None)
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
     """The data source of ``config["dataset"]``."""
-    return _build("dataset", config["dataset"])
+    return _build("dataset", {**_cache(config["dataset"]), **config["dataset"]})
+
+
+def _cache(dataset: dict[str, Any]) -> dict[str, str]:
+    """Where a source that simulates keeps its data, unless its configuration says so."""
+    if "cache" not in arguments(dataset.get("_target_"), "dataset"):
+        return {}
+    return {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")}
 
 
 def build_data(config: dict[str, Any]) -> DynamicsData:
     """The data module of ``config["data"]`` on the data source."""
     source = build_source(config)
-    part = {**config["data"], "_partial_": True}
-    return _build("data", part, source=source)
+    part = {"seed": config["seed"], **config["data"], "_partial_": True}
+    _, batches, _ = epochs(config)
+    return _build("data", part, source=source, batches_per_epoch=batches)
+
+
+def epochs(config: dict[str, Any]) -> tuple[int, int, int]:
+    """Epochs of a training, steps in each, and epochs from one validation to the next.
+
+    An epoch is a number of steps that divides the steps between two validations, so that the
+    training ends with a validation.
+
+    Raises:
+        ConfigError: unless ``trainer.steps`` is a multiple of ``trainer.validations``.
+    """
+    if not {"steps", "validations"} <= config["trainer"].keys():
+        raise ConfigError(
+            "trainer has no steps and validations: the configuration was written by pinn_dyn 0.2 "
+            "or before, go on with that version, or start again"
+        )
+    steps, validations = config["trainer"]["steps"], config["trainer"]["validations"]
+    between, rest = divmod(steps, validations)
+    if rest or not between:
+        fitting = max(between, 1) * validations
+        raise ConfigError(
+            f"trainer.steps is {steps} and trainer.validations {validations}: expected a multiple, "
+            f"as trainer.steps={fitting}"
+        )
+    fewest = -(-between // LONGEST_EPOCH)
+    every = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)
+    return validations * every, between // every, every
 
 
 def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
@@ -139,9 +157,9 @@ def compiles(config: dict[str, Any]) -> bool:
     """
     choice = config["compile"]
     if choice == "auto":
-        steps = config["trainer"]["max_epochs"] * config["data"]["batches_per_epoch"]
         on_cpu = config["trainer"]["accelerator"] == "cpu"
-        return on_cpu and steps >= STEPS_FOR_DERIVATIVE and has_cpp_compiler()
+        long = config["trainer"]["steps"] >= STEPS_FOR_DERIVATIVE
+        return on_cpu and long and has_cpp_compiler()
     if not isinstance(choice, bool):
         raise ConfigError(f"compile is {choice!r}, expected true, false or auto")
     if choice and not has_cpp_compiler():
@@ -171,8 +189,6 @@ def build_trainer(
     """
     # What a callback needs beyond its configuration, by its name there.
     needs: dict[str, dict[str, Any]] = {
-        "best": {"dirpath": str(folder / CHECKPOINTS)},
-        "last": {"dirpath": str(folder / CHECKPOINTS)},
         "figures": {
             "validator": validator,
             "labels": source.labels,
@@ -185,23 +201,46 @@ def build_trainer(
         _build(f"callbacks.{name}", part, **needs.get(name, {}))
         for name, part in config["callbacks"].items()
     ]
-    if config["trainer"].get("enable_progress_bar"):
+    # A resumed training finds them by these names.
+    saved: dict[str, Any] = {
+        "dirpath": str(folder / CHECKPOINTS),
+        "enable_version_counter": False,
+    }
+    callbacks += [
+        ModelCheckpoint(filename="best", monitor=VALIDATION_ERROR, **saved),
+        ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **saved),
+        LearningRateMonitor(),
+    ]
+    part = {key: x for key, x in config["trainer"].items() if key not in ("steps", "validations")}
+    if part.get("enable_progress_bar", True):
         # Drawing at every step takes a tenth of the time of a small network's step.
         callbacks.append(TQDMProgressBar(refresh_rate=20))
-    loggers = [_build_logger(name, part, folder) for name, part in config["logger"].items()]
+    loggers = [_build_logger(name, x, folder) for name, x in config["logger"].items()]
+    count, batches, every = epochs(config)
     return _build(
         "trainer",
-        {**config["trainer"], "_partial_": True},
+        {**part, "_partial_": True},
+        max_epochs=count,
+        check_val_every_n_epoch=every,
         callbacks=[*callbacks, description],
         logger=loggers,
+        plugins=[WholeCheckpoints()],
         default_root_dir=str(folder),
+        inference_mode=False,  # validation needs derivatives
+        num_sanity_val_steps=0,
+        log_every_n_steps=min(100, batches),
+        enable_model_summary=False,
         use_distributed_sampler=False,  # DynamicsData deals the windows of a batch out itself
     )
 
 
 def _build_logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
     """A logger that knows the run folder."""
-    extra = {"tags": {"folder": str(folder.resolve())}} if name == "mlflow" else {}
+    extra: dict[str, Any] = {}
+    if name == "tensorboard":  # one log for all parts of a training, also a resumed one
+        extra = {"name": "tensorboard", "version": "", "default_hp_metric": False}
+    if name == "mlflow":
+        extra = {"tags": {"folder": str(folder.resolve())}}
     try:
         return _build(f"logger.{name}", config, save_dir=str(folder), **extra)
     except ModuleNotFoundError as error:
@@ -254,7 +293,8 @@ def build_law(
         raise ConfigError(
             f"controllers.{name}.terms is {part['terms']!r}, expected {' or '.join(models)}"
         )
-    law = _build(f"controllers.{name}.law", part["law"], models[part["terms"]])
+    gains = {f"{key}_gain": value for key, value in config["gains"].items()}
+    law = _build(f"controllers.{name}.law", {**gains, **part["law"]}, models[part["terms"]])
     if "observer" not in part:
         return law
     return _build(f"controllers.{name}.observer", part["observer"], law)
@@ -272,7 +312,7 @@ def build_actuator(config: dict[str, Any]) -> Actuator:
 
 def build_sensor(config: dict[str, Any]) -> Sensor:
     """The noise of ``config["sensor"]``."""
-    return _build("sensor", config["sensor"])
+    return _build("sensor", {"seed": config["seed"], **config["sensor"]})
 
 
 def build_initial_states(config: dict[str, Any]) -> InitialStates:

@@ -2,41 +2,40 @@
 
 from __future__ import annotations
 
-import difflib
-import importlib
-import logging
-import sys
-import warnings
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException, OverrideParseException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.multirun import how_to_go_on
-
-_MODULES = {"train": "training", "evaluate": "evaluation", "control": "control", "gather": "sweeps"}
+from pinn_dyn.app.schema import KEYS, ConfigError, check, did_you_mean
+from pinn_dyn.app.schema import arguments as arguments_of
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
-class ConfigError(ValueError):
-    """The configuration cannot be used as it is; the message says what to change."""
+_CONFIG_DIR = re.compile(r"(?:--config-dir|-cd)[ =](\S+)")  # a user's own groups
+
+
+def config_folder(command: str) -> Path:
+    """Where the configuration of a command and its groups are: control has a folder of its own."""
+    own = CONF / command
+    return own if own.is_dir() else CONF
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as nested dicts, lists and values, all interpolations resolved.
 
     Raises:
-        ConfigError: naming every value that is still missing.
+        ConfigError: naming every value that is still missing, or one that cannot be computed.
     """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
@@ -44,55 +43,73 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
             f"no value for {', '.join(missing)}: give it on the command line, as in "
             f"'{missing[0]}=...'"
         )
-    values = OmegaConf.to_container(cfg, resolve=True)
+    try:
+        values = OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException as error:
+        said = str(error).splitlines()[0]
+        raise ConfigError(f"{getattr(error, 'full_key', '')}: {said}") from error
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 
 
-def main(command: str) -> None:
-    """Run train, evaluate, control or gather on the configuration that the command line asks for.
+def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
+    """The configuration of a command as plain values, of the right types and in range.
 
-    A misspelt key ends the program before anything is written, with the keys that were probably
-    meant; so does an error that the user can mend, without a traceback.
+    Raises:
+        ConfigError: naming the key that is missing, unknown or of the wrong kind.
     """
-    completing = {"-sc", "--shell-completion"} & set(sys.argv)  # whose words are no overrides
-    problem = None if completing else misspelt_key(command, sys.argv[1:])
-    if problem:
-        raise SystemExit(f"Error: {problem}")
-
-    def run(cfg: DictConfig) -> object:
-        # PyTorch and Lightning take seconds to import, which --help and a misspelt key do not need.
-        from pinn_dyn.data import SimulationError
-        from pinn_dyn.training import NonFiniteLossError
-
-        task = getattr(importlib.import_module(f"pinn_dyn.app.{_MODULES[command]}"), command)
-        try:
-            return task(cfg)
-        except (ConfigError, NonFiniteLossError, SimulationError) as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # SweepCallback then goes on with the other jobs
-            raise SystemExit(f"Error: {error}") from error
-
-    # What a user cannot act on: loggers and hardware, and our libraries about each other.
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
-    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
-    try:
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name=command)(run)()
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted") from None
-    finally:
-        if hint := how_to_go_on():
-            print(hint, file=sys.stderr)
+    config = plain(cfg)
+    check(command, config)
+    return config
 
 
-def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
-    """What is wrong with a key among command-line overrides, and what was probably meant.
+def completed(command: str, arguments: list[str]) -> list[str]:
+    """Command-line arguments, with a ``++`` before keys that exist but stand in no YAML.
 
-    None if every key exists, or if Hydra itself will explain the error (a group's wrong option,
-    say, for which it lists the right ones).
+    A YAML names the arguments that are usually changed. What else a class takes may be given as
+    well, as in ``loss.huber=0.01``, and so may the optional keys of a command, as ``resume=...``.
+
+    Raises:
+        ConfigError: on a key that does not exist, with those that were probably meant. What Hydra
+            itself explains, a group's wrong option say, is left to it.
     """
+    arguments = list(arguments)
+    while True:
+        unknown = _unknown_key(command, arguments)
+        if unknown is None:
+            return arguments
+        key, known = unknown
+        path, name = key.rpartition(".")[::2]
+        if name not in _takes(command, known, path):
+            keys = list(_keys(known))
+            close = did_you_mean(key, keys)
+            if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
+                close = f": did you mean {' or '.join(same[:3])}?"
+            raise ConfigError(
+                f"the configuration has no key '{key}'{close or ': no key is like it.'} See all "
+                f"keys with 'python {command}.py --cfg job'."
+            )
+        index = next(k for k, word in enumerate(arguments) if re.match(rf"{key}[.=]", word))
+        arguments[index] = f"++{arguments[index]}"
+
+
+def _takes(command: str, known: dict[str, Any], path: str) -> dict[str, Any]:
+    """What may be set at a place of the configuration, besides what is there."""
+    if not path:
+        return KEYS[command]
+    part: Any = known
+    for name in path.split("."):
+        part = part.get(name) if isinstance(part, dict) else None
+    if isinstance(part, dict) and "_target_" in part:
+        return arguments_of(part["_target_"], path)
+    return {}
+
+
+def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any]] | None:
+    """The first key of the overrides that is in no YAML, and the configuration without it."""
     words = [word for word in arguments if "=" in word and not word.startswith("-")]
+    if folders := _CONFIG_DIR.findall(" ".join(arguments)):
+        words.append(f"hydra.searchpath=[file://{Path(folders[0]).resolve()}]")
     try:
         overrides = []
         for word, parsed in zip(
@@ -107,37 +124,28 @@ def misspelt_key(config_name: str, arguments: list[str]) -> str | None:
             overrides.append(word)
     except OverrideParseException:
         return None
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(command))):
         try:
-            hydra.compose(config_name, overrides=overrides)
+            hydra.compose(command, overrides=overrides)
         except ConfigCompositionException as error:
             key = getattr(error.__cause__, "full_key", None)
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
-            groups = [o for o in overrides if "." not in o.split("=")[0] and _is_group(o)]
-            known = _keys(hydra.compose(config_name, overrides=groups))
-            close = difflib.get_close_matches(key, known, n=3, cutoff=0.6) or [
-                name for name in known if name.split(".")[-1] == key.split(".")[-1]
-            ]
-            hint = f"did you mean {' or '.join(close[:3])}?" if close else "no key is like it."
-            return (
-                f"the configuration has no key '{key}': {hint} See all keys with "
-                f"'python {config_name}.py --cfg job'."
-            )
+            folder = config_folder(command)
+            groups = [o for o in overrides if _is_group(folder, o)]
+            known = OmegaConf.to_container(hydra.compose(command, overrides=groups))
+            assert isinstance(known, dict)
+            return key, {str(name): value for name, value in known.items()}
     return None
 
 
-def _is_group(override: str) -> bool:
-    return (CONF / override.split("=")[0].lstrip("+~")).is_dir()
+def _is_group(folder: Path, override: str) -> bool:
+    name = override.split("=")[0].lstrip("+~").split("@")[0]
+    return "." not in name and (folder / name).is_dir()
 
 
-def _keys(cfg: DictConfig) -> list[str]:
-    def walk(values: dict[Any, Any], prefix: str) -> Iterator[str]:
-        for key, value in values.items():
-            yield f"{prefix}{key}"
-            if isinstance(value, dict):
-                yield from walk(value, f"{prefix}{key}.")
-
-    values = OmegaConf.to_container(cfg)
-    assert isinstance(values, dict)
-    return list(walk(values, ""))
+def _keys(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _keys(value, f"{prefix}{key}.")

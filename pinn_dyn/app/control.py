@@ -25,10 +25,11 @@ from pinn_dyn.app.build import (
     build_sensor,
     build_source,
 )
-from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.control_results import write_results, write_stability
-from pinn_dyn.app.origin import build_origin, command_line, data_hash
-from pinn_dyn.app.runs import load_run, provenance, write_config
+from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
+from pinn_dyn.app.run_folder import load_run, write_config
+from pinn_dyn.app.trust import packages
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Controller,
@@ -62,11 +63,11 @@ def control(cfg: DictConfig) -> float:
     Raises:
         ConfigError: on a run that is no mechanical model, or a part that does not fit the robot.
     """
-    config = plain(cfg)
+    config = checked("control", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
     torch.set_num_threads(config["threads"])
-    run = load_run(Path(config["run"]), config["checkpoint"])
+    run = load_run(Path(config["run"]), config["checkpoint"], packages(config.get("trust")))
     model = _one_model(run.model, config["member"])
     if not isinstance(model, MechanicalSystem):
         raise ConfigError(

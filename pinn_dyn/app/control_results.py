@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
-from pinn_dyn.app.runs import CONFIG
+from pinn_dyn.app.run_folder import CONFIG
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Helix,
@@ -80,8 +80,8 @@ def write_results(
             record,
             settle_fraction=config["settle_fraction"],
             settled_after=config["settled_after"] if _at_rest(record) else None,
-            u_low=actuator["low"],
-            u_high=actuator["high"],
+            u_low=actuator.get("low"),
+            u_high=actuator.get("high"),
         )
         for name, record in records.items()
     }

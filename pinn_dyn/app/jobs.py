@@ -8,16 +8,19 @@ import json
 import math
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.multirun import ERROR
-from pinn_dyn.app.runs import CONFIG, METRICS
+from pinn_dyn.app.run_folder import CHECKPOINTS, CONFIG, METRICS
+from pinn_dyn.app.sweep import ERROR
+from pinn_dyn.app.trust import read_yaml
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
+
+MOST_FOLDERS = 50_000
+"""Looked through below a place; a large sweep has some thousand."""
 
 _HYDRA_CONFIG = Path(".hydra") / "config.yaml"
 
@@ -47,13 +50,15 @@ def find_jobs(patterns: list[str] | str) -> list[Job]:
     Raises:
         ConfigError: if a pattern leads to no job.
     """
+    if not patterns:
+        raise ConfigError("runs is empty, expected run folders, folders of them, or globs")
     found: dict[Path, Job] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         places = [Path(p) for p in sorted(glob.glob(os.path.expanduser(pattern)))]
         below = {
             path.parent.parent if path.parent.name == ".hydra" else path.parent
             for place in places
-            for path in place.rglob(CONFIG)
+            for path in _configs_below(place, pattern)
         }
         jobs = [job for job in map(_read_job, sorted(below, key=_natural)) if job is not None]
         if not jobs:
@@ -86,13 +91,29 @@ def _read_job(folder: Path) -> Job | None:
     return Job(folder, config, derived, record, problem)
 
 
+def _configs_below(place: Path, pattern: str) -> Iterator[Path]:
+    """Configurations in a folder and below it.
+
+    Raises:
+        ConfigError: if there are so many folders that these can hardly be runs alone.
+    """
+    for count, (folder, below, files) in enumerate(os.walk(place)):
+        if count == MOST_FOLDERS:
+            raise ConfigError(
+                f"runs: '{pattern}' has more than {MOST_FOLDERS} folders below it, expected run "
+                "folders or a folder of them, as runs=[runs/soft_arm_1]"
+            )
+        if CONFIG in files:
+            yield Path(folder, CONFIG)
+        below[:] = [name for name in below if name not in (CHECKPOINTS, "tensorboard")]
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
     """A configuration; empty if it is missing or damaged."""
     try:
-        values = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+        return read_yaml(path)
+    except ConfigError:
         return {}
-    return values if isinstance(values, dict) else {}
 
 
 def _last_words(folder: Path) -> str:

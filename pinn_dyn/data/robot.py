@@ -75,10 +75,10 @@ class RobotSource(DataSource):
         train: int,
         validation: int,
         test: int,
-        seed: int,
-        workers: int | None,
+        seed: int = 0,
+        workers: int | None = None,
         cache: str,
-        configurations: Mapping[str, Sequence[float]] | None,
+        configurations: Mapping[str, Sequence[float]] | None = None,
     ):
         if not (isinstance(system, MechanicalSystem) and isinstance(system, Robot)):
             raise TypeError(

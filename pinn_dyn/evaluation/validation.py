@@ -39,7 +39,7 @@ class RolloutValidator:
         self,
         *,
         horizon: float,
-        step: float | None,
+        step: float | None = None,
         training_step: float,
         window: float | None = None,
     ):

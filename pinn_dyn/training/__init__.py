@@ -1,5 +1,6 @@
 """Training: the LightningModule, losses, gradients, schedule."""
 
+from pinn_dyn.training.checkpoints import WholeCheckpoints
 from pinn_dyn.training.fit import fit
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, WindowLoss
@@ -10,6 +11,7 @@ __all__ = [
     "IncrementLoss",
     "MidpointLoss",
     "NonFiniteLossError",
+    "WholeCheckpoints",
     "WindowLoss",
     "fit",
     "one_cycle",

@@ -1,4 +1,4 @@
-"""The learning rate over a training."""
+"""The learning-rate schedule."""
 
 from __future__ import annotations
 
@@ -6,22 +6,29 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
 
-def one_cycle(optimizer: Optimizer, *, total_steps: int, peak: float) -> OneCycleLR:
-    """A short rise from peak/25 to the peak, then a cosine down to peak/25000.
+def one_cycle(optimizer: Optimizer, *, total_steps: int, warm_up: float) -> OneCycleLR:
+    """Half a cosine up to the optimizer's learning rate, then one down to next to nothing.
 
-    The rise takes 5 % of the steps, at least two. Smith and Topin (2018), "Super-convergence".
+    Smith and Topin 2019, "Super-convergence". The rate starts at a 25th of the peak and ends at a
+    25,000th of it; momentum stays as it is.
 
     Args:
-        optimizer: whose learning rate it is.
-        total_steps: of the training.
-        peak: the largest learning rate.
+        optimizer: its learning rate is the peak.
+        total_steps: steps of the training.
+        warm_up: the part of them that the rate rises in, 0 to 1.
+
+    Raises:
+        ValueError: on a part outside 0 to 1.
     """
-    total = max(total_steps, 3)  # OneCycleLR divides by zero in phases of a single step
+    if not 0 <= warm_up <= 1:
+        raise ValueError(f"warm_up is {warm_up}, expected a part of the training, 0 to 1")
+    if warm_up * total_steps == 1:  # the slope of a rise of exactly one step is not defined
+        total_steps += 1
     return OneCycleLR(
         optimizer,
-        max_lr=peak,
-        total_steps=total,
-        pct_start=max(0.05, 2 / total),
+        [group["lr"] for group in optimizer.param_groups],
+        total_steps=total_steps,
+        pct_start=warm_up,
         cycle_momentum=False,
         final_div_factor=1000.0,
     )

@@ -18,7 +18,7 @@ def cache(tmp_path_factory):
 def hnn_run(tmp_path_factory):
     """A Hamiltonian network, two epochs, with figures."""
     folder = tmp_path_factory.mktemp("runs") / "hnn"
-    return train(folder, "model=hnn", "trainer.max_epochs=2")
+    return train(folder, "model=hnn", "trainer.steps=4", "trainer.validations=2")
 
 
 @pytest.fixture(scope="session")

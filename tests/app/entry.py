@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import re
 import runpy
 import signal
 import subprocess
@@ -25,12 +26,11 @@ STRIDE = "data.stride=5"
 TINY_TRAINING = [
     "data.pairs=64",
     "data.batch_size=32",
-    "data.batches_per_epoch=2",
     "validator.horizon=0.1",
     "validator.window=null",
     "validator.step=null",
-    "trainer.max_epochs=1",
-    "trainer.check_val_every_n_epoch=1",
+    "trainer.steps=2",
+    "trainer.validations=1",
     "trainer.enable_progress_bar=false",
 ]
 TINY = [*TINY_DATA, STRIDE, *TINY_TRAINING]
@@ -58,13 +58,21 @@ def run_script(script, *arguments, checked=False):
 
     A configuration is composed three times: for its keys, for a mode that ours leave to -m, and to
     be used. Unless checked, only the last is done: a composition takes as long as a tiny training.
+    Keys then get their ``++`` whether they stand in a YAML or not.
     """
     with pytest.MonkeyPatch.context() as patch, own_logging():
         patch.setattr(sys, "argv", [script, *arguments])
         if not checked:
-            patch.setattr("pinn_dyn.app.config.misspelt_key", lambda *_: None)
+            patch.setattr("pinn_dyn.app.command.completed", lambda _, words: [*map(added, words)])
             patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
         runpy.run_path(str(ROOT / script), run_name="__main__")
+
+
+def added(word):
+    """An override that adds its key where it is not there."""
+    key = word.split("=")[0]
+    dotted = re.fullmatch(r"(?!hydra\.)\w+\.[\w.]+", key)
+    return f"++{word}" if dotted or key in ("start_from", "resume", "trust") else word
 
 
 def train(folder, *arguments):

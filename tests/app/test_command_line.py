@@ -26,10 +26,10 @@ def said(error, capsys):
     ("script", "mistake", "meant"),
     [
         ("train.py", "data.pair=64", "data.pairs"),
-        ("train.py", "trainer.max_epoch=1", "trainer.max_epochs"),
+        ("train.py", "trainer.step=1", "trainer.steps"),
         ("train.py", "optimiser.lr=0.1", "optimizer.lr"),
         ("train.py", "sed=1", "seed"),
-        ("train.py", "max_epochs=1", "trainer.max_epochs"),
+        ("train.py", "validations=1", "trainer.validations"),
         ("evaluate.py", "run=[runs/here]", "runs"),
         ("evaluate.py", "horizn=1", "horizon"),
     ],

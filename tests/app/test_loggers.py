@@ -7,7 +7,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from pinn_dyn.app.description import run_settings
+from pinn_dyn.app.train import run_settings
 from tests.app.entry import NO_FIGURES, TINY, refused_text, train
 
 FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}
@@ -86,7 +86,7 @@ def test_the_scalars_that_tensorboard_compares_first_hold_the_validation_error(h
 def test_a_training_that_fails_is_among_the_others_without_success(tmp_path):
     run = tmp_path / "run"
     with pytest.raises(SystemExit):
-        train(run, "model=mlp", "optimizer.lr=1e30", "trainer.max_epochs=3", NO_FIGURES)
+        train(run, "model=mlp", "optimizer.lr=1e30", "trainer.steps=6", NO_FIGURES)
     settings, success = session(tensorboard(run))
     assert settings["optimizer.lr"] == 1e30
     assert not success
@@ -102,7 +102,7 @@ def test_settings_are_those_of_the_command_line_with_their_resolved_values():
         "loss": {"_target_": "pinn_dyn.training.IncrementLoss"},
         "data": {"pairs": 8},
         "optimizer": {"lr": 0.1},
-        "trainer": {"max_epochs": 2, "precision": None},
+        "trainer": {"steps": 2, "precision": None},
         "model": {"hidden": [16, 16], "damping": {"epsilon": 0.0}},
         "callbacks": {"best": {"filename": "best"}},
     }
@@ -113,7 +113,7 @@ def test_settings_are_those_of_the_command_line_with_their_resolved_values():
         "seed": 3,
         "data.pairs": 8,
         "optimizer.lr": 0.1,
-        "trainer.max_epochs": 2,
+        "trainer.steps": 2,
     }
     assert run_settings(config, []) == usual
     overrides = [
@@ -142,7 +142,9 @@ def test_mlflow_keeps_settings_errors_figures_and_the_configuration_offline(tmp_
     from mlflow import MlflowClient
 
     monkeypatch.chdir(tmp_path)
-    run = train("run", "logger=mlflow", "model=lnn", "trainer.max_epochs=2").resolve()
+    run = train(
+        "run", "logger=mlflow", "model=lnn", "trainer.steps=4", "trainer.validations=2"
+    ).resolve()
     client = MlflowClient("sqlite:///runs/mlflow/mlflow.db")
     experiment = client.get_experiment_by_name("soft_arm_1")
     (found,) = client.search_runs([experiment.experiment_id])

@@ -8,8 +8,7 @@ import pandas as pd
 import pytest
 
 from pinn_dyn.app.build import build_source
-from pinn_dyn.app.origin import command_line, data_hash
-from pinn_dyn.app.runs import provenance, read_config
+from pinn_dyn.app.provenance import command_line, data_hash, provenance, read_config
 from pinn_dyn.data import LogSource
 from tests.app.entry import run_script
 from tests.app.test_control import SET_POINTS
@@ -120,8 +119,8 @@ def test_the_command_line_can_be_pasted_into_a_shell(monkeypatch):
 
 
 def test_uncommitted_changes_are_reported(monkeypatch):
-    answers = {"rev-parse": "abc1234", "status": " M pinn_dyn/app/runs.py"}
-    monkeypatch.setattr("pinn_dyn.app.runs._git", lambda *arguments: answers[arguments[0]])
+    answers = {"rev-parse": "abc1234", "status": " M pinn_dyn/app/run_folder.py"}
+    monkeypatch.setattr("pinn_dyn.app.run_folder._git", lambda *arguments: answers[arguments[0]])
     assert provenance()["uncommitted_changes"] == "yes"
     answers["status"] = ""
     assert provenance()["uncommitted_changes"] == "no"

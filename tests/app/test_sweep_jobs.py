@@ -59,7 +59,7 @@ def test_a_failed_job_does_not_end_the_sweep_and_is_listed_with_its_error(sweep,
 
 
 def test_the_same_sweep_again_skips_what_is_done_and_runs_the_rest(sweep, tmp_path, monkeypatch):
-    choices = ["model=lnn", "seed=0,1", "trainer.max_epochs=2"]
+    choices = ["model=lnn", "seed=0,1", "trainer.steps=4"]
     assert sweep(*choices) is None
     first, second = job(tmp_path, "0_lnn-seed0"), job(tmp_path, "1_lnn-seed1")
     kept, lost = (path / "metrics.json" for path in (first, second))
@@ -128,7 +128,7 @@ def test_a_search_goes_past_diverged_trials_and_asks_for_the_same_ones_again(swe
         "hydra.sweeper.n_trials=4",
         "hydra.sweeper.sampler.n_startup_trials=2",
         "optimizer.lr=choice(0.005,1e9)",
-        "trainer.max_epochs=1",
+        "trainer.steps=2",
     ]
     said = sweep(*words)
     folders = sorted(path.parent for path in (tmp_path / "sweep").glob("*/.hydra"))
@@ -208,7 +208,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = [
         *("-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"),
-        *(f"hydra/launcher={launcher}", "trainer.max_epochs=20"),
+        *(f"hydra/launcher={launcher}", "trainer.steps=40"),
     ]
     first = tmp_path / "sweep" / "0_lnn-seed0"
     log = tmp_path / "log.txt"
@@ -230,7 +230,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
 
 
 def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
-    words = ["-m", *TINY, NO_FIGURES, "model=lnn,mlp", STRIDE, "data.batches_per_epoch=5"]
+    words = ["-m", *TINY, NO_FIGURES, "model=lnn,mlp", STRIDE, "trainer.steps=5"]
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         at = dict(folder=tmp_path, output=output)

@@ -38,7 +38,7 @@ def configuration(model, pairs, seed, lr=0.01, epochs=5):
         "model": HEADS[model],
         "optimizer": {"lr": lr},
         "scheduler": {"max_lr": lr},
-        "trainer": {"max_epochs": epochs},
+        "trainer": {"steps": epochs},
         "name": f"arm/{model}",
         "model_name": model,
         "seed": seed,
@@ -312,8 +312,8 @@ def test_real_runs_are_gathered_with_their_evaluation(
         assert row["test/error_mean"] == pytest.approx(summary.error_mean[model])
         assert row["parameters"] == record["parameters"]
     # Epochs differ between the runs, but the model says it.
-    assert "trainer.max_epochs" in table
-    assert "trainer.max_epochs" not in text.split("only in the files")[0]
+    assert "trainer.steps" in table
+    assert "trainer.steps" not in text.split("only in the files")[0]
 
 
 def test_help_shows_examples(capsys):

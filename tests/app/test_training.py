@@ -8,7 +8,7 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pinn_dyn.app.runs import load_run
+from pinn_dyn.app.run_folder import load_run
 from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
 
 PLAIN = (str, int, float, bool, type(None))
@@ -44,8 +44,8 @@ def test_the_configuration_is_written_resolved(hnn_run):
     assert "???" not in text
     config = yaml.safe_load(text)
     assert config["model_name"] == "hnn"
-    assert config["trainer"]["max_epochs"] == 2
-    assert config["data"]["seed"] == config["seed"] == 0
+    assert config["trainer"]["steps"] == 4
+    assert config["seed"] == 0
     assert config["dataset"]["labels"][0] == "Δx [rad]"
     assert config == load(hnn_run)["hyper_parameters"]["config"]
 
@@ -113,28 +113,23 @@ def test_the_last_checkpoint_is_of_the_last_epoch(tmp_path):
     run = train(
         tmp_path / "run",
         "model=lnn",
-        "data.batches_per_epoch=10",
-        "trainer.max_epochs=6",
-        "+callbacks.best.mode=max",
+        "trainer.steps=60",
+        "trainer.validations=6",
+        "optimizer.lr=0.5",  # which diverges
         NO_FIGURES,
     )
     assert load(run, "best")["global_step"] < 60
     assert load(run, "last")["global_step"] == 60
 
 
-def test_a_training_ends_with_a_validation(tmp_path):
-    """Also one that is shorter than the epochs between validations, or no multiple of them."""
-    run = train(
-        tmp_path / "run",
-        "model=lnn",
-        "trainer.max_epochs=5",
-        "trainer.check_val_every_n_epoch=3",
-        "+callbacks.best.save_top_k=-1",
-        "callbacks.best.filename='{step}'",
-        NO_FIGURES,
-    )
-    found = {path.stem for path in (run / "checkpoints").glob("step=*.ckpt")}
-    assert found == {"step=6", "step=10"}
+@pytest.mark.parametrize(("steps", "validations"), [(10, 2), (6, 6), (3, 1)])
+def test_validations_are_spread_evenly_and_end_the_training(tmp_path, steps, validations):
+    length = [f"trainer.steps={steps}", f"trainer.validations={validations}"]
+    run = train(tmp_path / "run", "model=lnn", *length, NO_FIGURES)
+    log = EventAccumulator(str(run / "tensorboard")).Reload()
+    between = steps // validations
+    expected = [(k + 1) * between - 1 for k in range(validations)]
+    assert [event.step for event in log.Scalars("val/error_mean")] == expected
 
 
 def test_a_run_loads_back_with_the_weights_of_its_checkpoint(hnn_run):

@@ -44,11 +44,10 @@ SHORT = {"duration": 0.5, "train": 4, "validation": 2, "test": 2, "workers": 1}
 
 def build(cache, dataset="panda", **changes):
     """The data set of conf/dataset with its own excitations, short, built as the app does."""
-    config = OmegaConf.merge(
-        OmegaConf.load(CONF / "dataset" / f"{dataset}.yaml"),
-        {**SHORT, "cache": str(cache)},
-        changes,
-    )
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        composed = hydra.compose(f"dataset/{dataset}").dataset
+    OmegaConf.set_struct(composed, False)
+    config = OmegaConf.merge(composed, {**SHORT, "cache": str(cache)}, changes)
     config = OmegaConf.to_container(config, resolve=True)
     return hydra.utils.instantiate(config, _convert_="all")
 
@@ -336,7 +335,7 @@ def test_everything_else_imports_without_pybullet():
     """In a process where importing PyBullet fails."""
     code = (
         "import sys; sys.modules['pybullet'] = sys.modules['pybullet_data'] = None\n"
-        "import pinn_dyn.app.training, pinn_dyn.data, pinn_dyn.evaluation\n"
+        "import pinn_dyn.app.train, pinn_dyn.data, pinn_dyn.evaluation\n"
         "from pinn_dyn.systems import BulletArm, SoftArm\n"
         "SoftArm()\n"
         "try:\n    BulletArm('franka_panda/panda.urdf')\n"

@@ -20,7 +20,7 @@ from hydra.errors import ConfigCompositionException, MissingConfigException
 from hydra.utils import get_object
 from omegaconf import OmegaConf
 
-from pinn_dyn.app.config import CONF
+from pinn_dyn.app.config import CONF, ConfigError, completed, config_folder
 from tests.docs.blocks import PAGES, ROOT, blocks
 from tests.docs.test_played_pages import PLAYED
 
@@ -220,9 +220,10 @@ def compose(program, overrides, folder):
     """The configuration of a command line, with the configuration folders below a folder."""
     candidates = [folder, *sorted(path for path in folder.glob("*conf") if path.is_dir())]
     paths = ",".join(f"file://{path}" for path in candidates)
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+    words = completed(program, [f"hydra.searchpath=[{paths}]", *overrides])
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(program))):
         try:
-            cfg = hydra.compose(program, overrides=[f"hydra.searchpath=[{paths}]", *overrides])
+            cfg = hydra.compose(program, overrides=words)
         except MissingConfigException as error:
             if re.search(r"hydra/(launcher|sweeper)", str(error)):
                 pytest.skip(f"needs a plugin of Hydra: {error}")
@@ -246,14 +247,16 @@ def compose(program, overrides, folder):
     ],
 )
 def test_a_wrong_command_is_seen(command, tmp_path):
-    with pytest.raises((AssertionError, ConfigCompositionException)):
+    with pytest.raises((AssertionError, ConfigCompositionException, ConfigError)):
         check_command(command.split(), tmp_path)
 
 
+FOLDERS = [config_folder(program) for program in ("train", "control")]
 GROUPS = {
-    path.relative_to(CONF).as_posix()
-    for path in CONF.rglob("*")
-    if path.is_dir() and "experiment/" not in f"{path.relative_to(CONF)}"
+    path.relative_to(folder).as_posix()
+    for folder in FOLDERS
+    for path in folder.rglob("*")
+    if path.is_dir() and "experiment/" not in f"{path.relative_to(folder)}"
 }
 MENTION = re.compile(r"(?<![\w./@+])\+?(" + "|".join(sorted(GROUPS)) + r")=([\w/]+)(?![\w/.({\[<])")
 
@@ -266,4 +269,5 @@ def test_options_that_the_text_names_exist(page, files):
     for group, option in MENTION.findall(page.read_text()):
         path = f"{group}/{option}.yaml"
         plugin = group.startswith("hydra/")
-        assert (CONF / path).is_file() or path in own or plugin, f"no option {group}={option}"
+        ours = any((folder / path).is_file() for folder in FOLDERS)
+        assert ours or path in own or plugin, f"no option {group}={option}"

@@ -51,7 +51,7 @@ def reference():
 def test_the_configuration_reference_has_every_option_and_every_key():
     page = reference()
     for path in CONF.rglob("*.yaml"):
-        name = path.relative_to(CONF).with_suffix("").as_posix()
+        name = path.relative_to(CONF).with_suffix("").as_posix().removeprefix("control/")
         group, _, option = name.rpartition("/")
         if name.startswith("experiment/"):
             assert f"| `{name.removeprefix('experiment/')}` |" in page
@@ -66,9 +66,10 @@ def test_the_configuration_reference_has_every_option_and_every_key():
 def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments():
     page = reference()
     # From the docstring of NetworkCholesky.
-    assert "| `model.mass.hidden` | `[32, 32, 32]` | widths of the hidden layers. |" in page
+    kind, text = "a list, each a whole number", "widths of the hidden layers."
+    assert f"| `model.mass.hidden` | `[32, 32, 32]` | {kind} | {text} |" in page
     # From the comment beside the key.
-    assert "| `gains.position` | `100.0` | K\\_P. |" in page
+    assert "| `gains.position` | `100.0` | | K\\_P. |" in page
     # From the comment above the key.
     above = "Control instants per second, with the input held in between;"
-    assert f"| `rate` | `1000.0` | {above}" in page
+    assert f"| `rate` | `1000.0` | a number above 0 or null | {above}" in page

@@ -14,8 +14,8 @@ LONG = [
     "model=lnn",
     "data.steps=2",
     "loss.curriculum=[1,2]",  # the second step counts from the middle of the training on
-    f"data.batches_per_epoch={BATCHES}",
-    f"trainer.max_epochs={EPOCHS}",
+    f"trainer.steps={EPOCHS * BATCHES}",
+    f"trainer.validations={EPOCHS}",
 ]
 
 

@@ -14,9 +14,10 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from pinn_dyn.app.build import build_source
-from pinn_dyn.app.config import ConfigError, plain
-from pinn_dyn.app.origin import build_origin, command_line, data_hash
-from pinn_dyn.app.runs import Run, find_runs, load_run, provenance
+from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
+from pinn_dyn.app.run_folder import Run, find_runs, load_run
+from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
     Prediction,
@@ -73,16 +74,14 @@ def evaluate(cfg: DictConfig) -> float:
     """Evaluate runs side by side; returns the smallest mean error.
 
     Raises:
-        ConfigError: on runs that cannot be loaded, or that were trained on different data, and on
-            an unknown split.
+        ConfigError: on runs that cannot be loaded, or that were trained on different data.
     """
-    config = plain(cfg)
+    config = checked("evaluate", cfg)
     split = config["split"]
-    if split not in _SPLITS:
-        raise ConfigError(f"split: {split!r}, expected one of {', '.join(_SPLITS)}")
     folder = Path(HydraConfig.get().runtime.output_dir)
     torch.set_num_threads(config["threads"])
-    runs = [load_run(path, config["checkpoint"]) for path in find_runs(config["runs"])]
+    trust = packages(config.get("trust"))
+    runs = [load_run(path, config["checkpoint"], trust) for path in find_runs(config["runs"])]
     source = build_source(_shared_dataset(runs))
     try:
         truth = stack(getattr(source.load(), split))

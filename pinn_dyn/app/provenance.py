@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import platform
 import shlex
+import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 import yaml
 
-from pinn_dyn.app.runs import Run
+from pinn_dyn.app.run_folder import Run
 from pinn_dyn.data import DataSource, LogSource, RobotSource, SimulatedSource
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.logs.reader import find_files
@@ -41,6 +45,19 @@ def data_hash(source: DataSource) -> str:
     return f"{cache_key(source.describe())} (key of the simulation in the cache)"
 
 
+def provenance() -> dict[str, str]:
+    """Commit, whether tracked files differ from it, software and hardware, for the records."""
+    commit = _git("rev-parse", "--short", "HEAD")
+    changed = _git("status", "--porcelain", "--untracked-files=no")
+    return {
+        "commit": commit or "unknown",
+        "uncommitted_changes": "unknown" if not commit else "yes" if changed else "no",
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "hardware": f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
+    }
+
+
 def build_origin(
     runs: Mapping[str, Run], source: DataSource, record: Mapping[str, str], config: dict[str, Any]
 ) -> Origin:
@@ -49,7 +66,7 @@ def build_origin(
     Args:
         runs: names of the runs as they are in the tables.
         source: the data that they share.
-        record: what :func:`pinn_dyn.app.runs.provenance` and :func:`command_line` say.
+        record: what :func:`provenance` and :func:`command_line` say.
         config: the resolved configuration of this program.
     """
     rows = [
@@ -77,3 +94,17 @@ def build_origin(
 
 def _text(config: dict[str, Any]) -> str:
     return yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+
+
+def _git(*arguments: str) -> str:
+    """What git says of the code; nothing where there is no repository."""
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(x.split(":")[1].strip() for x in lines if x.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

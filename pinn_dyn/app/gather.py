@@ -12,7 +12,7 @@ import pandas as pd
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pinn_dyn.app.config import ConfigError, plain
+from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.jobs import Job, derived_keys, filter_jobs, find_jobs
 from pinn_dyn.evaluation import save, write_table
 from pinn_dyn.evaluation.sweep_figures import sweep_figure
@@ -38,7 +38,7 @@ def gather(cfg: DictConfig) -> None:
     Raises:
         ConfigError: if no run is found or left by the filter, or a column does not exist.
     """
-    config = plain(cfg)
+    config = checked("gather", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     jobs = filter_jobs(find_jobs(config["runs"]), config["filter"] or {})
     finished = [job for job in jobs if job.record is not None]

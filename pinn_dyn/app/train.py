@@ -5,34 +5,62 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
 import time
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from pinn_dyn.app.build import (
+    VALIDATION_ERROR,
     build_data,
     build_learner,
     build_predictor,
     build_trainer,
     build_validator,
     check_processes,
+    epochs,
 )
-from pinn_dyn.app.claims import claimed, recorded_error
-from pinn_dyn.app.config import ConfigError, plain
-from pinn_dyn.app.description import describe
-from pinn_dyn.app.runs import CHECKPOINTS, METRICS, load_run, provenance, read_config
+from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.provenance import provenance
+from pinn_dyn.app.run_folder import (
+    CHECKPOINTS,
+    CONFIG,
+    METRICS,
+    claimed,
+    load_run,
+    read_config,
+    recorded_error,
+)
+from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
 from pinn_dyn.ensembles import Ensemble, EnsembleData
-from pinn_dyn.evaluation import cleaning_figure, save
+from pinn_dyn.evaluation import RunDescription, cleaning_figure, save
+from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
 
 log = logging.getLogger(__name__)
+
+_OVERRIDES = Path(".hydra") / "overrides.yaml"
+
+# Compared among all runs, chosen on the command line or not.
+_ALWAYS = (
+    "seed",
+    "data.pairs",
+    "data.steps",
+    "data.stride",
+    "data.batch_size",
+    "optimizer.lr",
+    "trainer.steps",
+)
+# Not about what is learned.
+_IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "resume", "search")
 
 
 def train(cfg: DictConfig) -> float:
@@ -47,28 +75,39 @@ def train(cfg: DictConfig) -> float:
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if cfg.resume is not None:
-        others = [word for word in HydraConfig.get().overrides.task if word[:7] != "resume="]
+    if cfg.get("resume") is None:
+        config = checked("train", cfg)
+        trust = packages(config.get("trust"))
+    else:
+        folder, trust = Path(cfg.resume), packages(cfg.get("trust"))
+        others = [
+            word
+            for word in HydraConfig.get().overrides.task
+            if not word.lstrip("+").startswith(("resume=", "trust="))
+        ]
         if others:
             raise ConfigError(
                 f"resume goes on with the run's own configuration: leave out {', '.join(others)}"
             )
-        folder = Path(cfg.resume)
-    config = plain(cfg) if cfg.resume is None else read_config(folder)
+        config = read_config(folder, trust)
+        epochs(config)  # an old run says so
+        check("train", config)
     last = folder / CHECKPOINTS / "last.ckpt"
-    if cfg.resume is not None and not last.is_file():
+    if cfg.get("resume") is not None and not last.is_file():
         raise ConfigError(f"nothing to resume from: {last} does not exist")
     with claimed(folder, config):
         error = recorded_error(folder)
-        if error is not None and cfg.resume is None:
+        if error is not None and cfg.get("resume") is None:
             log.info("already trained, to train again delete %s", folder)
             return error
         if last.is_file():
             log.info("going on with the training in %s", folder)
-        return _train(folder, config, last if last.is_file() else None)
+        return _train(folder, config, last if last.is_file() else None, trust)
 
 
-def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
+def _train(
+    folder: Path, config: dict[str, Any], last: Path | None, trust: tuple[str, ...]
+) -> float:
     """Train in a folder, from a checkpoint if there is one."""
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
@@ -94,7 +133,7 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
             "model.state=qv, which learns from (q, v), or use model=lnn"
         )
     if config.get("start_from") and last is None:
-        _take_weights(model, Path(config["start_from"]))
+        _take_weights(model, Path(config["start_from"]), trust)
     learner = build_learner(config, model, statistics, validator)
     description = describe(folder, config)
     trainer = build_trainer(config, folder, data.source, validator, description)
@@ -106,14 +145,14 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
         trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
         if last is not None and not trainer.callback_metrics:  # ended just before its record
             trainer.validate(learner, batches, verbose=False)
-    except SystemExit:  # Lightning's end of an interrupted training
+    except SystemExit as stop:  # Lightning's end of an interrupted training; SIGTERM has no status
         if HydraConfig.get().mode == RunMode.RUN:
             log.warning("interrupted; go on with: python train.py resume=%s", folder)
-        raise
+        raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
     seconds = time.perf_counter() - start
 
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
-    error = metrics.get("val/error_mean", float("nan"))
+    error = metrics.get(VALIDATION_ERROR, float("nan"))
     parameters = sum(p.numel() for p in model.parameters())
     record = {
         "name": config["name"],
@@ -141,10 +180,10 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     return error
 
 
-def _take_weights(model: Predictor, folder: Path) -> None:
+def _take_weights(model: Predictor, folder: Path, trust: tuple[str, ...]) -> None:
     """Give the model the trained weights, and the scales, of another run."""
     try:
-        trained = load_run(folder, "best").model
+        trained = load_run(folder, "best", trust).model
     except ConfigError as error:
         raise ConfigError(f"start_from: {error}") from error
     try:
@@ -179,3 +218,35 @@ def _write_report(source: LogSource, folder: Path) -> None:
     )
     save(figure, folder / "log_cleaning.png")
     log.info("what was done to the log is in %s and log_cleaning.png", folder / "log_report.md")
+
+
+def describe(folder: Path, config: dict[str, Any]) -> RunDescription:
+    """The description of the run in a folder."""
+    path = folder / _OVERRIDES
+    overrides = yaml.safe_load(path.read_text()) if path.is_file() else []
+    return RunDescription(
+        settings=run_settings(config, overrides),
+        configuration=(folder / CONFIG).read_text(),
+        provenance=provenance(),
+    )
+
+
+def run_settings(config: dict[str, Any], overrides: list[str]) -> dict[str, Cell]:
+    """The settings to compare with those of other runs.
+
+    The whole configuration has some hundred values that hardly ever differ. So these are: model,
+    data set, the usual ones, and every value or group that was given on the command line, in a
+    sweep too, such as ``model.substeps=2`` and ``model/damping=constant``.
+    """
+    flat = flatten(config)
+    settings = {
+        "model": flat["model_name"],
+        "dataset": flat["dataset.name"],
+        "loss": flat["loss._target_"],
+        **{key: flat[key] for key in _ALWAYS if key in flat},
+    }
+    for override in overrides:
+        key, _, value = override.lstrip("+").partition("=")
+        if not key.startswith("~") and key.split(".")[0] not in _IGNORED:
+            settings.setdefault(key, flat.get(key, value))
+    return settings

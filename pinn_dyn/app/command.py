@@ -1,0 +1,66 @@
+"""The commands: what train.py, evaluate.py, control.py, gather.py and the installed scripts call.
+
+A command is the function of its name in the module of its name beside this one, and its
+configuration is ``conf/<name>.yaml``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+import warnings
+from functools import partial
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from pinn_dyn.app.config import ConfigError, completed, config_folder
+from pinn_dyn.app.sweep import how_to_go_on
+
+
+def main(command: str) -> None:
+    """Run train, evaluate, control or gather on the configuration that the command line asks for.
+
+    A misspelt key ends the program before anything is written, with the keys that were probably
+    meant; so does an error that the user can mend, without a traceback.
+    """
+    if not {"-sc", "--shell-completion"} & set(sys.argv):  # whose words are no overrides
+        try:
+            sys.argv[1:] = completed(command, sys.argv[1:])
+        except ConfigError as error:
+            raise SystemExit(f"Error: {error}") from error
+
+    def run(cfg: DictConfig) -> object:
+        # PyTorch and Lightning take seconds to import, which --help and a misspelt key do not need.
+        from pinn_dyn.data import SimulationError
+        from pinn_dyn.training import NonFiniteLossError
+
+        task = getattr(importlib.import_module(f"pinn_dyn.app.{command}"), command)
+        try:
+            return task(cfg)
+        except (ConfigError, NonFiniteLossError, SimulationError) as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # SweepCallback then goes on with the other jobs
+            raise SystemExit(f"Error: {error}") from error
+
+    # What a user cannot act on: loggers and hardware, and our libraries about each other.
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
+    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
+    try:
+        folder = str(config_folder(command))
+        hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted") from None
+    finally:
+        if hint := how_to_go_on():
+            print(hint, file=sys.stderr)
+
+
+train = partial(main, "train")
+evaluate = partial(main, "evaluate")
+control = partial(main, "control")
+gather = partial(main, "gather")

@@ -1,0 +1,222 @@
+"""Run folders: their layout, whose they are, and how a trained model is loaded back."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import json
+import os
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from filelock import FileLock, Timeout
+
+from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
+from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.trust import read_foreign
+from pinn_dyn.evaluation.sweep_table import flatten
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models import Statistics
+
+CONFIG = "config.yaml"
+METRICS = "metrics.json"
+
+_PLACES = ("dataset.cache",)  # where things lie does not change what is learned
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained model with its resolved configuration, scales and recorded metrics."""
+
+    folder: Path
+    config: dict[str, Any]
+    model: Predictor
+    statistics: Statistics
+    metrics: dict[str, Any]
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    """Write the resolved configuration of a run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIG).write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+
+
+def read_config(folder: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The resolved configuration of a run, which may come from anyone: see :mod:`trust`.
+
+    Raises:
+        ConfigError: if the folder is no run folder, its configuration is damaged, or it names what
+            a configuration of a run folder may not build.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise ConfigError(
+            f"{folder} is not a run folder: it has no {CONFIG}. A run folder is what train.py "
+            "writes, such as runs/soft_arm_1/hnn-seed0/<date>"
+        )
+    return read_foreign(path, trust)
+
+
+def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
+    """Load a run's model from one of its checkpoints, ``best`` or ``last``.
+
+    Args:
+        folder: the run folder.
+        checkpoint: ``best`` or ``last``.
+        trust: packages whose classes the run's configuration may build, besides those of this one.
+
+    Raises:
+        ConfigError: if the folder is no run folder, the checkpoint is missing or damaged, or it
+            belongs to another model or data set than the configuration says.
+    """
+    config = read_config(folder, trust)
+    for key, kind in (("dataset", dict), ("model", dict), ("model_name", str), ("seed", int)):
+        if not isinstance(config.get(key), kind):
+            raise ConfigError(
+                f"{folder / CONFIG}: {key} is {config.get(key)!r}, expected what train.py writes"
+            )
+    path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
+    saved = _read_checkpoint(path)
+    parameters = saved["hyper_parameters"]
+    for part in ("model", "dataset"):
+        there = {k: v for k, v in parameters["config"][part].items() if k != "cache"}
+        here = {k: v for k, v in config[part].items() if k != "cache"}
+        if there != here:
+            raise ConfigError(
+                f"{path} holds weights of another {_WHAT[part]} than {folder / CONFIG} describes "
+                f"({_differing(here, there)})"
+            )
+    statistics = Statistics.from_dict(parameters["statistics"])
+    model = build_predictor(config, statistics)
+    weights = {
+        key.removeprefix("model."): value
+        for key, value in saved["state_dict"].items()
+        if key.startswith("model.")
+    }
+    if broken := [key for key, value in weights.items() if value.isnan().any()]:
+        raise ConfigError(
+            f"{path} holds weights that are NaN ({broken[0]}): its training diverged, take another "
+            "checkpoint or train again with a lower optimizer.lr"
+        )
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ConfigError(
+            f"{path} holds weights of another model than {folder / CONFIG} describes: {error}"
+        ) from error
+    path = folder / METRICS
+    try:
+        metrics = json.loads(path.read_text()) if path.is_file() else {}
+    except ValueError as error:
+        raise ConfigError(f"{path} cannot be read, it may be cut short: {error}") from error
+    return Run(folder, config, model.eval(), statistics, metrics)
+
+
+_WHAT = {"model": "model", "dataset": "data set"}
+
+
+def _differing(here: dict[str, Any], there: dict[str, Any]) -> str:
+    """The first value in which two configurations differ."""
+    one, other = flatten(here), flatten(there)
+    key = next(key for key in [*one, *other] if one.get(key) != other.get(key))
+    return f"{key} is {one.get(key, 'absent')}, the checkpoint has {other.get(key, 'absent')}"
+
+
+def _read_checkpoint(path: Path) -> dict[str, Any]:
+    """What a checkpoint holds: tensors and plain values, no code.
+
+    Raises:
+        ConfigError: if it is missing, damaged, or no checkpoint of this program.
+    """
+    if not path.is_file():
+        found = sorted(p.stem for p in path.parent.glob("*.ckpt"))
+        raise ConfigError(
+            f"{path} does not exist; {path.parent} has {', '.join(found) or 'no checkpoint'}"
+        )
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():  # torch.load does not compare the checksums
+                raise zipfile.BadZipFile(f"{damaged} has another checksum")
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged archive or pickle raises nearly anything
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{path} cannot be read, it may be cut short: {said}") from error
+    parameters = saved.get("hyper_parameters") if isinstance(saved, dict) else None
+    if (
+        not isinstance(parameters, dict)
+        or not isinstance(saved.get("state_dict"), dict)
+        or not isinstance(parameters.get("statistics"), dict)
+        or not isinstance(parameters.get("config"), dict)
+        or not all(isinstance(parameters["config"].get(key), dict) for key in _WHAT)
+        or not all(isinstance(value, torch.Tensor) for value in saved["state_dict"].values())
+    ):
+        raise ConfigError(f"{path} is no checkpoint that train.py wrote")
+    return saved
+
+
+def find_runs(patterns: list[str] | str) -> list[Path]:
+    """Run folders that match paths or globs; folders without a config are passed over in globs.
+
+    Raises:
+        ConfigError: if a pattern matches nothing, or a plain path is no run folder.
+    """
+    if not patterns:
+        raise ConfigError("runs is empty, expected run folders or globs, as runs=[runs/my_arm/*]")
+    found: list[Path] = []
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        matches = sorted(Path(p) for p in glob.glob(os.path.expanduser(pattern)))
+        folders = [p for p in matches if (p / CONFIG).is_file()]
+        if not folders:
+            what = "matches nothing" if not matches else f"matches no run folder (no {CONFIG})"
+            raise ConfigError(f"runs: '{pattern}' {what}; give folders that train.py wrote")
+        found += [p for p in folders if p not in found]
+    return found
+
+
+@contextlib.contextmanager
+def claimed(folder: Path, config: dict[str, Any]) -> Iterator[None]:
+    """Work in a run folder, alone in it and with the configuration that it was made for.
+
+    Raises:
+        ConfigError: if another process works there, or the folder was made for another
+            configuration; it names the keys that differ.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            # A training that failed before its first checkpoint leaves nothing to be mixed up.
+            if (folder / METRICS).is_file() or (folder / CHECKPOINTS / "last.ckpt").is_file():
+                _refuse_another(folder, config)
+            else:
+                write_config(folder, config)
+            yield
+    except Timeout as error:
+        raise ConfigError(f"{folder} is in use: another process trains there") from error
+
+
+def _refuse_another(folder: Path, config: dict[str, Any]) -> None:
+    here, there = flatten(config), flatten(read_config(folder))
+    differing = [
+        f"{key}={here.get(key, 'absent')} (there {there.get(key, 'absent')})"
+        for key in dict.fromkeys([*here, *there])
+        if here.get(key) != there.get(key) and key not in _PLACES
+    ]
+    if differing:
+        shown = differing[:5] + (["..."] if len(differing) > 5 else [])
+        raise ConfigError(
+            f"{folder} holds a training of another configuration: {', '.join(shown)}; choose "
+            "another folder, or delete this one"
+        )
+
+
+def recorded_error(folder: Path) -> float | None:
+    """The validation error that a finished training recorded; None if it has not finished."""
+    path = folder / METRICS
+    if not path.is_file():
+        return None
+    return json.loads(path.read_text())["validation"].get(VALIDATION_ERROR, float("nan"))
