@@ -30,6 +30,7 @@ from pinn_dyn.models import (
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
+    Positive,
     Statistics,
 )
 
@@ -63,10 +64,10 @@ def make_model(kind: str) -> MechanicalSystem:
         momentum_increment_std=0.1 * increment,
         step=2e-3,
     )
-    mass = partial(NetworkCholesky, hidden=[32, 32, 32], epsilon=1e-3)
+    mass = partial(NetworkCholesky, hidden=[32, 32, 32])
     heads = {
         "potential": partial(NetworkPotential, hidden=[32, 32]),
-        "damping": partial(NetworkCholesky, hidden=[16, 16], epsilon=0.0),
+        "damping": partial(NetworkCholesky, hidden=[16, 16], positivity=Positive(floor=0.0)),
         "input": partial(NetworkInput, hidden=[16, 16]),
     }
     network = {"lnn": LagrangianNetwork, "hnn": HamiltonianNetwork}[kind]

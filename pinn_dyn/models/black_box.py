@@ -10,6 +10,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import ContinuousPredictor, Interpolation, Predictor
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -121,7 +122,9 @@ class AccelerationMLP(ContinuousPredictor):
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
         self.register_buffer("scale", acceleration.float())
-        self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
+        self.initial_velocity = initial_velocity(
+            Scales(statistics, statistics.v_std, tuple(angles))
+        )
         self.learns_initial_state = self.initial_velocity.learned
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:

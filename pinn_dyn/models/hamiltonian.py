@@ -86,13 +86,7 @@ class HamiltonianNetwork(StructuredNetwork):
             # As in the Lagrangian network: what an acceleration takes, without a momentum.
             acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
             inverse_mass_scale = acceleration / self.input.typical_force(statistics.u_rms)
-        self.inverse_mass = inverse_mass(
-            size=size,
-            scale=inverse_mass_scale.sqrt(),
-            mean=statistics.q_mean,
-            std=statistics.q_std,
-            angles=angles,
-        )
+        self.inverse_mass = inverse_mass(self._scales(statistics, inverse_mass_scale.sqrt()))
         if self.inverse_mass.transposed:
             raise ValueError(
                 "inverse_mass.transposed is true, expected false: M^-1 = L L^T is already M = R^T "

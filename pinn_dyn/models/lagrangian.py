@@ -73,20 +73,15 @@ class LagrangianNetwork(StructuredNetwork):
         )
         size = self.num_coordinates
         acceleration = statistics.velocity_increment_std[0, size:] / statistics.step
-        self.mass = mass(
-            size=size,
-            scale=(self.input.typical_force(statistics.u_rms) / acceleration).sqrt(),
-            mean=statistics.q_mean,
-            std=statistics.q_std,
-            angles=angles,
-        )
+        inertia = self.input.typical_force(statistics.u_rms) / acceleration
+        self.mass = mass(self._scales(statistics, inertia.sqrt()))
         if self.mass.chain and not self.mass.transposed:
             raise ValueError(
                 "mass.chain is true and mass.transposed false, expected both: only in M = L^T L "
                 "does a column of L depend on the joints after it alone"
             )
 
-        self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
+        self.initial_velocity = initial_velocity(self._scales(statistics, statistics.v_std))
         self.learns_initial_state = self.initial_velocity.learned
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 Tape = tuple[Tensor, ...]
-"""Slopes of the hidden activations at one input, kept for the tangent and reverse passes."""
+"""Slopes of the features and hidden activations at one input, for the passes below."""
 
 
 def _softplus(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -35,12 +35,26 @@ ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 }
 """Smooth activations, each as (value, slope); dynamics need two derivatives, so no ReLU here."""
 
+REACH = 3.0
+"""Standard deviations from the mean up to which a saturating network sees its input as it is."""
+
+
+def saturated(z: Tensor) -> tuple[Tensor, Tensor]:
+    """s(z) and its slope: z itself up to ``REACH``, beyond smoothly no more than ``REACH`` + 1.
+
+    s(z) = c + tanh(z - c) with c = z clipped to +-REACH; its second derivative is continuous.
+    """
+    clipped = z.clamp(-REACH, REACH)
+    beyond = torch.tanh(z - clipped)
+    return clipped + beyond, 1 - beyond * beyond
+
 
 class MLP(nn.Module):
     """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
 
     An entry x_i that is an angle goes in as sin(x_i) and cos(x_i) instead, so that y has its
-    period of 2 pi.
+    period of 2 pi. With ``saturate`` the others go in as s(z_i), see :func:`saturated`: unchanged
+    within the data, bounded beyond, and y with them.
 
     With ``after`` the output y_o depends on the entries x_i, i > after_o, alone: the weights W_k
     are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on, and
@@ -58,6 +72,7 @@ class MLP(nn.Module):
         mean, std: normalization of x, ``(inputs,)``; none if left out.
         angles: positions of the angles in x.
         after: for each output the position in x after which it reads; all of x if None.
+        saturate: whether what the network sees of x is bounded.
 
     Raises:
         ValueError: on an unknown activation, widths below 1, a position that x does not have, or
@@ -78,6 +93,7 @@ class MLP(nn.Module):
         std: Tensor | None = None,
         angles: Sequence[int] = (),
         after: Sequence[int] | None = None,
+        saturate: bool = False,
     ):
         super().__init__()
         if activation not in ACTIVATIONS:
@@ -90,6 +106,7 @@ class MLP(nn.Module):
             raise ValueError(f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}")
         self._activation = ACTIVATIONS[activation]
         self._has_angles = len(angles) > 0
+        self._saturates = saturate and len(set(angles)) < inputs
         is_angle = torch.zeros(inputs, dtype=torch.bool)
         is_angle[list(angles)] = True
         self.register_buffer("is_angle", is_angle, persistent=False)
@@ -147,6 +164,8 @@ class MLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
         h = (x - self.mean) / self.std
+        if self._saturates:
+            h, _ = saturated(h)
         if self._has_angles:
             cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
             h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
@@ -158,7 +177,7 @@ class MLP(nn.Module):
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
         """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
         h, slopes = self._features(columns(x))
-        tape = [slopes] if slopes is not None else []
+        tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
             h, slope = self._activation(torch.addmm(bias, weight, h))
@@ -172,7 +191,7 @@ class MLP(nn.Module):
         """
         features, slopes = self._features(columns(x))
         tangent = self._tangent(columns(dx), slopes)
-        tape = [slopes] if slopes is not None else []
+        tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
             z, dz = _side_by_side(weight, features, tangent)
@@ -185,43 +204,46 @@ class MLP(nn.Module):
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
         *hidden, last = self._weights()
-        slopes, tape = (tape[0], tape[1:]) if self._has_angles else (None, tape)
-        h = self._tangent(columns(dx), slopes)
-        for weight, slope in zip(hidden, tape, strict=True):
+        h = self._tangent(columns(dx), tape[0])
+        for weight, slope in zip(hidden, tape[1:], strict=True):
             h = (weight @ h) * slope
         return rows(last @ h, dx)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
         *hidden, last = self._weights()
-        first, rest = (tape[0], tape[1:]) if self._has_angles else (None, tape)
+        first, *rest = tape
         h = columns(dy)
         # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
         # ones(B, 1) @ W to a wrong gradient at some small sizes.
         h = last.T * h if last.shape[0] == 1 else last.T @ h
         for weight, slope in zip(reversed(hidden), reversed(rest), strict=True):
             h = weight.T @ (h * slope)
-        if first is None:
-            return rows(h / self.std[:, None], dy)
-        sine_or_linear, cosine = (h * first).chunk(2)
-        return rows(sine_or_linear + cosine, dy)
+        h = h * first
+        if self._has_angles:
+            sine_or_linear, cosine = h.chunk(2)
+            h = sine_or_linear + cosine
+        return rows(h, dy)
 
-    def _features(self, column: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the first layer sees of x, ``(n, B)``, and its slopes in x where x has angles."""
+    def _features(self, column: Tensor) -> tuple[Tensor, Tensor]:
+        """What the first layer sees of x, and its slopes in x, each ``(n, B)``."""
         z = (column - self.mean[:, None]) / self.std[:, None]
+        slope = (1 / self.std[:, None]).expand_as(column)
+        if self._saturates:
+            z, bend = saturated(z)
+            slope = bend * slope
         if not self._has_angles:
-            return z, None
+            return z, slope
         # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
         is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
         sine, cosine = torch.sin(column), torch.cos(column)
-        slope = (1 / self.std[:, None]).expand_as(column)
         features = [torch.where(is_angle, sine, z), torch.where(is_angle, cosine, zero)]
         slopes = [torch.where(is_angle, cosine, slope), torch.where(is_angle, -sine, zero)]
         return torch.cat(features), torch.cat(slopes)
 
-    def _tangent(self, dx: Tensor, slopes: Tensor | None) -> Tensor:
+    def _tangent(self, dx: Tensor, slopes: Tensor) -> Tensor:
         """What the first layer sees of a tangent dx, ``(n, B)``."""
-        return dx / self.std[:, None] if slopes is None else torch.cat([dx, dx]) * slopes
+        return (torch.cat([dx, dx]) if self._has_angles else dx) * slopes
 
 
 def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,17 +14,17 @@ from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import Potential
+from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
-CholeskyHead = Callable[..., CholeskyFactor]
-"""Builds a Cholesky head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
-PotentialHead = Callable[..., Potential]
-"""Builds a potential head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
-InputHead = Callable[..., InputMatrix]
-"""Builds an input head from ``size``, ``inputs``, ``scale``, ``mean``, ``std``, ``angles``,
-``u_mean`` and ``u_std``."""
-FrictionHead = Callable[..., Friction]
-"""Builds a friction head from ``size``, ``force`` and ``v_std``."""
+CholeskyHead = Callable[[Scales], CholeskyFactor]
+"""Builds a Cholesky head; the value of its scales is that of the rows of L."""
+PotentialHead = Callable[[Scales], Potential]
+"""Builds a potential head; the value of its scales is an energy."""
+InputHead = Callable[[Scales], InputMatrix]
+"""Builds an input head; the value of its scales is that of the columns of A."""
+FrictionHead = Callable[[Scales], Friction]
+"""Builds a friction head; the value of its scales is a force."""
 
 
 class StructuredNetwork(MechanicalSystem):
@@ -56,30 +56,17 @@ class StructuredNetwork(MechanicalSystem):
         self.integrator: Integrator = integrator
         self.substeps = substeps
         self.angles = tuple(angles)
-        mean, std, u_rms = statistics.q_mean, statistics.q_std, statistics.u_rms
-        self.input = input(
-            size=size,
-            inputs=inputs,
-            scale=u_rms.square().mean().sqrt() / u_rms,
-            mean=mean,
-            std=std,
-            angles=angles,
-            u_mean=statistics.u_mean,
-            u_std=statistics.u_std,
-        )
+        u_rms = statistics.u_rms
+        self.input = input(self._scales(statistics, u_rms.square().mean().sqrt() / u_rms))
         self.input_affine = self.input.affine
         force = self.input.typical_force(u_rms)
-        self.potential = potential(
-            size=size,
-            scale=float(force.square().mean().sqrt() * std.mean()),
-            mean=mean,
-            std=std,
-            angles=angles,
-        )
-        self.damping = damping(
-            size=size, scale=(force / statistics.v_std).sqrt(), mean=mean, std=std, angles=angles
-        )
-        self.friction = friction(size=size, force=force, v_std=statistics.v_std)
+        energy = force.square().mean().sqrt() * statistics.q_std.mean()
+        self.potential = potential(self._scales(statistics, energy))
+        self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
+        self.friction = friction(self._scales(statistics, force))
+
+    def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
+        return Scales(statistics, value, self.angles)
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""

@@ -11,7 +11,13 @@ from torch._inductor import config as inductor_config
 
 from pinn_dyn.data import draw_windows
 from pinn_dyn.mechanics import Trajectory, rollout
-from pinn_dyn.models import CoulombFriction, NetworkCholesky, NetworkInput, NetworkPotential
+from pinn_dyn.models import (
+    CoulombFriction,
+    NetworkCholesky,
+    NetworkInput,
+    NetworkPotential,
+    Positive,
+)
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.training import ImpulseLoss
 from pinn_dyn.training.impulse import input_weights, velocity_increment
@@ -275,7 +281,7 @@ def test_compiled_it_has_the_same_value_and_gradients():
         2,
         mass=partial(NetworkCholesky, hidden=[4]),
         potential=partial(NetworkPotential, hidden=[4]),
-        damping=partial(NetworkCholesky, hidden=[], epsilon=0.0),
+        damping=partial(NetworkCholesky, hidden=[], positivity=Positive(floor=0.0)),
         input=partial(NetworkInput, hidden=[]),
         dtype=torch.float32,
     )

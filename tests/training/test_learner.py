@@ -20,13 +20,14 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkPotential,
     NextStateMLP,
+    Positive,
 )
 from pinn_dyn.training import DynamicsLearner, IncrementLoss, NonFiniteLossError, WindowLoss
 from tests.support.linear import damped_oscillators
 
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[8]),
-    damping=partial(ConstantCholesky, epsilon=0.0),
+    damping=partial(ConstantCholesky, positivity=Positive(floor=0.0)),
     input=ConstantInput,
 )
 MODELS = {

@@ -16,6 +16,7 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkPotential,
     NextStateMLP,
+    Positive,
     Statistics,
 )
 from pinn_dyn.training import IncrementLoss
@@ -39,7 +40,7 @@ ONE_STEP = replace(
 )
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[4]),
-    damping=partial(ConstantCholesky, epsilon=0.0),
+    damping=partial(ConstantCholesky, positivity=Positive(floor=0.0)),
     input=ConstantInput,
 )
 MODELS = {
