@@ -56,6 +56,8 @@ def make_model(kind: str) -> MechanicalSystem:
     scales = Statistics(
         q_mean=0 * one,
         q_std=0.5 * one,
+        q_low=-2 * one,
+        q_high=2 * one,
         v_std=one,
         p_std=0.05 * one,
         u_mean=0 * one,

@@ -64,7 +64,9 @@ def make_model(size: int, dtype: torch.dtype) -> tuple[LagrangianNetwork, Statis
     torch.manual_seed(0)
     one = torch.ones(size, dtype=torch.float64)
     increment = torch.cat([STEP * one, STEP * one])[None]
-    scales = Statistics(0 * one, one, one, one, 0 * one, one, increment, increment, STEP)
+    scales = Statistics(
+        0 * one, one, -5 * one, 5 * one, one, one, 0 * one, one, increment, increment, STEP
+    )
     model = LagrangianNetwork(
         scales,
         mass=partial(NetworkCholesky, hidden=[32, 32, 32]),

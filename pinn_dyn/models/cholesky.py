@@ -9,9 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.models.mlp import MLP, Tape, columns, rows
+from pinn_dyn.models.mlp import Tape, columns, rows
 from pinn_dyn.models.positivity import Positive, Positivity
 from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.triangular import square
 
 
 class CholeskyFactor(nn.Module, abc.ABC):
@@ -53,9 +54,7 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     def matrix(self, q: Tensor) -> Tensor:
         """L(q) L(q)^T, or L(q)^T L(q) if transposed, ``(*batch, N, N)``."""
-        factor = self(q).transpose(-1, -2) if self.transposed else self(q)
-        # For matrices this small a sum of products: a batched matrix product cannot be fused.
-        return (factor.unsqueeze(-2) * factor.unsqueeze(-3)).sum(-1)
+        return square(self(q).transpose(-1, -2) if self.transposed else self(q))
 
     def product(self, q: Tensor, x: Tensor) -> Tensor:
         """The matrix times x, ``(*batch, N)``, by its factor: N^2 operations, not N^3."""
@@ -106,23 +105,14 @@ class NetworkCholesky(CholeskyFactor):
         chain: bool = False,
     ):
         super().__init__()
-        size, statistics = scales.size, scales.statistics
+        size = scales.size
         self.size = size
         self.positivity = positivity
         self.transposed = transposed
         self.chain = chain
         row, column = torch.tril_indices(size, size, offset=-1)
-        self.network = MLP(
-            size,
-            size * (size + 1) // 2,
-            hidden,
-            activation,
-            statistics.q_mean,
-            statistics.q_std,
-            scales.angles,
-            after=[*range(size), *column.tolist()] if chain else None,
-            saturate=True,
-        )
+        after = [*range(size), *column.tolist()] if chain else None
+        self.network = scales.network(size * (size + 1) // 2, hidden, activation, after)
         with torch.no_grad():
             # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
             last = self.network.linears[-1]

@@ -18,9 +18,8 @@ from pinn_dyn.models.structured import (
     InputHead,
     PotentialHead,
     StructuredNetwork,
-    lower_solve,
-    upper_solve,
 )
+from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
 class HamiltonianNetwork(StructuredNetwork):
@@ -116,7 +115,7 @@ class HamiltonianNetwork(StructuredNetwork):
         return upper_solve(factor, lower_solve(factor, v))
 
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        return matvec(self.inverse_mass_matrix(q), p)
+        return self.inverse_mass.product(q, p)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
         """d(v^T M v / 2)/dq at fixed v = -d(p^T W p / 2)/dq at fixed p = M v."""

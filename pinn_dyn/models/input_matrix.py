@@ -60,11 +60,7 @@ class NetworkInput(InputMatrix):
 
     def __init__(self, scales: Scales, *, hidden: Sequence[int], activation: str = "softplus"):
         super().__init__(scales)
-        mean, std = scales.statistics.q_mean, scales.statistics.q_std
-        outputs = scales.size * scales.inputs
-        self.network = MLP(
-            scales.size, outputs, hidden, activation, mean, std, scales.angles, saturate=True
-        )
+        self.network = scales.network(scales.size * scales.inputs, hidden, activation)
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:

@@ -19,9 +19,8 @@ from pinn_dyn.models.structured import (
     InputHead,
     PotentialHead,
     StructuredNetwork,
-    lower_solve,
-    upper_solve,
 )
+from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
 class LagrangianNetwork(StructuredNetwork):
@@ -100,6 +99,9 @@ class LagrangianNetwork(StructuredNetwork):
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         factor, bias = self._factor_and_coriolis_force(q, v)
         return self._solve(factor, force - bias - self._potential_force(q))
+
+    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        return self.mass.product(q, v)
 
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
         return self._solve(self.mass(q), p)

@@ -35,26 +35,15 @@ ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 }
 """Smooth activations, each as (value, slope); dynamics need two derivatives, so no ReLU here."""
 
-REACH = 3.0
-"""Standard deviations from the mean up to which a saturating network sees its input as it is."""
-
-
-def saturated(z: Tensor) -> tuple[Tensor, Tensor]:
-    """s(z) and its slope: z itself up to ``REACH``, beyond smoothly no more than ``REACH`` + 1.
-
-    s(z) = c + tanh(z - c) with c = z clipped to +-REACH; its second derivative is continuous.
-    """
-    clipped = z.clamp(-REACH, REACH)
-    beyond = torch.tanh(z - clipped)
-    return clipped + beyond, 1 - beyond * beyond
-
 
 class MLP(nn.Module):
     """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
 
     An entry x_i that is an angle goes in as sin(x_i) and cos(x_i) instead, so that y has its
-    period of 2 pi. With ``saturate`` the others go in as s(z_i), see :func:`saturated`: unchanged
-    within the data, bounded beyond, and y with them.
+    period of 2 pi. With ``limits`` the others go in as z = (c - mean)/std + tanh((x - c)/std) with
+    c = x clipped to its limits: unchanged within them, never more than a standard deviation beyond
+    them, and smooth (its second derivative is continuous). So y has no value far outside the data
+    that it does not have near them.
 
     With ``after`` the output y_o depends on the entries x_i, i > after_o, alone: the weights W_k
     are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on, and
@@ -72,7 +61,7 @@ class MLP(nn.Module):
         mean, std: normalization of x, ``(inputs,)``; none if left out.
         angles: positions of the angles in x.
         after: for each output the position in x after which it reads; all of x if None.
-        saturate: whether what the network sees of x is bounded.
+        limits: smallest and largest x in the data, ``(inputs,)`` each; no limits if None.
 
     Raises:
         ValueError: on an unknown activation, widths below 1, a position that x does not have, or
@@ -81,6 +70,7 @@ class MLP(nn.Module):
 
     mean: Tensor
     std: Tensor
+    limits: Tensor | None
     is_angle: Tensor
 
     def __init__(
@@ -93,7 +83,7 @@ class MLP(nn.Module):
         std: Tensor | None = None,
         angles: Sequence[int] = (),
         after: Sequence[int] | None = None,
-        saturate: bool = False,
+        limits: tuple[Tensor, Tensor] | None = None,
     ):
         super().__init__()
         if activation not in ACTIVATIONS:
@@ -106,7 +96,6 @@ class MLP(nn.Module):
             raise ValueError(f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}")
         self._activation = ACTIVATIONS[activation]
         self._has_angles = len(angles) > 0
-        self._saturates = saturate and len(set(angles)) < inputs
         is_angle = torch.zeros(inputs, dtype=torch.bool)
         is_angle[list(angles)] = True
         self.register_buffer("is_angle", is_angle, persistent=False)
@@ -120,6 +109,10 @@ class MLP(nn.Module):
             self._mask(inputs, after)
         self.register_buffer("mean", torch.zeros(inputs) if mean is None else mean.float())
         self.register_buffer("std", torch.ones(inputs) if std is None else std.float())
+        if limits is not None and len(set(angles)) < inputs:
+            self.register_buffer("limits", torch.stack(limits).float())
+        else:
+            self.register_buffer("limits", None)
 
     @property
     def linears(self) -> list[nn.Linear]:
@@ -163,9 +156,7 @@ class MLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
-        h = (x - self.mean) / self.std
-        if self._saturates:
-            h, _ = saturated(h)
+        h, _ = self._normalized(x)
         if self._has_angles:
             cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
             h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
@@ -225,13 +216,21 @@ class MLP(nn.Module):
             h = sine_or_linear + cosine
         return rows(h, dy)
 
+    def _normalized(self, x: Tensor, in_columns: bool = False) -> tuple[Tensor, Tensor]:
+        """z and its slope in x, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
+        mean, std, limits = self.mean, self.std, self.limits
+        if in_columns:
+            mean, std = mean[:, None], std[:, None]
+            limits = None if limits is None else limits[..., None]
+        if limits is None:
+            return (x - mean) / std, (1 / std).expand_as(x)
+        clipped = x.clamp(limits[0], limits[1])
+        beyond = torch.tanh((x - clipped) / std)
+        return (clipped - mean) / std + beyond, (1 - beyond * beyond) / std
+
     def _features(self, column: Tensor) -> tuple[Tensor, Tensor]:
         """What the first layer sees of x, and its slopes in x, each ``(n, B)``."""
-        z = (column - self.mean[:, None]) / self.std[:, None]
-        slope = (1 / self.std[:, None]).expand_as(column)
-        if self._saturates:
-            z, bend = saturated(z)
-            slope = bend * slope
+        z, slope = self._normalized(column, in_columns=True)
         if not self._has_angles:
             return z, slope
         # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP, columns, rows
+from pinn_dyn.models.mlp import columns, rows
 from pinn_dyn.models.scales import Scales
 
 
@@ -49,8 +49,8 @@ class NetworkPotential(Potential):
         quadratic: bool = True,
     ):
         super().__init__()
-        size, mean, std = scales.size, scales.statistics.q_mean, scales.statistics.q_std
-        self.network = MLP(size, 1, hidden, activation, mean, std, scales.angles, saturate=True)
+        size = scales.size
+        self.network = scales.network(1, hidden, activation)
         self.register_buffer("scale", scales.value.float())
         quadratic = quadratic and len(set(scales.angles)) < size
         self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None

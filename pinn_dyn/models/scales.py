@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
+from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -32,3 +34,16 @@ class Scales:
     def inputs(self) -> int:
         """M."""
         return self.statistics.num_inputs
+
+    def network(
+        self,
+        outputs: int,
+        hidden: Sequence[int],
+        activation: str,
+        after: Sequence[int] | None = None,
+    ) -> MLP:
+        """A network of q; outside the data what it sees of q saturates, see :class:`MLP`."""
+        data = self.statistics
+        limits = (data.q_low, data.q_high)
+        mean, std = data.q_mean, data.q_std
+        return MLP(self.size, outputs, hidden, activation, mean, std, self.angles, after, limits)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import get_args
 
-import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import Coordinates, MechanicalSystem
@@ -76,6 +75,9 @@ class StructuredNetwork(MechanicalSystem):
         """D(q) = L_D L_D^T, ``(*batch, N, N)``."""
         return self.damping.matrix(q)
 
+    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
+        return self.damping.product(q, v)
+
     def input_matrix(self, q: Tensor) -> Tensor:
         """A(q), ``(*batch, N, M)``."""
         return self.input(q)
@@ -91,29 +93,3 @@ class StructuredNetwork(MechanicalSystem):
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.potential.gradient(q)
-
-
-def lower_solve(factor: Tensor, vector: Tensor) -> Tensor:
-    """x with L x = b, for a lower triangular L ``(*batch, N, N)`` and b ``(*batch, N)``.
-
-    Unrolled over N: for the few coordinates of a robot this is faster than a batched LAPACK call,
-    and its derivative is made of the same few operations.
-    """
-    entries = [row.unbind(-1) for row in factor.unbind(-2)]
-    x: list[Tensor] = []
-    for row, rest in zip(entries, vector.unbind(-1), strict=True):
-        for j, known in enumerate(x):
-            rest = rest - row[j] * known
-        x.append(rest / row[len(x)])
-    return torch.stack(x).movedim(0, -1)
-
-
-def upper_solve(factor: Tensor, vector: Tensor) -> Tensor:
-    """x with L^T x = b, for the same lower triangular L."""
-    entries = [row.unbind(-1) for row in factor.unbind(-2)]
-    x = list(vector.unbind(-1))
-    for i in reversed(range(len(x))):
-        for j in range(i + 1, len(x)):
-            x[i] = x[i] - entries[j][i] * x[j]
-        x[i] = x[i] / entries[i][i]
-    return torch.stack(x).movedim(0, -1)

@@ -39,6 +39,8 @@ def make_statistics(n, m, step=STEP):
     return Statistics(
         q_mean=0.1 * rows - 0.3,
         q_std=0.6 + 0.1 * rows,
+        q_low=-2.0 - 0.1 * rows,
+        q_high=1.9 + 0.2 * rows,
         v_std=1.5 - 0.2 * rows,
         p_std=0.7 + 0.1 * rows,
         u_mean=0.2 * columns - 0.5,
@@ -52,7 +54,14 @@ def make_statistics(n, m, step=STEP):
 def make_scales(n, m, value=1.0, angles=(), **statistics):
     """Scales of a head; the value is one number or a list, ``statistics`` replace the usual."""
     value = torch.as_tensor(value, dtype=torch.float64)
-    data = replace(make_statistics(n, m), **statistics)
+    data = make_statistics(n, m)
+    if "q_mean" in statistics:  # then of normal data, nearly
+        reach = 3 * statistics["q_std"]
+        statistics |= {
+            "q_low": statistics["q_mean"] - reach,
+            "q_high": statistics["q_mean"] + reach,
+        }
+    data = replace(data, **statistics)
     return Scales(data, value, tuple(angles))
 
 

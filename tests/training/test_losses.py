@@ -24,6 +24,8 @@ from pinn_dyn.training import IncrementLoss
 STATISTICS = Statistics(
     q_mean=torch.zeros(1, dtype=torch.float64),
     q_std=torch.ones(1, dtype=torch.float64),
+    q_low=torch.full((1,), -2.0, dtype=torch.float64),
+    q_high=torch.full((1,), 2.0, dtype=torch.float64),
     v_std=torch.ones(1, dtype=torch.float64),
     p_std=torch.ones(1, dtype=torch.float64),
     u_mean=torch.zeros(1, dtype=torch.float64),
