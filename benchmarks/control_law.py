@@ -57,7 +57,9 @@ def untrained() -> MechanicalSystem:
         config = plain(compose("train", overrides=["experiment=panda/lnn", "model_name=lnn"]))
     one, increment = torch.ones(JOINTS), torch.ones(1, 2 * JOINTS)
     torch.manual_seed(0)
-    statistics = Statistics(0 * one, one, one, one, 0 * one, one, increment, increment, 1.0)
+    statistics = Statistics(
+        0 * one, one, -one, one, one, one, 0 * one, one, increment, increment, 1.0
+    )
     model = build_model(config, statistics)
     assert isinstance(model, MechanicalSystem)
     return model

@@ -31,6 +31,7 @@ from pinn_dyn.models import (
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
+    Positive,
     Statistics,
 )
 
@@ -56,6 +57,8 @@ def make_model(kind: str) -> MechanicalSystem:
     scales = Statistics(
         q_mean=0 * one,
         q_std=0.5 * one,
+        q_low=-2 * one,
+        q_high=2 * one,
         v_std=one,
         p_std=0.05 * one,
         u_mean=0 * one,
@@ -64,10 +67,10 @@ def make_model(kind: str) -> MechanicalSystem:
         qp_increment_std=0.1 * increment,
         step=2e-3,
     )
-    mass = partial(NetworkCholesky, hidden=[32, 32, 32], epsilon=1e-3)
+    mass = partial(NetworkCholesky, hidden=[32, 32, 32])
     heads = {
         "potential": partial(NetworkPotential, hidden=[32, 32]),
-        "damping": partial(NetworkCholesky, hidden=[16, 16], epsilon=0.0),
+        "damping": partial(NetworkCholesky, hidden=[16, 16], positivity=Positive(floor=0.0)),
         "input": partial(NetworkInput, hidden=[16, 16]),
     }
     network = {"lnn": LagrangianNetwork, "hnn": HamiltonianNetwork}[kind]

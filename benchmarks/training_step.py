@@ -48,6 +48,7 @@ from pinn_dyn.models import (
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
+    Positive,
     Statistics,
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss
@@ -65,12 +66,14 @@ def make_model(size: int, dtype: torch.dtype) -> tuple[LagrangianNetwork, Statis
     torch.manual_seed(0)
     one = torch.ones(size, dtype=torch.float64)
     increment = torch.cat([STEP * one, STEP * one])[None]
-    scales = Statistics(0 * one, one, one, one, 0 * one, one, increment, increment, STEP)
+    scales = Statistics(
+        0 * one, one, -5 * one, 5 * one, one, one, 0 * one, one, increment, increment, STEP
+    )
     model = LagrangianNetwork(
         scales,
-        mass=partial(NetworkCholesky, hidden=[32, 32, 32], epsilon=1e-3),
+        mass=partial(NetworkCholesky, hidden=[32, 32, 32]),
         potential=partial(NetworkPotential, hidden=[32, 32]),
-        damping=partial(NetworkCholesky, hidden=[16, 16], epsilon=0.0),
+        damping=partial(NetworkCholesky, hidden=[16, 16], positivity=Positive(floor=0.0)),
         input=partial(NetworkInput, hidden=[16, 16]),
     )
     with torch.no_grad():

@@ -91,7 +91,7 @@ class Windows:
         )
 
     def statistics(self) -> Statistics:
-        """Means and standard deviations over the windows."""
+        """Means, standard deviations and ranges over the windows."""
         one = torch.ones_like(self.q[0])
 
         def spread(values: Tensor) -> Tensor:
@@ -103,6 +103,8 @@ class Windows:
         return Statistics(
             q_mean=self.q.mean(0),
             q_std=spread(self.q),
+            q_low=self.q.amin(0),
+            q_high=self.q.amax(0),
             v_std=spread(self.v),
             p_std=spread(self.p) if has_momentum else one,
             u_mean=self.u.mean((0, 1)),

@@ -84,6 +84,9 @@ class MechanicalSystem(ContinuousPredictor):
         bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
         return spd_solve(self.mass_matrix(q), force - bias)
 
+    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
+        return matvec(self.damping_matrix(q), v)
+
     def _friction_force(self, v: Tensor) -> Tensor:
         return torch.zeros_like(v)
 
@@ -132,7 +135,7 @@ class MechanicalSystem(ContinuousPredictor):
     def dissipative_force(self, q: Tensor, v: Tensor) -> Tensor:
         """D(q) v + F(v), ``(*batch, N)``; its power v^T D v + v^T F(v) is never negative."""
         self._check(q=q, v=v)
-        return matvec(self.damping_matrix(q), v) + self._friction_force(v)
+        return self._damping_force(q, v) + self._friction_force(v)
 
     @final
     def coriolis_matrix(self, q: Tensor, v: Tensor) -> Tensor:

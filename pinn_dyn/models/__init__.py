@@ -19,12 +19,15 @@ from pinn_dyn.models.input_matrix import (
 )
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
+from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
 __all__ = [
     "MLP",
     "AccelerationMLP",
+    "Bounded",
     "ChainPotential",
     "CholeskyFactor",
     "ConstantCholesky",
@@ -45,5 +48,8 @@ __all__ = [
     "NextStateMLP",
     "NoFriction",
     "NonlinearInput",
+    "Positive",
+    "Positivity",
+    "Scales",
     "Statistics",
 ]

@@ -10,6 +10,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import RK4, ContinuousPredictor, Integrator, Predictor, Signal
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -104,7 +105,9 @@ class AccelerationMLP(ContinuousPredictor):
         mean, std = statistics.network_input(repeat_input=1)
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         self.register_buffer("scale", statistics.acceleration.float())
-        self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
+        self.initial_velocity = initial_velocity(
+            Scales(statistics, statistics.v_std, tuple(angles))
+        )
         self.learns_initial_state = self.initial_velocity.learned
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import abc
-import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP, Tape, columns, rows
+from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.mlp import Tape, columns, rows
+from pinn_dyn.models.positivity import Positive, Positivity
+from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.triangular import square
 
 
 class CholeskyFactor(nn.Module, abc.ABC):
@@ -53,23 +54,21 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     def matrix(self, q: Tensor) -> Tensor:
         """L(q) L(q)^T, or L(q)^T L(q) if transposed, ``(*batch, N, N)``."""
+        return square(self(q).transpose(-1, -2) if self.transposed else self(q))
+
+    def product(self, q: Tensor, x: Tensor) -> Tensor:
+        """The matrix times x, ``(*batch, N)``, by its factor: N^2 operations, not N^3."""
         factor = self(q).transpose(-1, -2) if self.transposed else self(q)
-        # For matrices this small a sum of products: a batched matrix product cannot be fused.
-        return (factor.unsqueeze(-2) * factor.unsqueeze(-3)).sum(-1)
+        return matvec(factor, matvec(factor.transpose(-1, -2), x))
 
 
 class NetworkCholesky(CholeskyFactor):
     """L(q) = diag(scale) * tril(network(q)), with a positive diagonal.
 
-    The network has N (N + 1)/2 outputs y, the first N for the diagonal (paper, section Sub-Network
-    Structures). With ``diagonal="softplus"`` or ``"relu"``::
-
-        L_ii = scale_i (act(y_i) + epsilon),   L_ij = scale_i y_ij  (i > j)
-
-    With a ``bound`` b the entries cannot leave a range (the paper's scaled sigmoid for a real
-    arm, b = 3.5)::
-
-        L_ii = scale_i (b sigmoid(y_i) + epsilon),   L_ij = scale_i b (2 sigmoid(y_ij) - 1)
+    The network has N (N + 1)/2 outputs, the first N for the diagonal (paper, section Sub-Network
+    Structures); ``positivity`` makes the entries of them. What the network sees of q saturates
+    outside the data, so that the matrix is nowhere larger, and nowhere nearer to singular, than in
+    a box around the data.
 
     In a chain of bodies row i of L in M = L^T L (``transposed``) describes the bodies from joint i
     to the tip, so that most entries are simpler functions than those of L in M = L L^T
@@ -82,76 +81,47 @@ class NetworkCholesky(CholeskyFactor):
     the network cannot say otherwise: its weights are masked.
 
     Args:
-        size: N.
-        scale: typical size of the rows of L, ``(N,)``; from the data.
-        mean, std: normalization of q, ``(N,)``; from the data.
-        angles: which coordinates are angles, and enter the network as sine and cosine.
+        scales: of the data; the value is the typical size of the rows of L, ``(N,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        diagonal: what keeps the diagonal non-negative, softplus or relu.
-        epsilon: smallest diagonal entry in units of the scale; 0 allows a semi-definite matrix.
-        bound: b above, or None.
+        positivity: what keeps the diagonal positive.
         transposed: use L for L^T L.
         chain: let column j of L depend on the coordinates after q_j alone.
-        initial: what epsilon is added to before training; below 1 in the mass matrix of a robot
-            that moves almost without inertia. With a bound b it is 0.63 b.
 
     Raises:
-        ValueError: on an unknown diagonal, a negative epsilon, a bound or a start that is not
-            positive, or both of these; with ``chain`` on hidden layers of too few units.
+        ValueError: with ``chain`` on hidden layers of too few units.
     """
 
     placement: Tensor
 
     def __init__(
         self,
+        scales: Scales,
         *,
-        size: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
         hidden: Sequence[int],
         activation: str = "softplus",
-        diagonal: Literal["softplus", "relu"] = "softplus",
-        epsilon: float = 1e-3,
-        bound: float | None = None,
+        positivity: Positivity = Positive(),  # noqa: B008, it is frozen
         transposed: bool = False,
         chain: bool = False,
-        initial: float = 1.0,
     ):
         super().__init__()
-        if diagonal not in ("softplus", "relu"):
-            raise ValueError(f"diagonal is {diagonal!r}, expected 'softplus' or 'relu'")
-        if epsilon < 0:
-            raise ValueError(f"epsilon is {epsilon}, expected zero or a positive number")
-        if bound is not None and not bound > 0:
-            raise ValueError(f"bound is {bound}, expected a positive number or none")
-        if bound is not None and initial != 1.0:
-            raise ValueError(
-                f"initial is {initial} and bound {bound}, expected one of them: with a bound b the "
-                "diagonal starts at 0.63 b"
-            )
-        _check_initial(initial)
+        size = scales.size
         self.size = size
-        self.diagonal = diagonal
-        self.epsilon = epsilon
-        self.bound = bound
+        self.positivity = positivity
         self.transposed = transposed
         self.chain = chain
         row, column = torch.tril_indices(size, size, offset=-1)
         after = [*range(size), *column.tolist()] if chain else None
-        outputs = size * (size + 1) // 2
-        self.network = MLP(size, outputs, hidden, activation, mean, std, angles, after)
+        self.network = scales.network(size * (size + 1) // 2, hidden, activation, after)
         with torch.no_grad():
             # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
-            last.bias[:size] = _softplus_inverse(initial) if diagonal == "softplus" else initial
+            last.bias[:size] = positivity.start
         # vec(L) = y S, where S holds the scales and says which entry of y goes where.
         order = torch.cat([torch.arange(size) * (size + 1), row * size + column])
-        placement = torch.zeros(outputs, size * size)
-        placement[torch.arange(outputs), order] = scale.float()[
+        placement = torch.zeros(len(order), size * size)
+        placement[torch.arange(len(order)), order] = scales.value.float()[
             order % size if transposed else order // size
         ]
         self.register_buffer("placement", placement)
@@ -181,22 +151,9 @@ class NetworkCholesky(CholeskyFactor):
 
     def _entries(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Entries of L in units of its scale, the diagonal first, and their slopes in y."""
-        diagonal, lower = y[: self.size], y[self.size :]
-        if self.bound is not None:
-            sigmoid, side = torch.sigmoid(diagonal), torch.sigmoid(lower)
-            diagonal, diagonal_slope = (
-                self.bound * sigmoid,
-                self.bound * sigmoid * (1 - sigmoid),
-            )
-            lower, lower_slope = self.bound * (2 * side - 1), 2 * self.bound * side * (1 - side)
-        else:
-            if self.diagonal == "softplus":
-                diagonal, diagonal_slope = F.softplus(diagonal), torch.sigmoid(diagonal)
-            else:
-                diagonal, diagonal_slope = F.relu(diagonal), (diagonal > 0).to(y.dtype)
-            lower_slope = torch.ones_like(lower)
-        values = torch.cat([diagonal + self.epsilon, lower])
-        return values, torch.cat([diagonal_slope, lower_slope])
+        diagonal, diagonal_slope = self.positivity.diagonal(y[: self.size])
+        lower, lower_slope = self.positivity.lower(y[self.size :])
+        return torch.cat([diagonal, lower]), torch.cat([diagonal_slope, lower_slope])
 
     def _scales(self, y: Tensor) -> Tensor:
         """Scale of the row of L that each entry is in, to multiply y ``(K, ...)`` with."""
@@ -226,15 +183,6 @@ def _matrices(square: Tensor, like: Tensor) -> Tensor:
     return rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
 
 
-def _check_initial(initial: float) -> None:
-    if not initial > 0:
-        raise ValueError(f"initial is {initial}, expected a positive number")
-
-
-def _softplus_inverse(value: float) -> float:
-    return math.log(math.expm1(value))
-
-
 class _ConstantFactor(CholeskyFactor):
     """An L that is the same at every q."""
 
@@ -254,40 +202,24 @@ class ConstantCholesky(_ConstantFactor):
     """L = diag(scale) * tril(parameters), the same at every q.
 
     Args:
-        size: N.
-        scale: typical size of the rows of L, ``(N,)``; from the data.
-        mean, std, angles: not used by a constant; every head takes the same arguments.
-        epsilon: smallest diagonal entry in units of the scale.
-        initial: what epsilon is added to before training.
-
-    Raises:
-        ValueError: on a start that is not positive.
+        scales: of the data; the value is the typical size of the rows of L, ``(N,)``.
+        positivity: what keeps the diagonal positive.
     """
 
     scale: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        epsilon: float = 1e-3,
-        initial: float = 1.0,
-    ):
+    def __init__(self, scales: Scales, *, positivity: Positivity = Positive()):  # noqa: B008
         super().__init__()
-        _check_initial(initial)
-        self.epsilon = epsilon
-        self.raw_diagonal = nn.Parameter(torch.full((size,), _softplus_inverse(initial)))
-        self.lower = nn.Parameter(torch.zeros(size, size))
-        self.register_buffer("scale", scale.float())
+        self.positivity = positivity
+        self.raw_diagonal = nn.Parameter(torch.full((scales.size,), positivity.start))
+        self.lower = nn.Parameter(torch.zeros(scales.size, scales.size))
+        self.register_buffer("scale", scales.value.float())
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
         """L and an empty tape."""
-        diagonal = torch.diag_embed(F.softplus(self.raw_diagonal) + self.epsilon)
-        factor = (diagonal + self.lower.tril(-1)) * self.scale.unsqueeze(-1)
+        diagonal, _ = self.positivity.diagonal(self.raw_diagonal)
+        lower, _ = self.positivity.lower(self.lower)
+        factor = (torch.diag_embed(diagonal) + lower.tril(-1)) * self.scale.unsqueeze(-1)
         return factor.expand(*q.shape[:-1], *factor.shape), ()
 
 
@@ -295,8 +227,7 @@ class FixedCholesky(_ConstantFactor):
     """L = the Cholesky factor of a given constant matrix, not learned.
 
     Args:
-        size: N.
-        scale, mean, std, angles: not used; every head takes the same arguments from the model.
+        scales: of the data.
         value: the symmetric positive semi-definite matrix, ``(N, N)``.
 
     Raises:
@@ -305,17 +236,9 @@ class FixedCholesky(_ConstantFactor):
 
     factor: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        value: Sequence[Sequence[float]],
-    ):
+    def __init__(self, scales: Scales, *, value: Sequence[Sequence[float]]):
         super().__init__()
+        size = scales.size
         matrix = torch.tensor(value, dtype=torch.float64)
         if matrix.shape != (size, size) or not torch.equal(matrix, matrix.T):
             raise ValueError(

@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pinn_dyn.models.scales import Scales
+
 
 class Friction(nn.Module, abc.ABC):
     """A dissipative force F(v) ``(*batch, N)`` beside D(q) v, with v^T F(v) >= 0."""
@@ -25,10 +27,10 @@ class NoFriction(Friction):
     """F = 0: dissipation is viscous, as in the paper.
 
     Args:
-        size, force, v_std: not used; every head takes the same arguments from the model.
+        scales: of the data.
     """
 
-    def __init__(self, *, size: int, force: Tensor, v_std: Tensor):
+    def __init__(self, scales: Scales):
         super().__init__()
 
     def forward(self, v: Tensor) -> Tensor:
@@ -49,9 +51,7 @@ class CoulombFriction(Friction):
     control of machines with friction", for the law and what it leaves out (stiction).
 
     Args:
-        size: N.
-        force: typical generalized forces, ``(N,)``.
-        v_std: typical speeds, ``(N,)``.
+        scales: of the data; the value is a typical generalized force, ``(N,)``.
         level: c starts at this part of the typical forces.
         width: w starts at this part of the typical speeds beyond a hundredth, below which it never
             falls, as a jump in the force could not be integrated.
@@ -63,23 +63,15 @@ class CoulombFriction(Friction):
     force: Tensor
     v_std: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        force: Tensor,
-        v_std: Tensor,
-        level: float = 0.1,
-        width: float = 0.1,
-    ):
+    def __init__(self, scales: Scales, *, level: float = 0.1, width: float = 0.1):
         super().__init__()
         for name, value in (("level", level), ("width", width)):
             if not value > 0:
                 raise ValueError(f"friction: {name} is {value}, expected a positive number")
-        self.raw_force = nn.Parameter(torch.full((size,), level).expm1().log())
-        self.raw_width = nn.Parameter(torch.full((size,), width).expm1().log())
-        self.register_buffer("force", force.float().clone())
-        self.register_buffer("v_std", v_std.float().clone())
+        self.raw_force = nn.Parameter(torch.full((scales.size,), level).expm1().log())
+        self.raw_width = nn.Parameter(torch.full((scales.size,), width).expm1().log())
+        self.register_buffer("force", scales.value.float().clone())
+        self.register_buffer("v_std", scales.statistics.v_std.float().clone())
 
     def forward(self, v: Tensor) -> Tensor:
         """F(v)."""

@@ -17,9 +17,8 @@ from pinn_dyn.models.structured import (
     InputHead,
     PotentialHead,
     StructuredNetwork,
-    lower_solve,
-    upper_solve,
 )
+from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
 class HamiltonianNetwork(StructuredNetwork):
@@ -74,20 +73,13 @@ class HamiltonianNetwork(StructuredNetwork):
             angles,
             integrator,
         )
-        size = self.num_coordinates
         if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std
         else:
             # As in the Lagrangian network: what an acceleration takes, without a momentum.
             force = self.input.typical_force(statistics.u_rms)
             inverse_mass_scale = statistics.acceleration / force
-        self.inverse_mass = inverse_mass(
-            size=size,
-            scale=inverse_mass_scale.sqrt(),
-            mean=statistics.q_mean,
-            std=statistics.q_std,
-            angles=angles,
-        )
+        self.inverse_mass = inverse_mass(self._scales(statistics, inverse_mass_scale.sqrt()))
         if self.inverse_mass.transposed:
             raise ValueError(
                 "inverse_mass.transposed is true, expected false: M^-1 = L L^T is already M = R^T "
@@ -117,7 +109,7 @@ class HamiltonianNetwork(StructuredNetwork):
         return upper_solve(factor, lower_solve(factor, v))
 
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        return matvec(self.inverse_mass_matrix(q), p)
+        return self.inverse_mass.product(q, p)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
         """d(v^T M v / 2)/dq at fixed v = -d(p^T W p / 2)/dq at fixed p = M v."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from pinn_dyn.models.mlp import MLP
-from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.scales import Scales
 
 
 class InitialVelocity(nn.Module, abc.ABC):
@@ -31,20 +31,20 @@ class InitialVelocity(nn.Module, abc.ABC):
         return torch.cat([q, self(q, v, u0)], dim=-1)
 
 
-InitialVelocityHead = Callable[..., InitialVelocity]
-"""Builds a head for the velocity at which roll-outs start from ``statistics`` and ``angles``."""
+InitialVelocityHead = Callable[[Scales], InitialVelocity]
+"""Builds a head for the velocity at which roll-outs start."""
 
 
 class MeasuredVelocity(InitialVelocity):
     """v_0 = v.
 
     Args:
-        statistics, angles: not used; every head takes the same arguments from the model.
+        scales: of the data.
     """
 
     learned = False
 
-    def __init__(self, *, statistics: Statistics, angles: Sequence[int]):
+    def __init__(self, scales: Scales):
         super().__init__()
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
@@ -63,8 +63,7 @@ class LearnedVelocity(InitialVelocity):
     identification").
 
     Args:
-        statistics: scales of the data; s_v is the standard deviation of v.
-        angles: which coordinates are angles.
+        scales: of the data; the value is s_v, ``(N,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
     """
@@ -72,24 +71,14 @@ class LearnedVelocity(InitialVelocity):
     learned = True
     scale: Tensor
 
-    def __init__(
-        self,
-        *,
-        statistics: Statistics,
-        angles: Sequence[int],
-        hidden: Sequence[int] = (64,),
-        activation: str = "tanh",
-    ):
+    def __init__(self, scales: Scales, *, hidden: Sequence[int] = (64,), activation: str = "tanh"):
         super().__init__()
-        size = statistics.num_coordinates
-        mean, std = statistics.network_input(repeat_input=1)
-        self.network = MLP(
-            2 * size + statistics.num_inputs, size, hidden, activation, mean, std, angles
-        )
+        mean, std = scales.statistics.network_input(repeat_input=1)
+        self.network = MLP(len(mean), scales.size, hidden, activation, mean, std, scales.angles)
         last = self.network.linears[-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
-        self.register_buffer("scale", statistics.v_std.float().clone())
+        self.register_buffer("scale", scales.value.float().clone())
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """v + s_v * network(q, v, u)."""

@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.scales import Scales
 
 
 class InputMatrix(nn.Module, abc.ABC):
     """A(q) ``(*batch, N, M)``.
 
     Args:
-        size: N.
-        inputs: M.
+        scales: of the data.
 
     Attributes:
         affine: whether the force is A(q) u, with an A that does not depend on u.
@@ -25,9 +25,9 @@ class InputMatrix(nn.Module, abc.ABC):
 
     affine: bool = True
 
-    def __init__(self, size: int, inputs: int):
+    def __init__(self, scales: Scales):
         super().__init__()
-        self.shape = (size, inputs)
+        self.shape = (scales.size, scales.inputs)
 
     @abc.abstractmethod
     def forward(self, q: Tensor) -> Tensor:
@@ -46,57 +46,30 @@ class InputMatrix(nn.Module, abc.ABC):
 
 
 class NetworkInput(InputMatrix):
-    """A(q) = scale_i * network(q), reshaped to N x M (paper, figure A-NN).
+    """A(q) = scale_j * network(q), reshaped to N x M (paper, figure A-NN).
+
+    What the network sees of q saturates outside the data, so that A is bounded.
 
     Args:
-        size: N.
-        inputs: M.
-        scale: typical size of the entries of each column, ``(M,)``; from the data.
-        mean, std: normalization of q, ``(N,)``; from the data.
-        angles: which coordinates are angles, and enter the network as sine and cosine.
-        u_mean, u_std: not used; every input head takes the same arguments.
+        scales: of the data; the value is the typical size of the entries of each column, ``(M,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        bound: largest entry in units of the scale (scaled sigmoid), or None for no bound.
-
-    Raises:
-        ValueError: on a bound that is not positive.
     """
 
     scale: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        inputs: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        u_mean: Tensor | None = None,
-        u_std: Tensor | None = None,
-        hidden: Sequence[int],
-        activation: str = "softplus",
-        bound: float | None = None,
-    ):
-        super().__init__(size, inputs)
-        if bound is not None and not bound > 0:
-            raise ValueError(f"bound is {bound}, expected a positive number or none")
-        self.bound = bound
-        self.network = MLP(size, size * inputs, hidden, activation, mean, std, angles)
-        self.register_buffer("scale", scale.float())
+    def __init__(self, scales: Scales, *, hidden: Sequence[int], activation: str = "softplus"):
+        super().__init__(scales)
+        self.network = scales.network(scales.size * scales.inputs, hidden, activation)
+        self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
         """A(q), ``(*batch, N, M)``."""
-        y = self.network.linearize(q)[0].unflatten(-1, self.shape)
-        if self.bound is not None:
-            y = self.bound * (2 * torch.sigmoid(y) - 1)
-        return self.scale * y
+        return self.scale * self.network.linearize(q)[0].unflatten(-1, self.shape)
 
 
 class NonlinearInput(InputMatrix):
-    """tau = A(q, u) u with A(q, u) = scale_i * network(q, u), reshaped to N x M.
+    """tau = A(q, u) u with A(q, u) = scale_j * network(q, u), reshaped to N x M.
 
     The columns of the ``linear`` inputs are constants instead, and the network does not see those
     inputs. Of the rates of motors a log often says no more than that, and a network that depends on
@@ -108,12 +81,7 @@ class NonlinearInput(InputMatrix):
     between motors and body, none of them linear. The controllers need an A(q) and refuse it.
 
     Args:
-        size: N.
-        inputs: M.
-        scale: typical size of the entries of each column, ``(M,)``; from the data.
-        mean, std: normalization of q, ``(N,)``; from the data.
-        angles: which coordinates are angles, and enter the network as sine and cosine.
-        u_mean, u_std: normalization of u, ``(M,)``; from the data.
+        scales: of the data; the value is the typical size of the entries of each column, ``(M,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         linear: inputs with a constant column.
@@ -128,34 +96,29 @@ class NonlinearInput(InputMatrix):
 
     def __init__(
         self,
+        scales: Scales,
         *,
-        size: int,
-        inputs: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        u_mean: Tensor,
-        u_std: Tensor,
         hidden: Sequence[int],
         activation: str = "softplus",
         linear: Sequence[int] = (),
     ):
-        super().__init__(size, inputs)
+        super().__init__(scales)
+        size, inputs = self.shape
         self.curved = [k for k in range(inputs) if k not in linear]
         if len(self.curved) + len(linear) != inputs or not self.curved:
             raise ValueError(
                 f"linear is {list(linear)}, expected some but not all of the {inputs} inputs, 0 to "
                 f"{inputs - 1}, each once"
             )
-        mean, std = torch.cat([mean, u_mean[self.curved]]), torch.cat([std, u_std[self.curved]])
-        seen = len(self.curved)
-        self.network = MLP(size + seen, size * seen, hidden, activation, mean, std, angles)
+        data, seen = scales.statistics, len(self.curved)
+        mean = torch.cat([data.q_mean, data.u_mean[self.curved]])
+        std = torch.cat([data.q_std, data.u_std[self.curved]])
+        self.network = MLP(size + seen, size * seen, hidden, activation, mean, std, scales.angles)
         self.constant = nn.Parameter(torch.zeros(size, len(linear))) if linear else None
         # Where each column of [curved, linear] belongs.
         self.order = sorted(range(inputs), key=[*self.curved, *linear].__getitem__)
-        self.register_buffer("scale", scale.float())
-        self.register_buffer("u_mean", u_mean.float())
+        self.register_buffer("scale", scales.value.float())
+        self.register_buffer("u_mean", data.u_mean.float())
 
     def forward(self, q: Tensor) -> Tensor:
         """A(q, u) at the mean input, ``(*batch, N, M)``."""
@@ -179,30 +142,15 @@ class ConstantInput(InputMatrix):
     """A = scale * parameters, the same at every q.
 
     Args:
-        size: N.
-        inputs: M.
-        scale: typical size of the entries of each column, ``(M,)``; from the data.
-        mean, std, angles, u_mean, u_std: not used by a constant; every input head takes the same
-            arguments.
+        scales: of the data; the value is the typical size of the entries of each column, ``(M,)``.
     """
 
     scale: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        inputs: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        u_mean: Tensor | None = None,
-        u_std: Tensor | None = None,
-    ):
-        super().__init__(size, inputs)
-        self.raw = nn.Parameter(torch.eye(size, inputs))
-        self.register_buffer("scale", scale.float())
+    def __init__(self, scales: Scales):
+        super().__init__(scales)
+        self.raw = nn.Parameter(torch.eye(*self.shape))
+        self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
         """A, ``(*batch, N, M)``."""
@@ -214,10 +162,7 @@ class FixedInput(InputMatrix):
     """A = a given constant matrix, not learned.
 
     Args:
-        size: N.
-        inputs: M.
-        scale, mean, std, angles, u_mean, u_std: not used; every input head takes the same arguments
-            from the model.
+        scales: of the data.
         value: the matrix, ``(N, M)``; the identity if None, which needs N = M.
 
     Raises:
@@ -226,20 +171,9 @@ class FixedInput(InputMatrix):
 
     value: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        inputs: int,
-        scale: Tensor,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        u_mean: Tensor | None = None,
-        u_std: Tensor | None = None,
-        value: Sequence[Sequence[float]] | None = None,
-    ):
-        super().__init__(size, inputs)
+    def __init__(self, scales: Scales, *, value: Sequence[Sequence[float]] | None = None):
+        super().__init__(scales)
+        size, inputs = self.shape
         matrix = torch.eye(inputs) if value is None else torch.tensor(value, dtype=torch.float32)
         if matrix.shape != (size, inputs):
             raise ValueError(

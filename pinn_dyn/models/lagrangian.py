@@ -19,9 +19,8 @@ from pinn_dyn.models.structured import (
     InputHead,
     PotentialHead,
     StructuredNetwork,
-    lower_solve,
-    upper_solve,
 )
+from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
 class LagrangianNetwork(StructuredNetwork):
@@ -69,21 +68,15 @@ class LagrangianNetwork(StructuredNetwork):
             angles,
             integrator,
         )
-        size = self.num_coordinates
-        self.mass = mass(
-            size=size,
-            scale=(self.input.typical_force(statistics.u_rms) / statistics.acceleration).sqrt(),
-            mean=statistics.q_mean,
-            std=statistics.q_std,
-            angles=angles,
-        )
+        inertia = self.input.typical_force(statistics.u_rms) / statistics.acceleration
+        self.mass = mass(self._scales(statistics, inertia.sqrt()))
         if self.mass.chain and not self.mass.transposed:
             raise ValueError(
                 "mass.chain is true and mass.transposed false, expected both: only in M = L^T L "
                 "does a column of L depend on the joints after it alone"
             )
 
-        self.initial_velocity = initial_velocity(statistics=statistics, angles=angles)
+        self.initial_velocity = initial_velocity(self._scales(statistics, statistics.v_std))
         self.learns_initial_state = self.initial_velocity.learned
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
@@ -102,6 +95,9 @@ class LagrangianNetwork(StructuredNetwork):
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         factor, bias = self._factor_and_coriolis_force(q, v)
         return self._solve(factor, force - bias - self._potential_force(q))
+
+    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
+        return self.mass.product(q, v)
 
     def _velocity(self, q: Tensor, p: Tensor) -> Tensor:
         return self._solve(self.mass(q), p)

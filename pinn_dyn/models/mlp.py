@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 Tape = tuple[Tensor, ...]
-"""Slopes of the hidden activations at one input, kept for the tangent and reverse passes."""
+"""Slopes of the features and hidden activations at one input, for the passes below."""
 
 
 def _softplus(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -40,7 +40,10 @@ class MLP(nn.Module):
     """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
 
     An entry x_i that is an angle goes in as sin(x_i) and cos(x_i) instead, so that y has its
-    period of 2 pi.
+    period of 2 pi. With ``limits`` the others go in as z = (c - mean)/std + tanh((x - c)/std) with
+    c = x clipped to its limits: unchanged within them, never more than a standard deviation beyond
+    them, and smooth (its second derivative is continuous). So y has no value far outside the data
+    that it does not have near them.
 
     With ``after`` the output y_o depends on the entries x_i, i > after_o, alone: the weights W_k
     are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on, and
@@ -58,6 +61,7 @@ class MLP(nn.Module):
         mean, std: normalization of x, ``(inputs,)``; none if left out.
         angles: positions of the angles in x.
         after: for each output the position in x after which it reads; all of x if None.
+        limits: smallest and largest x in the data, ``(inputs,)`` each; no limits if None.
 
     Raises:
         ValueError: on an unknown activation, widths below 1, a position that x does not have, or
@@ -66,6 +70,7 @@ class MLP(nn.Module):
 
     mean: Tensor
     std: Tensor
+    limits: Tensor | None
     is_angle: Tensor
 
     def __init__(
@@ -78,6 +83,7 @@ class MLP(nn.Module):
         std: Tensor | None = None,
         angles: Sequence[int] = (),
         after: Sequence[int] | None = None,
+        limits: tuple[Tensor, Tensor] | None = None,
     ):
         super().__init__()
         if activation not in ACTIVATIONS:
@@ -103,6 +109,10 @@ class MLP(nn.Module):
             self._mask(inputs, after)
         self.register_buffer("mean", torch.zeros(inputs) if mean is None else mean.float())
         self.register_buffer("std", torch.ones(inputs) if std is None else std.float())
+        if limits is not None and len(set(angles)) < inputs:
+            self.register_buffer("limits", torch.stack(limits).float())
+        else:
+            self.register_buffer("limits", None)
 
     @property
     def linears(self) -> list[nn.Linear]:
@@ -146,7 +156,7 @@ class MLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
-        h = (x - self.mean) / self.std
+        h, _ = self._normalized(x)
         if self._has_angles:
             cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
             h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
@@ -158,7 +168,7 @@ class MLP(nn.Module):
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
         """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
         h, slopes = self._features(columns(x))
-        tape = [slopes] if slopes is not None else []
+        tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
             h, slope = self._activation(torch.addmm(bias, weight, h))
@@ -172,7 +182,7 @@ class MLP(nn.Module):
         """
         features, slopes = self._features(columns(x))
         tangent = self._tangent(columns(dx), slopes)
-        tape = [slopes] if slopes is not None else []
+        tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
             z, dz = _side_by_side(weight, features, tangent)
@@ -185,43 +195,54 @@ class MLP(nn.Module):
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
         """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
         *hidden, last = self._weights()
-        slopes, tape = (tape[0], tape[1:]) if self._has_angles else (None, tape)
-        h = self._tangent(columns(dx), slopes)
-        for weight, slope in zip(hidden, tape, strict=True):
+        h = self._tangent(columns(dx), tape[0])
+        for weight, slope in zip(hidden, tape[1:], strict=True):
             h = (weight @ h) * slope
         return rows(last @ h, dx)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
         *hidden, last = self._weights()
-        first, rest = (tape[0], tape[1:]) if self._has_angles else (None, tape)
+        first, *rest = tape
         h = columns(dy)
         # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
         # ones(B, 1) @ W to a wrong gradient at some small sizes.
         h = last.T * h if last.shape[0] == 1 else last.T @ h
         for weight, slope in zip(reversed(hidden), reversed(rest), strict=True):
             h = weight.T @ (h * slope)
-        if first is None:
-            return rows(h / self.std[:, None], dy)
-        sine_or_linear, cosine = (h * first).chunk(2)
-        return rows(sine_or_linear + cosine, dy)
+        h = h * first
+        if self._has_angles:
+            sine_or_linear, cosine = h.chunk(2)
+            h = sine_or_linear + cosine
+        return rows(h, dy)
 
-    def _features(self, column: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the first layer sees of x, ``(n, B)``, and its slopes in x where x has angles."""
-        z = (column - self.mean[:, None]) / self.std[:, None]
+    def _normalized(self, x: Tensor, in_columns: bool = False) -> tuple[Tensor, Tensor]:
+        """z and its slope in x, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
+        mean, std, limits = self.mean, self.std, self.limits
+        if in_columns:
+            mean, std = mean[:, None], std[:, None]
+            limits = None if limits is None else limits[..., None]
+        if limits is None:
+            return (x - mean) / std, (1 / std).expand_as(x)
+        clipped = x.clamp(limits[0], limits[1])
+        beyond = torch.tanh((x - clipped) / std)
+        return (clipped - mean) / std + beyond, (1 - beyond * beyond) / std
+
+    def _features(self, column: Tensor) -> tuple[Tensor, Tensor]:
+        """What the first layer sees of x, and its slopes in x, each ``(n, B)``."""
+        z, slope = self._normalized(column, in_columns=True)
         if not self._has_angles:
-            return z, None
+            return z, slope
         # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
         is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
         sine, cosine = torch.sin(column), torch.cos(column)
-        slope = (1 / self.std[:, None]).expand_as(column)
         features = [torch.where(is_angle, sine, z), torch.where(is_angle, cosine, zero)]
         slopes = [torch.where(is_angle, cosine, slope), torch.where(is_angle, -sine, zero)]
         return torch.cat(features), torch.cat(slopes)
 
-    def _tangent(self, dx: Tensor, slopes: Tensor | None) -> Tensor:
+    def _tangent(self, dx: Tensor, slopes: Tensor) -> Tensor:
         """What the first layer sees of a tangent dx, ``(n, B)``."""
-        return dx / self.std[:, None] if slopes is None else torch.cat([dx, dx]) * slopes
+        return (torch.cat([dx, dx]) if self._has_angles else dx) * slopes
 
 
 def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor]:

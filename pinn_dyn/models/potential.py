@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP, columns, rows
+from pinn_dyn.models.mlp import columns, rows
+from pinn_dyn.models.scales import Scales
 
 
 class Potential(nn.Module, abc.ABC):
@@ -28,12 +29,10 @@ class NetworkPotential(Potential):
 
     K = S S^T is a learned constant: an elastic or gravity well is mostly quadratic, and the
     network then only has to learn what is left. Angles are left out of z, as V is periodic in them.
+    What the network sees of q saturates outside the data, so that V is bounded from below.
 
     Args:
-        size: N.
-        scale: typical energy, J; from the data.
-        mean, std: normalization of q, ``(N,)``; from the data.
-        angles: which coordinates are angles, and enter the network as sine and cosine.
+        scales: of the data; the value is a typical energy, J.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         quadratic: whether the K term is there; false is the paper's plain network.
@@ -43,20 +42,17 @@ class NetworkPotential(Potential):
 
     def __init__(
         self,
+        scales: Scales,
         *,
-        size: int,
-        scale: float,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
         hidden: Sequence[int],
         activation: str = "softplus",
         quadratic: bool = True,
     ):
         super().__init__()
-        self.network = MLP(size, 1, hidden, activation, mean, std, angles)
-        self.register_buffer("scale", torch.tensor(float(scale)))
-        quadratic = quadratic and len(set(angles)) < size
+        size = scales.size
+        self.network = scales.network(1, hidden, activation)
+        self.register_buffer("scale", scales.value.float())
+        quadratic = quadratic and len(set(scales.angles)) < size
         self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None
 
     def forward(self, q: Tensor) -> Tensor:
@@ -96,10 +92,7 @@ class ChainPotential(Potential):
     adds. Three rows are enough to write that potential exactly; more make it easier to learn.
 
     Args:
-        size: N.
-        scale: typical energy, J; from the data.
-        mean, std: not used; every potential head takes the same arguments from the model.
-        angles: which coordinates are angles: all of them.
+        scales: of the data, with all coordinates angles; the value is a typical energy, J.
         rank: rows of the vectors w, h and e.
 
     Raises:
@@ -108,17 +101,9 @@ class ChainPotential(Potential):
 
     scale: Tensor
 
-    def __init__(
-        self,
-        *,
-        size: int,
-        scale: float,
-        mean: Tensor,
-        std: Tensor,
-        angles: Sequence[int] = (),
-        rank: int = 8,
-    ):
+    def __init__(self, scales: Scales, *, rank: int = 8):
         super().__init__()
+        size, angles = scales.size, scales.angles
         if set(angles) != set(range(size)):
             raise ValueError(
                 f"angles is {list(angles)}, expected all {size} coordinates: the chain potential "
@@ -137,7 +122,7 @@ class ChainPotential(Potential):
         with torch.no_grad():
             for turn in self.turns:
                 turn.mul_(0.7)  # w keeps its size along the chain
-        self.register_buffer("scale", torch.tensor(float(scale)))
+        self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""

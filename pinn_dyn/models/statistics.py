@@ -13,10 +13,11 @@ from pinn_dyn.mechanics import State
 
 @dataclass(frozen=True)
 class Statistics:
-    """Means and standard deviations over the training windows, in SI units.
+    """Means, standard deviations and ranges over the training windows, in SI units.
 
     Attributes:
         q_mean, q_std: configuration, ``(N,)``.
+        q_low, q_high: smallest and largest configuration, ``(N,)``.
         v_std: velocity, ``(N,)``.
         p_std: momentum, ``(N,)``; ones where the data have none.
         u_mean, u_std: input, ``(M,)``.
@@ -27,6 +28,8 @@ class Statistics:
 
     q_mean: Tensor
     q_std: Tensor
+    q_low: Tensor
+    q_high: Tensor
     v_std: Tensor
     p_std: Tensor
     u_mean: Tensor

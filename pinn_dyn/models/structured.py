@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
@@ -12,17 +11,17 @@ from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import Potential
+from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
-CholeskyHead = Callable[..., CholeskyFactor]
-"""Builds a Cholesky head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
-PotentialHead = Callable[..., Potential]
-"""Builds a potential head from ``size``, ``scale``, ``mean``, ``std`` and ``angles``."""
-InputHead = Callable[..., InputMatrix]
-"""Builds an input head from ``size``, ``inputs``, ``scale``, ``mean``, ``std``, ``angles``,
-``u_mean`` and ``u_std``."""
-FrictionHead = Callable[..., Friction]
-"""Builds a friction head from ``size``, ``force`` and ``v_std``."""
+CholeskyHead = Callable[[Scales], CholeskyFactor]
+"""Builds a Cholesky head; the value of its scales is that of the rows of L."""
+PotentialHead = Callable[[Scales], Potential]
+"""Builds a potential head; the value of its scales is an energy."""
+InputHead = Callable[[Scales], InputMatrix]
+"""Builds an input head; the value of its scales is that of the columns of A."""
+FrictionHead = Callable[[Scales], Friction]
+"""Builds a friction head; the value of its scales is a force."""
 
 
 class StructuredNetwork(MechanicalSystem):
@@ -48,30 +47,17 @@ class StructuredNetwork(MechanicalSystem):
         super().__init__(size, inputs, state)
         self.integrator = integrator or RK4()
         self.angles = tuple(angles)
-        mean, std, u_rms = statistics.q_mean, statistics.q_std, statistics.u_rms
-        self.input = input(
-            size=size,
-            inputs=inputs,
-            scale=u_rms.square().mean().sqrt() / u_rms,
-            mean=mean,
-            std=std,
-            angles=angles,
-            u_mean=statistics.u_mean,
-            u_std=statistics.u_std,
-        )
+        u_rms = statistics.u_rms
+        self.input = input(self._scales(statistics, u_rms.square().mean().sqrt() / u_rms))
         self.input_affine = self.input.affine
         force = self.input.typical_force(u_rms)
-        self.potential = potential(
-            size=size,
-            scale=float(force.square().mean().sqrt() * std.mean()),
-            mean=mean,
-            std=std,
-            angles=angles,
-        )
-        self.damping = damping(
-            size=size, scale=(force / statistics.v_std).sqrt(), mean=mean, std=std, angles=angles
-        )
-        self.friction = friction(size=size, force=force, v_std=statistics.v_std)
+        energy = force.square().mean().sqrt() * statistics.q_std.mean()
+        self.potential = potential(self._scales(statistics, energy))
+        self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
+        self.friction = friction(self._scales(statistics, force))
+
+    def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
+        return Scales(statistics, value, self.angles)
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""
@@ -80,6 +66,9 @@ class StructuredNetwork(MechanicalSystem):
     def damping_matrix(self, q: Tensor) -> Tensor:
         """D(q) = L_D L_D^T, ``(*batch, N, N)``."""
         return self.damping.matrix(q)
+
+    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
+        return self.damping.product(q, v)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """A(q), ``(*batch, N, M)``."""
@@ -96,29 +85,3 @@ class StructuredNetwork(MechanicalSystem):
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.potential.gradient(q)
-
-
-def lower_solve(factor: Tensor, vector: Tensor) -> Tensor:
-    """x with L x = b, for a lower triangular L ``(*batch, N, N)`` and b ``(*batch, N)``.
-
-    Unrolled over N: for the few coordinates of a robot this is faster than a batched LAPACK call,
-    and its derivative is made of the same few operations.
-    """
-    entries = [row.unbind(-1) for row in factor.unbind(-2)]
-    x: list[Tensor] = []
-    for row, rest in zip(entries, vector.unbind(-1), strict=True):
-        for j, known in enumerate(x):
-            rest = rest - row[j] * known
-        x.append(rest / row[len(x)])
-    return torch.stack(x).movedim(0, -1)
-
-
-def upper_solve(factor: Tensor, vector: Tensor) -> Tensor:
-    """x with L^T x = b, for the same lower triangular L."""
-    entries = [row.unbind(-1) for row in factor.unbind(-2)]
-    x = list(vector.unbind(-1))
-    for i in reversed(range(len(x))):
-        for j in range(i + 1, len(x)):
-            x[i] = x[i] - entries[j][i] * x[j]
-        x[i] = x[i] / entries[i][i]
-    return torch.stack(x).movedim(0, -1)

@@ -56,11 +56,11 @@ def test_another_choice_is_refused(compiler, choice):
 
 @pytest.mark.parametrize("nested", [False, True])
 def test_an_option_of_another_class_says_how_to_remove_it(nested):
-    config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "statistics": None}
+    config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "scales": None}
     key = "hidden"
     if nested:
-        config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "statistics": config}
-        key = "statistics.hidden"
+        config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "scales": config}
+        key = "scales.hidden"
     says = rf"model.*: MeasuredVelocity takes no 'hidden'.*remove it by '~model\.{key}'"
     with pytest.raises(ConfigError, match=says):
         build._build("model", config)

@@ -131,7 +131,7 @@ def test_presets_of_hardware_have_the_structure_of_the_paper():
     assert fit.dataset.steps.fit.degree == 7
     assert len(neck.dataset.u.columns) == 4
     assert neck.model.input._target_.endswith("NetworkInput")
-    assert panda.model.mass.bound == 3.5
+    assert panda.model.mass.positivity.limit == 3.5
     assert panda.model.input._target_.endswith("FixedInput")
     assert len(panda.model.angles) == len(panda.dataset.q.columns) == 7
     for preset in (neck, fit, panda):

@@ -13,7 +13,7 @@ from pinn_dyn.control.contracts import Controller
 from pinn_dyn.control.export import export_law, load_law
 from pinn_dyn.control.laws import ProportionalDerivative, Tracking
 from pinn_dyn.data.simulation import has_cpp_compiler
-from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential
+from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential, Positive
 from tests.models.builders import make_structured
 from tests.support.linear import unit_masses
 
@@ -38,7 +38,7 @@ def make_law():
         2,
         mass=partial(NetworkCholesky, hidden=[4]),
         potential=partial(NetworkPotential, hidden=[4]),
-        damping=partial(NetworkCholesky, hidden=[3], epsilon=0.0),
+        damping=partial(NetworkCholesky, hidden=[3], positivity=Positive(floor=0.0)),
         input=partial(NetworkInput, hidden=[3]),
         angles=[0],
     )

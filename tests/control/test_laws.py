@@ -16,7 +16,7 @@ from pinn_dyn.control.laws import (
     Tracking,
     pseudo_inverse_times,
 )
-from pinn_dyn.models import NetworkCholesky
+from pinn_dyn.models import NetworkCholesky, Positive
 from pinn_dyn.systems import SoftArm
 from tests.contracts.controller import ControllerContract, states
 from tests.models.builders import make_model, make_structured
@@ -186,9 +186,11 @@ def test_computed_torque_on_the_truth_gives_the_linear_error_dynamics(system):
 
 @pytest.mark.parametrize("law", MODEL_BASED)
 def test_hamiltonian_and_lagrangian_network_of_equal_terms_give_equal_inputs(law):
-    lagrangian = make_structured("lnn", mass=partial(NetworkCholesky, hidden=[6], epsilon=1.0))
+    lagrangian = make_structured(
+        "lnn", mass=partial(NetworkCholesky, hidden=[6], positivity=Positive(floor=1.0))
+    )
     mass = copy.deepcopy(lagrangian.mass)
-    hamiltonian = make_structured("hnn", mass=lambda **_: InverseOf(mass))
+    hamiltonian = make_structured("hnn", mass=lambda _: InverseOf(mass))
     mass.load_state_dict(lagrangian.mass.state_dict())
     for name in ("potential", "damping", "input"):
         getattr(hamiltonian, name).load_state_dict(getattr(lagrangian, name).state_dict())

@@ -137,6 +137,8 @@ def test_statistics_are_those_of_the_windows(trajectories):
     expected = {
         "q_mean": windows.q.mean(0),
         "q_std": windows.q.std(0, correction=0),
+        "q_low": windows.q.min(0).values,
+        "q_high": windows.q.max(0).values,
         "v_std": windows.v.std(0, correction=0),
         "p_std": windows.p.std(0, correction=0),
         "u_mean": windows.u.reshape(-1, 1).mean(0),

@@ -1,11 +1,13 @@
 """Small models with non-trivial weights, and the data scales that they are built from."""
 
+from dataclasses import replace
 from functools import partial
 
 import torch
 
 from pinn_dyn.models import (
     AccelerationMLP,
+    Bounded,
     ChainPotential,
     ConstantCholesky,
     ConstantInput,
@@ -21,6 +23,8 @@ from pinn_dyn.models import (
     NextStateMLP,
     NoFriction,
     NonlinearInput,
+    Positive,
+    Scales,
     Statistics,
 )
 
@@ -35,6 +39,8 @@ def make_statistics(n, m, step=STEP):
     return Statistics(
         q_mean=0.1 * rows - 0.3,
         q_std=0.6 + 0.1 * rows,
+        q_low=-2.0 - 0.1 * rows,
+        q_high=1.9 + 0.2 * rows,
         v_std=1.5 - 0.2 * rows,
         p_std=0.7 + 0.1 * rows,
         u_mean=0.2 * columns - 0.5,
@@ -43,6 +49,20 @@ def make_statistics(n, m, step=STEP):
         qp_increment_std=torch.stack([0.7 * increment, 1.4 * increment]),
         step=step,
     )
+
+
+def make_scales(n, m, value=1.0, angles=(), **statistics):
+    """Scales of a head; the value is one number or a list, ``statistics`` replace the usual."""
+    value = torch.as_tensor(value, dtype=torch.float64)
+    data = make_statistics(n, m)
+    if "q_mean" in statistics:  # then of normal data, nearly
+        reach = 3 * statistics["q_std"]
+        statistics |= {
+            "q_low": statistics["q_mean"] - reach,
+            "q_high": statistics["q_mean"] + reach,
+        }
+    data = replace(data, **statistics)
+    return Scales(data, value, tuple(angles))
 
 
 def perturb(model, seed=0, spread=0.3):
@@ -88,7 +108,7 @@ def make_structured(
     mass = mass or partial(NetworkCholesky, hidden=[6, 5])
     heads = {
         "potential": potential or partial(NetworkPotential, hidden=[6, 5]),
-        "damping": damping or partial(NetworkCholesky, hidden=[5], epsilon=0.0),
+        "damping": damping or partial(NetworkCholesky, hidden=[5], positivity=Positive(floor=0.0)),
         "input": input or partial(NetworkInput, hidden=[5]),
         "friction": friction or NoFriction,
         "angles": angles,
@@ -117,17 +137,18 @@ VARIANTS = {
     "bounded-tanh-mass-constant-damping-2x1": dict(
         n=2,
         m=1,
-        mass=partial(NetworkCholesky, hidden=[6], activation="tanh", bound=2.0),
-        damping=partial(ConstantCholesky, epsilon=1e-3),
-        input=partial(NetworkInput, hidden=[4], activation="tanh", bound=1.5),
+        mass=partial(NetworkCholesky, hidden=[6], activation="tanh", positivity=Bounded(2.0)),
+        damping=ConstantCholesky,
+        input=partial(NetworkInput, hidden=[4], activation="tanh"),
     ),
-    "relu-silu-fixed-input-2x4": dict(
+    "silu-fixed-input-2x4": dict(
         n=2,
         m=4,
-        # A large epsilon keeps the matrix regular where the relu is zero.
-        mass=partial(NetworkCholesky, hidden=[6], activation="silu", diagonal="relu", epsilon=0.3),
+        mass=partial(
+            NetworkCholesky, hidden=[6], activation="silu", positivity=Positive(0.3, initial=0.5)
+        ),
         potential=partial(NetworkPotential, hidden=[6], activation="silu", quadratic=False),
-        damping=partial(NetworkCholesky, hidden=[4], diagonal="relu", epsilon=0.0),
+        damping=partial(NetworkCholesky, hidden=[4], positivity=Positive(floor=0.0)),
         input=partial(FixedInput, value=input_values(2, 4)),
     ),
     "constant-mass-fixed-damping-constant-input-3x3": dict(
@@ -154,7 +175,7 @@ TRANSPOSED = dict(
     n=3,
     m=3,
     mass=partial(NetworkCholesky, hidden=[6], transposed=True),
-    damping=partial(NetworkCholesky, hidden=[4], bound=2.0, transposed=True),
+    damping=partial(NetworkCholesky, hidden=[4], positivity=Bounded(2.0), transposed=True),
 )
 """M = L^T L, for the Lagrangian network alone."""
 

@@ -6,12 +6,16 @@ import pytest
 import torch
 
 from pinn_dyn.models import MLP, ChainPotential, LagrangianNetwork, NetworkCholesky
-from tests.models.builders import CHAIN, make_statistics, make_structured, perturb
+from tests.models.builders import CHAIN, make_scales, make_statistics, make_structured, perturb
 from tests.support.finite_differences import assert_near, partial_derivatives
 
 GRAVITY = torch.tensor([0.3, -0.4, 9.7], dtype=torch.float64)
 JOINTS = 4
-SCALES = {"scale": torch.ones(JOINTS), "mean": torch.zeros(JOINTS), "std": torch.ones(JOINTS)}
+
+
+def scales(value=(1.0,) * JOINTS, angles=()):
+    """Of a head of the chain."""
+    return make_scales(JOINTS, 1, value, angles)
 
 
 def _constants(*shape, seed):
@@ -94,16 +98,16 @@ def test_in_a_true_chain_a_column_depends_on_the_joints_after_it(factor, q):
 
 def test_the_head_for_a_chain_depends_on_what_a_true_chain_depends_on(q):
     torch.manual_seed(3)
-    head = NetworkCholesky(size=JOINTS, **SCALES, angles=range(JOINTS), hidden=[12, 9], chain=True)
+    head = NetworkCholesky(scales(angles=range(JOINTS)), hidden=[12, 9], chain=True)
     assert torch.equal(dependence(perturb(head.double()), q[0]), rule())
-    free = NetworkCholesky(size=JOINTS, **SCALES, angles=range(JOINTS), hidden=[12, 9])
+    free = NetworkCholesky(scales(angles=range(JOINTS)), hidden=[12, 9])
     assert int(dependence(perturb(free.double()), q[0]).sum()) > int(rule().sum())
 
 
 def test_a_mask_stays_while_weights_are_trained(q):
     """The masked weights get no gradient, and no optimizer moves the output by them."""
     torch.manual_seed(3)
-    head = NetworkCholesky(size=JOINTS, **SCALES, angles=range(JOINTS), hidden=[12], chain=True)
+    head = NetworkCholesky(scales(angles=range(JOINTS)), hidden=[12], chain=True)
     head = perturb(head.double())
     head(q).square().sum().backward()
     network = head.network
@@ -140,7 +144,7 @@ def test_masked_units_start_as_large_as_others():
 
 def test_too_few_units_for_a_chain_are_refused():
     with pytest.raises(ValueError, match="a layer of 2 units, expected at least 6, some that"):
-        NetworkCholesky(size=JOINTS, **SCALES, hidden=[12, 2], chain=True)
+        NetworkCholesky(scales(), hidden=[12, 2], chain=True)
 
 
 def test_a_lagrangian_chain_needs_the_transposed_form():
@@ -154,8 +158,7 @@ def test_a_lagrangian_chain_needs_the_transposed_form():
 
 def make_potential(rank):
     torch.manual_seed(3)
-    angles = range(JOINTS)
-    return ChainPotential(size=JOINTS, **SCALES | {"scale": 2.0}, angles=angles, rank=rank).double()
+    return ChainPotential(scales(2.0, range(JOINTS)), rank=rank).double()
 
 
 def test_three_rows_hold_the_potential_of_a_true_chain(q):
@@ -199,23 +202,22 @@ def test_it_starts_near_the_scale(rank):
     spreads = []
     for seed in range(20):
         torch.manual_seed(seed)
-        scales = {"scale": 2.0, "mean": None, "std": None}
-        head = ChainPotential(size=7, **scales, angles=range(7), rank=rank).double()
+        head = ChainPotential(make_scales(7, 1, 2.0, range(7)), rank=rank).double()
         spreads.append(float(head(q).std()))
     assert 0.3 < sum(spreads) / len(spreads) / 2.0 < 3
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("angles", "rank", "message"),
     [
-        ({"angles": [0, 1, 3]}, r"angles is \[0, 1, 3\], expected all 4 coordinates"),
-        ({}, r"angles is \[\], expected all 4"),
-        ({"angles": range(4), "rank": 0}, "rank is 0, expected at least 1"),
+        ([0, 1, 3], 8, r"angles is \[0, 1, 3\], expected all 4 coordinates"),
+        ([], 8, r"angles is \[\], expected all 4"),
+        (range(4), 0, "rank is 0, expected at least 1"),
     ],
 )
-def test_a_wrong_argument_of_the_potential_is_refused(settings, message):
+def test_a_wrong_argument_of_the_potential_is_refused(angles, rank, message):
     with pytest.raises(ValueError, match=message):
-        ChainPotential(size=JOINTS, **SCALES | {"scale": 1.0}, **settings)
+        ChainPotential(scales(1.0, angles), rank=rank)
 
 
 def test_the_potential_is_refused_where_a_coordinate_is_no_angle():

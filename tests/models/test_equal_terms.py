@@ -13,6 +13,7 @@ from pinn_dyn.models import (
     FixedInput,
     NetworkCholesky,
     NetworkPotential,
+    Positive,
 )
 from tests.models.builders import (
     input_values,
@@ -82,12 +83,14 @@ def paths(lagrangian, hamiltonian, count=4):
 def pair(request):
     heads = {
         "constant mass": partial(FixedCholesky, value=positive_matrix(3)),
-        # A large epsilon keeps the masses, and with them the accelerations, moderate.
-        "mass that depends on q": partial(NetworkCholesky, hidden=[6], epsilon=1.0),
+        # A high floor keeps the masses, and with them the accelerations, moderate.
+        "mass that depends on q": partial(
+            NetworkCholesky, hidden=[6], positivity=Positive(floor=1.0)
+        ),
     }
     lagrangian = make_structured("lnn", mass=heads[request.param])
     mass = copy.deepcopy(lagrangian.mass)
-    hamiltonian = make_structured("hnn", mass=lambda **_: InverseOf(mass))
+    hamiltonian = make_structured("hnn", mass=lambda _: InverseOf(mass))
     mass.load_state_dict(lagrangian.mass.state_dict())
     for name in ("potential", "damping", "input"):
         getattr(hamiltonian, name).load_state_dict(getattr(lagrangian, name).state_dict())

@@ -10,7 +10,7 @@ import torch
 
 from pinn_dyn.mechanics import Signal
 from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
-from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential
+from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential, Positive
 from tests.models.builders import STEP, make_model, make_structured, perturb, random_batch
 from tests.support.finite_differences import assert_near
 
@@ -139,7 +139,7 @@ def test_a_compiled_model_has_the_same_increments_and_gradients(monkeypatch, kin
     heads = {
         "mass": partial(NetworkCholesky, hidden=[4]),
         "potential": partial(NetworkPotential, hidden=[6, 5]),
-        "damping": partial(NetworkCholesky, hidden=[], epsilon=0.0),
+        "damping": partial(NetworkCholesky, hidden=[], positivity=Positive(floor=0.0)),
         "input": partial(NetworkInput, hidden=[]),
     }
     if kind == "acceleration":

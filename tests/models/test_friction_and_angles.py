@@ -15,13 +15,20 @@ from pinn_dyn.models import (
     NetworkPotential,
     NextStateMLP,
 )
-from tests.models.builders import make_statistics, make_structured, perturb, random_batch
+from tests.models.builders import (
+    make_scales,
+    make_statistics,
+    make_structured,
+    perturb,
+    random_batch,
+)
 from tests.support.finite_differences import assert_near, slope
 
 
 def make_friction(size=3, seed=0):
     force, v_std = torch.linspace(0.5, 20.0, size), torch.linspace(0.1, 2.0, size)
-    return perturb(CoulombFriction(size=size, force=force, v_std=v_std).double(), seed, 2.0)
+    scales = make_scales(size, 1, force, v_std=v_std)
+    return perturb(CoulombFriction(scales).double(), seed, 2.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -38,7 +45,7 @@ def test_friction_opposes_every_velocity(seed):
 def test_friction_starts_at_the_level_and_the_width_asked_for():
     """c = level times the force and w = (width + 0.01) times the speed."""
     force, v_std = torch.tensor([2.0, 30.0]), torch.tensor([0.5, 4.0])
-    friction = CoulombFriction(size=2, force=force, v_std=v_std, level=0.05, width=0.03)
+    friction = CoulombFriction(make_scales(2, 1, force, v_std=v_std), level=0.05, width=0.03)
     torch.testing.assert_close(friction(1e3 * v_std), 0.05 * force)
     width = 0.04 * v_std
     torch.testing.assert_close(friction(width), 0.05 * force * torch.tanh(torch.ones(2)))
@@ -48,7 +55,7 @@ def test_friction_starts_at_the_level_and_the_width_asked_for():
 @pytest.mark.parametrize("name", ["level", "width"])
 def test_a_start_of_friction_that_is_not_positive_is_refused(name):
     with pytest.raises(ValueError, match=f"friction: {name} is 0.0, expected a positive"):
-        CoulombFriction(size=1, force=torch.ones(1), v_std=torch.ones(1), **{name: 0.0})
+        CoulombFriction(make_scales(1, 1, [1.0]), **{name: 0.0})
 
 
 def test_friction_is_odd_and_reaches_its_level():
@@ -148,9 +155,8 @@ def test_passes_through_angles_are_exact():
 
 
 def test_the_quadratic_well_leaves_angles_out():
-    heads = dict(size=2, scale=1.0, mean=torch.zeros(2), std=torch.ones(2), hidden=[4])
-    assert NetworkPotential(**heads, angles=[0, 1]).stiffness_root is None
-    mixed = perturb(NetworkPotential(**heads, angles=[0]).double())
+    assert NetworkPotential(make_scales(2, 1, angles=[0, 1]), hidden=[4]).stiffness_root is None
+    mixed = perturb(NetworkPotential(make_scales(2, 1, angles=[0]), hidden=[4]).double())
     q, _, _, _ = random_batch(2, 2)
     turn = torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
     assert_near(mixed(q + turn), mixed(q), 1e-12)

@@ -8,9 +8,9 @@ import torch
 from pinn_dyn.data import draw_windows
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory, rollout
-from pinn_dyn.models import AccelerationMLP, LearnedVelocity
+from pinn_dyn.models import AccelerationMLP, LearnedVelocity, Scales
 from pinn_dyn.training import IncrementLoss, MidpointLoss
-from tests.models.builders import STEP, make_statistics, make_structured, perturb
+from tests.models.builders import STEP, make_scales, make_statistics, make_structured, perturb
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
 
 
@@ -58,7 +58,7 @@ def untrained(model):
 
 
 def test_before_training_roll_outs_start_at_the_measured_velocity():
-    head = LearnedVelocity(statistics=make_statistics(2, 2), angles=[])
+    head = LearnedVelocity(make_scales(2, 2, [1.0, 1.0]))
     x0, _, u = (value.float() for value in motion())
     q, v = x0.chunk(2, -1)
     assert torch.equal(head(q, v, u[:, 0]), v)
@@ -107,7 +107,7 @@ def test_a_wrong_measured_velocity_is_mended():
     )
     statistics = windows.statistics()
     torch.manual_seed(0)
-    head = LearnedVelocity(statistics=statistics, angles=[], hidden=[8]).double()
+    head = LearnedVelocity(Scales(statistics, statistics.v_std), hidden=[8]).double()
     started = Started(system, head)
     loss = IncrementLoss(statistics, started, velocity_weight=1e-6).double()
     optimizer = torch.optim.Adam(head.parameters(), lr=0.04)

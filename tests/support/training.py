@@ -16,12 +16,13 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkPotential,
     NextStateMLP,
+    Positive,
 )
 from tests.support.linear import damped_oscillators
 
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[8]),
-    damping=partial(ConstantCholesky, epsilon=0.0),
+    damping=partial(ConstantCholesky, positivity=Positive(floor=0.0)),
     input=ConstantInput,
 )
 MODELS = {

@@ -14,6 +14,7 @@ from pinn_dyn.models import (
     ConstantInput,
     LagrangianNetwork,
     NetworkPotential,
+    Positive,
 )
 from pinn_dyn.training import IncrementLoss, fit
 
@@ -47,7 +48,7 @@ def model(data):
         data.statistics,
         mass=ConstantCholesky,
         potential=partial(NetworkPotential, hidden=[8]),
-        damping=partial(ConstantCholesky, epsilon=0.0),
+        damping=partial(ConstantCholesky, positivity=Positive(floor=0.0)),
         input=ConstantInput,
     )
 

@@ -16,6 +16,7 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NetworkPotential,
     NextStateMLP,
+    Positive,
     Statistics,
 )
 from pinn_dyn.training import IncrementLoss
@@ -23,6 +24,8 @@ from pinn_dyn.training import IncrementLoss
 STATISTICS = Statistics(
     q_mean=torch.zeros(1, dtype=torch.float64),
     q_std=torch.ones(1, dtype=torch.float64),
+    q_low=torch.full((1,), -2.0, dtype=torch.float64),
+    q_high=torch.full((1,), 2.0, dtype=torch.float64),
     v_std=torch.ones(1, dtype=torch.float64),
     p_std=torch.ones(1, dtype=torch.float64),
     u_mean=torch.zeros(1, dtype=torch.float64),
@@ -39,7 +42,7 @@ ONE_STEP = replace(
 )
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[4]),
-    damping=partial(ConstantCholesky, epsilon=0.0),
+    damping=partial(ConstantCholesky, positivity=Positive(floor=0.0)),
     input=ConstantInput,
 )
 MODELS = {

@@ -15,6 +15,7 @@ from pinn_dyn.models import (
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
+    Positive,
 )
 from pinn_dyn.training import IncrementLoss
 from tests.models.autodiff import lagrangian_derivative, rk4_increment
@@ -24,7 +25,7 @@ from tests.support.finite_differences import assert_near, slope
 STEP = 0.05
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[6, 5]),
-    damping=partial(NetworkCholesky, hidden=[5], epsilon=0.0),
+    damping=partial(NetworkCholesky, hidden=[5], positivity=Positive(floor=0.0)),
     input=partial(NetworkInput, hidden=[5]),
 )
 

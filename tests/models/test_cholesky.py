@@ -1,0 +1,213 @@
+"""The Cholesky heads: their contract, formulas, floors, bounds, starts and refused arguments."""
+
+from functools import partial
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from pinn_dyn.models import Bounded, ConstantCholesky, FixedCholesky, NetworkCholesky, Positive
+from tests.contracts.cholesky_head import CholeskyHeadContract
+from tests.models.builders import make_scales, perturb, positive_matrix
+from tests.support.finite_differences import assert_near
+
+SIZE = 3
+SCALE = torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)
+MEAN = torch.tensor([0.5, -0.25, 0.125], dtype=torch.float64)
+STD = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
+HEADS = {
+    "softplus": partial(NetworkCholesky, hidden=[5], positivity=Positive(0.01)),
+    "semidefinite": partial(NetworkCholesky, hidden=[5], positivity=Positive(0.0)),
+    "bounded": partial(
+        NetworkCholesky, hidden=[5], activation="tanh", positivity=Bounded(1.5, floor=0.01)
+    ),
+    "constant": partial(ConstantCholesky, positivity=Positive(0.01)),
+    "bounded constant": partial(ConstantCholesky, positivity=Bounded(1.5, floor=0.01)),
+    "fixed": partial(FixedCholesky, value=positive_matrix(SIZE)),
+    "transposed": partial(NetworkCholesky, hidden=[5, 4], activation="silu", transposed=True),
+    "chain": partial(NetworkCholesky, hidden=[9], chain=True, transposed=True),
+}
+
+
+def scales(angles=(), value=SCALE):
+    return make_scales(SIZE, 1, value, angles, q_mean=MEAN, q_std=STD)
+
+
+def make(builder, spread=0.6, angles=()):
+    torch.manual_seed(3)
+    return perturb(builder(scales(angles)).double(), spread=spread)
+
+
+@pytest.fixture
+def q():
+    generator = torch.Generator().manual_seed(4)
+    return MEAN + STD * torch.randn(40, SIZE, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", HEADS)
+class TestCholeskyHead(CholeskyHeadContract):
+    @pytest.fixture
+    def head(self, name):
+        return make(HEADS[name])
+
+
+class TestWithAngles(CholeskyHeadContract):
+    @pytest.fixture
+    def head(self):
+        return make(HEADS["softplus"], angles=[1])
+
+    def test_far_outside_the_data_it_is_as_large_as_near_them(self, head, q):
+        """Bounded, but not at rest: the angle turns on."""
+        largest = float(head.matrix(1e3 * q).abs().max())
+        assert float(head.matrix(1e5 * q).abs().max()) < 2 * largest
+
+
+def outputs(head, q):
+    """Diagonal and off-diagonal outputs of a head's network, by a plain forward pass."""
+    network = head.network
+    activation = {"softplus": F.softplus, "tanh": torch.tanh}
+    name = next(k for k in activation if k in network._activation.__name__)
+    h = (q - MEAN) / STD
+    h = activation[name](h @ network.layers[0].weight.T + network.layers[0].bias)
+    y = h @ network.layers[1].weight.T + network.layers[1].bias
+    return y[..., :SIZE], y[..., SIZE:]
+
+
+def test_entries_are_those_of_the_documented_formula(q):
+    """Within three standard deviations of the data: there the features are as they are."""
+    q = MEAN + (q - MEAN).clamp(-3 * STD, 3 * STD)
+    rows, columns = (1, 2, 2), (0, 0, 1)
+    diagonals = {
+        "softplus": lambda y: F.softplus(y) + 0.01,
+        "bounded": lambda y: 1.5 * torch.sigmoid(y) + 0.01,
+    }
+    for name, diagonal in diagonals.items():
+        head = make(HEADS[name])
+        y, lower = outputs(head, q)
+        lower = 1.5 * (2 * torch.sigmoid(lower) - 1) if name == "bounded" else lower
+        expected = torch.zeros(40, SIZE, SIZE, dtype=torch.float64)
+        for i in range(SIZE):
+            expected[:, i, i] = SCALE[i] * diagonal(y)[:, i]
+        for k, (i, j) in enumerate(zip(rows, columns, strict=True)):
+            expected[:, i, j] = SCALE[i] * lower[:, k]
+        assert_near(head(q), expected, 1e-7)
+
+
+@pytest.mark.parametrize("name", ["softplus", "bounded", "constant"])
+def test_the_floor_is_the_smallest_diagonal_entry(name, q):
+    head = make(HEADS[name])
+    with torch.no_grad():  # drive the diagonal to its lower end
+        if name == "constant":
+            head.raw_diagonal.fill_(-80.0)
+        else:
+            head.network.layers[-1].bias[:SIZE] = -80.0
+    diagonal = head(q).diagonal(dim1=-2, dim2=-1)
+    floor = 0.01 * SCALE
+    assert_near(diagonal, floor.expand_as(diagonal), 1e-6)
+    # det(L L^T) is the squared product of that diagonal: the matrix stays regular.
+    assert_near(torch.linalg.det(head.matrix(q)), floor.prod().square().expand(40), 1e-3)
+
+
+@pytest.mark.parametrize("name", ["bounded", "bounded constant"])
+def test_bounded_entries_stay_in_their_range(name, q):
+    head = make(HEADS[name], spread=20.0)
+    ratio = head(q) / SCALE[:, None]
+    diagonal = ratio.diagonal(dim1=-2, dim2=-1)
+    lower = ratio.tril(-1).abs()
+    assert float(diagonal.min()) >= 0.01 - 1e-6
+    assert float(diagonal.max()) <= 1.51 + 1e-6
+    assert float(lower.max()) <= 1.5 + 1e-6
+    # The weights are large enough to reach the ends: an unbounded head would leave the range.
+    assert float(diagonal.max()) > 1.5
+    assert float(lower.max()) > 1.49
+
+
+def test_a_transposed_head_has_the_scale_in_its_columns(q):
+    plain, transposed = (
+        make(partial(NetworkCholesky, hidden=[5], transposed=flag)) for flag in (False, True)
+    )
+    unscaled = plain(q) / SCALE[:, None]
+    assert_near(transposed(q), unscaled * SCALE, 1e-12)
+
+
+@pytest.mark.parametrize("factor", [0.5, 4.0])
+@pytest.mark.parametrize("name", [name for name in HEADS if name != "fixed"])
+def test_the_scale_is_honoured(name, factor, q):
+    """L is proportional to it; a fixed matrix has its own."""
+    scaled = make(lambda _: HEADS[name](scales(value=factor * SCALE)))
+    assert_near(scaled(q), factor * make(HEADS[name])(q), 1e-6)
+
+
+@pytest.mark.parametrize("name", ["constant", "fixed"])
+def test_a_constant_has_no_slopes(name, q):
+    head = make(HEADS[name])
+    _, tape = head.linearize(q)
+    assert not head.pushforward(tape, q).any()
+    assert not head.pullback(tape, head(q)).any()
+    assert bool(list(head.parameters())) == (name == "constant")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        positive_matrix(3),
+        [[0.0, 0.0, 0.0]] * 3,
+        [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [3.0, 6.0, 9.0]],
+        [[0.0, 0.0, 0.0], [0.0, 2.0, -1.0], [0.0, -1.0, 1.0]],
+        [[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 5.0]],
+    ],
+    ids=["regular", "zero", "rank 1", "zero first row", "rank 2"],
+)
+def test_a_fixed_matrix_is_reproduced_also_if_singular(value, q):
+    head = FixedCholesky(scales(), value=value)
+    factor = head(q.float())
+    assert torch.isfinite(factor).all()
+    assert torch.equal(factor, factor.tril())
+    expected = torch.tensor(value).expand(40, 3, 3)
+    torch.testing.assert_close(head.matrix(q.float()), expected, rtol=0, atol=3e-6)
+
+
+@pytest.mark.parametrize("initial", [0.05, 1.0, 3.0])
+@pytest.mark.parametrize(
+    "builder", [partial(NetworkCholesky, hidden=[5]), ConstantCholesky], ids=["network", "constant"]
+)
+def test_the_diagonal_starts_where_it_is_told(builder, initial):
+    """A network's own part, a tenth of its usual size, comes on top."""
+    head = make(partial(builder, positivity=Positive(0.01, initial)), spread=0.0)
+    if hasattr(head, "network"):
+        head.network.linears[-1].weight.data.zero_()
+    factor = head(torch.zeros(SIZE).double())
+    assert_near(factor, torch.diag((initial + 0.01) * SCALE), 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("builder", "message"),
+    [
+        (lambda: Positive(floor=-1e-3), "floor is -0.001, expected zero or a positive"),
+        (lambda: Positive(floor=float("nan")), "floor is nan"),
+        (lambda: Positive(initial=0.0), "initial is 0.0, expected a positive"),
+        (lambda: Bounded(limit=-1.0), "limit is -1.0"),
+        (lambda: Bounded(limit=0.0), "limit is 0.0"),
+        (lambda: Bounded(limit=float("nan")), "limit is nan"),
+        (lambda: Bounded(floor=-1.0), "floor is -1.0"),
+        (lambda: NetworkCholesky(scales(), hidden=[4], activation="relu"), "activation is 'relu'"),
+        (lambda: NetworkCholesky(scales(), hidden=[0]), r"hidden is \[0\]"),
+        (lambda: FixedCholesky(scales(), value=[[1.0, 0.0], [0.0, 1.0]]), r"shape \(2, 2\)"),
+        (lambda: FixedCholesky(scales(), value=[1.0, 1.0, 1.0]), r"shape \(3,\)"),
+        (
+            lambda: FixedCholesky(scales(), value=[[1.0, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]]),
+            "expected a symmetric",
+        ),
+        (
+            lambda: FixedCholesky(scales(), value=[[1.0, 2, 0], [2, 1.0, 0], [0, 0, 1.0]]),
+            "eigenvalue -1, expected a positive semi-definite",
+        ),
+        (
+            lambda: FixedCholesky(scales(), value=[[-2.0, 0, 0], [0, -1.0, 0], [0, 0, 0]]),
+            "eigenvalue -2, expected a positive semi-definite",
+        ),
+    ],
+)
+def test_a_wrong_argument_is_refused(builder, message):
+    with pytest.raises(ValueError, match=message):
+        builder()
