@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.logs.checks import (
     check_angles,
     check_clock,
@@ -23,10 +25,16 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table
 from pinn_dyn.data.logs.recording import Recording, Report
-from pinn_dyn.data.logs.splits import Part, split
+from pinn_dyn.data.logs.splits import SPLITS, Part, split
 from pinn_dyn.data.logs.step import Step, sample_time
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import Interpolation, Trajectory
+
+# What the trajectories depend on beside the files.
+_SETTINGS = (
+    *("time", "q", "v", "u", "trajectory", "steps", "validation", "test"),
+    *("guard", "shortest", "seed", "interpolation"),
+)
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,8 @@ class LogSource(DataSource):
         interpolation: how the input moves between samples.
         labels, input_labels: name and unit of each coordinate and input; None takes the columns.
         configurations: named configurations for learned terms.
+        angles: numbers of the coordinates that are angles of joints, for models that know them by
+            sine and cosine.
 
     Raises:
         LogError: on a description that cannot be right; of the files, by :meth:`load`.
@@ -96,6 +106,7 @@ class LogSource(DataSource):
         labels: list[str] | None = None,
         input_labels: list[str] | None = None,
         configurations: Mapping[str, list[float]] | None = None,
+        angles: Sequence[int] = (),
     ):
         self.name = name
         self.root = root
@@ -132,6 +143,13 @@ class LogSource(DataSource):
         for step in self.steps.values():
             self.input_labels = step.input_labels(self.input_labels)
         self.system = None
+        self.angles = tuple(angles)
+        for k in self.angles:
+            if not (0 <= k < len(self.q.columns) and self.q.units[k] == "rad"):
+                raise LogError(
+                    f"angles is {list(angles)}, expected numbers of columns of q, from 0, that "
+                    f"have a unit of angle: their SI units are {', '.join(self.q.units)}"
+                )
         self.configurations = dict(configurations or {})
         self._loaded: tuple[Splits, Report, list[Cleaned]] | None = None
 
@@ -142,6 +160,22 @@ class LogSource(DataSource):
             LogError: on a file that cannot be used; names the file, the place and what to do.
         """
         return self._load()[0]
+
+    def fingerprint(self) -> dict[str, object]:
+        """Files (name, size, SHA-256), rows, columns, cleaning, and the stretches of each split."""
+        root = Path(self.root).expanduser()
+        files = {
+            path.relative_to(root).as_posix(): {
+                "bytes": path.stat().st_size,
+                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            }
+            for path in find_files(self.root, self.files)
+        }
+        splits: dict[str, list[str]] = {split: [] for split in SPLITS}
+        for part in self.cleaned:
+            splits[part.split].append(f"{part.raw.place}, {len(part.raw)} rows")
+        settings = {key: describe(getattr(self, key)) for key in _SETTINGS}
+        return {"files": files, "splits": splits, **settings}
 
     @property
     def report(self) -> str:
