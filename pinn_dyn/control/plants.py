@@ -14,7 +14,7 @@ from pinn_dyn.control.contracts import Plant
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite, require_last_dim
-from pinn_dyn.systems import BulletArm
+from pinn_dyn.systems import Stepped
 
 log = logging.getLogger(__name__)
 
@@ -119,22 +119,22 @@ class SystemPlant(Plant):
 
 
 class BulletPlant(Plant):
-    """K copies of a Bullet arm, moved one after the other in Bullet's own steps.
+    """K copies of a robot that a simulator such as Bullet moves in steps of its own, in turn.
 
     Args:
-        arm: the arm, which applies its damping itself.
-        step: time step of Bullet, s.
+        arm: the robot, which applies its damping itself.
+        step: time step of the simulator, s.
 
     Raises:
-        TypeError: if the arm is another system.
+        TypeError: if the robot does not step by itself.
         ValueError: on a step that is not positive.
     """
 
-    def __init__(self, arm: BulletArm, *, step: float = 0.001):
-        if not isinstance(arm, BulletArm):
+    def __init__(self, arm: Stepped, *, step: float = 0.001):
+        if not isinstance(arm, Stepped):
             raise TypeError(
-                f"arm is a {type(arm).__name__}, expected a BulletArm: use plant=simulated for "
-                "other systems"
+                f"arm is a {type(arm).__name__}, expected a robot with set_state and step, such as "
+                "a BulletArm: use plant=simulated for other systems"
             )
         if not step > 0:
             raise ValueError(f"step is {step} s, expected a positive number")
@@ -147,7 +147,7 @@ class BulletPlant(Plant):
         self._x = torch.cat([q0, v0], dim=-1)
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        """As the contract; the duration must be an integer multiple of Bullet's step.
+        """As the contract; the duration must be an integer multiple of the step.
 
         Raises:
             ValueError: if it is not.
@@ -156,8 +156,8 @@ class BulletPlant(Plant):
         steps = round(duration / self._step)
         if steps < 1 or abs(duration / self._step - steps) > 1e-6:
             raise ValueError(
-                f"duration is {duration:g} s and Bullet's step is {self._step:g} s: expected an "
-                "integer multiple of it, change the rate of the controller or BulletPlant(step=)"
+                f"duration is {duration:g} s and the simulator's step {self._step:g} s: expected "
+                "an integer multiple of it, change the rate of the controller or BulletPlant(step=)"
             )
         for k in range(len(u)):
             state = self._move(self._x[k].double().numpy(), u[k].double().numpy(), steps)
