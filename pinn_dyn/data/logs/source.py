@@ -17,14 +17,19 @@ from pinn_dyn.data.logs.checks import (
     check_clock,
     check_force_signs,
     check_inputs,
+    check_rest,
     check_second_clock,
+    check_unseen_inputs,
     check_velocities,
 )
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
-from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table
+from pinn_dyn.data.logs.jumps import Rows, check_rows
+from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table, run_name
 from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.repairs import RemoveJumps
+from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import SPLITS, Part, split
 from pinn_dyn.data.logs.step import Step, sample_time
 from pinn_dyn.data.source import DataSource, Splits
@@ -122,6 +127,14 @@ class LogSource(DataSource):
                 f"v has the SI units {', '.join(self.v.units)}, expected those of q, "
                 f"{', '.join(self.q.units)}, per second, in the same order"
             )
+        for key, columns, expected in (("q", self.q, ("rad", "m", "1")), ("u", self.u, None)):
+            for label, unit in zip(columns.columns, columns.units, strict=True):
+                if unit == "s" or (expected is not None and unit not in expected):
+                    raise LogError(
+                        f"{key} has the column {label!r} in {unit}, expected "
+                        f"{'an angle, a length or 1' if expected else 'no time'}: is it the right "
+                        "column, and its unit?"
+                    )
         self.trajectory = trajectory
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self.validation = Part.from_config("validation", validation)
@@ -194,17 +207,25 @@ class LogSource(DataSource):
             check_inputs(recordings, self.u, report)
             check_angles(recordings, self.q, report)
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
+            check_copies(parts, report)
             cleaned = self._clean(parts, report)
             step = self._one_sample_time(cleaned)
             training = [item for part in cleaned if part.split == "train" for item in part.clean]
             if self.v is not None:
                 check_velocities(training, self.q, self.v, step, report)
             check_force_signs(training, self.u, step, report)
+            check_rest(training, self.q, report)
             report.add("Splits", "train", _summary(training, step))
+            kept = {"train": training}
+            for name, part in (("validation", self.validation), ("test", self.test)):
+                kept[name] = self._pieces(name, part, cleaned, step, report)
+            check_unseen_inputs(training, kept["validation"] + kept["test"], self.u, report)
+            check_repeats(training, kept["test"], "test", report)
             splits = Splits(
-                train=[self._trajectory(recording, step) for recording in training],
-                validation=self._pieces("validation", self.validation, cleaned, step, report),
-                test=self._pieces("test", self.test, cleaned, step, report),
+                **{
+                    name: [self._trajectory(item, step) for item in items]
+                    for name, items in kept.items()
+                }
             )
             self._loaded = splits, report, cleaned
         return self._loaded
@@ -214,7 +235,7 @@ class LogSource(DataSource):
         recordings = []
         for path in paths:
             table = read_table(path, self.time.columns[0])
-            stem = path.relative_to(Path(self.root).expanduser()).with_suffix("").as_posix()
+            stem = run_name(path, self.root)
             groups = [(stem, slice(None))]
             if self.trajectory is not None:
                 ids = column(table, path, self.trajectory, "trajectory")
@@ -244,6 +265,14 @@ class LogSource(DataSource):
                 for name, other in zip(self.time.columns[1:], others, strict=True):
                     names = (self.time.columns[0], name)
                     check_second_clock(t, other, lines[rows], path, names)
+                for signal, columns in (("q", self.q), ("v", self.v), ("u", self.u)):
+                    if columns is not None:
+                        signal_rows = Rows(path, lines[rows], signal, columns, values[signal][rows])
+                        repaired = any(
+                            isinstance(step, RemoveJumps) and signal in step.signals
+                            for step in steps
+                        )
+                        check_rows(signal_rows, t, report, jumps_are_removed=repaired)
                 v = values["v"][rows] if "v" in values else None
                 recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
                 report.add(
@@ -274,6 +303,11 @@ class LogSource(DataSource):
                 report.add(f"{name}: {step}", f"{part.split} {recording.place}", text)
                 done += changed
             result.append(replace(part, clean=done))
+        before, after = (
+            [item for part in parts for item in part.clean] for parts in (cleaned, result)
+        )
+        for text in step.losses(before, after):
+            report.warn(f"{name}: {step}: {text}")
         return self._long_enough(name, result, report)
 
     def _long_enough(self, name: str, cleaned: list[Cleaned], report: Report) -> list[Cleaned]:
@@ -321,7 +355,7 @@ class LogSource(DataSource):
 
     def _pieces(
         self, name: str, part: Part, cleaned: list[Cleaned], step: float, report: Report
-    ) -> list[Trajectory]:
+    ) -> list[Recording]:
         """Roll-outs of one length; neighbours share the sample between them."""
         stretches = [item for one in cleaned if one.split == name for item in one.clean]
         span = round(part.piece / step)
@@ -348,7 +382,7 @@ class LogSource(DataSource):
             f"{_summary(pieces, step)}, each a roll-out of its own; {max(rest, 0):.4g} s are left "
             "over and dropped",
         )
-        return [self._trajectory(piece, step) for piece in pieces]
+        return pieces
 
     def _trajectory(self, recording: Recording, step: float) -> Trajectory:
         return Trajectory(
