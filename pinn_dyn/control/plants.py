@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -56,7 +55,7 @@ class SystemPlant(Plant):
     ):
         self.num_coordinates = system.num_coordinates
         self.num_inputs = system.num_inputs
-        self._eager = self._equation = system.velocity_derivative
+        self._equation = system.velocity_derivative
         self._rtol, self._atol = rtol, atol
         if compile and has_cpp_compiler():
             self._equation = torch.compile(system.velocity_derivative)
@@ -80,7 +79,7 @@ class SystemPlant(Plant):
                 x, held = self._x[alive], u[alive]
                 # Equal steps up to the next instant, rather than a short one at the end.
                 h = (duration - time) / np.ceil((duration - time) / step * (1 - 1e-9))
-                slopes = slopes or [self._derivative(x, held)]
+                slopes = slopes or [self._equation(x, held)]
                 x_new, last_slope, error = self._try_step(x, held, h, slopes[0])
                 # An error that is not a number is a step that has to be smaller.
                 error = error.nan_to_num(nan=torch.inf)
@@ -104,18 +103,12 @@ class SystemPlant(Plant):
         """The state after a step, the slope there, and the error of each copy, ``(K,)``."""
         stages = [slope]
         for row in range(1, len(_NODES)):
-            stages.append(self._derivative(x + h * _combine(_NODES[row], stages), u))
+            stages.append(self._equation(x + h * _combine(_NODES[row], stages), u))
         x_new = x + h * _combine(_WEIGHTS, stages)
-        stages.append(self._derivative(x_new, u))
+        stages.append(self._equation(x_new, u))
         scale = self._atol + self._rtol * torch.maximum(x.abs(), x_new.abs())
         error = h * _combine(_ERROR_WEIGHTS, stages) / scale
         return x_new, stages[-1], error.square().mean(-1).sqrt()
-
-    def _derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        try:
-            return self._equation(x, u)
-        except torch.linalg.LinAlgError:
-            return solve_by_halves(self._eager, x, u)
 
 
 class BulletPlant(Plant):
@@ -176,22 +169,6 @@ class BulletPlant(Plant):
             else:
                 return state
         return np.full_like(state, np.nan)
-
-
-def solve_by_halves(function: Callable[..., Tensor], x: Tensor, *rest: Tensor) -> Tensor:
-    """A function of rows ``(K, n) -> (K, n)`` that one bad row stops: NaN for that row only."""
-    try:
-        return function(x, *rest)
-    except torch.linalg.LinAlgError:
-        if len(x) == 1:
-            return torch.full_like(x, torch.nan)
-        half = len(x) // 2
-        return torch.cat(
-            [
-                solve_by_halves(function, x[:half], *(y[:half] for y in rest)),
-                solve_by_halves(function, x[half:], *(y[half:] for y in rest)),
-            ]
-        )
 
 
 def _combine(weights: Tensor, stages: list[Tensor]) -> Tensor:

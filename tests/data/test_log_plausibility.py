@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from pinn_dyn.data.logs import Butterworth, Deduplicate, LogError, MovingAverage, RemoveJumps
+from pinn_dyn.data.logs import Deduplicate, LogError, MovingAverage, RemoveJumps
 from tests.data.logs_files import motion, source, write
 
 
@@ -275,11 +275,6 @@ def test_an_average_over_the_run(tmp_path):
     assert "smooth: MovingAverage(window=900" in text
     assert "column 1 of q has " in text
     assert "% of its spread left" in text
-
-
-def test_a_filter_below_the_motion(tmp_path):
-    text = warned(tmp_path, motion(), steps=dict(filter=Butterworth(0.2, order=4, signals=["u"])))
-    assert "of u has " in text
 
 
 def test_a_threshold_below_the_noise(tmp_path):

@@ -126,28 +126,26 @@ def check_angles(recordings: list[Recording], q: Columns, report: Report) -> Non
 
 
 def check_rest(training: list[Recording], q: Columns, report: Report) -> None:
-    """Warns of coordinates that never move, move no more than their noise, or mostly rest.
-
-    For noise without motion the mean square of the steps is twice the variance (von Neumann 1941).
+    """Warns of coordinates that never move or move no more than their noise, and of long rest.
 
     Raises:
         LogError: if no coordinate ever moves.
     """
     every = np.vstack([item.q for item in training])
     steps = np.vstack([np.diff(item.q, axis=0) for item in training])
-    spread = np.where(np.ptp(every, axis=0) > 0, every.var(axis=0), 0.0)
-    if not spread.any():
+    still = np.ptp(every, axis=0) == 0
+    if still.all():
         raise LogError(
             f"q: no coordinate ({', '.join(q.columns)}) moves in the training runs: there is no "
             "motion to learn from; are these the right columns?"
         )
     for k, name in enumerate(q.columns):
-        if spread[k] == 0:
+        if still[k]:
             report.warn(f"column {name!r} (q): never moves in the training runs")
-        elif (steps[:, k] ** 2).mean() > spread[k]:
+        elif not moves(training, k):
             report.warn(
                 f"column {name!r} (q): moves no more than its noise in the training runs, "
-                f"{math.sqrt(spread[k]):.3g} {q.units[k]}"
+                f"{every[:, k].std():.3g} {q.units[k]}"
             )
     speed = np.abs(steps) / np.abs(steps).max(axis=0).clip(min=1e-300)
     share = float((speed < 0.01).all(axis=1).mean())
@@ -210,10 +208,13 @@ def check_velocities(
 
 
 def moves(training: list[Recording], k: int) -> bool:
-    """Whether coordinate k moves by more than noise."""
-    spread = np.vstack([item.q[:, k : k + 1] for item in training]).var()
-    steps = np.vstack([np.diff(item.q[:, k : k + 1], axis=0) for item in training])
-    return bool(spread > 0 and (steps**2).mean() <= spread)
+    """Whether coordinate k moves by more than noise.
+
+    For noise alone the mean square of the steps is twice the variance (von Neumann 1941).
+    """
+    every = np.concatenate([item.q[:, k] for item in training])
+    steps = np.concatenate([np.diff(item.q[:, k]) for item in training])
+    return bool(np.ptp(every) > 0 and (steps**2).mean() <= every.var())
 
 
 def _agreement(
