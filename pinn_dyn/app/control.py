@@ -49,7 +49,7 @@ from pinn_dyn.data import DataSource
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
-from pinn_dyn.systems import BulletArm
+from pinn_dyn.systems import HasLimits
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +92,7 @@ def control(cfg: DictConfig) -> float:
     robot = build_robot(run.config["dataset"], config["robot"])
     reference = build_reference(config, robot)
     q0, v0 = _initial_states(config, reference)
-    if isinstance(robot, BulletArm):
+    if isinstance(robot, HasLimits):
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
     if not 0 <= config["trajectory"] < len(q0):

@@ -25,22 +25,21 @@ from pinn_dyn.control import (
 )
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
-    animate_bullet_arm,
-    animate_soft_arm,
+    animate,
     closed_loop_figure,
     closed_loop_metrics,
     comparison_table,
     controller_comparison_figure,
     format_table,
+    pose_strip,
     save,
-    soft_arm_strip,
     steady_state_figure,
     tip_path_figure,
     write_table,
 )
 from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.systems import BulletArm, SoftArm
+from pinn_dyn.systems import Drawable, HasTip
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +107,7 @@ def write_results(
     first = next(iter(records))
     animation = folder / f"animation_{first}.gif"
     if config["animate"]:
-        _animate(records[first], robot, config["trajectory"], animation)
+        animate(records[first], config["trajectory"], robot, animation)
 
     shown = [column for column in table if column.startswith(_SHOWN)]
     duration, runs = f"{config['duration']:g} s", len(records[first].stopped)
@@ -203,12 +202,12 @@ def _figures(
         records, title=f"{source.name}: error of the closed loop"
     )
     first = next(iter(records.values()))
-    if isinstance(robot, SoftArm):
+    if isinstance(robot, Drawable):
         times = [time for time in _STRIP_TIMES if time <= config["duration"]]
-        figures["strip"] = soft_arm_strip(
+        figures["strip"] = pose_strip(
             first, run, robot, times, title=f"{source.name}, {next(iter(records))} controller"
         )
-    if isinstance(reference, Helix) and isinstance(robot, BulletArm):
+    if isinstance(reference, Helix) and isinstance(robot, HasTip):
         figures["tip_path"] = tip_path_figure(
             first.t,
             {name: _tip_path(robot, record.q[run]) for name, record in records.items()},
@@ -218,7 +217,7 @@ def _figures(
     return figures
 
 
-def _tip_path(arm: BulletArm, q: Tensor) -> Tensor:
+def _tip_path(arm: HasTip, q: Tensor) -> Tensor:
     """Positions of the tip, ``(T, 3)``, NaN after a stop."""
     alive = q.isfinite().all(-1)
     path = q.new_full((len(q), 3), torch.nan)
@@ -236,10 +235,3 @@ def _at_rest(record: ClosedLoopRecord) -> bool:
     """Whether the reference is a set point that the runs do not start at."""
     constant = bool((record.reference.q == record.reference.q[:, :1]).all())
     return constant and not bool((record.q[:, 0] == record.reference.q[:, 0]).all(-1).any())
-
-
-def _animate(record: ClosedLoopRecord, robot: MechanicalSystem, run: int, path: Path) -> None:
-    if isinstance(robot, SoftArm):
-        animate_soft_arm(record, run, robot, path)
-    elif isinstance(robot, BulletArm):
-        animate_bullet_arm(record, run, robot, path)

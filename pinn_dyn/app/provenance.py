@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
 import shlex
@@ -17,9 +16,8 @@ import torch
 import yaml
 
 from pinn_dyn.app.run_folder import Run
-from pinn_dyn.data import DataSource, LogSource, RobotSource, SimulatedSource
+from pinn_dyn.data import DataSource
 from pinn_dyn.data.cache import cache_key
-from pinn_dyn.data.logs.reader import find_files
 from pinn_dyn.evaluation.report import Origin
 
 
@@ -31,18 +29,8 @@ def command_line() -> str:
 
 
 def data_hash(source: DataSource) -> str:
-    """What tells one data set from another: 16 hexadecimal digits, and of what they are.
-
-    Of a simulation it is the key in the name of its cache file, which covers everything the
-    trajectories depend on; of logs it is the SHA-256 of the names and contents of the files.
-    """
-    if isinstance(source, LogSource):
-        digest = hashlib.sha256()
-        for path in find_files(source.root, source.files):
-            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-        return f"{digest.hexdigest()[:16]} (the log files)"
-    assert isinstance(source, (SimulatedSource, RobotSource))
-    return f"{cache_key(source.describe())} (key of the simulation in the cache)"
+    """What tells one data set from another: 16 hexadecimal digits of its fingerprint."""
+    return cache_key(source.fingerprint())
 
 
 def provenance() -> dict[str, str]:

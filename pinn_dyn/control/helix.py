@@ -9,10 +9,11 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.interpolate import make_interp_spline
+from torch.autograd import functional
 
 from pinn_dyn.control.contracts import Motion, Reference
 from pinn_dyn.control.references import require_positive, smooth_step
-from pinn_dyn.systems import BulletArm
+from pinn_dyn.systems import HasLimits, HasTip
 
 _KNOTS_PER_TURN = 64
 _ITERATIONS = 300
@@ -41,7 +42,7 @@ class Helix(Reference):
     v = q' dphi/dt and a = q'' (dphi/dt)^2 + q' d^2phi/dt^2 are its exact derivatives.
 
     Args:
-        arm: the robot.
+        arm: the robot; its joint limits are checked where it has some (:class:`HasLimits`).
         posture: configuration at the start, ``(N,)``, rad.
         radius: m.
         pitch: advance along the axis in one turn, m; 0 is a circle, negative advances backwards.
@@ -61,7 +62,7 @@ class Helix(Reference):
 
     def __init__(
         self,
-        arm: BulletArm,
+        arm: HasTip,
         posture: Sequence[float],
         radius: float,
         pitch: float,
@@ -86,8 +87,8 @@ class Helix(Reference):
         rest = np.asarray(posture, dtype=float)
         if rest.shape != (arm.num_coordinates,) or not np.isfinite(rest).all():
             raise ValueError(
-                f"posture is {rest.tolist()}, but the arm has {arm.num_coordinates} joints "
-                f"({', '.join(arm.joint_names)}): expected one finite number for each, in rad"
+                f"posture is {rest.tolist()}, but the robot has {arm.num_coordinates} coordinates "
+                f"({', '.join(_names(arm))}): expected one finite number for each"
             )
         self.num_coordinates = arm.num_coordinates
         self.rise_time, self.duration = float(rise_time), float(longest + rise_time)
@@ -137,12 +138,12 @@ class Helix(Reference):
         shift = np.array([r * (math.cos(phi) - 1), r * math.sin(phi), self._slope * phi])
         return self._origin + shift @ self._axes
 
-    def _solve(self, arm: BulletArm, rest: np.ndarray, guess: np.ndarray, phi: float) -> np.ndarray:
+    def _solve(self, arm: HasTip, rest: np.ndarray, guess: np.ndarray, phi: float) -> np.ndarray:
         """The configuration nearest to rest that puts the tip at p(phi)."""
         target, q = self._point(phi), guess
         for _ in range(_ITERATIONS):
             error = target - _tip(arm, q)
-            jacobian = arm.tip_jacobian(torch.from_numpy(q))[:3].numpy()
+            jacobian = functional.jacobian(arm.tip_position, torch.from_numpy(q)).numpy()
             left, values, rows = np.linalg.svd(jacobian, full_matrices=False)
             homing = rest - q  # of which only the part in the null space is used
             change = homing + rows.T @ (
@@ -160,7 +161,7 @@ class Helix(Reference):
             "edge of the reach: take a smaller radius or pitch, fewer turns, or another posture"
         )
 
-    def _measure(self, arm: BulletArm, angles: np.ndarray) -> float:
+    def _measure(self, arm: HasTip, angles: np.ndarray) -> float:
         """The largest path error at the angles, where the joint limits are checked as well."""
         errors = []
         for phi in angles:
@@ -177,7 +178,9 @@ class Helix(Reference):
             )
         return errors[worst]
 
-    def _require_within_limits(self, arm: BulletArm, q: np.ndarray, phi: float) -> None:
+    def _require_within_limits(self, arm: HasTip, q: np.ndarray, phi: float) -> None:
+        if not isinstance(arm, HasLimits):
+            return
         outside = (q < arm.q_low - 1e-9) | (q > arm.q_high + 1e-9)
         if outside.any():
             i = int(np.argmax(outside))
@@ -194,5 +197,10 @@ class Helix(Reference):
         return float(np.interp(phi, [self._angle(t)[0] for t in times], times))
 
 
-def _tip(arm: BulletArm, q: np.ndarray) -> np.ndarray:
+def _names(arm: HasTip) -> list[str]:
+    numbered = [f"q{k + 1}" for k in range(arm.num_coordinates)]
+    return arm.joint_names if isinstance(arm, HasLimits) else numbered
+
+
+def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:
     return arm.tip_position(torch.from_numpy(q)).numpy()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from pinn_dyn.control.contracts import Plant
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite, require_last_dim
-from pinn_dyn.systems import BulletArm
+from pinn_dyn.systems import Stepped
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +55,7 @@ class SystemPlant(Plant):
     ):
         self.num_coordinates = system.num_coordinates
         self.num_inputs = system.num_inputs
-        self._eager = self._equation = system.velocity_derivative
+        self._equation = system.velocity_derivative
         self._rtol, self._atol = rtol, atol
         if compile and has_cpp_compiler():
             self._equation = torch.compile(system.velocity_derivative)
@@ -80,7 +79,7 @@ class SystemPlant(Plant):
                 x, held = self._x[alive], u[alive]
                 # Equal steps up to the next instant, rather than a short one at the end.
                 h = (duration - time) / np.ceil((duration - time) / step * (1 - 1e-9))
-                slopes = slopes or [self._derivative(x, held)]
+                slopes = slopes or [self._equation(x, held)]
                 x_new, last_slope, error = self._try_step(x, held, h, slopes[0])
                 # An error that is not a number is a step that has to be smaller.
                 error = error.nan_to_num(nan=torch.inf)
@@ -104,37 +103,31 @@ class SystemPlant(Plant):
         """The state after a step, the slope there, and the error of each copy, ``(K,)``."""
         stages = [slope]
         for row in range(1, len(_NODES)):
-            stages.append(self._derivative(x + h * _combine(_NODES[row], stages), u))
+            stages.append(self._equation(x + h * _combine(_NODES[row], stages), u))
         x_new = x + h * _combine(_WEIGHTS, stages)
-        stages.append(self._derivative(x_new, u))
+        stages.append(self._equation(x_new, u))
         scale = self._atol + self._rtol * torch.maximum(x.abs(), x_new.abs())
         error = h * _combine(_ERROR_WEIGHTS, stages) / scale
         return x_new, stages[-1], error.square().mean(-1).sqrt()
 
-    def _derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        try:
-            return self._equation(x, u)
-        except torch.linalg.LinAlgError:
-            return solve_by_halves(self._eager, x, u)
-
 
 class BulletPlant(Plant):
-    """K copies of a Bullet arm, moved one after the other in Bullet's own steps.
+    """K copies of a robot that a simulator such as Bullet moves in steps of its own, in turn.
 
     Args:
-        arm: the arm, which applies its damping itself.
-        step: time step of Bullet, s.
+        arm: the robot, which applies its damping itself.
+        step: time step of the simulator, s.
 
     Raises:
-        TypeError: if the arm is another system.
+        TypeError: if the robot does not step by itself.
         ValueError: on a step that is not positive.
     """
 
-    def __init__(self, arm: BulletArm, *, step: float = 0.001):
-        if not isinstance(arm, BulletArm):
+    def __init__(self, arm: Stepped, *, step: float = 0.001):
+        if not isinstance(arm, Stepped):
             raise TypeError(
-                f"arm is a {type(arm).__name__}, expected a BulletArm: use plant=simulated for "
-                "other systems"
+                f"arm is a {type(arm).__name__}, expected a robot with set_state and step, such as "
+                "a BulletArm: use plant=simulated for other systems"
             )
         if not step > 0:
             raise ValueError(f"step is {step} s, expected a positive number")
@@ -147,7 +140,7 @@ class BulletPlant(Plant):
         self._x = torch.cat([q0, v0], dim=-1)
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        """As the contract; the duration must be an integer multiple of Bullet's step.
+        """As the contract; the duration must be an integer multiple of the step.
 
         Raises:
             ValueError: if it is not.
@@ -156,8 +149,8 @@ class BulletPlant(Plant):
         steps = round(duration / self._step)
         if steps < 1 or abs(duration / self._step - steps) > 1e-6:
             raise ValueError(
-                f"duration is {duration:g} s and Bullet's step is {self._step:g} s: expected an "
-                "integer multiple of it, change the rate of the controller or BulletPlant(step=)"
+                f"duration is {duration:g} s and the simulator's step {self._step:g} s: expected "
+                "an integer multiple of it, change the rate of the controller or BulletPlant(step=)"
             )
         for k in range(len(u)):
             state = self._move(self._x[k].double().numpy(), u[k].double().numpy(), steps)
@@ -176,22 +169,6 @@ class BulletPlant(Plant):
             else:
                 return state
         return np.full_like(state, np.nan)
-
-
-def solve_by_halves(function: Callable[..., Tensor], x: Tensor, *rest: Tensor) -> Tensor:
-    """A function of rows ``(K, n) -> (K, n)`` that one bad row stops: NaN for that row only."""
-    try:
-        return function(x, *rest)
-    except torch.linalg.LinAlgError:
-        if len(x) == 1:
-            return torch.full_like(x, torch.nan)
-        half = len(x) // 2
-        return torch.cat(
-            [
-                solve_by_halves(function, x[:half], *(y[:half] for y in rest)),
-                solve_by_halves(function, x[half:], *(y[half:] for y in rest)),
-            ]
-        )
 
 
 def _combine(weights: Tensor, stages: list[Tensor]) -> Tensor:

@@ -1,5 +1,6 @@
 """Data: excitation signals, simulated data sets, logs, windows and the LightningDataModule."""
 
+from pinn_dyn.data.changes import fingerprint_changes
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
 from pinn_dyn.data.logs import Cleaned, LogError, LogSource
@@ -37,5 +38,6 @@ __all__ = [
     "TrackedMultiSine",
     "Windows",
     "draw_windows",
+    "fingerprint_changes",
     "simulate",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import logging
@@ -31,8 +32,9 @@ def load_or_make(
 
     A file is ``<name>-<key>.npz``: plain arrays without pickle, with the description beside them.
     It is written under another name and moved into place, so a reader never sees half a file; a
-    lock lets one process make it while others wait. On reading, the archive's checksums are
-    verified; a damaged file is reported, kept aside as ``.damaged`` and made again.
+    lock lets one process make it while others wait. On reading, the archive's checksums and the
+    description are compared; a file that is damaged or of other data is reported, kept aside as
+    ``.damaged`` and made again. A folder that may only be read serves what is there.
 
     Args:
         folder: the cache folder, made if missing.
@@ -42,10 +44,12 @@ def load_or_make(
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{cache_key(description)}.npz"
+    if path.exists() and not os.access(folder, os.W_OK):
+        return _read(path, description)
     with FileLock(f"{path}.lock"):
         if path.exists():
             try:
-                return _read(path)
+                return _read(path, description)
             except (
                 OSError,
                 ValueError,
@@ -62,14 +66,23 @@ def load_or_make(
                     error,
                     aside.name,
                 )
+        # Who holds the lock is the only one to write: the others ended early.
+        for left in folder.glob(f"{glob.escape(path.name)}.*.partial"):
+            left.unlink(missing_ok=True)
         arrays = make()
         _write(path, arrays, description)
     return arrays
 
 
-def _read(path: Path) -> Arrays:
+def _read(path: Path, description: object) -> Arrays:
     # numpy reads each member to its end, where zipfile compares the checksum.
     with np.load(path, allow_pickle=False) as archive:
+        found = json.loads(str(archive["description"]))
+        if cache_key(found) != cache_key(description):
+            raise ValueError(
+                f"it holds the data of another description, {json.dumps(found)[:200]}, expected "
+                f"{json.dumps(description)[:200]}"
+            )
         return {str(name): archive[str(name)] for name in archive["names"]}
 
 

@@ -8,7 +8,6 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pinn_dyn.data.cache import Arrays, load_or_make
+from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
 from pinn_dyn.data.simulation import SimulationError
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
-_VERSION = 3
+_VERSION = 4
 _SPLITS = ("train", "validation", "test")
 _DRAWS = 20
 
@@ -127,6 +127,7 @@ class RobotSource(DataSource):
         self.workers = workers or os.cpu_count() or 1
         self.cache = Path(cache).expanduser()
         self.configurations = {key: list(q) for key, q in configurations.items()}
+        self.angles = tuple(getattr(system, "angles", ()))
         self.labels = [f"q{i + 1} [rad]" for i in range(size)]
         self.input_labels = [f"τ{i + 1} [Nm]" for i in range(size)]
 
@@ -145,18 +146,20 @@ class RobotSource(DataSource):
         return Splits(splits["train"], splits["validation"], splits["test"])
 
     def describe(self) -> dict[str, object]:
-        """Everything the trajectories depend on: the key of the cache."""
+        """What the trajectories depend on, code included: the key of the cache."""
         return {
             "version": _VERSION,
-            "robot": self.robot.describe(),
-            "excitations": [
-                {"class": type(item).__name__, **asdict(item)} for item in self.excitations
-            ],
+            "robot": describe(self.robot),
+            "excitations": describe(self.excitations),
             "duration": self.duration,
             "step": self.step,
             "counts": self.counts,
             "seed": self.seed,
         }
+
+    def fingerprint(self) -> dict[str, object]:
+        """What the trajectories depend on."""
+        return self.describe()
 
     def simulate(self) -> Arrays:
         """Record all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T + 1, .)``.

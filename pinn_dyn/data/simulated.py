@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -13,12 +13,13 @@ from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation
+from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.simulation import simulate
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
-_VERSION = 2
+_VERSION = 3
 _SPLITS = ("train", "validation", "test")
 
 
@@ -161,6 +162,7 @@ class SimulatedSource(DataSource):
                 raise ValueError(f"{name}: {key} has {found} entries, the system needs {expected}")
         self.name = name
         self.system: MechanicalSystem = system
+        self.angles = tuple(getattr(system, "angles", ()))
         self.configurations = {key: list(q) for key, q in configurations.items()}
         self.excitation = excitation
         self.initial_states = initial_states
@@ -197,18 +199,13 @@ class SimulatedSource(DataSource):
         return Splits(splits["train"], splits["validation"], splits["test"])
 
     def describe(self) -> dict[str, object]:
-        """Everything the trajectories depend on: the key of the cache."""
-        settings = {
-            key: value
-            for key, value in vars(self.system).items()
-            if isinstance(value, (int, float, str)) and key != "training"
+        """What the simulation depends on, the code of the system included: the key of the cache."""
+        parts = {
+            key: describe(getattr(self, key)) for key in ("system", "excitation", "initial_states")
         }
-        constants = {key: value.tolist() for key, value in self.system.state_dict().items()}
         return {
             "version": _VERSION,
-            "system": {"class": type(self.system).__name__, **settings, **constants},
-            "excitation": _describe(self.excitation),
-            "initial_states": _describe(asdict(self.initial_states)),
+            **parts,
             "duration": self.duration,
             "test_duration": self.test_duration,
             "step": self.step,
@@ -218,6 +215,11 @@ class SimulatedSource(DataSource):
             "rtol": self.rtol,
             "atol": self.atol,
         }
+
+    def fingerprint(self) -> dict[str, object]:
+        """What the trajectories depend on; the key of the cache where every sample is kept."""
+        kept = {} if self.keep_every == 1 else {"keep_every": self.keep_every}
+        return {**self.describe(), **kept}
 
     def simulate(self) -> Arrays:
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
@@ -282,18 +284,3 @@ class SimulatedSource(DataSource):
         pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
         with torch.no_grad():
             return torch.cat([self.system.momentum(a, b) for a, b in pieces]).reshape(q.shape)
-
-
-def _describe(value: object) -> object:
-    """Plain lists, dicts and values that say what an excitation is made of."""
-    if isinstance(value, Excitation):
-        return {"class": type(value).__name__, **_described_items(vars(value))}
-    if isinstance(value, Mapping):
-        return _described_items(value)
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_describe(item) for item in value]
-    return value
-
-
-def _described_items(values: Mapping[str, object]) -> dict[str, object]:
-    return {str(key): _describe(value) for key, value in values.items()}

@@ -1,6 +1,6 @@
 """How good a model is: roll-out errors, learned terms against true ones, tables and figures."""
 
-from pinn_dyn.evaluation.animation import animate_bullet_arm, animate_soft_arm, soft_arm_strip
+from pinn_dyn.evaluation.animation import animate, pose_strip
 from pinn_dyn.evaluation.control_figures import (
     closed_loop_figure,
     controller_comparison_figure,
@@ -47,8 +47,7 @@ __all__ = [
     "RunDescription",
     "RunResult",
     "TermComparison",
-    "animate_bullet_arm",
-    "animate_soft_arm",
+    "animate",
     "cleaning_figure",
     "closed_loop_figure",
     "closed_loop_metrics",
@@ -60,11 +59,11 @@ __all__ = [
     "format_table",
     "grouped_table",
     "member_metrics",
+    "pose_strip",
     "predict_trajectories",
     "predict_windows",
     "rollout_metrics",
     "save",
-    "soft_arm_strip",
     "spread_figure",
     "steady_state_figure",
     "summary_table",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,28 +15,35 @@ from torch import Tensor
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.figures import _COLOURS, _TRUTH
-from pinn_dyn.systems import BulletArm, SoftArm
-from pinn_dyn.systems.bullet_world import import_bullet
+from pinn_dyn.systems import Drawable, Rendered
 
 _TIP = "#CC0000"
 _LAST_FRAME = 1000  # ms
 
 
-def animate_soft_arm(
+def animate(record: ClosedLoopRecord, run: int, robot: object, path: Path) -> None:
+    """Write a GIF of a robot that can be drawn; of any other there is none."""
+    if isinstance(robot, Rendered):
+        animate_pictures(record, run, robot, path)
+    elif isinstance(robot, Drawable):
+        animate_lines(record, run, robot, path)
+
+
+def animate_lines(
     record: ClosedLoopRecord,
     run: int,
-    system: SoftArm,
+    robot: Drawable,
     path: Path,
     *,
     fps: float = 25,
     reference: bool = True,
 ) -> None:
-    """Write a GIF of the backbone in motion, in real time, with the path of its tip in red.
+    """Write a GIF of a robot's lines in motion, in real time, with the path of its tip in red.
 
     Args:
         record: K runs.
         run: which of the K to draw; a stopped one is drawn up to its stop.
-        system: the arm whose backbone belongs to q.
+        robot: what gives the lines of q.
         path: the GIF; its folder is made if there is none.
         fps: frames per second, rounded to what a GIF can, a multiple of 10 ms each.
         reference: draw the wanted shape in grey.
@@ -46,12 +52,12 @@ def animate_soft_arm(
         ValueError: on fps outside (0, 50].
     """
     samples, duration = _frames(record, run, fps)
-    shape, wanted = _shapes(record, run, system)
+    shape, wanted = _shapes(record, run, robot)
     scene = _scene(record, run, shape, wanted if reference else None)
     figure = Figure(figsize=(4.8, 4.8), dpi=90)
     canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
-    _set_space(ax, scene)
+    _set_space(ax, scene, robot.z_is_down)
     images: list[Image.Image] = []
     for sample in samples:
         for line in list(ax.lines):
@@ -66,22 +72,22 @@ def animate_soft_arm(
     _save_gif(images, path, duration)
 
 
-def soft_arm_strip(
-    record: ClosedLoopRecord, run: int, system: SoftArm, times: list[float], *, title: str
+def pose_strip(
+    record: ClosedLoopRecord, run: int, robot: Drawable, times: list[float], *, title: str
 ) -> Figure:
-    """Poses side by side: the backbone, the wanted one in grey, the path of the tip so far in red.
+    """Poses side by side: the robot, the wanted pose in grey, the path of the tip so far in red.
 
     Args:
         record: K runs.
         run: which of the K to draw.
-        system: the arm whose backbone belongs to q.
+        robot: what gives the lines of q.
         times: when, s, on the clock of the record; the nearest sample is drawn.
         title: plant and controller.
 
     Raises:
         ValueError: on no times, or times outside the run, which ends where it was stopped.
     """
-    shape, wanted = _shapes(record, run, system)
+    shape, wanted = _shapes(record, run, robot)
     t = record.t[: len(shape)]
     first, last = float(t[0]), float(t[-1])
     slack = 1e-9 * (1 + last - first)
@@ -94,7 +100,7 @@ def soft_arm_strip(
     axes = figure.subplots(1, len(times), subplot_kw={"projection": "3d"}, squeeze=False)[0]
     scene = _scene(record, run, shape, wanted)
     for ax, time in zip(axes, times, strict=True):
-        _set_space(ax, scene)
+        _set_space(ax, scene, robot.z_is_down)
         _draw_pose(ax, shape, wanted, int((t - time).abs().argmin()))
         ax.set_title(f"{time:g} s", y=1.0)
     _legend(figure, axes[0])
@@ -103,84 +109,49 @@ def soft_arm_strip(
     return figure
 
 
-def animate_bullet_arm(
+def animate_pictures(
     record: ClosedLoopRecord,
     run: int,
-    arm: BulletArm,
+    robot: Rendered,
     path: Path,
     *,
     fps: float = 20,
     size: tuple[int, int] = (480, 360),
     trace: bool = True,
 ) -> None:
-    """Write a GIF of the arm in motion, in real time, drawn by Bullet's software renderer.
-
-    Locked joints are at zero. The camera sees the whole arm at all times.
+    """Write a GIF of the pictures that a robot's simulator takes of its motion, in real time.
 
     Args:
         record: K runs.
         run: which of the K to draw; a stopped one is drawn up to its stop.
-        arm: the arm, whose URDF has the visual shapes.
+        robot: what takes the pictures.
         path: the GIF; its folder is made if there is none.
         fps: frames per second, rounded to what a GIF can, a multiple of 10 ms each.
         size: width and height in pixels.
-        trace: draw the path of the tip in red and the wanted one in grey, in front of the arm.
+        trace: draw the path of the tip in red and the wanted one in grey, in front of the robot.
 
     Raises:
-        ImportError: without PyBullet.
         ValueError: on fps outside (0, 50].
     """
     samples, duration = _frames(record, run, fps)
-    q = record.q[run, samples].double()
-    tips, wanted = arm.tip_position(q), arm.tip_position(record.reference.q[run, samples].double())
-    bullet = import_bullet()
-    client = bullet.connect(bullet.DIRECT)
-    try:
-        target = {"physicsClientId": client}
-        # The arm's own world has no visual shapes.
-        body = bullet.loadURDF(str(arm.urdf.path), useFixedBase=True, **target)
-        links = list(range(bullet.getNumJoints(body, **target)))
-        names = [bullet.getJointInfo(body, link, **target)[1].decode() for link in links]
-        joints = [names.index(name) for name in arm.joint_names]
-
-        def pose(row: Tensor) -> None:
-            for joint, angle in zip(joints, row.tolist(), strict=True):
-                bullet.resetJointState(body, joint, angle, **target)
-
-        points = [np.zeros((1, 3)), tips.numpy(), wanted.numpy()]
-        for row in q:
-            pose(row)
-            states = bullet.getLinkStates(body, links, computeForwardKinematics=True, **target)
-            points.append(np.array([state[4] for state in states]))
-        view, projection = _camera(bullet, np.concatenate(points), size)
-        shown, goal = (_pixels(x.numpy(), view, projection, size) for x in (tips, wanted))
-        images = []
-        for frame, (sample, row) in enumerate(zip(samples, q, strict=True)):
-            pose(row)
-            width, height, rgba, *_ = bullet.getCameraImage(
-                *size,
-                view,
-                projection,
-                shadow=0,
-                renderer=bullet.ER_TINY_RENDERER,
-                flags=bullet.ER_NO_SEGMENTATION_MASK,
-                **target,
-            )
-            pixels = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
-            image = Image.fromarray(pixels)
-            draw = ImageDraw.Draw(image)
-            if trace:
-                draw.line(goal, fill="#707070", width=1)
-                draw.line(shown[: frame + 1], fill=_TIP, width=2)
-                draw.circle(goal[frame], 3, outline="black")
-                draw.circle(shown[frame], 3, fill=_TIP)
-                key = "path of the tip: red, wanted: grey"
-                draw.text((8, size[1] - 20), key, fill="black", font_size=12)
-            text = _time_text(record, run, sample, last=frame == len(samples) - 1)
-            draw.text((8, 6), text, fill="black", font_size=14)
-            images.append(image)
-    finally:
-        bullet.disconnect(client)
+    q, q_ref = (x[run, samples].double() for x in (record.q, record.reference.q))
+    points = torch.cat([robot.tip_position(q), robot.tip_position(q_ref)]).numpy()
+    pictures, places = robot.render(q.numpy(), points, size)
+    shown, goal = (list(map(tuple, part.tolist())) for part in np.split(places, 2))
+    images = []
+    for frame, (sample, picture) in enumerate(zip(samples, pictures, strict=True)):
+        image = Image.fromarray(picture)
+        draw = ImageDraw.Draw(image)
+        if trace:
+            draw.line(goal, fill="#707070", width=1)
+            draw.line(shown[: frame + 1], fill=_TIP, width=2)
+            draw.circle(goal[frame], 3, outline="black")
+            draw.circle(shown[frame], 3, fill=_TIP)
+            key = "path of the tip: red, wanted: grey"
+            draw.text((8, size[1] - 20), key, fill="black", font_size=12)
+        text = _time_text(record, run, sample, last=frame == len(samples) - 1)
+        draw.text((8, 6), text, fill="black", font_size=14)
+        images.append(image)
     _save_gif(images, path, duration)
 
 
@@ -213,15 +184,11 @@ def _save_gif(images: list[Image.Image], path: Path, duration: int) -> None:
     )
 
 
-# The soft arm.
-
-
-def _shapes(record: ClosedLoopRecord, run: int, system: SoftArm) -> tuple[Tensor, Tensor]:
-    """Backbone reached and wanted, ``(T, n, S, 3)`` each, up to the stop."""
+def _shapes(record: ClosedLoopRecord, run: int, robot: Drawable) -> tuple[Tensor, Tensor]:
+    """Lines reached and wanted, ``(T, S, P, 3)`` each, up to the stop."""
     end = samples_before_stop(record, run)
-    s = torch.linspace(0, 1, 21, dtype=torch.float64)
     q, q_ref = record.q[run, :end], record.reference.q[run, :end]
-    return system.backbone(q.double(), s), system.backbone(q_ref.double(), s)
+    return robot.lines(q.double()), robot.lines(q_ref.double())
 
 
 def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, wanted: Tensor | None) -> Tensor:
@@ -231,13 +198,13 @@ def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, wanted: Tensor | N
     return torch.cat(points if wanted is None else [*points, wanted.reshape(-1, 3)])
 
 
-def _set_space(ax: Axes3D, points: Tensor) -> None:
+def _set_space(ax: Axes3D, points: Tensor, z_is_down: bool) -> None:
     """Equal scales around points ``(P, 3)``, gravity downwards."""
     low, high = points.amin(dim=0), points.amax(dim=0)
     size = (1.1 * (high - low)).clamp(min=0.5 * float((high - low).max()))
     middle = 0.5 * (low + high)
     (x0, y0, z0), (x1, y1, z1) = (middle - size / 2).tolist(), (middle + size / 2).tolist()
-    ax.set(xlim=(x0, x1), ylim=(y0, y1), zlim=(z1, z0))
+    ax.set(xlim=(x0, x1), ylim=(y0, y1), zlim=(z1, z0) if z_is_down else (z0, z1))
     ax.set_box_aspect(size.tolist(), zoom=0.82)
     for axis, name in ((ax.xaxis, "x (m)"), (ax.yaxis, "y (m)"), (ax.zaxis, "z (m)")):
         axis.set_label_text(name, fontsize="small")
@@ -265,37 +232,3 @@ def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor | None, sample: int) ->
     tip = shape[: sample + 1, -1, -1].T.numpy()
     ax.plot(*tip, color=_TIP, linewidth=1.5, label="path of the tip")
     ax.plot(*tip[:, -1:], "o", color=_TIP, markersize=4)
-
-
-# The arm in Bullet.
-
-
-def _camera(
-    bullet: Any, points: np.ndarray, size: tuple[int, int]
-) -> tuple[list[float], list[float]]:
-    """View and projection that hold all points, and 0.1 m of what surrounds them."""
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    radius = np.linalg.norm(points - middle, axis=1).max() + 0.1
-    view = bullet.computeViewMatrixFromYawPitchRoll(
-        middle.tolist(), 3 * radius, yaw=50, pitch=-20, roll=0, upAxisIndex=2
-    )
-    x, y, z, _ = np.reshape(view, (4, 4), order="F") @ _homogeneous(points)
-    aspect = size[0] / size[1]
-    slope = max(((abs(x) + 0.1) / aspect / -z).max(), ((abs(y) + 0.1) / -z).max())
-    angle = 2 * np.degrees(np.arctan(slope))
-    return view, bullet.computeProjectionMatrixFOV(angle, aspect, 2 * radius, 4 * radius)
-
-
-def _pixels(
-    points: np.ndarray, view: list[float], projection: list[float], size: tuple[int, int]
-) -> list[tuple[float, float]]:
-    """Where points ``(T, 3)`` are in the image; Bullet's matrices come column by column."""
-    look, project = (np.reshape(matrix, (4, 4), order="F") for matrix in (view, projection))
-    x, y, _, w = project @ look @ _homogeneous(points)
-    x, y = x / w, y / w
-    columns, rows = (x + 1) / 2 * size[0], (1 - y) / 2 * size[1]
-    return list(zip(columns.tolist(), rows.tolist(), strict=True))
-
-
-def _homogeneous(points: np.ndarray) -> np.ndarray:
-    return np.vstack([points.T, np.ones(len(points))])

@@ -1,6 +1,7 @@
 """Analytic and simulated robots, the truth that models are compared with."""
 
 from pinn_dyn.systems.bullet_arm import BulletArm
+from pinn_dyn.systems.protocols import Drawable, HasLimits, HasTip, Rendered, Stepped
 from pinn_dyn.systems.soft_arm import SoftArm
 
-__all__ = ["BulletArm", "SoftArm"]
+__all__ = ["BulletArm", "Drawable", "HasLimits", "HasTip", "Rendered", "SoftArm", "Stepped"]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import spd_solve
+from pinn_dyn.systems.bullet_camera import photograph
 from pinn_dyn.systems.bullet_world import World, import_bullet, open_world
 from pinn_dyn.systems.known_slope import KnownSlope
 from pinn_dyn.systems.urdf import Inertia, find_urdf, read_urdf
@@ -113,6 +114,7 @@ class BulletArm(MechanicalSystem):
                     )
         limits = np.array([description.limits[name] for name in self.joint_names])
         self.q_low, self.q_high, self.v_max, self.u_max = limits.T.copy()
+        self.angles = tuple(range(size))
         self.register_buffer("_damping", _joint_values(damping, self.joint_names, source))
         middle = 0.5 * (self.q_low + self.q_high)
         smallest = np.linalg.eigvalsh(self._mass(middle))[0]
@@ -230,6 +232,12 @@ class BulletArm(MechanicalSystem):
         """
         self._set_time_step(step)
         return self._move(self._world.state()[1], torque)
+
+    def render(
+        self, q: np.ndarray, points: np.ndarray, size: tuple[int, int]
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """Pictures of the arm, locked joints at zero; see :class:`Rendered`."""
+        return photograph(self.urdf.path, self.joint_names, q, points, size)
 
     def _set_time_step(self, step: float) -> None:
         self._world.bullet.setTimeStep(step, physicsClientId=self._world.client)

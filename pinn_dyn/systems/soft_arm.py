@@ -70,6 +70,7 @@ class SoftArm(MechanicalSystem):
             zero or not n, or negative gravity, stiffness or damping.
     """
 
+    z_is_down = True
     _s: Tensor
     _masses: Tensor
     _weights: Tensor
@@ -141,6 +142,14 @@ class SoftArm(MechanicalSystem):
     def tip_positions(self, q: Tensor) -> Tensor:
         """World position of each segment's tip, ``(*batch, n, 3)``, m."""
         return self.backbone(q, q.new_ones(1)).squeeze(-2)
+
+    def tip_position(self, q: Tensor) -> Tensor:
+        """World position of the arm's tip, ``(*batch, 3)``, m."""
+        return self.tip_positions(q)[..., -1, :]
+
+    def lines(self, q: Tensor) -> Tensor:
+        """The backbone as a line of 21 points for each segment, ``(*batch, n, 21, 3)``, m."""
+        return self.backbone(q, torch.linspace(0, 1, 21, dtype=q.dtype, device=q.device))
 
     def backbone(self, q: Tensor, s: Tensor) -> Tensor:
         """World position of the backbone, ``(*batch, n, S, 3)``, m.

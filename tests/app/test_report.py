@@ -2,14 +2,12 @@
 
 import json
 import shlex
-import shutil
 
 import pandas as pd
 import pytest
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.provenance import command_line, data_hash, provenance, read_config
-from pinn_dyn.data import LogSource
 from tests.app.entry import run_script
 from tests.app.test_control import SET_POINTS
 from tests.evaluation.report_pages import Page
@@ -83,32 +81,6 @@ def test_the_hash_of_a_simulation_is_that_of_its_cache_file(hnn_run, cache):
     assert (cache / f"soft_arm_1-{key}.npz").is_file()
     config["dataset"]["seed"] += 1
     assert data_hash(build_source(config)).split()[0] != key
-
-
-def test_the_hash_of_logs_changes_with_their_files(tmp_path):
-    def make(folder):
-        return LogSource(
-            name="log",
-            root=str(folder),
-            files="*.csv",
-            time={"columns": ["t"], "unit": "s"},
-            q={"columns": ["q"], "unit": "rad"},
-            u={"columns": ["u"], "unit": "Nm"},
-            validation={"runs": 1, "piece": 1.0},
-            test={"runs": 1, "piece": 1.0},
-        )
-
-    first, second = tmp_path / "a", tmp_path / "b"
-    first.mkdir()
-    for k in range(2):
-        (first / f"{k}.csv").write_text(f"t,q,u\n0,{k},0\n")
-    shutil.copytree(first, second)
-    assert data_hash(make(first)) == data_hash(make(second))
-    (second / "1.csv").write_text("t,q,u\n0,1.5,0\n")
-    assert data_hash(make(first)) != data_hash(make(second))
-    shutil.copy(first / "1.csv", second / "1.csv")
-    (second / "1.csv").rename(second / "2.csv")
-    assert data_hash(make(first)) != data_hash(make(second))
 
 
 def test_the_command_line_can_be_pasted_into_a_shell(monkeypatch):

@@ -115,7 +115,7 @@ def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
             {"posture": [0.1, -0.3, 0, -2.2, 0, 4.0, 0]},
             r"t = 0 s joint 'panda_joint6' would be at 4",
         ),
-        ({"posture": [0.1, -0.3]}, r"posture is \[0.1, -0.3\], but the arm has 7 joints"),
+        ({"posture": [0.1, -0.3]}, r"posture is \[0.1, -0.3\], but the robot has 7 coordinates"),
         ({"radius": 0.0}, r"radius is 0.0, expected a positive"),
         ({"pitch": math.nan}, r"pitch is nan, expected a finite"),
         ({"period": -1.0}, r"period is -1.0, expected a positive"),

@@ -8,7 +8,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from pinn_dyn.control import plants
-from pinn_dyn.control.plants import BulletPlant, SystemPlant, solve_by_halves
+from pinn_dyn.control.plants import BulletPlant, SystemPlant
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
@@ -128,15 +128,6 @@ def test_a_copy_with_an_input_that_is_not_finite_is_nan_and_stays_so():
     assert states[:2].isfinite().all()
     assert states[2, 0].isfinite().all()
     assert states[2, 1:].isnan().all()
-
-
-def test_only_the_row_that_cannot_be_solved_is_nan():
-    matrix = torch.eye(2, dtype=torch.float64).repeat(5, 1, 1)
-    matrix[3, 0, 0] = -1.0
-    x = torch.arange(10, dtype=torch.float64).reshape(5, 2)
-    y = solve_by_halves(lambda x, m: (torch.linalg.cholesky(m) @ x[..., None])[..., 0], x, matrix)
-    assert y[3].isnan().all()
-    torch.testing.assert_close(y[[0, 1, 2, 4]], x[[0, 1, 2, 4]])
 
 
 def test_without_a_compiler_it_runs_uncompiled_and_says_so(monkeypatch, caplog):

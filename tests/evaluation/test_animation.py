@@ -7,14 +7,9 @@ from PIL import Image
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import save
-from pinn_dyn.evaluation.animation import (
-    _camera,
-    _pixels,
-    animate_bullet_arm,
-    animate_soft_arm,
-    soft_arm_strip,
-)
+from pinn_dyn.evaluation.animation import animate_lines, animate_pictures, pose_strip
 from pinn_dyn.systems import SoftArm
+from pinn_dyn.systems.bullet_camera import camera, pixels
 
 PANDA = "franka_panda/panda.urdf"
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -60,7 +55,7 @@ def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(
     bending, fps, duration, count, tmp_path
 ):
     path = tmp_path / "new" / "arm.gif"
-    animate_soft_arm(bending, 0, SoftArm(2), path, fps=fps)
+    animate_lines(bending, 0, SoftArm(2), path, fps=fps)
     found, times = frames(path)
     # From 0 s up to 0.48 s, and the last sample at 0.5 s.
     assert times == [duration] * (count - 1) + [1000]
@@ -72,7 +67,7 @@ def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(
 def test_the_reference_is_drawn_in_grey(bending, tmp_path):
     pictures = []
     for shown in (True, False):
-        animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "a.gif", fps=2, reference=shown)
+        animate_lines(bending, 0, SoftArm(2), tmp_path / "a.gif", fps=2, reference=shown)
         first = frames(tmp_path / "a.gif")[0][0]
         grey = np.abs(first - 0.7 * 255).max(-1) < 8
         pictures.append(int(grey[40:-40].sum()))  # the legend is below
@@ -81,22 +76,22 @@ def test_the_reference_is_drawn_in_grey(bending, tmp_path):
 
 def test_a_stopped_run_is_drawn_up_to_its_stop(bending, tmp_path):
     stop(bending, 21)
-    animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=25)
+    animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=25)
     assert frames(tmp_path / "arm.gif")[1] == [40] * 5 + [1000]  # 0 to 0.16 s, 0.2 s
 
 
 def test_bad_frame_rates_and_runs_that_never_started_are_refused(bending, tmp_path):
     with pytest.raises(ValueError, match="fps is 60"):
-        animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=60)
+        animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=60)
     stop(bending, 0)
     with pytest.raises(ValueError, match="run 0 has no finite q at its start"):
-        animate_soft_arm(bending, 0, SoftArm(2), tmp_path / "arm.gif")
+        animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif")
 
 
 def test_a_strip_shows_the_arm_at_the_times_asked_for(bending, tmp_path):
     times = [0.0, 0.1, 0.3]
     arm = SoftArm(2)
-    figure = soft_arm_strip(bending, 0, arm, times, title="fake")
+    figure = pose_strip(bending, 0, arm, times, title="fake")
     save(figure, tmp_path / "strip.png")
     assert np.ptp(matplotlib.image.imread(tmp_path / "strip.png")[..., :3]) > 0.5
     assert [ax.get_title() for ax in figure.axes] == ["0 s", "0.1 s", "0.3 s"]
@@ -117,14 +112,14 @@ def test_a_strip_shows_the_arm_at_the_times_asked_for(bending, tmp_path):
 def test_a_run_that_ran_away_does_not_set_the_scale(bending):
     bending.q[0, 39:] *= 1e3
     stop(bending, 41)
-    figure = soft_arm_strip(bending, 0, SoftArm(2), [0.1], title="fake")
+    figure = pose_strip(bending, 0, SoftArm(2), [0.1], title="fake")
     assert abs(np.subtract(*figure.axes[0].get_zlim())) < 1.0
 
 
 @pytest.mark.parametrize("times", [[], [0.6], [-0.1, 0.2]])
 def test_times_outside_the_run_are_refused(bending, times):
     with pytest.raises(ValueError, match=r"expected some between 0 and 0\.5 s"):
-        soft_arm_strip(bending, 0, SoftArm(2), times, title="fake")
+        pose_strip(bending, 0, SoftArm(2), times, title="fake")
 
 
 @pytest.mark.panda
@@ -138,11 +133,11 @@ def test_panda_moves_in_view_of_the_camera(tmp_path):
     record = make_record(q_ref - 0.05, q_ref, t)
     arm = BulletArm(PANDA, locked_joints=FINGERS)
     path = tmp_path / "panda.gif"
-    animate_bullet_arm(record, 0, arm, path, fps=10, size=(240, 180))
+    animate_pictures(record, 0, arm, path, fps=10, size=(240, 180))
     found, times = frames(path)
     assert times == [100] * 5 + [1000]
     assert count_red(found[-1]) > count_red(found[0]) + 30
-    animate_bullet_arm(record, 0, arm, path, fps=10, size=(240, 180), trace=False)
+    animate_pictures(record, 0, arm, path, fps=10, size=(240, 180), trace=False)
     plain = frames(path)[0]
     for picture in plain:
         arm_pixels = (picture < 220).all(-1)
@@ -159,8 +154,8 @@ def test_panda_moves_in_view_of_the_camera(tmp_path):
 def test_points_are_where_bullet_draws_them(size):
     bullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
     points = np.array([[0.5, 0.2, 0.1], [-0.3, 0.4, 0.9], [0.1, -0.6, 0.4]])
-    view, projection = _camera(bullet, points, size)
-    expected = _pixels(points, view, projection, size)
+    view, projection = camera(bullet, points, size)
+    expected = pixels(points, view, projection, size)
     client = bullet.connect(bullet.DIRECT)
     try:
         ball = bullet.createVisualShape(bullet.GEOM_SPHERE, radius=0.03, physicsClientId=client)

@@ -15,9 +15,11 @@ from pinn_dyn.data.logs.step import Step
 
 # Logs of robots are written between 2 Hz and 100 kHz.
 _SAMPLE_TIMES = (1e-5, 0.5)
-# What the factor between dq/dt and v may be without a warning, and how well it must be determined.
+# What factor between dq/dt and v needs no warning, and the correlation that determines it.
 _FACTORS = (0.8, 1.25)
 _CLEAR = 0.8
+# Share of the samples in which a robot may rest without a warning.
+_AT_REST = 0.9
 # A partial correlation of force and acceleration below this is clear.
 _REVERSED = -0.5
 
@@ -123,36 +125,118 @@ def check_angles(recordings: list[Recording], q: Columns, report: Report) -> Non
                 break
 
 
+def check_rest(training: list[Recording], q: Columns, report: Report) -> None:
+    """Warns of coordinates that never move or move no more than their noise, and of long rest.
+
+    Raises:
+        LogError: if no coordinate ever moves.
+    """
+    every = np.vstack([item.q for item in training])
+    steps = np.vstack([np.diff(item.q, axis=0) for item in training])
+    still = np.ptp(every, axis=0) == 0
+    if still.all():
+        raise LogError(
+            f"q: no coordinate ({', '.join(q.columns)}) moves in the training runs: there is no "
+            "motion to learn from; are these the right columns?"
+        )
+    for k, name in enumerate(q.columns):
+        if still[k]:
+            report.warn(f"column {name!r} (q): never moves in the training runs")
+        elif not moves(training, k):
+            report.warn(
+                f"column {name!r} (q): moves no more than its noise in the training runs, "
+                f"{every[:, k].std():.3g} {q.units[k]}"
+            )
+    speed = np.abs(steps) / np.abs(steps).max(axis=0).clip(min=1e-300)
+    share = float((speed < 0.01).all(axis=1).mean())
+    if share > _AT_REST:
+        report.warn(
+            f"the robot is at rest for {100 * share:.0f} % of the training samples: windows drawn "
+            "there teach little; use data.coverage, or cut the rest out"
+        )
+
+
+def check_unseen_inputs(
+    training: list[Recording], others: list[Recording], u: Columns, report: Report
+) -> None:
+    """Warns of inputs that stand still in the training runs and move in the others."""
+    first = training[0].u[0]
+    for k, name in enumerate(u.columns):
+        still = all((item.u[:, k] == first[k]).all() for item in training)
+        moved = [item.run for item in others if (item.u[:, k] != first[k]).any()]
+        if still and moved:
+            report.warn(
+                f"column {name!r} (u): is {first[k]:.4g} {u.units[k]} in all training runs and "
+                f"moves in {moved[0]}: what it does there cannot be learned"
+            )
+
+
 def check_velocities(
     training: list[Recording], q: Columns, v: Columns, step: float, report: Report
 ) -> None:
-    """Warns where q and v disagree by a factor k, by least squares over stretches of 10 samples.
+    """Warns where v is not the derivative of q: by a factor k, or not at all.
 
-    Δq_j = k ∫ v dt over stretch j; integrals are less noisy than derivatives.
+    Δq_j = k ∫ v dt over stretches of 10, 100 and 1000 samples, by least squares; integrals are less
+    noisy than derivatives. The stretches count over which the two agree best.
     """
-    dq, dv = [], []
-    for recording in training:
-        assert recording.v is not None
-        integral = np.cumsum(0.5 * (recording.v[1:] + recording.v[:-1]) * step, axis=0)
-        dq.append(np.diff(recording.q[1::10], axis=0))
-        dv.append(np.diff(integral[::10], axis=0))
+    names = [f"columns {a!r} and {b!r}" for a, b in zip(q.columns, v.columns, strict=True)]
+    agreement = [_agreement(training, step, samples) for samples in (10, 100, 1000)]
+    for k, name in enumerate(names):
+        correlation, factor = max(
+            ((abs(c[k, k]), f[k, k]) for c, f in agreement), key=lambda pair: pair[0]
+        )
+        if correlation >= _CLEAR and _FACTORS[0] <= factor <= _FACTORS[1]:
+            continue
+        if correlation >= _CLEAR:
+            degrees = any(
+                math.isclose(abs(factor), wrong, rel_tol=0.2)
+                for wrong in (180 / math.pi, math.pi / 180)
+            )
+            cause = "one of them is in degrees" if degrees else "check unit, scale and sign of both"
+            report.warn(f"{name}: the derivative of q is {factor:.4g} times v, expected 1: {cause}")
+        elif moves(training, k):
+            best = np.max([np.abs(c[k]) for c, _ in agreement], axis=0)
+            other = int(best.argmax())
+            zero = all(not item.v[:, k].any() for item in training if item.v is not None)
+            cause = "v is zero throughout" if zero else "is this the right column?"
+            if best[other] >= _CLEAR and other != k:
+                cause = f"{v.columns[other]!r} fits it: are columns of v exchanged?"
+            report.warn(
+                f"{name}: v is not the derivative of q, their correlation is {correlation:.2f}, "
+                f"expected nearly 1: {cause}"
+            )
+
+
+def moves(training: list[Recording], k: int) -> bool:
+    """Whether coordinate k moves by more than noise.
+
+    For noise alone the mean square of the steps is twice the variance (von Neumann 1941).
+    """
+    every = np.concatenate([item.q[:, k] for item in training])
+    steps = np.concatenate([np.diff(item.q[:, k]) for item in training])
+    return bool(np.ptp(every) > 0 and (steps**2).mean() <= every.var())
+
+
+def _agreement(
+    training: list[Recording], step: float, samples: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of Δq_i with ∫ v_k dt over stretches, and their factors, ``(N, N)`` each."""
+    size = training[0].q.shape[1]
+    dq, dv = [np.zeros((0, size))], [np.zeros((0, size))]
+    for item in training:
+        assert item.v is not None
+        integral = np.cumsum(0.5 * (item.v[1:] + item.v[:-1]) * step, axis=0)
+        dq.append(np.diff(item.q[1::samples], axis=0))
+        dv.append(np.diff(integral[::samples], axis=0))
     moved, integrated = np.vstack(dq), np.vstack(dv)
-    for k, (name, velocity) in enumerate(zip(q.columns, v.columns, strict=True)):
-        norm = np.linalg.norm(moved[:, k]) * np.linalg.norm(integrated[:, k])
-        if norm == 0:
-            continue
-        product = float(moved[:, k] @ integrated[:, k])
-        factor = product / float(integrated[:, k] @ integrated[:, k])
-        if abs(product) / norm < _CLEAR or _FACTORS[0] <= factor <= _FACTORS[1]:
-            continue
-        degrees = math.isclose(abs(factor), 180 / math.pi, rel_tol=0.2) or math.isclose(
-            abs(factor), math.pi / 180, rel_tol=0.2
-        )
-        cause = "one of them is in degrees" if degrees else "check unit, scale and sign of both"
-        report.warn(
-            f"columns {name!r} and {velocity!r}: the derivative of q is {factor:.4g} times v, "
-            f"expected 1: {cause}"
-        )
+    squares = (integrated**2).sum(axis=0)
+    norms = np.sqrt(np.outer((moved**2).sum(axis=0), squares))
+    product = moved.T @ integrated
+    if len(moved) < 5:  # too few to tell
+        return 0 * product, 0 * product
+    return product / np.where(norms > 0, norms, np.inf), product / np.where(
+        squares > 0, squares, np.inf
+    )
 
 
 def check_force_signs(training: list[Recording], u: Columns, step: float, report: Report) -> None:

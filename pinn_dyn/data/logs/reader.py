@@ -1,9 +1,13 @@
-"""Reads the columns of log files: CSV, and MATLAB through SciPy."""
+"""Reads the columns of log files: CSV, also compressed by gzip, and MATLAB through SciPy."""
 
 from __future__ import annotations
 
+import csv
 import difflib
+import gzip
+import re
 import warnings
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,6 +41,12 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     return sorted(found)
 
 
+def run_name(path: Path, root: str) -> str:
+    """The name of a file's run: its path from the folder, without ``.csv``, ``.gz`` or ``.mat``."""
+    inside = path.relative_to(Path(root).expanduser())
+    return (inside.with_suffix("") if inside.suffix == ".gz" else inside).with_suffix("").as_posix()
+
+
 def read_table(path: Path, time: str) -> pd.DataFrame:
     """All columns of a file; the index is the line in the file (the row, in a ``.mat`` file).
 
@@ -61,7 +71,18 @@ def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series
     Raises:
         LogError: if there is none; names the closest one.
     """
-    if name not in table.columns:
+    places = [k + 1 for k, known in enumerate(table.columns) if known == name]
+    if len(places) > 1:
+        raise LogError(
+            f"{path}: {len(places)} columns have the name {name!r}, which {signal} asks for: "
+            f"numbers {', '.join(map(str, places))}; give each a name of its own in the file"
+        )
+    if name in table.attrs.get("unusable", {}):
+        raise LogError(
+            f"{path}, variable {name!r} ({signal}): {table.attrs['unusable'][name]}, expected a "
+            "matrix of real numbers with as many rows as the time"
+        )
+    if not places:
         names = [str(known) for known in table.columns]
         close = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
@@ -79,6 +100,9 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
     if bad.any():
         k = int(bad.argmax())
         what = "is empty or NaN" if pd.isna(raw.iloc[k]) else f"is {str(raw.iloc[k])!r}"
+        if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", str(raw.iloc[k])):
+            what += ", with a decimal comma: write points (in a file whose columns are separated by"
+            what += " ';', replace every ',' by '.')"
         raise LogError(
             f"{path}, line {table.index[k]}, column {name!r} ({signal}): the value {what}, "
             f"expected a number ({int(bad.sum())} such rows in this column): repair or remove "
@@ -89,7 +113,9 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
 
 def _read_csv(path: Path) -> pd.DataFrame:
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with (gzip.open if path.suffix == ".gz" else open)(
+            path, "rt", encoding="utf-8-sig"
+        ) as file:
             header = file.readline()
         separator = max(",;\t", key=header.count)
         with warnings.catch_warnings():
@@ -109,9 +135,15 @@ def _read_csv(path: Path) -> pd.DataFrame:
         pd.errors.ParserWarning,
         pd.errors.EmptyDataError,
         UnicodeDecodeError,
+        gzip.BadGzipFile,
+        EOFError,
+        zlib.error,
     ) as error:
         raise LogError(f"{path}: cannot be read as CSV with a header line: {error}") from error
-    table.columns = [str(name).strip() for name in table.columns]
+    # Pandas would number columns of one name.
+    names = next(csv.reader([header], delimiter=separator, skipinitialspace=True), [])
+    found = names if len(names) == table.shape[1] else table.columns
+    table.columns = [str(name).strip() for name in found]
     table.index = pd.RangeIndex(2, len(table) + 2)
     # Blank lines are counted, so that lines keep their numbers, but at the end they do no harm.
     filled = np.flatnonzero(table.notna().any(axis=1))
@@ -130,9 +162,12 @@ def _read_mat(path: Path, time: str) -> pd.DataFrame:
     except (ValueError, TypeError, OSError) as error:
         raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
     arrays: dict[str, np.ndarray] = {}
+    unusable: dict[str, str] = {}
     for name, value in content.items():
         if not name.startswith("__"):
-            _flatten(name, value, arrays)
+            _flatten(name, value, arrays, unusable)
+    if time in unusable:
+        raise LogError(f"{path}, variable {time!r} (time): {unusable[time]}, expected real numbers")
     if time not in arrays:
         names = ", ".join(f"{name} {value.shape}" for name, value in arrays.items())
         close = difflib.get_close_matches(time, arrays, n=1)
@@ -142,20 +177,32 @@ def _read_mat(path: Path, time: str) -> pd.DataFrame:
     columns: dict[str, np.ndarray] = {}
     for name, value in arrays.items():
         rows = value if value.shape[0] == samples else value.T
-        if rows.shape[0] != samples:
-            continue  # parameters and the like
+        if rows.shape[0] != samples:  # parameters and the like
+            unusable[name] = f"is {' by '.join(map(str, value.shape))}, and the time has {samples}"
+            unusable[name] += " samples"
+            continue
         if rows.shape[1] == 1:
             columns[name] = rows[:, 0]
         else:
             columns |= {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
-    return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+    table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+    table.attrs["unusable"] = unusable
+    return table
 
 
-def _flatten(name: str, value: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
-    """Numeric matrices of a variable and of the fields of its structs, as ``log.q``."""
+def _flatten(
+    name: str, value: np.ndarray, arrays: dict[str, np.ndarray], unusable: dict[str, str]
+) -> None:
+    """Real matrices of a variable and of the fields of its structs, as ``log.q``; else why not."""
     if value.dtype.names:
         for field in value.dtype.names:
             if value.size == 1:
-                _flatten(f"{name}.{field}", value.flat[0][field], arrays)
+                _flatten(f"{name}.{field}", value.flat[0][field], arrays, unusable)
+            else:
+                unusable[f"{name}.{field}"] = f"is a field of an array of {value.size} structs"
     elif value.ndim == 2 and value.dtype.kind in "fiub":
         arrays[name] = value
+    else:
+        kinds = {"c": "holds complex numbers", "O": "is a cell array, such as of ragged rows"}
+        kinds |= {"U": "is a text", "S": "is a text"}
+        unusable[name] = kinds.get(value.dtype.kind, f"has {value.ndim} dimensions")

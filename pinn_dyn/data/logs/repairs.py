@@ -12,6 +12,9 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.step import Step, change, check_signals, sample_time
 
+# Share of the rows that may be jumps; more are noise or motion.
+_MANY = 0.05
+
 
 @dataclass(frozen=True)
 class RemoveJumps(Step):
@@ -67,6 +70,22 @@ class RemoveJumps(Step):
         more = " ..." if len(found) > 20 else ""
         text = f"{len(found)} samples replaced, at (off by): {', '.join(found[:20])}{more}"
         return [repaired], text
+
+    def losses(self, before: list[Recording], after: list[Recording]) -> list[str]:
+        pairs = [
+            (getattr(old, name), getattr(new, name))
+            for old, new in zip(before, after, strict=True)
+            for name in self.signals
+            if getattr(old, name) is not None
+        ]
+        replaced = np.concatenate([(old != new).any(axis=1) for old, new in pairs]).mean()
+        texts = super().losses(before, after)
+        if replaced > _MANY:
+            texts.append(
+                f"{100 * (1 - replaced):.0f} % of the rows are left as they were: the threshold is "
+                "below the noise, or below the motion within a window"
+            )
+        return texts
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,23 +11,35 @@ from typing import Any
 import numpy as np
 import torch
 
+from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.logs.checks import (
     check_angles,
     check_clock,
     check_force_signs,
     check_inputs,
+    check_rest,
     check_second_clock,
+    check_unseen_inputs,
     check_velocities,
 )
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
-from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table
+from pinn_dyn.data.logs.jumps import Rows, check_rows
+from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table, run_name
 from pinn_dyn.data.logs.recording import Recording, Report
-from pinn_dyn.data.logs.splits import Part, split
+from pinn_dyn.data.logs.repairs import RemoveJumps
+from pinn_dyn.data.logs.repeats import check_copies, check_repeats
+from pinn_dyn.data.logs.splits import SPLITS, Part, split
 from pinn_dyn.data.logs.step import Step, sample_time
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
+
+# What the trajectories depend on beside the files.
+_SETTINGS = (
+    *("time", "q", "v", "u", "trajectory", "steps", "validation", "test"),
+    *("guard", "shortest", "seed", "interpolation"),
+)
 
 
 @dataclass(frozen=True)
@@ -70,6 +83,8 @@ class LogSource(DataSource):
         interpolation: how the input moves between samples.
         labels, input_labels: name and unit of each coordinate and input; None takes the columns.
         configurations: named configurations for learned terms.
+        angles: numbers of the coordinates that are angles of joints, for models that know them by
+            sine and cosine.
 
     Raises:
         LogError: on a description that cannot be right; of the files, by :meth:`load`.
@@ -96,6 +111,7 @@ class LogSource(DataSource):
         labels: list[str] | None = None,
         input_labels: list[str] | None = None,
         configurations: Mapping[str, list[float]] | None = None,
+        angles: Sequence[int] = (),
     ):
         self.name = name
         self.root = root
@@ -111,6 +127,14 @@ class LogSource(DataSource):
                 f"v has the SI units {', '.join(self.v.units)}, expected those of q, "
                 f"{', '.join(self.q.units)}, per second, in the same order"
             )
+        for key, columns, expected in (("q", self.q, ("rad", "m", "1")), ("u", self.u, None)):
+            for label, unit in zip(columns.columns, columns.units, strict=True):
+                if unit == "s" or (expected is not None and unit not in expected):
+                    raise LogError(
+                        f"{key} has the column {label!r} in {unit}, expected "
+                        f"{'an angle, a length or 1' if expected else 'no time'}: is it the right "
+                        "column, and its unit?"
+                    )
         self.trajectory = trajectory
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self.validation = Part.from_config("validation", validation)
@@ -123,15 +147,22 @@ class LogSource(DataSource):
         self.interpolation = interpolation
         self.labels = labels or self.q.labels
         self.input_labels = input_labels or self.u.labels
-        for key, given, columns in (
-            ("labels", self.labels, self.q.columns),
-            ("input_labels", self.input_labels, self.u.columns),
+        for key, given, count in (
+            ("labels", self.labels, len(self.q.columns)),
+            ("input_labels", self.input_labels, len(self.u.columns)),
         ):
-            if len(given) != len(columns):
-                raise LogError(f"{key} has {len(given)} entries, expected {len(columns)}")
+            if len(given) != count:
+                raise LogError(f"{key} has {len(given)} entries, expected {count}")
         for step in self.steps.values():
             self.input_labels = step.input_labels(self.input_labels)
         self.system = None
+        self.angles = tuple(angles)
+        for k in self.angles:
+            if not (0 <= k < len(self.q.columns) and self.q.units[k] == "rad"):
+                raise LogError(
+                    f"angles is {list(angles)}, expected numbers of columns of q, from 0, that "
+                    f"have a unit of angle: their SI units are {', '.join(self.q.units)}"
+                )
         self.configurations = dict(configurations or {})
         self._loaded: tuple[Splits, Report, list[Cleaned]] | None = None
 
@@ -142,6 +173,22 @@ class LogSource(DataSource):
             LogError: on a file that cannot be used; names the file, the place and what to do.
         """
         return self._load()[0]
+
+    def fingerprint(self) -> dict[str, object]:
+        """Files (name, size, SHA-256), rows, columns, cleaning, and the stretches of each split."""
+        root = Path(self.root).expanduser()
+        files = {
+            path.relative_to(root).as_posix(): {
+                "bytes": path.stat().st_size,
+                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            }
+            for path in find_files(self.root, self.files)
+        }
+        splits: dict[str, list[str]] = {split: [] for split in SPLITS}
+        for part in self.cleaned:
+            splits[part.split].append(f"{part.raw.place}, {len(part.raw)} rows")
+        settings = {key: describe(getattr(self, key)) for key in _SETTINGS}
+        return {"files": files, "splits": splits, **settings}
 
     @property
     def report(self) -> str:
@@ -160,17 +207,25 @@ class LogSource(DataSource):
             check_inputs(recordings, self.u, report)
             check_angles(recordings, self.q, report)
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
+            check_copies(parts, report)
             cleaned = self._clean(parts, report)
             step = self._one_sample_time(cleaned)
             training = [item for part in cleaned if part.split == "train" for item in part.clean]
             if self.v is not None:
                 check_velocities(training, self.q, self.v, step, report)
             check_force_signs(training, self.u, step, report)
+            check_rest(training, self.q, report)
             report.add("Splits", "train", _summary(training, step))
+            kept = {"train": training}
+            for name, part in (("validation", self.validation), ("test", self.test)):
+                kept[name] = self._pieces(name, part, cleaned, step, report)
+            check_unseen_inputs(training, kept["validation"] + kept["test"], self.u, report)
+            check_repeats(training, kept["test"], "test", report)
             splits = Splits(
-                train=[self._trajectory(recording, step) for recording in training],
-                validation=self._pieces("validation", self.validation, cleaned, step, report),
-                test=self._pieces("test", self.test, cleaned, step, report),
+                **{
+                    name: [self._trajectory(item, step) for item in items]
+                    for name, items in kept.items()
+                }
             )
             self._loaded = splits, report, cleaned
         return self._loaded
@@ -180,7 +235,7 @@ class LogSource(DataSource):
         recordings = []
         for path in paths:
             table = read_table(path, self.time.columns[0])
-            stem = path.relative_to(Path(self.root).expanduser()).with_suffix("").as_posix()
+            stem = run_name(path, self.root)
             groups = [(stem, slice(None))]
             if self.trajectory is not None:
                 ids = column(table, path, self.trajectory, "trajectory")
@@ -210,6 +265,14 @@ class LogSource(DataSource):
                 for name, other in zip(self.time.columns[1:], others, strict=True):
                     names = (self.time.columns[0], name)
                     check_second_clock(t, other, lines[rows], path, names)
+                for signal, columns in (("q", self.q), ("v", self.v), ("u", self.u)):
+                    if columns is not None:
+                        signal_rows = Rows(path, lines[rows], signal, columns, values[signal][rows])
+                        repaired = any(
+                            isinstance(step, RemoveJumps) and signal in step.signals
+                            for step in steps
+                        )
+                        check_rows(signal_rows, t, report, jumps_are_removed=repaired)
                 v = values["v"][rows] if "v" in values else None
                 recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
                 report.add(
@@ -240,6 +303,11 @@ class LogSource(DataSource):
                 report.add(f"{name}: {step}", f"{part.split} {recording.place}", text)
                 done += changed
             result.append(replace(part, clean=done))
+        before, after = (
+            [item for part in parts for item in part.clean] for parts in (cleaned, result)
+        )
+        for text in step.losses(before, after):
+            report.warn(f"{name}: {step}: {text}")
         return self._long_enough(name, result, report)
 
     def _long_enough(self, name: str, cleaned: list[Cleaned], report: Report) -> list[Cleaned]:
@@ -287,7 +355,7 @@ class LogSource(DataSource):
 
     def _pieces(
         self, name: str, part: Part, cleaned: list[Cleaned], step: float, report: Report
-    ) -> list[Trajectory]:
+    ) -> list[Recording]:
         """Roll-outs of one length; neighbours share the sample between them."""
         stretches = [item for one in cleaned if one.split == name for item in one.clean]
         span = round(part.piece / step)
@@ -314,7 +382,7 @@ class LogSource(DataSource):
             f"{_summary(pieces, step)}, each a roll-out of its own; {max(rest, 0):.4g} s are left "
             "over and dropped",
         )
-        return [self._trajectory(piece, step) for piece in pieces]
+        return pieces
 
     def _trajectory(self, recording: Recording, step: float) -> Trajectory:
         q, v, u = (

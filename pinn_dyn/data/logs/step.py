@@ -19,6 +19,10 @@ SIGNALS = ("q", "v", "u")
 CLOCK_TOLERANCE = 0.02
 
 
+# A step that leaves a smaller share of the time, or of a signal's spread, is warned of.
+_LEFT = 0.5
+
+
 class Step(abc.ABC):
     """One step of the cleaning: a recording in, one or several out, and a line for the report."""
 
@@ -33,6 +37,27 @@ class Step(abc.ABC):
         Raises:
             LogError: if the step cannot be applied; says what to do first.
         """
+
+    def losses(self, before: list[Recording], after: list[Recording]) -> list[str]:
+        """What the step destroyed, with what is left: of the time, and of each signal's spread."""
+        texts = []
+        lasted, left = (sum(item.duration for item in items) for items in (before, after))
+        if left < _LEFT * lasted:
+            texts.append(f"{left:.4g} s of {lasted:.4g} s are left")
+        for name in SIGNALS if after else ():
+            spreads = [
+                np.vstack([getattr(item, name) - getattr(item, name).mean(0) for item in items])
+                for items in (before, after)
+                if all(getattr(item, name) is not None for item in items)
+            ]
+            if len(spreads) < 2:
+                continue
+            was, now = (values.std(axis=0) for values in spreads)
+            for k in np.flatnonzero(now[: len(was)] < _LEFT * was):
+                texts.append(
+                    f"column {k + 1} of {name} has {100 * now[k] / was[k]:.2g} % of its spread left"
+                )
+        return texts
 
     def input_labels(self, labels: list[str]) -> list[str]:
         """Names and units of the inputs after the step, given those before it."""

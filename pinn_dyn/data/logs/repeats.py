@@ -1,0 +1,85 @@
+"""Motions that come twice: copies of runs, and tests that repeat what was trained on."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import Recording, Report
+
+# A motion within this share of its spread of another one repeats it.
+_SAME = 0.05
+# Samples of a motion that are compared.
+_SAMPLES = 300
+
+
+def check_copies(parts: dict[str, list[Recording]], report: Report) -> None:
+    """Warns of stretches with the same numbers in one split.
+
+    Raises:
+        LogError: where they are in two splits, as the test would be of what was trained on.
+    """
+    first: dict[bytes, tuple[str, Recording]] = {}
+    for split, recordings in parts.items():
+        for item in recordings:
+            content = item.q.tobytes() + item.u.tobytes()
+            if content not in first:
+                first[content] = split, item
+                continue
+            other_split, other = first[content]
+            if other_split != split:
+                raise LogError(
+                    f"{item.run}, in {split}, is a copy of {other.run}, in {other_split}, number "
+                    "by number: leave one of them out, or put both into one split"
+                )
+            report.warn(f"{item.run} is a copy of {other.run}, number by number (both {split})")
+
+
+def check_repeats(
+    training: list[Recording], test: list[Recording], name: str, report: Report
+) -> None:
+    """Warns where a roll-out of the test repeats a motion of the training.
+
+    It does where, at some shift s along a training stretch, the mean over its samples of
+    ‖q_test(t) - q_train(t + s)‖² is below 0.05² times the variance of q_test, all at one rate.
+
+    Args:
+        training: training stretches.
+        test: the roll-outs.
+        name: of their split.
+        report: takes the warnings.
+    """
+    found: dict[tuple[str, str], int] = {}
+    for piece in test:
+        thin = max(1, len(piece) // _SAMPLES)
+        q = piece.q[::thin]
+        spread = float(q.var(axis=0).sum())
+        if spread == 0:
+            continue
+        for item in training:
+            if len(item) >= len(piece) and _distance(q, item.q, thin) < _SAME**2 * spread:
+                found[piece.run, item.run] = found.get((piece.run, item.run), 0) + 1
+    for (run, other), pieces in found.items():
+        report.warn(
+            f"{name}: {pieces} of the motions of {run} repeat one of {other}, which is in the "
+            "training: errors on them say little of new motions; keep such runs in one split"
+        )
+
+
+def _distance(q: np.ndarray, track: np.ndarray, thin: int) -> float:
+    """Smallest mean square distance of q ``(T, N)`` from every ``thin``-th sample of a track."""
+    best = np.inf
+    centre = q.mean(axis=0)
+    q, track = q - centre, track - centre
+    for start in range(0, thin, max(1, thin // 4)):
+        other = track[start::thin]
+        if len(other) >= len(q):
+            squares = np.cumsum(np.r_[0.0, (other**2).sum(axis=1)])
+            energy = squares[len(q) :] - squares[: -len(q)]
+            products = (
+                fftconvolve(a, b[::-1], mode="valid") for a, b in zip(other.T, q.T, strict=True)
+            )
+            least = (energy - 2 * sum(products) + (q**2).sum()).min()
+            best = min(best, float(least) / len(q))
+    return best

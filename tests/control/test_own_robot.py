@@ -1,0 +1,132 @@
+"""A user's robot of a few methods: it follows a helix, is drawn, and steps by itself."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pinn_dyn.control import BulletPlant, Helix
+from pinn_dyn.control.contracts import Motion
+from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.evaluation import animate, pose_strip
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.systems import Drawable, HasLimits, HasTip, Rendered, SoftArm, Stepped
+
+
+class Crane(MechanicalSystem):
+    """A turning column, a boom and a jib, with a point mass at the tip of each."""
+
+    z_is_down = False
+
+    def __init__(self):
+        super().__init__(3, 3)
+
+    def lines(self, q):
+        turn, boom, jib = q.unbind(-1)
+        radius = torch.stack([0 * turn, 0.4 * boom.cos(), 0.3 * (boom + jib).cos()], -1)
+        height = torch.stack([0.5 + 0 * turn, 0.4 * boom.sin(), 0.3 * (boom + jib).sin()], -1)
+        r, z = radius.cumsum(-1), height.cumsum(-1)
+        points = torch.stack([r * turn.cos()[..., None], r * turn.sin()[..., None], z], -1)
+        return torch.cat([torch.zeros_like(points[..., :1, :]), points], -2).unsqueeze(-3)
+
+    def tip_position(self, q):
+        return self.lines(q)[..., -1, -1, :]
+
+    def mass_matrix(self, q):
+        return torch.eye(3, dtype=q.dtype).expand(*q.shape, 3)
+
+    def potential_energy(self, q):
+        return 0 * q.sum(-1)
+
+    def damping_matrix(self, q):
+        return self.mass_matrix(q)
+
+    def input_matrix(self, q):
+        return self.mass_matrix(q)
+
+
+class Limited(Crane):
+    joint_names = ("column", "boom", "jib")
+    q_low, q_high = np.array([-3.0, 0.0, -3.0]), np.array([3.0, 3.0, 0.0])
+    v_max = u_max = np.ones(3)
+
+
+POSTURE = [0.0, 1.0, -1.2]
+
+
+def test_the_tip_of_a_robot_of_ones_own_runs_along_the_helix():
+    crane = Crane()
+    helix = Helix(crane, POSTURE, radius=0.05, pitch=0.02, period=2.0, turns=1.0)
+    start = [0.4 * np.cos(1.0) + 0.3 * np.cos(0.2), 0.0, 0.5 + 0.4 * np.sin(1) - 0.3 * np.sin(0.2)]
+    np.testing.assert_allclose(helix.path(0.0), start, rtol=0, atol=1e-14)
+    for t in np.linspace(0, helix.duration, 9):
+        turn, boom, jib = helix(t).q.tolist()
+        reach = 0.4 * np.cos(boom) + 0.3 * np.cos(boom + jib)
+        height = 0.5 + 0.4 * np.sin(boom) + 0.3 * np.sin(boom + jib)
+        tip = [reach * np.cos(turn), reach * np.sin(turn), height]
+        np.testing.assert_allclose(tip, helix.path(t), rtol=0, atol=1e-6)
+
+
+def test_limits_are_checked_where_a_robot_has_them_and_joints_are_named():
+    Helix(Limited(), POSTURE, radius=0.05, pitch=0.0, period=2.0, turns=0.5)
+    with pytest.raises(ValueError, match=r"joint 'jib' would be at 0.5 rad"):
+        Helix(Limited(), [0.0, 1.0, 0.5], radius=0.05, pitch=0.0, period=2.0, turns=0.5)
+    with pytest.raises(ValueError, match=r"has 3 coordinates \(q1, q2, q3\)"):
+        Helix(Crane(), [0.0], radius=0.05, pitch=0.0, period=2.0, turns=0.5)
+
+
+def test_the_soft_arm_follows_a_circle_with_its_tip():
+    arm = SoftArm(2)
+    helix = Helix(arm, [0.3, 0.2, 0.1, 0.2, 0.1, 0.1], 0.03, 0.0, period=2.0, turns=0.5)
+    tip = arm.backbone(helix(1.0).q, torch.ones(1, dtype=torch.float64))[-1, -1]
+    np.testing.assert_allclose(tip, helix.path(1.0), rtol=0, atol=1e-6)
+
+
+def test_a_robot_of_ones_own_is_drawn(tmp_path):
+    t = torch.linspace(0, 0.3, 4, dtype=torch.float64)
+    q = torch.tensor(POSTURE, dtype=torch.float64) + t[:, None]
+    motion = Motion(*[q[None]] * 3)
+    record = ClosedLoopRecord(t, q[None], 0 * q[None], 0 * q[None], 0 * q[None], motion, [None])
+    animate(record, 0, Crane(), tmp_path / "crane.gif")
+    with Image.open(tmp_path / "crane.gif") as image:
+        assert image.n_frames == 4
+    (axes,) = pose_strip(record, 0, Crane(), [0.3], title="crane").axes
+    low, high = axes.get_zlim()
+    assert low < high  # upwards
+    drawn = axes.lines[1].get_data_3d()
+    np.testing.assert_allclose(np.transpose(drawn), Crane().lines(q[-1])[0], atol=1e-12)
+    animate(record, 0, object(), tmp_path / "none.gif")
+    assert not (tmp_path / "none.gif").exists()
+
+
+class Hopping:
+    """Stands in for a simulator: q moves by the input, v counts the steps."""
+
+    num_coordinates = num_inputs = 1
+
+    def set_state(self, q, v):
+        self.q, self.v = q, v
+
+    def step(self, torque, step):
+        self.q, self.v = self.q + step * torque, self.v + 1
+        return self.q, self.v
+
+
+def test_a_robot_that_steps_by_itself_is_a_plant():
+    plant = BulletPlant(Hopping(), step=0.01)
+    start = torch.zeros(2, 1, dtype=torch.float64)
+    plant.start(start, start)
+    q, v = plant.advance(torch.tensor([[1.0], [2.0]], dtype=torch.float64), 0.05)
+    torch.testing.assert_close(q[:, 0], torch.tensor([0.05, 0.1], dtype=torch.float64))
+    assert v.tolist() == [[5.0], [5.0]]
+    with pytest.raises(TypeError, match="arm is a Crane, expected a robot with set_state and step"):
+        BulletPlant(Crane())
+
+
+def test_what_a_robot_offers_is_seen():
+    assert isinstance(Crane(), HasTip)
+    assert isinstance(Crane(), Drawable)
+    assert not isinstance(Crane(), (HasLimits, Rendered, Stepped))
+    assert isinstance(Limited(), HasLimits)
+    assert isinstance(SoftArm(), HasTip)
+    assert isinstance(SoftArm(), Drawable)

@@ -1,0 +1,151 @@
+"""Every data source keeps the contract, a user's own of a few lines too."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.data import (
+    DataSource,
+    InitialStates,
+    MultiSine,
+    RobotSource,
+    SimulatedSource,
+    Splits,
+    TorqueMultiSine,
+)
+from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.systems import SoftArm
+from tests.contracts.data_source import DataSourceContract
+from tests.data.logs_files import motion, source, write
+
+
+class TestSimulatedSource(DataSourceContract):
+    @pytest.fixture(scope="class")
+    def cache(self, tmp_path_factory):
+        return tmp_path_factory.mktemp("cache")
+
+    def make(self, cache, **changes):
+        arguments = dict(
+            name="arm",
+            system=SoftArm(),
+            excitation=MultiSine([0.0, 0.0, -1.0], [0.5, 0.5, 0.1]),
+            initial_states=InitialStates([-0.5, -0.5, 0.1], [0.5, 0.5, 0.2], [0.1, 0.1, 0.1]),
+            duration=0.1,
+            step=0.01,
+            train_initial_states=2,
+            train_inputs=1,
+            validation=1,
+            test=1,
+            seed=0,
+            rtol=1e-6,
+            atol=1e-7,
+            cache=str(cache),
+            labels=["x [rad]", "y [rad]", "l [m]"],
+            input_labels=["a [Nm]", "b [Nm]", "c [N]"],
+            configurations={"straight": [0.0, 0.0, 0.2]},
+        )
+        return SimulatedSource(**{**arguments, **changes})
+
+    @pytest.fixture
+    def source(self, cache):
+        return self.make(cache)
+
+    @pytest.fixture
+    def again(self, cache):
+        return self.make(cache)
+
+    @pytest.fixture
+    def changed(self, cache):
+        return self.make(cache, keep_every=2)
+
+
+@pytest.mark.panda
+class TestRobotSource(DataSourceContract):
+    @pytest.fixture(scope="class")
+    def cache(self, tmp_path_factory):
+        return tmp_path_factory.mktemp("cache")
+
+    def make(self, cache, seed=0):
+        pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+        from pinn_dyn.systems import BulletArm
+
+        return RobotSource(
+            name="iiwa",
+            system=BulletArm("kuka_iiwa/model.urdf"),
+            excitations=[
+                TorqueMultiSine(frequency=[0.1, 1.0], harmonics=2, amplitude=0.2, reach=0.5)
+            ],
+            duration=0.05,
+            step=0.001,
+            train=1,
+            validation=1,
+            test=1,
+            seed=seed,
+            workers=1,
+            cache=str(cache),
+            configurations=None,
+        )
+
+    @pytest.fixture
+    def source(self, cache):
+        return self.make(cache)
+
+    @pytest.fixture
+    def again(self, cache):
+        return self.make(cache)
+
+    @pytest.fixture
+    def changed(self, cache):
+        return self.make(cache, seed=1)
+
+
+class TestLogSource(DataSourceContract):
+    @pytest.fixture
+    def source(self, tmp_path):
+        write(tmp_path, motion())
+        return source(tmp_path, angles=[1])
+
+    @pytest.fixture
+    def again(self, tmp_path):
+        return source(tmp_path, angles=[1])
+
+    @pytest.fixture
+    def changed(self, tmp_path):
+        return source(tmp_path, guard=0.6)
+
+
+class Swings(DataSource):
+    """All that a source of one's own needs: attributes, and trajectories in memory."""
+
+    name = "swings"
+    labels = ("angle [rad]",)
+    input_labels = ("torque [Nm]",)
+
+    def __init__(self, rate=2.0):
+        self.rate = rate
+
+    def load(self):
+        t = torch.arange(100, dtype=torch.float64) / 50
+
+        def swing(k):
+            phase = self.rate * t + k
+            a = -(self.rate**2) * phase.sin()
+            return Trajectory(
+                phase.sin()[:, None], self.rate * phase.cos()[:, None], Signal(t, a[:, None])
+            )
+
+        return Splits([swing(0), swing(1)], [swing(2)], [swing(3)])
+
+
+class TestOwnSource(DataSourceContract):
+    @pytest.fixture
+    def source(self):
+        return Swings()
+
+    @pytest.fixture
+    def again(self):
+        return Swings()
+
+    @pytest.fixture
+    def changed(self):
+        return Swings(rate=np.pi)
