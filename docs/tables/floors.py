@@ -25,7 +25,7 @@ from pinn_dyn.mechanics import Predictor, stack
 
 FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
 _ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.validation=1")
-# Of each data set: the horizon, the step of the roll-outs, the windows, all in s, and what makes it small.
+# Of each data set: horizon, step of the roll-outs and windows, all in s, and what makes it small.
 SETS = {
     "soft_arm_1": (5.0, 0.002, (0.1, 1.0), _ONE),
     "soft_arm_2": (10.0, 0.005, (0.1, 1.0), _ONE),
@@ -72,4 +72,6 @@ if __name__ == "__main__":
         old = pd.read_csv(FILE)
         rows = pd.concat([old[~old["dataset"].isin(names)], rows])
     rows.sort_values("dataset").to_csv(FILE, index=False)
-    print(rows[["dataset", "horizon", "error_mean", "error_std", "diverged"]].to_string(index=False))
+    print(
+        rows[["dataset", "horizon", "error_mean", "error_std", "diverged"]].to_string(index=False)
+    )

@@ -17,8 +17,8 @@ NAMES = {
     "gravity_pd": "PD with true gravity",
     "pd": "PD alone",
 }
-# Of each row of the README: task, model, entry of ours, entry of the best black box, data set of the
-# floor. An entry is one of reproduction.yaml, or a log and its model.
+# Of each row of the README: task, model, entry of ours, of the best black box. An entry is one of
+# reproduction.yaml, or a log and its model.
 SUMMARY = [
     ("one-segment soft arm, 5 s", "hnn", "soft_arm_1/hnn", "soft_arm_1/acceleration_soap"),
     ("", "lnn", "soft_arm_1/lnn_midpoint", "soft_arm_1/acceleration_soap"),
@@ -60,7 +60,12 @@ def summary() -> str:
         mean, best = data["error_mean"].mean(), other["error_mean"].mean()
         paper = entries.get(ours, {}).get("paper", "–")
         experiment = entries[ours]["train"][0] if ours in entries else f"experiment=logs/{ours}"
-        cells = [task, f"`{model}`", paper, f"{bold(number(mean), mean < best)}{lost(data)}"]
+        cells = [
+            task,
+            f"`{model}`",
+            paper,
+            f"{bold(number(mean), mean < best and not lost(data))}{lost(data)}",
+        ]
         cells += [bold(number(best), best < mean), number(floor[ours.split("/")[0]])]
         rows.append([*cells, f"`{experiment}`"])
     head = ["task", "model", "paper", "ours", "best black box", "keeps its velocity"]
@@ -121,7 +126,7 @@ def neck() -> str:
         pairs = [*zip(*(runs[c] for c in WINDOWS[:2]), strict=True)]
         pairs.append(tuple(runs[WINDOWS[:2]].mean()))
         cells = [f"{a:.5f}, {b:.5f}" for a, b in pairs]
-        rows.append([f"`{model}`", substeps, *cells[:-1], f"**{cells[-1]}**"])
+        rows.append([f"`{model}`", substeps, *cells])
     head = ["model", "substeps", *(f"`dataset.seed={k}`" for k in range(3)), "mean"]
     return table(head, rows)
 
@@ -160,12 +165,10 @@ def regulation() -> str:
     ]
     rows = []
     for name, gains, row in found:
-        mean, worst = (
-            row[f"step_error_after_1_s_{c}_percent"] for c in ("mean", "worst")
-        )
+        mean, worst = (row[f"step_error_after_1_s_{c}_percent"] for c in ("mean", "worst"))
         settled = row["settling_time_worst_s"]
-        rows.append([name, gains, f"{mean:.2g} %", f"{worst:.2g} %"])
-        rows[-1] += [f"{row['overshoot_worst_percent']:.2g} %", f"{row['input_peak']:.0f}"]
+        rows.append([name, gains, f"{number(mean)} %", f"{number(worst)} %"])
+        rows[-1] += [f"{number(row['overshoot_worst_percent'])} %", f"{row['input_peak']:.0f}"]
         rows[-1].append("never" if settled == float("inf") else f"{settled:.2f} s")
     head = ["law on", "K_P / K_D", "step error, mean", "worst", "overshoot, worst", "largest input"]
     return table([*head, "settled within 2 %, worst"], rows)
@@ -177,17 +180,12 @@ def tracking() -> str:
     data = [_controlled("panda", run) for run in runs]
     rows = []
     for controller, name in NAMES.items():
-        cells = [
-            f"{_milli(run.loc[controller, 'rms_error'])}, {_milli(run.loc[controller, 'max_error'])}"
-            for run in data
-        ]
-        rows.append([name, *cells])
+        errors = [run.loc[controller, ["rms_error", "max_error"]] for run in data]
+        rows.append(
+            [name, *(f"{number(1000 * rms)}, {number(1000 * most)}" for rms, most in errors)]
+        )
     head = ["law", "sines", "helix", "sines, arm 20 % heavier", "helix, arm 20 % heavier"]
     return table(head, rows)
-
-
-def _milli(value: float) -> str:
-    return f"{1000 * value:.2g}"
 
 
 TABLES = {

@@ -1,4 +1,4 @@
-"""Whether what a command line names exists: scripts, targets, extras, and every choice of Hydra's."""
+"""Whether what a command line names exists: scripts, targets, extras, choices of Hydra's."""
 
 import importlib.metadata
 import importlib.util

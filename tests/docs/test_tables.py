@@ -1,4 +1,4 @@
-"""Tables of the pages: made of results/, every figure in its place, nothing kept that no page reads."""
+"""Tables of the pages: made of results/, each in its place; no result is kept that none reads."""
 
 import re
 
