@@ -177,6 +177,7 @@ def regulation() -> str:
 def tracking() -> str:
     """Sines and a helix of the Panda in PyBullet: RMS and largest errors, in mrad."""
     runs = ["tracking", "helix", "tracking_heavier", "helix_heavier"]
+    runs += ["tracking_payload", "tracking_other_inertia"]
     data = [_controlled("panda", run) for run in runs]
     rows = []
     for controller, name in NAMES.items():
@@ -184,8 +185,8 @@ def tracking() -> str:
         rows.append(
             [name, *(f"{number(1000 * rms)}, {number(1000 * most)}" for rms, most in errors)]
         )
-    head = ["law", "sines", "helix", "sines, arm 20 % heavier", "helix, arm 20 % heavier"]
-    return table(head, rows)
+    head = ["law", "sines", "helix", "sines, 20 % heavier", "helix, 20 % heavier"]
+    return table([*head, "sines, 1 kg in the hand", "sines, other inertias"], rows)
 
 
 TABLES = {

@@ -38,7 +38,7 @@ def test_the_best_of_a_log_is_bold_unless_the_floor_is_better():
     rows = [line.split(" | ") for line in results.logs().strip().splitlines()[2:]]
     log = ""
     for cells in rows:
-        log = re.sub(r"\W|rad", "", cells[0]) or log
+        log = next(iter(re.findall(r"`(\w+)`", cells[0])), log)
         bold = [index for index, cell in enumerate(cells[2:]) if "**" in cell]
         if "velocity" in cells[1]:
             wins = results.floors().loc[log, results.WINDOWS].to_numpy()
