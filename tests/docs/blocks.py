@@ -13,6 +13,8 @@ PAGES = [
     ROOT / "benchmarks" / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
+# The pages that run from start to end, in the order of their blocks: test_played_pages.py.
+PLAYED = ("docs/tutorial.md", "docs/your_log.md", "docs/your_robot.md")
 
 _FENCE = re.compile(r"^( *)(`{3,})([\w+-]*)(.*)$")
 _TITLE = re.compile(r'title="([^"]+)"')

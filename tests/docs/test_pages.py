@@ -10,7 +10,20 @@ import yaml
 from pinn_dyn.app.config import CONF
 from tests.docs.blocks import ROOT
 
+DIARY = r"(?i)\b(asked|missed|met|allowed|private (script|loop|code)|(an)?other job|busy machine)\b"
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], ids=lambda page: page.name
+)
+def test_a_page_speaks_to_its_reader_not_of_its_making(page):
+    found = [line for line in page.read_text().splitlines() if re.search(DIARY, line)]
+    assert not found, "what was tried goes into studies/"
+
+
+def test_the_readme_is_a_front_door():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
 
 
 def definitions(path):

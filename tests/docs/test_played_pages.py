@@ -9,10 +9,10 @@ import matplotlib
 import pytest
 
 from tests.app.entry import NO_FIGURES, ROOT, TINY_DATA, TINY_TRAINING, run_script
-from tests.docs.blocks import blocks
+from tests.docs.blocks import PLAYED, blocks
 
 # What makes each page small: added to the commands of train.py.
-PLAYED = {
+SMALL_DATA = {
     "docs/tutorial.md": [*TINY_DATA, "data.stride=5"],
     "docs/your_log.md": [],
     "docs/your_robot.md": [
@@ -66,7 +66,7 @@ def test_a_page_runs_from_start_to_end(name, tmp_path, monkeypatch):
 
 def play(name, words):
     script, *overrides = words
-    small = [*(PLAYED[name] if script == "train.py" else []), *SMALL[script]]
+    small = [*(SMALL_DATA[name] if script == "train.py" else []), *SMALL[script]]
     if Path("my_conf").is_dir() and not any("--config-dir" in word for word in overrides):
         small.append("--config-dir=my_conf")
     run_script(script, *overrides, *small, checked=True)

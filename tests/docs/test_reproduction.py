@@ -1,6 +1,5 @@
-"""docs/reproduction.md: its tables are those of results/, the paper's errors the paper's."""
+"""results/reproduction.yaml: the paper's errors are the paper's, and what it names exists."""
 
-import importlib.util
 import re
 
 import pytest
@@ -11,8 +10,7 @@ from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.mechanics import Terms
 from pinn_dyn.systems import SoftArm
 from reproduce import ENTRIES, read_entries
-from tests.docs.blocks import ROOT
-from tests.docs.test_code_blocks import check_python
+from tests.docs.commands import check_python
 
 Q = {"strongly_bent": [1.2, -0.2, 0.15], "bent": [0.8, 0.2, 0.3]}
 # The matrices that the paper prints.
@@ -69,27 +67,6 @@ def test_the_papers_errors_follow_from_the_matrices_that_it_prints(model, config
         reference = learned[term] if model == "lnn" else near
         error = 100 * (learned[term] - near).norm() / reference.norm()
         assert float(error) == pytest.approx(expected, abs=0.051), term
-
-
-def tables():
-    path = ROOT / "docs" / "reproduction_tables.py"
-    spec = importlib.util.spec_from_file_location("reproduction_tables", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_page_is_made_of_the_results():
-    page = (ROOT / "docs" / "reproduction.md").read_text()
-    assert tables().filled(page) == page, "run: python docs/reproduction_tables.py"
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.00181, "0.0018"), (0.0996, "0.100"), (0.797, "0.80"), (2.8, "2.8"), (44.7, "45")],
-)
-def test_numbers_have_two_digits(value, text):
-    assert tables().number(value) == text
 
 
 def test_the_entries_name_experiments_and_options_that_exist(tmp_path):

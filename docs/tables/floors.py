@@ -1,0 +1,77 @@
+"""The floor under every table: the error of a prediction that keeps its velocity, q + v t.
+
+    python -m docs.tables.floors                every test set, into results/floors.csv
+    python -m docs.tables.floors soft_arm_1     some of them
+
+The logs of real robots are looked for in the folder PINN_DYN_LOGS. Only the test trajectories are
+simulated: they are drawn apart from those of training, so their number does not matter.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import hydra
+import pandas as pd
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from pinn_dyn.app.build import build_source
+from pinn_dyn.app.config import CONF
+from pinn_dyn.evaluation import predict_trajectories, predict_windows, rollout_metrics
+from pinn_dyn.mechanics import Predictor, stack
+
+FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
+_ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.validation=1")
+# Of each data set: horizon, step of the roll-outs and windows, all in s, and what makes it small.
+SETS = {
+    "soft_arm_1": (5.0, 0.002, (0.1, 1.0), _ONE),
+    "soft_arm_2": (10.0, 0.005, (0.1, 1.0), _ONE),
+    "panda": (2.0, 0.01, (0.05, 0.5), ("dataset.train=1", "dataset.validation=1")),
+    "double_pendulum": (2.0, 0.01, (0.1, 1.0), ()),
+    "panda_gaz": (3.0, 0.01, (0.1, 1.0), ()),
+    "soft_neck": (11.0, 0.1, (0.1, 1.0), ()),
+    "trunk": (10.0, 0.1, (0.1, 1.0), ()),
+}
+
+
+class KeepsVelocity(Predictor):
+    """q(t) = q(0) + v(0) t."""
+
+    def increments(self, x0: Tensor, t: Tensor, u: Tensor, **_: object) -> Tensor:
+        v = x0[..., None, self.num_coordinates :]
+        return torch.cat([v * (t - t[0])[:, None], torch.zeros_like(v * t[:, None])], dim=-1)
+
+
+def floor(name: str) -> dict[str, object]:
+    """Errors of q + v t on the test trajectories of one data set, as evaluate.py counts them."""
+    horizon, step, windows, small = SETS[name]
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        cfg = hydra.compose("train", overrides=[f"dataset={name}", *small])
+    dataset = OmegaConf.to_container(cfg.dataset, resolve=True)
+    truth = stack(build_source({"dataset": dataset}).load().test).until(horizon)
+    model = KeepsVelocity(truth.q.shape[-1], truth.u.shape[-1], "velocity")
+    whole = predict_trajectories(model, truth, step=step)
+    figures = rollout_metrics(whole.q_hat, whole.q, whole.t, thresholds={})
+    row = {"dataset": name, "step": step, **figures.to_dict()}
+    for window in windows:
+        part = predict_windows(model, truth, window=window, step=step)
+        error = rollout_metrics(part.q_hat, part.q, part.t, thresholds={}).error_mean
+        row[f"window_{window:g}s_error_mean"] = error
+    return row
+
+
+if __name__ == "__main__":
+    names = sys.argv[1:] or list(SETS)
+    if unknown := set(names) - set(SETS):
+        raise SystemExit(f"no data set {', '.join(unknown)}: expected some of {', '.join(SETS)}")
+    rows = pd.DataFrame([floor(name) for name in names])
+    if FILE.exists():
+        old = pd.read_csv(FILE)
+        rows = pd.concat([old[~old["dataset"].isin(names)], rows])
+    rows.sort_values("dataset").to_csv(FILE, index=False)
+    print(
+        rows[["dataset", "horizon", "error_mean", "error_std", "diverged"]].to_string(index=False)
+    )

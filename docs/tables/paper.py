@@ -1,0 +1,150 @@
+"""Tables of docs/reproduction.md: the paper's figures beside those of results/reproduction.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import yaml
+
+from docs.tables.text import commands, number, table
+from reproduce import ENTRIES, ROOT, Entry, read_entries, recorded, training_seconds
+
+FIGURE = ROOT / "docs" / "figures" / "sample_efficiency.png"
+
+
+def tables() -> dict[str, str]:
+    """Every table of the page, by the name of its place."""
+    return {
+        **{name: prediction_table(name) for name in ("soft_arm_1", "soft_arm_2", "panda")},
+        **{f"{name}_commands": train_commands(name) for name in ("soft_arm_1", "soft_arm_2")},
+        "panda_commands": train_commands("panda"),
+        "hardware": hardware_table(),
+        "control": control_table(),
+        "terms": terms_table(),
+        "sample_efficiency": sample_efficiency_table(),
+        "hardware_used": "\n" + yaml.safe_load(ENTRIES.read_text())["hardware"] + ".\n",
+    }
+
+
+def entries_of(group: str) -> dict[str, Entry]:
+    """The entries of one table, by the rest of their names."""
+    return {
+        name.removeprefix(f"{group}/"): entry
+        for name, entry in read_entries().items()
+        if name.startswith(f"{group}/")
+    }
+
+
+def prediction_table(group: str) -> str:
+    """Prediction errors, a row for each entry: means over the seeds."""
+    head = ["model", "paper", "ours: mean norm ± std", "squared norm, mean ± variance"]
+    head += ["each seed", "pairs (paper)", "training, s"]
+    rows = []
+    for name, entry in entries_of(group).items():
+        data = recorded(entry)
+        mean = data.mean(numeric_only=True)
+        took = training_seconds(data)
+        pairs = f" ({entry['pairs']:,})" if "pairs" in entry else ""
+        rows.append(
+            [
+                name,
+                entry.get("paper", "–"),
+                f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
+                f"{mean['squared_error_mean']:.1e} ± {mean['squared_error_variance']:.1e}",
+                " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
+                f"{data['pairs'].iloc[0]:,}{pairs}",
+                f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
+            ]
+        )
+    return table(head, rows)
+
+
+def lost(data: pd.DataFrame) -> str:
+    """How many roll-outs diverged, if any did."""
+    diverged = int(data["diverged"].sum())
+    return f", {diverged} of {int(data['trajectories'].sum())} diverged" if diverged else ""
+
+
+def train_commands(group: str) -> str:
+    """What trains the rows of a table, in their order."""
+    lines = [" ".join(["python train.py -m", *e["train"]]) for e in entries_of(group).values()]
+    return commands(lines)
+
+
+def hardware_table() -> str:
+    """What the paper measured on robots whose logs are not published."""
+    rows = [
+        [name, entry["paper"], f"{entry['pairs']:,}", entry["missing"]]
+        for name, entry in entries_of("hardware").items()
+    ]
+    return table(["log, model", "paper", "pairs (paper)", "with such a log"], rows)
+
+
+def control_table() -> str:
+    """Closed loops: the law on learned terms, the same law on the truth, PD alone."""
+    rows = []
+    for name, entry in entries_of("control").items():
+        found = []
+        for law in ("learned", "truth", "pd"):
+            data = recorded({**entry, "select": {"controller": law}})[entry["metric"]]
+            found.append(f"{data.mean():.2g} {entry['unit']}")
+        seeds = str(len(recorded(entry)))
+        rows.append([f"`{name}`", entry["paper"], f"**{found[0]}**", *found[1:], seeds])
+        rows[-1].append(f"`{' '.join(entry['control'])}`")
+    head = ["task", "paper", "ours, on learned terms", "on the truth", "PD alone", "seeds"]
+    return table([*head, "`control.py`"], rows)
+
+
+def terms_table() -> str:
+    """Relative errors of the learned terms, mean over the seeds, beside the paper's."""
+    rows = []
+    for model, entry in yaml.safe_load(ENTRIES.read_text())["terms"].items():
+        data = pd.concat([pd.read_csv(path) for path in sorted(ROOT.glob(entry["results"]))])
+        means = data.groupby(["configuration", "term"])[entry["column"]].mean()
+        for configuration, printed in entry["paper"].items():
+            cells = [
+                f"{100 * means[configuration, term]:.1f} ({theirs:.1f})"
+                for term, theirs in zip(entry["terms"], printed, strict=True)
+            ]
+            inverse = entry["terms"][0] == "M_inverse"
+            cells = ["", cells[0], *cells[1:]] if inverse else [cells[0], "", *cells[1:]]
+            rows.append([f"`{model}`", f"`{configuration}`", *cells])
+    return table(["model", "configuration", "M", "M⁻¹", "D", "G", "A"], rows)
+
+
+def sample_efficiency() -> pd.DataFrame:
+    return recorded(read_entries()["study/sample_efficiency"])
+
+
+def sample_efficiency_table() -> str:
+    """Errors against pairs: mean ± standard deviation, and the worst trajectory."""
+    data = sample_efficiency()
+    sizes = sorted(data["pairs"].unique())
+    rows = []
+    for model, runs in data.groupby("model", sort=False):
+        by_size = runs.set_index("pairs")
+        took = training_seconds(runs)
+        cells = [_errors(by_size.loc[size]) if size in by_size.index else "–" for size in sizes]
+        rows.append([f"`{model}`", *cells, f"{took.min():.0f}–{took.max():.0f}"])
+    return table(["model", *(f"{size:,} pairs" for size in sizes), "training, s"], rows)
+
+
+def _errors(row: pd.Series) -> str:
+    mean, std, worst = (number(row[f"error_{name}"]) for name in ("mean", "std", "worst"))
+    return f"**{mean}** ± {std}, {worst}"
+
+
+def draw(path: Path) -> None:
+    """The error against the pairs, a line for each model."""
+    from pinn_dyn.evaluation import save
+    from pinn_dyn.evaluation.sweep_figures import sweep_figure
+
+    names = {"pairs": "training pairs", "error_mean": "mean error over 5 s, unseen trajectories"}
+    runs = sample_efficiency().rename(columns=names)
+    figure = sweep_figure(runs, x=names["pairs"], lines=["model"], y=names["error_mean"])
+    (ax,) = figure.axes
+    title = "one-segment soft arm, 4,000 training steps each, seed 0"
+    ax.set_title(title, loc="right", fontsize="small")  # in the place of the other one
+    ax.set_yscale("log")
+    save(figure, path)

@@ -1,0 +1,202 @@
+"""Tables of README.md, docs/results.md and docs/control.md, made of the CSV files in results/."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from docs.tables.paper import lost
+from docs.tables.text import bold, number, table
+from reproduce import ROOT, read_entries, recorded
+
+RESULTS = ROOT / "results"
+NAMES = {
+    "learned": "the paper's law on learned terms",
+    "learned_observer": "the same with the observer",
+    "truth": "the paper's law on the truth",
+    "computed_torque": "computed torque on the truth",
+    "gravity_pd": "PD with true gravity",
+    "pd": "PD alone",
+}
+# Of each row of the README: task, model, entry of ours, of the best black box. An entry is one of
+# reproduction.yaml, or a log and its model.
+SUMMARY = [
+    ("one-segment soft arm, 5 s", "hnn", "soft_arm_1/hnn", "soft_arm_1/acceleration_soap"),
+    ("", "lnn", "soft_arm_1/lnn_midpoint", "soft_arm_1/acceleration_soap"),
+    ("two-segment soft arm, 10 s", "lnn", "soft_arm_2/lnn_1000hz_wide", "soft_arm_2/mlp_100hz"),
+    ("Panda in PyBullet, 2 s", "lnn", "panda/lnn", "panda/mlp"),
+    ("double pendulum, real, 2 s", "lnn", "double_pendulum/lnn", "double_pendulum/acceleration"),
+    ("tendon-driven trunk, real, 10 s", "lnn", "trunk/lnn", "trunk/mlp"),
+]
+LOGS = {"double_pendulum": "rad", "panda_gaz": "rad", "soft_neck": "rad", "trunk": "m"}
+WINDOWS = ["window_0.1s_error_mean", "window_1s_error_mean", "error_mean"]
+
+
+def floors() -> pd.DataFrame:
+    """Errors of q + v t, a row for each data set."""
+    return pd.read_csv(RESULTS / "floors.csv").set_index("dataset")
+
+
+def read_log(name: str) -> pd.DataFrame:
+    """The evaluations of one log."""
+    files = sorted(RESULTS.glob(f"logs/{name}/summary.csv"))
+    files += sorted(RESULTS.glob(f"logs/{name}_mlp/summary.csv"))
+    return pd.concat([pd.read_csv(path) for path in files])
+
+
+def rows_of(entry: str) -> pd.DataFrame:
+    dataset, model = entry.split("/")
+    if dataset in LOGS:
+        data = read_log(dataset)
+        return data[data["model"] == model]
+    return recorded(read_entries()[entry])
+
+
+def summary() -> str:
+    """The table of the README: the paper, ours, the best black box and the floor."""
+    entries, floor = read_entries(), floors()["error_mean"]
+    rows = []
+    for task, model, ours, rival in SUMMARY:
+        data, other = rows_of(ours), rows_of(rival)
+        mean, best = data["error_mean"].mean(), other["error_mean"].mean()
+        paper = entries.get(ours, {}).get("paper", "–")
+        experiment = entries[ours]["train"][0] if ours in entries else f"experiment=logs/{ours}"
+        cells = [
+            task,
+            f"`{model}`",
+            paper,
+            f"{bold(number(mean), mean < best and not lost(data))}{lost(data)}",
+        ]
+        cells += [bold(number(best), best < mean), number(floor[ours.split("/")[0]])]
+        rows.append([*cells, f"`{experiment}`"])
+    head = ["task", "model", "paper", "ours", "best black box", "keeps its velocity"]
+    return table([*head, "trained by"], rows)
+
+
+def panda() -> str:
+    """The Panda in PyBullet over windows of three lengths."""
+    data = pd.read_csv(RESULTS / "panda" / "summary.csv")
+    floor = floors().loc["panda"]
+    columns = ["window_0.05s_error_mean", "window_0.5s_error_mean", "error_mean", "error_median"]
+    rows = []
+    for _, row in data.iterrows():
+        cells = [bold(number(row[c]), row[c] == data[c].min()) for c in columns]
+        diverged = f"{row['diverged']} of {row['trajectories']}"
+        rows.append([f"`{row['model']}`", f"{row['pairs']:,}", *cells, diverged])
+    rows.append(["keeps its velocity", "–", *(number(floor[c]) for c in columns), "0 of 20"])
+    head = ["model", "pairs", "0.05 s windows", "0.5 s windows", "2 s", "2 s, median", "diverged"]
+    return table(head, rows)
+
+
+def logs() -> str:
+    """The logs of real robots: means over the seeds, with the smallest and the largest."""
+    rows = []
+    for name, unit in LOGS.items():
+        data, floor = read_log(name), floors().loc[name]
+        means = data.groupby("model")[WINDOWS].mean()
+        for index, model in enumerate(("lnn", "acceleration", "mlp")):
+            runs = data[data["model"] == model]
+            cells = []
+            for column in WINDOWS:
+                mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
+                best = mean == means[column].min() and mean < floor[column]
+                cells.append(f"{bold(_precise(mean), best)} ({_precise(low)}–{_precise(high)})")
+            rows.append([f"`{name}`, {unit}" if index == 0 else "", f"`{model}`", *cells])
+        rows.append(["", "keeps its velocity", *(_floor(floor[c], means[c]) for c in WINDOWS)])
+    return table(["log", "model", "0.1 s windows", "1 s windows", "open loop"], rows)
+
+
+def _precise(value: float) -> str:
+    """Three digits, as the models of a log are close to each other."""
+    return f"{value:#.3g}"
+
+
+def _floor(value: float, models: pd.Series) -> str:
+    return bold(_precise(value), value < models.min())
+
+
+def neck() -> str:
+    """Ensembles of five on three draws of the neck's runs: errors after 0.1 s and 1 s."""
+    files = [RESULTS / "logs" / f"soft_neck_ensembles_draw{k}" / "summary.csv" for k in range(3)]
+    draws = [pd.read_csv(path).assign(draw=k) for k, path in enumerate(files)]
+    data = pd.concat(draws)
+    data["substeps"] = data["run"].str.extract(r"_(\d)$")[0].fillna("–")
+    rows = []
+    for (model, substeps), runs in data.groupby(["model", "substeps"], sort=False):
+        runs = runs.sort_values("draw")
+        pairs = [*zip(*(runs[c] for c in WINDOWS[:2]), strict=True)]
+        pairs.append(tuple(runs[WINDOWS[:2]].mean()))
+        cells = [f"{a:.5f}, {b:.5f}" for a, b in pairs]
+        rows.append([f"`{model}`", substeps, *cells])
+    head = ["model", "substeps", *(f"`dataset.seed={k}`" for k in range(3)), "mean"]
+    return table(head, rows)
+
+
+def long_rollout() -> str:
+    """50,000 steps of the one-segment arm."""
+    data = pd.read_csv(RESULTS / "soft_arm_1" / "long_rollout.csv")
+    columns = ["error_first_half", "error_second_half", "error_worst"]
+    rows = []
+    for _, row in data.iterrows():
+        mean = f"{number(row['error_mean'])} ± {number(row['error_std'])}"
+        rows.append([f"`{row['model']}`", mean, *(number(row[c]) for c in columns)])
+    return table(["model", "mean ± std", "first 5 s", "last 5 s", "worst trajectory"], rows)
+
+
+def _controlled(robot: str, run: str) -> pd.DataFrame:
+    path = RESULTS / "control" / robot / run / "summary.csv"
+    return pd.read_csv(path).set_index("controller")
+
+
+def regulation() -> str:
+    """Set points of the two-segment arm."""
+    nominal = [_controlled("soft_arm_2", f"regulation_seed{seed}") for seed in range(3)]
+    soft = _controlled("soft_arm_2", "regulation_paper_gains")
+    heavier = _controlled("soft_arm_2", "regulation_heavier")
+    found = [
+        *(
+            (f"learned terms, seed {k}", "200 / 20", run.loc["learned"])
+            for k, run in enumerate(nominal)
+        ),
+        ("true terms", "200 / 20", nominal[0].loc["truth"]),
+        ("PD alone", "200 / 20", nominal[0].loc["pd"]),
+        ("learned, the arm 20 % heavier", "200 / 20", heavier.loc["learned"]),
+        ("true terms of the lighter arm, the same", "200 / 20", heavier.loc["truth"]),
+        ("learned terms, the paper's gains", "10 / 50", soft.loc["learned"]),
+    ]
+    rows = []
+    for name, gains, row in found:
+        mean, worst = (row[f"step_error_after_1_s_{c}_percent"] for c in ("mean", "worst"))
+        settled = row["settling_time_worst_s"]
+        rows.append([name, gains, f"{number(mean)} %", f"{number(worst)} %"])
+        rows[-1] += [f"{number(row['overshoot_worst_percent'])} %", f"{row['input_peak']:.0f}"]
+        rows[-1].append("never" if settled == float("inf") else f"{settled:.2f} s")
+    head = ["law on", "K_P / K_D", "step error, mean", "worst", "overshoot, worst", "largest input"]
+    return table([*head, "settled within 2 %, worst"], rows)
+
+
+def tracking() -> str:
+    """Sines and a helix of the Panda in PyBullet: RMS and largest errors, in mrad."""
+    runs = ["tracking", "helix", "tracking_heavier", "helix_heavier"]
+    runs += ["tracking_payload", "tracking_other_inertia"]
+    data = [_controlled("panda", run) for run in runs]
+    rows = []
+    for controller, name in NAMES.items():
+        errors = [run.loc[controller, ["rms_error", "max_error"]] for run in data]
+        rows.append(
+            [name, *(f"{number(1000 * rms)}, {number(1000 * most)}" for rms, most in errors)]
+        )
+    head = ["law", "sines", "helix", "sines, 20 % heavier", "helix, 20 % heavier"]
+    return table([*head, "sines, 1 kg in the hand", "sines, other inertias"], rows)
+
+
+TABLES = {
+    "README.md": lambda: {"summary": summary()},
+    "docs/results.md": lambda: {
+        "summary": summary(),
+        "panda": panda(),
+        "logs": logs(),
+        "neck": neck(),
+        "long_rollout": long_rollout(),
+    },
+    "docs/control.md": lambda: {"regulation": regulation(), "tracking": tracking()},
+}
