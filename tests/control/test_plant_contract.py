@@ -1,0 +1,26 @@
+"""Every plant meets the contract."""
+
+import pytest
+
+from pinn_dyn.control.plants import BulletPlant, SystemPlant
+from pinn_dyn.systems import SoftArm
+from tests.contracts.plant import PlantContract
+from tests.support.linear import damped_oscillators
+
+
+class TestSystemPlant(PlantContract):
+    @pytest.fixture(params=[damped_oscillators, SoftArm], ids=["oscillators", "soft arm"])
+    def plant(self, request):
+        return SystemPlant(request.param())
+
+
+@pytest.mark.panda
+class TestBulletPlant(PlantContract):
+    @pytest.fixture(scope="class")
+    def plant(self):
+        pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+        from pinn_dyn.systems import BulletArm
+
+        fingers = ("panda_finger_joint1", "panda_finger_joint2")
+        arm = BulletArm("franka_panda/panda.urdf", locked_joints=fingers, damping=0.5)
+        return BulletPlant(arm, step=0.001)

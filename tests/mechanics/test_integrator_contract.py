@@ -1,0 +1,12 @@
+"""Every integrator meets the contract."""
+
+import pytest
+
+from pinn_dyn.mechanics import RK4, Rosenbrock
+from tests.contracts.integrator import IntegratorContract
+
+
+class TestIntegrators(IntegratorContract):
+    @pytest.fixture(params=[RK4, Rosenbrock], ids=lambda kind: kind.__name__)
+    def kind(self, request):
+        return request.param

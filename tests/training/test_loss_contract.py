@@ -1,0 +1,20 @@
+"""Every loss meets the contract."""
+
+from functools import partial
+
+import pytest
+
+from pinn_dyn.training import IncrementLoss, MidpointLoss
+from tests.contracts.loss import WindowLossContract
+
+LOSSES = {
+    "increment": IncrementLoss,
+    "increment, huber": partial(IncrementLoss, huber=0.3),
+    "midpoint": MidpointLoss,
+}
+
+
+class TestLosses(WindowLossContract):
+    @pytest.fixture(params=LOSSES.values(), ids=LOSSES)
+    def make(self, request):
+        return request.param
