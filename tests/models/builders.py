@@ -101,6 +101,7 @@ def make_structured(
     angles=(),
     statistics=None,
     integrator="rk4",
+    coordinates=None,
     dtype=torch.float64,
 ):
     """A Lagrangian or Hamiltonian network; a head that is left out is a small network."""
@@ -119,7 +120,8 @@ def make_structured(
         start = initial_velocity or MeasuredVelocity
         model = LagrangianNetwork(statistics, mass, initial_velocity=start, **heads)
     else:
-        model = HamiltonianNetwork(statistics, mass, **heads)
+        state = coordinates or "momentum"
+        model = HamiltonianNetwork(statistics, mass, coordinates=state, **heads)
     return perturb(model.to(dtype))
 
 
