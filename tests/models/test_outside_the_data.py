@@ -24,25 +24,18 @@ MASSES = {
 }
 CASES = {
     **{
-        f"{kind} {state} {name}": (kind, state, mass, ())
+        f"{kind} {state} {name}": (kind, state, mass)
         for kind, state in (("lnn", "velocity"), ("hnn", "momentum"), ("hnn", "velocity"))
         for name, mass in MASSES.items()
     },
     "lnn velocity transposed": (
-        "lnn", "velocity", partial(NetworkCholesky, hidden=[6], transposed=True), ()
+        "lnn", "velocity", partial(NetworkCholesky, hidden=[6], transposed=True),
     ),
-    "lnn velocity one angle": ("lnn", "velocity", MASSES["network"], (0,)),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES)
-class TestOutsideTheData(OutsideTheDataContract):
-    @pytest.fixture
-    def system(self, case):
-        kind, state, mass, angles = CASES[case]
-        return make_structured(
-            kind, N, 1, mass=mass, friction=CoulombFriction, angles=angles, coordinates=state
-        )
+class MechanicalNetwork(OutsideTheDataContract):
+    """The ranges of the builders' data."""
 
     @pytest.fixture
     def ranges(self, system):
@@ -51,3 +44,19 @@ class TestOutsideTheData(OutsideTheDataContract):
         return torch.stack(
             [torch.cat([data.q_low, -3 * second]), torch.cat([data.q_high, 3 * second])]
         )
+
+
+@pytest.mark.parametrize("case", CASES)
+class TestOutsideTheData(MechanicalNetwork):
+    @pytest.fixture
+    def system(self, case):
+        kind, state, mass = CASES[case]
+        return make_structured(kind, N, 1, mass=mass, friction=CoulombFriction, coordinates=state)
+
+
+class TestWithAnAngle(MechanicalNetwork):
+    duration = 5.0  # it turns several times a second
+
+    @pytest.fixture
+    def system(self):
+        return make_structured("lnn", N, 1, friction=CoulombFriction, angles=[0])
