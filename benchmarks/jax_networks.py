@@ -75,7 +75,7 @@ class Network:
         # vec(L) = y S with the scales in S; as a product it is faster than a scatter.
         self.mass_places = _array(mass.placement)
         self.damping_places = _array(damping.placement)
-        self.mass_epsilon, self.damping_epsilon = mass.epsilon, damping.epsilon
+        self.mass_epsilon, self.damping_epsilon = mass.positivity.floor, damping.positivity.floor
         self.potential_scale = _array(model.potential.scale)
         self.input_scale = _array(model.input.scale)
 

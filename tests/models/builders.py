@@ -101,6 +101,7 @@ def make_structured(
     angles=(),
     statistics=None,
     integrator=None,
+    state=None,
     dtype=torch.float64,
 ):
     """A Lagrangian or Hamiltonian network; a head that is left out is a small network."""
@@ -119,7 +120,7 @@ def make_structured(
         start = initial_velocity or MeasuredVelocity
         model = LagrangianNetwork(statistics, mass, initial_velocity=start, **heads)
     else:
-        model = HamiltonianNetwork(statistics, mass, **heads)
+        model = HamiltonianNetwork(statistics, mass, state=state or "qp", **heads)
     return perturb(model.to(dtype))
 
 

@@ -6,16 +6,17 @@ import torch.nn.functional as F
 
 from pinn_dyn.models import MLP
 from tests.models.builders import perturb
-from tests.support.finite_differences import assert_near
+from tests.support.finite_differences import assert_near, slope
 
+LIMITS = torch.tensor([[-0.5, -1.0, -3.0], [1.0, 0.4, 2.0]])
 PLAIN = {"softplus": F.softplus, "tanh": torch.tanh, "silu": F.silu}
 
 
-def make_mlp(activation, hidden=(5, 4), normalized=True):
+def make_mlp(activation, hidden=(5, 4), normalized=True, limits=None, angles=()):
     torch.manual_seed(1)
     mean = torch.tensor([0.5, -0.3, 0.2]) if normalized else None
     std = torch.tensor([0.7, 1.4, 2.0]) if normalized else None
-    return perturb(MLP(3, 2, hidden, activation, mean, std).double())
+    return perturb(MLP(3, 2, hidden, activation, mean, std, angles, limits=limits).double())
 
 
 @pytest.fixture(params=list(PLAIN))
@@ -91,6 +92,36 @@ def test_tangent_and_reverse_pass_are_adjoint(activation):
     _, tape = network.linearize(x)
     left = (network.pushforward(tape, dx) * dy).sum()
     assert_near(left, (network.pullback(tape, dy) * dx).sum(), 1e-12)
+
+
+@pytest.mark.parametrize("angles", [(), (1,)], ids=["lengths", "an angle"])
+def test_the_passes_of_a_limited_network_are_those_of_automatic_differentiation(activation, angles):
+    """At x inside and outside the limits."""
+    network = make_mlp(activation, limits=LIMITS.unbind(), angles=angles)
+    x, dx = 4 * torch.randn(2, 50, 3, dtype=torch.float64)
+    dy = torch.randn(50, 2, dtype=torch.float64)
+    value, tape = network.linearize(x)
+    assert_near(value, network(x), 1e-12)
+    tangent = torch.func.jvp(network, (x,), (dx,))[1]
+    assert_near(network.pushforward(tape, dx), tangent, 1e-12)
+    assert_near(network.linearize_along(x, dx)[1], tangent, 1e-12)
+    assert_near(network.pullback(tape, dy), torch.func.vjp(network, x)[1](dy)[0], 1e-12)
+    second = lambda x: network.pushforward(network.linearize(x)[1], dx)  # noqa: E731
+    expected = slope(lambda e: second(x + e * dx), 1e-4)
+    assert_near(torch.func.jvp(second, (x,), (dx,))[1], expected, 1e-4)
+
+
+def test_limits_change_nothing_within_them_and_bound_all_beyond(activation):
+    limited, plain = make_mlp(activation, limits=LIMITS.unbind()), make_mlp(activation)
+    low, high = LIMITS.double()
+    inside = low + (high - low) * torch.rand(50, 3, dtype=torch.float64)
+    assert torch.equal(limited(inside), plain(inside))
+    assert_near(limited(1e6 * inside), limited(1e4 * inside), 1e-12)
+    # Never more than a standard deviation beyond: there the plain network has the same values.
+    std = torch.tensor([0.7, 1.4, 2.0]).double()
+    outside = torch.where(torch.rand(50, 3) > 0.5, high + 1e4, low - 1e4)
+    corner = torch.where(outside > 0, high + std, low - std)
+    assert_near(limited(outside), plain(corner), 1e-6)
 
 
 def test_without_hidden_layers_it_is_linear():
