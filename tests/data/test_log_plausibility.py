@@ -184,7 +184,9 @@ def test_a_robot_at_rest(tmp_path):
     assert text == "- column 'q1' (q): never moves in the training runs"
     noise = 1e-3 * np.random.default_rng(0).normal(size=(2, 1001))
     text = warned(tmp_path, motion().assign(q1=noise[0], v1=noise[1]))
-    assert text == "- column 'q1' (q): moves no more than its noise in the training runs, 0.001 rad"
+    assert (
+        text == "- column 'q1' (q): moves no more than its noise in the training runs, 0.000997 rad"
+    )
     table = motion(100.0)
     table.loc[500:, ["q1", "q2"]] = table.loc[500, ["q1", "q2"]].to_numpy()
     table.loc[500:, ["v1", "v2"]] = 0.0

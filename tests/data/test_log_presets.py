@@ -34,7 +34,7 @@ def preset(name, *overrides):
     ("name", "train", "validation", "test", "step", "coordinates", "inputs"),
     [
         ("panda_gaz", 1, 1, 1, 0.002, 7, 7),
-        ("double_pendulum", 7, 4, 8, 0.002, 2, 2),
+        ("double_pendulum", 7, 5, 10, 0.002, 2, 2),
         ("soft_neck", 103, 6, 12, 0.02, 2, 6),
         ("trunk", 1, 4, 15, 0.01, 4, 6),
     ],

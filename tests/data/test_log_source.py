@@ -106,6 +106,22 @@ def test_no_row_is_in_two_splits_even_without_a_guard(folder):
     assert [part.split for part in parts] == ["train", "validation", "test"]
 
 
+@pytest.mark.parametrize(
+    ("seconds", "starts"),
+    [(2.0, [0, 50, 100, 150]), (1.99, [0, 50, 99, 149]), (1.98, [0, 50, 100])],
+)
+def test_pieces_share_their_ends_and_one_sample_less_costs_none(tmp_path, seconds, starts):
+    write(tmp_path, motion(), "a.csv")
+    table = motion(seconds, phase=2.0)
+    write(tmp_path, table, "b.csv")
+    splits = source(
+        tmp_path, validation=dict(seconds=1.0, piece=1.0), test=dict(runs=["b"], piece=0.5)
+    ).load()
+    found = [int(np.abs(table["q1"] - float(item.q[0, 0])).argmin()) for item in splits.test]
+    assert found == starts
+    assert all(len(item.t) == 51 for item in splits.test)
+
+
 @pytest.fixture
 def runs(tmp_path):
     for k in range(8):

@@ -32,6 +32,7 @@ from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import SPLITS, Part, split
 from pinn_dyn.data.logs.step import Step, sample_time
+from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
@@ -127,14 +128,8 @@ class LogSource(DataSource):
                 f"v has the SI units {', '.join(self.v.units)}, expected those of q, "
                 f"{', '.join(self.q.units)}, per second, in the same order"
             )
-        for key, columns, expected in (("q", self.q, ("rad", "m", "1")), ("u", self.u, None)):
-            for label, unit in zip(columns.columns, columns.units, strict=True):
-                if unit == "s" or (expected is not None and unit not in expected):
-                    raise LogError(
-                        f"{key} has the column {label!r} in {unit}, expected "
-                        f"{'an angle, a length or 1' if expected else 'no time'}: is it the right "
-                        "column, and its unit?"
-                    )
+        _check_units("q", self.q, ("rad", "m", "1"))
+        _check_units("u", self.u, sorted({unit for unit, _ in UNITS.values()} - {"s"}))
         self.trajectory = trajectory
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self.validation = Part.from_config("validation", validation)
@@ -356,7 +351,10 @@ class LogSource(DataSource):
     def _pieces(
         self, name: str, part: Part, cleaned: list[Cleaned], step: float, report: Report
     ) -> list[Recording]:
-        """Roll-outs of one length; neighbours share the sample between them."""
+        """Roll-outs of one length; neighbours share the sample between them, or two.
+
+        A stretch of T samples that lasts one sample less than n pieces has n of them all the same.
+        """
         stretches = [item for one in cleaned if one.split == name for item in one.clean]
         span = round(part.piece / step)
         if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
@@ -367,7 +365,7 @@ class LogSource(DataSource):
         pieces = [
             item.rows(slice(first, first + span + 1))
             for item in stretches
-            for first in range(0, len(item) - span, span)
+            for first in _starts(len(item), span)
         ]
         if not pieces:
             longest = max(item.duration for item in stretches)
@@ -391,6 +389,25 @@ class LogSource(DataSource):
         )
         t = torch.arange(len(recording), dtype=torch.float64) * step
         return Trajectory(q, v, Signal(t, u, self.interpolation))
+
+
+def _check_units(name: str, columns: Columns, expected: Sequence[str]) -> None:
+    for label, unit in zip(columns.columns, columns.units, strict=True):
+        if unit not in expected:
+            raise LogError(
+                f"{name} has the column {label!r} in {unit}, expected {', '.join(expected)}: is it "
+                "the right column, and its unit?"
+            )
+
+
+def _starts(samples: int, span: int) -> list[int]:
+    """First samples of the pieces of ``span`` + 1 samples that a stretch is cut into."""
+    number = samples // span
+    if number * span < samples:
+        return [k * span for k in range(number)]
+    # One sample is missing for as many: two neighbours overlap by it.
+    last = samples - 1 - span
+    return [round(k * last / (number - 1)) for k in range(number)] if number > 1 < span else []
 
 
 def _summary(recordings: list[Recording], step: float) -> str:
