@@ -41,7 +41,7 @@ def test_a_terminated_training_ends_with_a_status_and_can_go_on(tmp_path, sweep)
     log = tmp_path / "log.txt"
     last = folder / "checkpoints" / "last.ckpt"
     with log.open("w") as output:
-        length = ["trainer.steps=500000", "trainer.validations=1000", "model=lnn"]
+        length = ["trainer.steps=50000", "trainer.validations=1000", "compile=false", "model=lnn"]
         words = [*TINY, *length, NO_FIGURES, *where]
         process = start_process("train.py", *words, folder=tmp_path, output=output)
         try:
