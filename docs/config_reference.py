@@ -8,6 +8,7 @@ what the constructor's docstring and the comment beside the key say about it.
 
 from __future__ import annotations
 
+import inspect
 import logging
 import re
 from pathlib import Path
@@ -15,11 +16,18 @@ from pathlib import Path
 import griffe
 import yaml
 
-from pinn_dyn.app.schema import KEYS, ConfigError, arguments, words
+from pinn_dyn.app.schema import KEYS, ConfigError, arguments, find, words
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
 PROGRAMS = ("train", "evaluate", "control", "gather")
+PLAIN = (bool, int, float, str, tuple, type(None))
+# Keys of the programs that stand in no YAML.
+OPTIONAL = {
+    "start_from": "a run folder whose trained weights the training starts from.",
+    "resume": "a run folder to go on with after an interruption, by its own configuration.",
+    "trust": "packages whose classes the configuration of a run folder may build: SECURITY.md.",
+}
 
 HEAD = """# Configuration reference
 
@@ -107,7 +115,26 @@ def _rows(package, lines: list[str], node: yaml.Node, prefix: str, types) -> lis
             rows.append(f"| `{prefix}{name}` | {', '.join(classes)} | {kind}| {text} |")
         else:
             rows.append(f"| `{prefix}{name}` | {_value(value)} | {kind}| {text} |")
+    there = {key.value for key, _ in node.value}
+    if target and described:
+        rows.extend(_unlisted(target, prefix, types, described, there))
+    elif not prefix:
+        rows.extend(
+            f"| `{name}` | | {_cell(words(types[name]))} | {text} |"
+            for name, text in OPTIONAL.items()
+            if name in types and name not in there
+        )
     return rows
+
+
+def _unlisted(target: str, prefix: str, types, described, there) -> list[str]:
+    """Rows for what a class takes besides the keys of its YAML."""
+    return [
+        f"| `{prefix}{name}` | `{'null' if one.default is None else one.default}` "
+        f"| {_cell(words(types[name]))} | {_cell(described[name])} |"
+        for name, one in inspect.signature(find(target)).parameters.items()
+        if name in described and name not in there and isinstance(one.default, PLAIN)
+    ]
 
 
 def _defaults(value: yaml.SequenceNode) -> list[str]:

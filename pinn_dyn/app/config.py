@@ -22,6 +22,7 @@ _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
+_OPEN = ("filter", "robot", "thresholds")  # mappings with keys of the user's choice
 _CONFIG_DIR = re.compile(r"(?:--config-dir|-cd)[ =](\S+)")  # a user's own groups
 
 
@@ -80,8 +81,9 @@ def completed(command: str, arguments: list[str]) -> list[str]:
             return arguments
         key, known = unknown
         path, name = key.rpartition(".")[::2]
-        if name not in _takes(command, known, path):
-            keys = list(_keys(known))
+        taken = _takes(command, known, path)
+        if name not in taken and path not in _OPEN:
+            keys = [*_keys(known), *(f"{path}.{one}" if path else one for one in taken)]
             close = did_you_mean(key, keys)
             if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
                 close = f": did you mean {' or '.join(same[:3])}?"
@@ -89,7 +91,9 @@ def completed(command: str, arguments: list[str]) -> list[str]:
                 f"the configuration has no key '{key}'{close or ': no key is like it.'} See all "
                 f"keys with 'python {command}.py --cfg job'."
             )
-        index = next(k for k, word in enumerate(arguments) if re.match(rf"{key}[.=]", word))
+        index = next(
+            k for k, word in enumerate(arguments) if re.match(rf"{re.escape(key)}[.=]", word)
+        )
         arguments[index] = f"++{arguments[index]}"
 
 
@@ -132,7 +136,7 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
             folder = config_folder(command)
-            groups = [o for o in overrides if _is_group(folder, o)]
+            groups = [o for o in overrides if _is_group(folder, o) or "hydra.searchpath" in o]
             known = OmegaConf.to_container(hydra.compose(command, overrides=groups))
             assert isinstance(known, dict)
             return key, {str(name): value for name, value in known.items()}

@@ -297,6 +297,8 @@ def test_a_training_of_an_earlier_version_is_not_taken_for_a_new_one():
         ("train", "trust=[my_package]"),
         ("control", "actuator.low=-1"),
         ("control", "sensor.q_noise=0.1"),
+        ("control", "robot.mass=0.36"),
+        ("evaluate", "thresholds.tiny=0.001"),
         ("evaluate", "trust=my_package"),
     ],
 )
