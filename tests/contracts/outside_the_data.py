@@ -82,7 +82,7 @@ class OutsideTheDataContract:
         assert solution.success, solution.message
         x = torch.from_numpy(solution.y.T.copy()).reshape(-1, count, 2 * n)
         q, v = x.chunk(2, -1)
-        if system.coordinates == "momentum":
+        if system.state == "qp":
             v = system.velocity(q, v)
         energy = system.total_energy(q, v)
         assert torch.isfinite(energy).all()
