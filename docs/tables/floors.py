@@ -21,7 +21,7 @@ from torch import Tensor
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import CONF
 from pinn_dyn.evaluation import predict_trajectories, predict_windows, rollout_metrics
-from pinn_dyn.mechanics import Predictor, stack
+from pinn_dyn.mechanics import Predictor, Signal, stack
 
 FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
 _ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.validation=1")
@@ -40,7 +40,7 @@ SETS = {
 class KeepsVelocity(Predictor):
     """q(t) = q(0) + v(0) t."""
 
-    def increments(self, x0: Tensor, t: Tensor, u: Tensor, **_: object) -> Tensor:
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         v = x0[..., None, self.num_coordinates :]
         return torch.cat([v * (t - t[0])[:, None], torch.zeros_like(v * t[:, None])], dim=-1)
 
@@ -52,7 +52,7 @@ def floor(name: str) -> dict[str, object]:
         cfg = hydra.compose("train", overrides=[f"dataset={name}", *small])
     dataset = OmegaConf.to_container(cfg.dataset, resolve=True)
     truth = stack(build_source({"dataset": dataset}).load().test).until(horizon)
-    model = KeepsVelocity(truth.q.shape[-1], truth.u.shape[-1], "velocity")
+    model = KeepsVelocity(truth.q.shape[-1], truth.u.shape[-1])
     whole = predict_trajectories(model, truth, step=step)
     figures = rollout_metrics(whole.q_hat, whole.q, whole.t, thresholds={})
     row = {"dataset": name, "step": step, **figures.to_dict()}
