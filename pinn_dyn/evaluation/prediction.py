@@ -22,7 +22,7 @@ class Prediction:
 
     Attributes:
         t: times, ``(T,)``, s.
-        q_hat: predicted configuration, ``(K, T, N)``; NaN where the roll-out broke down.
+        q_hat: predicted configuration, ``(K, T, N)``; not finite where the roll-out broke down.
         q: true configuration, ``(K, T, N)``.
         members: of an ensemble, what each of its E members predicts, ``(E, K, T, N)``; q_hat is
             their mean.
@@ -36,6 +36,13 @@ class Prediction:
     def error(self) -> Tensor:
         """e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
         return torch.linalg.vector_norm(self.q_hat - self.q, dim=-1)
+
+    def every(self, samples: int) -> Prediction:
+        """The same roll-outs at every ``samples``-th time, to be compared on a coarser grid."""
+        members = None if self.members is None else self.members[..., ::samples, :]
+        return Prediction(
+            self.t[::samples], self.q_hat[:, ::samples], self.q[:, ::samples], members
+        )
 
     def spread(self) -> Tensor:
         """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
@@ -57,7 +64,7 @@ def predict_trajectories(
 
     The roll-out runs in float64 on a copy of the model in evaluation mode; a long one takes
     compiled steps, which changes its numbers by rounding alone. Where a trajectory breaks down (a
-    mass matrix that is no longer positive definite), all of its q_hat is NaN.
+    mass matrix that is no longer positive definite), its q_hat is NaN from there on.
 
     Args:
         model: what predicts, with N coordinates and M inputs.
@@ -147,31 +154,14 @@ def model_for_roll_outs(
 def _roll_out(
     model: Predictor, x0: Tensor, t: Tensor, u: Tensor, stride: int, truth: Trajectory
 ) -> Tensor:
-    """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; NaN rows where it broke down.
-
-    E is 1, but for an ensemble.
-    """
-    try:
-        with torch.no_grad():
-            settings: Any = {"t_input": t, "interpolation": truth.interpolation}
-            if isinstance(model, Ensemble):
-                states = x0.unsqueeze(-2) + model.member_increments(x0, t[::stride], u, **settings)
-            else:
-                states = model.predict(x0, t[::stride], u, **settings).unsqueeze(0)
-        return states[..., : truth.q.shape[-1]]
-    except torch.linalg.LinAlgError:
-        # One broken trajectory stops the whole batch: halve it until that one is alone.
-        if x0.shape[0] == 1:
-            size = model.size if isinstance(model, Ensemble) else 1
-            return x0.new_full((size, 1, t[::stride].shape[0], truth.q.shape[-1]), torch.nan)
-        half = x0.shape[0] // 2
-        return torch.cat(
-            [
-                _roll_out(model, x0[:half], t, u[:half], stride, truth),
-                _roll_out(model, x0[half:], t, u[half:], stride, truth),
-            ],
-            dim=1,
-        )
+    """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; E is 1, but for an ensemble."""
+    with torch.no_grad():
+        settings: Any = {"t_input": t, "interpolation": truth.interpolation}
+        if isinstance(model, Ensemble):
+            states = x0.unsqueeze(-2) + model.member_increments(x0, t[::stride], u, **settings)
+        else:
+            states = model.predict(x0, t[::stride], u, **settings).unsqueeze(0)
+    return states[..., : truth.q.shape[-1]]
 
 
 def _require_stacked(truth: Trajectory) -> None:

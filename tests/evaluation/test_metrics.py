@@ -5,13 +5,14 @@ import torch
 
 from pinn_dyn.evaluation import (
     Prediction,
+    left_data,
     member_metrics,
     predict_trajectories,
     predict_windows,
     rollout_metrics,
 )
 from pinn_dyn.evaluation.prediction import model_for_roll_outs
-from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, Predictor, Trajectory
+from pinn_dyn.mechanics import ContinuousPredictor, Ensemble, Trajectory
 from pinn_dyn.systems import SoftArm
 
 
@@ -25,18 +26,6 @@ class PointMass(ContinuousPredictor):
     def state_derivative(self, x, u):
         assert not self.training
         return torch.cat([x[..., 1:], self.gain * u], dim=-1)
-
-
-class Fragile(Predictor):
-    """Stands still, and breaks down as a whole batch if any start is negative."""
-
-    def __init__(self):
-        super().__init__(1, 1, "velocity")
-
-    def increments(self, x0, t, u, *, t_input=None, interpolation="linear"):
-        if bool((x0[..., 0] < 0).any()):
-            raise torch.linalg.LinAlgError("not positive-definite")
-        return x0.new_zeros(*x0.shape[:-1], t.shape[0], 2)
 
 
 def ramps(count=3, samples=13, sample_time=0.25):
@@ -114,6 +103,36 @@ def test_a_truth_that_never_moves_does_not_make_every_error_a_divergence():
     assert found.diverged == 0
 
 
+def test_leaving_the_data_is_by_more_than_their_width():
+    """Training data from -1 to 1 and from 0 to 10: left beyond +-3, and below -10 or above 20."""
+    t = torch.arange(5.0)
+    q = torch.tensor([[-1.0, 0.0], [1.0, 10.0]])
+    train = [Trajectory(t[:2], q, q, q)]
+    inside = torch.tensor([[3.0, 0.0], [-3.0, 0.0], [0.0, 20.0], [0.0, -10.0], [0.0, 5.0]])
+    far = inside.clone()
+    far[3, 1] = -10.5
+    broken = inside.clone()
+    broken[2:, 0] = torch.nan
+    found = {
+        name: left_data(Prediction(t + 7, q_hat, q_hat), train)
+        for name, q_hat in {
+            "inside": torch.stack([inside, inside]),
+            "far": torch.stack([inside, far]),
+            "broken": torch.stack([broken, far]),
+        }.items()
+    }
+    assert found["inside"] == {"left_data": 0, "left_data_after": math.inf}
+    assert found["far"] == {"left_data": 1, "left_data_after": 3.0}
+    assert found["broken"] == {"left_data": 2, "left_data_after": 2.0}
+
+
+def test_every_other_time_of_a_prediction():
+    prediction = predict_trajectories(PointMass(gain=2.0), ramps()).every(3)
+    full = predict_trajectories(PointMass(gain=2.0), ramps())
+    assert torch.equal(prediction.t, full.t[::3])
+    assert torch.equal(prediction.error(), full.error()[:, ::3])
+
+
 def test_metrics_refuse_shapes_that_do_not_match():
     q = torch.zeros(2, 5, 3)
     with pytest.raises(ValueError, match=r"q_hat has shape \(5, 3\).*expected \(K, T, N\)"):
@@ -165,16 +184,6 @@ def test_an_incomplete_last_window_is_left_out():
     prediction = predict_windows(PointMass(), ramps(), window=1.25)
     assert prediction.t[-1] == 2.5
     torch.testing.assert_close(prediction.q_hat, prediction.q)
-
-
-def test_a_breakdown_costs_only_its_own_trajectory():
-    t = torch.arange(3.0)
-    q = torch.tensor([1.0, 2.0, -3.0, 4.0, -5.0])[:, None, None].expand(5, 3, 1)
-    zero = torch.zeros(5, 3, 1)
-    prediction = predict_trajectories(Fragile(), Trajectory(t, q, zero, zero))
-    broken = torch.isnan(prediction.q_hat).all(dim=(1, 2))
-    assert broken.tolist() == [False, False, True, False, True]
-    assert torch.equal(prediction.q_hat[~broken], prediction.q[~broken])
 
 
 def test_a_momentum_model_starts_from_the_momentum():
