@@ -28,7 +28,7 @@ from pinn_dyn.app.config import ConfigError, plain
 from pinn_dyn.app.description import describe
 from pinn_dyn.app.runs import CHECKPOINTS, METRICS, load_run, provenance, read_config
 from pinn_dyn.data import LogSource
-from pinn_dyn.evaluation import cleaning_figure, save
+from pinn_dyn.evaluation import ValidationHistory, cleaning_figure, save
 from pinn_dyn.mechanics import Predictor
 
 log = logging.getLogger(__name__)
@@ -127,15 +127,20 @@ def _train(folder: Path, config: dict[str, Any], last: Path | None) -> float:
     partial = folder / f"{METRICS}.partial"
     partial.write_text(json.dumps(record, indent=2))
     partial.replace(folder / METRICS)  # a record is whole or absent
+    histories = [one for one in trainer.callbacks if isinstance(one, ValidationHistory)]  # type: ignore[attr-defined]
     log.info(
-        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s",
+        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s",
         config["name"],
         config["seed"],
         error,
         validator,
         seconds,
         folder,
+        "".join(f"; {one.summary()}" for one in histories),
     )
+    for one in histories:
+        if said := one.warning():
+            log.warning("%s", said)
     return error
 
 
