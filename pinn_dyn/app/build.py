@@ -19,7 +19,7 @@ from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
-from pinn_dyn.evaluation import RolloutValidator, RunDescription
+from pinn_dyn.evaluation import RolloutValidator, RunDescription, ValidationHistory
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
@@ -29,7 +29,9 @@ CHECKPOINTS = "checkpoints"
 LONGEST_EPOCH = 1000
 """Steps after which the last checkpoint is written anew, at the latest."""
 VALIDATION_ERROR = "val/error_mean"
-"""The figure by which the best checkpoint is chosen."""
+"""What a training is summed up by, and a sweep minimizes."""
+BEST_BY = "val/error_windowed"
+"""What the best checkpoint is chosen by: a long roll-out may err least before it learns."""
 
 
 def _build(name: str, config: dict[str, Any], /, *given: Any, **extra: Any) -> Any:
@@ -207,9 +209,10 @@ def build_trainer(
         "enable_version_counter": False,
     }
     callbacks += [
-        ModelCheckpoint(filename="best", monitor=VALIDATION_ERROR, **saved),
+        ModelCheckpoint(filename="best", monitor=BEST_BY, **saved),
         ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **saved),
         LearningRateMonitor(),
+        ValidationHistory(),
     ]
     part = {key: x for key, x in config["trainer"].items() if key not in ("steps", "validations")}
     if part.get("enable_progress_bar", True):

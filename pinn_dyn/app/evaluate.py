@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -16,30 +18,40 @@ from tqdm import tqdm
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
-from pinn_dyn.app.run_folder import Run, find_runs, load_run
+from pinn_dyn.app.run_folder import CONFIG, Run, find_runs, load_run
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
     Prediction,
     RunResult,
     TermComparison,
+    beaten_by_floors,
+    build_floors,
+    common_stride,
     compare_terms,
+    default_horizon,
+    default_windows,
     error_figure,
     format_table,
     grouped_table,
+    left_data,
     member_metrics,
     predict_trajectories,
     predict_windows,
     rollout_metrics,
+    samples_of,
     save,
     spread_figure,
     summary_table,
     terms_figure,
+    torque_error,
     trajectory_figure,
     write_table,
 )
+from pinn_dyn.evaluation.drawing import with_unit
+from pinn_dyn.evaluation.figures import ERROR
 from pinn_dyn.evaluation.report import prediction_report
-from pinn_dyn.mechanics import MechanicalSystem, Trajectory, stack
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory, stack
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +62,9 @@ _SHOWN = (
     "error_median",
     "error_worst",
     "diverged",
-    "squared_error_mean",
+    "left_data",
+    "left_data_after",
+    "torque_share",
     "member_error_mean",
     "member_error_std",
     "spread_over_error",
@@ -62,82 +76,172 @@ _SPLITS = {"test": "unseen test trajectories", "validation": "validation traject
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One run's roll-outs and its row of the table."""
+    """The roll-outs of one run, or of a floor, and the row of the table."""
 
-    run: Run
     label: str
+    model: Predictor
     prediction: Prediction
     result: RunResult
 
 
 def evaluate(cfg: DictConfig) -> float:
-    """Evaluate runs side by side; returns the smallest mean error.
+    """Evaluate runs side by side, and floors beside them; returns the smallest mean error.
 
     Raises:
-        ConfigError: on runs that cannot be loaded, or that were trained on different data.
+        ConfigError: on settings that do not fit the data, and on runs that were trained on
+            different data. Run folders that cannot be loaded are passed over; when all else is
+            written, they end the program with this error too.
     """
     config = checked("evaluate", cfg)
+    _check(config)
     split = config["split"]
     folder = Path(HydraConfig.get().runtime.output_dir)
     torch.set_num_threads(config["threads"])
     trust = packages(config.get("trust"))
-    runs = [load_run(path, config["checkpoint"], trust) for path in find_runs(config["runs"])]
+    runs, damaged = _load_all(find_runs(config["runs"]), config["checkpoint"], trust)
     source = build_source(_shared_dataset(runs))
     try:
-        truth = stack(getattr(source.load(), split))
+        splits = source.load()
+        truth = stack(getattr(splits, split))
+        config["horizon"] = config["horizon"] or default_horizon(truth.duration)
+        truth = truth.until(config["horizon"])
+        steps = [run.model.fixed_step or config["step"] or run.statistics.step for run in runs]
+        stride = common_stride(steps, truth.t)
     except ValueError as error:
         raise ConfigError(f"{source.name}: {error}") from error
+    grid = stride * truth.duration / (len(truth.t) - 1)
+    if config["windows"] is None:
+        config["windows"] = default_windows(config["horizon"], grid)
+    if not 0 <= config["trajectory"] < len(truth.q):
+        raise ConfigError(
+            f"trajectory is {config['trajectory']}, expected 0 to {len(truth.q) - 1}, one of the "
+            f"{len(truth.q)} {_SPLITS[split]}"
+        )
     log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], _SPLITS[split], source.name)
 
     labels = _labels(runs)
+    floors = build_floors(splits.train, splits.validation, step=grid)
     evaluations = []
-    for run, label in zip(tqdm(runs, desc="evaluating runs"), labels, strict=True):
+    for run, label, step in zip(tqdm(runs, desc="evaluating runs"), labels, steps, strict=True):
+        recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
+        extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
+        row = RunResult(
+            label, run.config["model_name"], run.config["seed"], {}, {**extra, "step": step}
+        )
         try:
-            evaluations.append(_evaluate(run, label, truth, config))
+            evaluations.append(_evaluate(run.model, row, truth, splits.train, stride, config))
         except ValueError as error:
             raise ConfigError(f"{run.folder}: {error}") from error
+    trained = list(evaluations)
+    for label, floor in floors.items():
+        row = RunResult(label, label, None, {}, {"step": grid}, floor=True)
+        evaluations.append(_evaluate(floor, row, truth, splits.train, stride, config))
+    joints = _torque_errors(trained, truth, source)
     summary = summary_table([item.result for item in evaluations])
     write_table(summary, folder, "summary")
     grouped = grouped_table(summary)
     write_table(grouped, folder, "by_model")
+    if len(joints):
+        write_table(joints, folder, "torque")
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
     (folder / "provenance.json").write_text(
         json.dumps({"config": config, "dataset": runs[0].config["dataset"], **record}, indent=2)
     )
-    horizon_truth = truth.until(config["horizon"])
-    _draw(evaluations, horizon_truth, source, config, folder)
-    comparisons = _compare_with_truth(evaluations, source, folder)
+    _draw(evaluations, truth, source, config, folder)
+    comparisons = _compare_with_truth(trained, source, folder)
 
-    horizon = f"{config['horizon']:g} s"
-    shown = ["run", "seed", "pairs", *_SHOWN, *[c for c in summary if c.startswith("window_")]]
+    shown = ["run", "seed", "floor", "pairs", *_SHOWN]
+    shown += [name for name in summary if name.startswith(("window_", "valid_time_"))]
     text = _terms_text(comparisons)
     print(f"\n{text}" if text else "")
     trajectories = f"{truth.q.shape[0]} {_SPLITS[split]}"
-    print(f"{source.name}: {trajectories}, {horizon} open loop")
-    print(format_table(summary[[name for name in shown if name in summary]]))
+    print(f"{source.name}: {trajectories}, {config['horizon']:g} s open loop")
+    headers = {name: name.removesuffix("_error_mean") for name in summary if "window_" in name}
+    headers |= {"left_data_after": "after", "torque_share": "torque"}
+    print(format_table(summary[[name for name in shown if name in summary]], headers))
+    verdict = beaten_by_floors(summary)
+    notes = ["* best; only a model that beats all in brackets; valid_time and after in s"]
+    print("\n".join([*notes, *verdict]))
     if len(grouped) < len(summary):
-        best = [
-            "model",
-            "runs",
-            *[c for c in grouped if c.endswith(("_error_mean", "_error_worst"))],
-        ]
-        print(f"\nover seeds:\n{format_table(grouped[[c for c in best if c in grouped]])}")
+        figures = [c for c in grouped if c.endswith(("_error_mean", "_error_worst"))]
+        print(f"\nover seeds:\n{format_table(grouped[['model', 'seeds', 'floor', *figures]])}")
     report = prediction_report(
         title=f"{source.name}: trained models on unseen motions",
         trajectories=trajectories,
         summary=summary,
         grouped=grouped,
-        truth=horizon_truth,
+        truth=truth,
         predictions={item.label: item.prediction for item in evaluations},
         trajectory=config["trajectory"],
         labels=source.labels,
         input_labels=source.input_labels,
         comparisons=comparisons,
-        origin=build_origin({item.label: item.run for item in evaluations}, source, record, config),
+        joints=joints,
+        origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
     )
     (folder / "report.html").write_text(report, encoding="utf-8")
     print(f"\nfigures and tables are in {folder}; open report.html there in a browser")
-    return float(summary["error_mean"].min())
+    if damaged:
+        raise ConfigError(
+            f"{len(damaged)} of {len(damaged) + len(runs)} runs could not be evaluated and are "
+            "missing from the tables:\n  " + "\n  ".join(damaged)
+        )
+    return float(summary["error_mean"][~summary["floor"]].min())
+
+
+def _check(config: dict[str, Any]) -> None:
+    """Refuse settings that no data could fit.
+
+    Raises:
+        ConfigError: naming the setting, what it is and what was expected.
+    """
+    if config["split"] not in _SPLITS:
+        raise ConfigError(f"split: {config['split']!r}, expected one of {', '.join(_SPLITS)}")
+    if not config["runs"]:
+        raise ConfigError("runs is empty: give run folders, as in runs=[runs/soft_arm_1/*/*]")
+    for name in ("horizon", "step"):
+        if config[name] is not None and not _positive(config[name]):
+            raise ConfigError(f"{name} is {config[name]!r}, expected a number of seconds or null")
+    windows = config["windows"]
+    if windows is not None and not (isinstance(windows, list) and all(map(_positive, windows))):
+        raise ConfigError(
+            f"windows is {windows!r}, expected a list of seconds, as in windows=[0.1,1.0], null "
+            "for those that fit, or [] for none"
+        )
+    if not isinstance(config["trajectory"], int):
+        raise ConfigError(f"trajectory is {config['trajectory']!r}, expected its number, from 0")
+
+
+def _positive(value: object) -> bool:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and 0 < value < math.inf  # type: ignore[operator]
+
+
+def _load_all(
+    folders: list[Path], checkpoint: str, trust: tuple[str, ...]
+) -> tuple[list[Run], list[str]]:
+    """The runs that can be loaded, and what is wrong with each of the others.
+
+    Raises:
+        ConfigError: if none can.
+    """
+    runs, damaged = [], []
+    for folder in folders:
+        try:
+            run = load_run(folder, checkpoint, trust)
+            if missing := [
+                key for key in ("dataset", "model_name", "seed") if key not in run.config
+            ]:
+                raise ConfigError(f"its {CONFIG} has no {', '.join(missing)}, it may be cut short")
+            runs.append(run)
+        except Exception as error:  # a file that is cut short raises nearly anything
+            said = f"{type(error).__name__} {error}"
+            text = str(error) if isinstance(error, ConfigError) else f"it may be cut short: {said}"
+            damaged.append(f"{folder}: {text}")
+            log.warning("passed over: %s", damaged[-1])
+    if not runs:
+        raise ConfigError("runs: none can be loaded:\n  " + "\n  ".join(damaged))
+    return runs, damaged
 
 
 def _shared_dataset(runs: list[Run]) -> dict[str, Any]:
@@ -166,25 +270,47 @@ def _labels(runs: list[Run]) -> list[str]:
     return [f"{name} {run.folder.name}" for name, run in zip(seeds, runs, strict=True)]
 
 
-def _evaluate(run: Run, label: str, truth: Trajectory, config: dict[str, Any]) -> Evaluation:
-    step = run.model.fixed_step or config["step"] or run.statistics.step
-    horizon = truth.until(config["horizon"])
-    prediction = predict_trajectories(run.model, horizon, step=step)
+def _evaluate(
+    model: Predictor,
+    row: RunResult,
+    truth: Trajectory,
+    train: list[Trajectory],
+    stride: int,
+    config: dict[str, Any],
+) -> Evaluation:
+    """Roll out over the horizon and window by window; compared at every ``stride``-th sample."""
+    step = row.extra["step"]
+    every = stride // samples_of("step", step, truth.t)
+    prediction = predict_trajectories(model, truth, step=step).every(every)
     metrics = rollout_metrics(
         prediction.q_hat, prediction.q, prediction.t, thresholds=config["thresholds"]
     ).to_dict()
+    metrics |= left_data(prediction, train)
     if prediction.members is not None:
         metrics |= member_metrics(prediction)
     for window in config["windows"]:
-        windowed = predict_windows(run.model, horizon, window=window, step=step)
+        windowed = predict_windows(model, truth, window=window, step=step).every(every)
         figures = rollout_metrics(windowed.q_hat, windowed.q, windowed.t, thresholds={})
         metrics[f"window_{window:g}s_error_mean"] = figures.error_mean
-    recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
-    extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
-    result = RunResult(
-        label, run.config["model_name"], run.config["seed"], metrics, {**extra, "step": step}
-    )
-    return Evaluation(run, label, prediction, result)
+        metrics[f"window_{window:g}s_diverged"] = figures.diverged
+    return Evaluation(row.run, model, prediction, replace(row, metrics=metrics))
+
+
+def _torque_errors(
+    evaluations: list[Evaluation], truth: Trajectory, source: DataSource
+) -> pd.DataFrame:
+    """Give mechanical models their torque error; returns it joint by joint."""
+    tables = []
+    for item in evaluations:
+        if isinstance(item.model, MechanicalSystem):
+            try:
+                found = torque_error(item.model, truth, system=source.system)
+            except ValueError as error:
+                log.warning("no torque error: %s", error)
+                break
+            item.result.metrics.update(torque_error=found.mean, torque_share=found.share)
+            tables.append(found.to_frame(source.labels).assign(run=item.label))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def _draw(
@@ -194,7 +320,8 @@ def _draw(
     config: dict[str, Any],
     folder: Path,
 ) -> None:
-    predictions = {item.label: item.prediction for item in evaluations}
+    floors = {item.label: item.prediction for item in evaluations if item.result.floor}
+    predictions = {item.label: item.prediction for item in evaluations if not item.result.floor}
     split = config["split"]
     title = f"{source.name}, {_SPLITS[split]}, {config['horizon']:g} s open loop"
     figure = trajectory_figure(
@@ -206,7 +333,9 @@ def _draw(
         input_labels=source.input_labels,
     )
     save(figure, folder / "trajectory.png")
-    save(error_figure(predictions, title=title), folder / "error.png")
+    label = with_unit(ERROR, source.labels)
+    figure = error_figure(predictions, floors=floors, title=title, label=label)
+    save(figure, folder / "error.png")
     for label, prediction in predictions.items():
         if prediction.members is not None:
             figure = spread_figure(
@@ -225,7 +354,7 @@ def _compare_with_truth(
     q = torch.tensor([source.configurations[name] for name in names], dtype=torch.float64)
     comparisons = {}
     for item in evaluations:
-        model = item.run.model
+        model = item.model
         if not isinstance(model, MechanicalSystem):
             continue
         comparison = compare_terms(model, source.system, q, names=names)

@@ -41,7 +41,7 @@ from pinn_dyn.app.run_folder import (
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
 from pinn_dyn.ensembles import Ensemble, EnsembleData
-from pinn_dyn.evaluation import RunDescription, cleaning_figure, save
+from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
 
@@ -168,15 +168,20 @@ def _train(
     partial = folder / f"{METRICS}.partial"
     partial.write_text(json.dumps(record, indent=2))
     partial.replace(folder / METRICS)  # a record is whole or absent
+    histories = [one for one in trainer.callbacks if isinstance(one, ValidationHistory)]  # type: ignore[attr-defined]
     log.info(
-        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s",
+        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s",
         config["name"],
         config["seed"],
         error,
         validator,
         seconds,
         folder,
+        "".join(f"; {one.summary()}" for one in histories),
     )
+    for one in histories:
+        if said := one.warning():
+            log.warning("%s", said)
     return error
 
 

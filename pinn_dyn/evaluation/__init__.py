@@ -14,61 +14,83 @@ from pinn_dyn.evaluation.control_metrics import (
 )
 from pinn_dyn.evaluation.figures import (
     error_figure,
-    save,
     spread_figure,
     terms_figure,
     trajectory_figure,
 )
+from pinn_dyn.evaluation.floors import KeepsVelocity, StandsStill, build_floors
+from pinn_dyn.evaluation.horizons import common_stride, default_horizon, default_windows
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import (
     RolloutMetrics,
     diverged_trajectories,
+    left_data,
     member_metrics,
     rollout_metrics,
 )
-from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
+from pinn_dyn.evaluation.png import save
+from pinn_dyn.evaluation.prediction import (
+    Prediction,
+    predict_trajectories,
+    predict_windows,
+    samples_of,
+)
 from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.evaluation.tables import (
     RunResult,
+    beaten_by_floors,
     format_table,
     grouped_table,
     summary_table,
     write_table,
 )
-from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
+from pinn_dyn.evaluation.torque import TorqueError, torque_error
+from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator, ValidationHistory
 
 __all__ = [
     "ClosedLoopMetrics",
+    "KeepsVelocity",
     "Prediction",
     "RolloutFigures",
     "RolloutMetrics",
     "RolloutValidator",
     "RunDescription",
     "RunResult",
+    "StandsStill",
     "TermComparison",
+    "TorqueError",
+    "ValidationHistory",
     "animate",
+    "beaten_by_floors",
+    "build_floors",
     "cleaning_figure",
     "closed_loop_figure",
     "closed_loop_metrics",
+    "common_stride",
     "compare_terms",
     "comparison_table",
     "controller_comparison_figure",
+    "default_horizon",
+    "default_windows",
     "diverged_trajectories",
     "error_figure",
     "format_table",
     "grouped_table",
+    "left_data",
     "member_metrics",
     "pose_strip",
     "predict_trajectories",
     "predict_windows",
     "rollout_metrics",
+    "samples_of",
     "save",
     "spread_figure",
     "steady_state_figure",
     "summary_table",
     "terms_figure",
     "tip_path_figure",
+    "torque_error",
     "trajectory_figure",
     "write_table",
 ]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
-from pinn_dyn.evaluation.figures import _COLOURS, _TRUTH
+from pinn_dyn.evaluation.drawing import COLOURS, TRUTH
 from pinn_dyn.systems import Drawable, Rendered
 
 _TIP = "#CC0000"
@@ -222,10 +222,10 @@ def _legend(figure: Figure, ax: Axes3D) -> None:
 def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor | None, sample: int) -> None:
     if wanted is not None:
         ax.plot(
-            *wanted[sample].flatten(0, 1).T.numpy(), color=_TRUTH, linewidth=7, label="reference"
+            *wanted[sample].flatten(0, 1).T.numpy(), color=TRUTH, linewidth=7, label="reference"
         )
     for index, segment in enumerate(shape[sample]):
-        colour = _COLOURS[(0, 5)[index % 2]]
+        colour = COLOURS[(0, 5)[index % 2]]
         name = "arm" if index == 0 else None
         ax.plot(*segment.T.numpy(), color=colour, linewidth=4, solid_capstyle="butt", label=name)
     ax.plot([0], [0], [0], "s", color="black", markersize=7)

@@ -1,20 +1,74 @@
-"""Figures of closed loops, drawn without a display or global state."""
+"""Figures of closed loops."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop, stopped_runs
-from pinn_dyn.evaluation.figures import _COLOURS, _TRUTH, _limits, _names
+from pinn_dyn.evaluation.drawing import (
+    COLOURS,
+    DARK,
+    TRUTH,
+    Line,
+    Panel,
+    error_panel,
+    look,
+    names,
+    with_unit,
+)
+from pinn_dyn.evaluation.png import mean_png, motion_png
 
-_WARNING = "#D55E00"
+ERROR = "‖q_ref − q‖₂"
 
-# A peak of the input this many times above its 95th percentile gets a logarithmic axis.
-_SPIKE = 20
+
+def control_panels(
+    records: Mapping[str, ClosedLoopRecord],
+    labels: Sequence[str],
+    input_labels: Sequence[str],
+    *,
+    error: str = ERROR,
+    held: bool = True,
+) -> tuple[list[Panel], list[Panel]]:
+    """A panel per coordinate, reached and dotted reference, the error below; and one per input.
+
+    Args:
+        records: names of laws and their K runs; the order fixes colours and dashes.
+        labels, input_labels: name and unit of each coordinate and input.
+        error: name and unit of the error.
+        held: whether the input holds between two control instants.
+    """
+    laws = [(name, record, *look(k)) for k, (name, record) in enumerate(records.items())]
+    first = laws[0][1]
+    states = []
+    for k, label in enumerate(labels):
+        lines = [Line(name, r.t, r.q[..., k], c, d) for name, r, c, d in laws]
+        wanted = Line("reference", first.t, first.reference.q[..., k], DARK, "dot", always=True)
+        states.append(Panel(label, [*lines, wanted]))
+    errors = [Line(name, r.t, control_errors(r), c, d) for name, r, c, d in laws]
+    states.append(Panel(error, errors, log=True))
+    inputs = [
+        Panel(label, [Line(name, r.t, r.u[..., k], c, d, held=held) for name, r, c, d in laws])
+        for k, label in enumerate(input_labels)
+    ]
+    return states, inputs
+
+
+def control_errors(record: ClosedLoopRecord) -> Tensor:
+    """|q_ref - q|_2, ``(K, T)``."""
+    return (record.reference.q - record.q).double().norm(dim=-1)
+
+
+def control_error_panel(records: Mapping[str, ClosedLoopRecord], label: str = ERROR) -> Panel:
+    """Errors of laws over time; the runs that were stopped are lost."""
+    return error_panel(
+        {name: (r.t, control_errors(r), stopped_runs(r)) for name, r in records.items()},
+        label=label,
+    )
 
 
 def closed_loop_figure(
@@ -22,14 +76,12 @@ def closed_loop_figure(
     run: int,
     *,
     title: str,
-    labels: list[str] | None = None,
-    input_labels: list[str] | None = None,
+    labels: Sequence[str] | None = None,
+    input_labels: Sequence[str] | None = None,
 ) -> Figure:
-    """One run: states over dotted references, errors q_ref - q, and inputs.
+    """One run: states over dotted references, the error, and the inputs.
 
-    Up to 6 coordinates and inputs share three panels, each with its colour; more get a row each.
-    A run that was stopped has a line at that time, and the reason above; its last tenth, where it
-    may run away, does not count for the range of the panels.
+    A run that was stopped has a line at that time, and the reason above.
 
     Args:
         record: K runs.
@@ -41,78 +93,19 @@ def closed_loop_figure(
     Raises:
         ValueError: on labels that do not fit.
     """
-    q, q_ref, u, t = record.q[run], record.reference.q[run], record.u[run], record.t
-    labels = _names(labels, "q", q.shape[-1], "labels")
-    input_labels = _names(input_labels, "u", u.shape[-1], "input_labels")
-    rows = max(len(labels), len(input_labels))
-    shared = rows <= len(_COLOURS)
-    names = ("configuration q", r"error $q_{ref} - q$", "input u")
-    if shared:
-        figure = Figure(figsize=(8, 7.5), layout="constrained")
-        grid = figure.subplots(3, 1, sharex=True, squeeze=False)
-        panels = [[grid[row, 0]] * rows for row in range(3)]
-        for ax, name in zip(grid[:, 0], names, strict=True):
-            ax.set_ylabel(name)
-    else:
-        figure = Figure(figsize=(12, 1.35 * rows + 1.6), layout="constrained")
-        grid = figure.subplots(rows, 3, sharex=True, squeeze=False)
-        panels = [list(grid[:, column]) for column in range(3)]
-        for ax, name in zip(grid[0], names, strict=True):
-            ax.set_title(name, fontsize="medium")
-    state_axes, error_axes, input_axes = panels
-    for k, label in enumerate(labels):
-        colour = _COLOURS[k] if shared else _COLOURS[0]
-        reference = colour if shared else "black"
-        state_axes[k].plot(t, q[:, k], color=colour, linewidth=1.4, label=label)
-        state_axes[k].plot(t, q_ref[:, k], ":", color=reference, linewidth=1.6)
-        error_axes[k].plot(t, q_ref[:, k] - q[:, k], color=colour, linewidth=1.2)
-    for k, label in enumerate(input_labels):
-        colour = _COLOURS[k] if shared else _COLOURS[0]
-        # The input is held between two control instants.
-        input_axes[k].plot(
-            t, u[:, k], color=colour, linewidth=1.2, drawstyle="steps-post", label=label
-        )
-    for k in range(1 if shared else len(input_labels)):
-        _make_room_for_spikes(input_axes[k], u if shared else u[:, k])
-    for ax in dict.fromkeys(error_axes[: len(labels)]):
-        ax.axhline(0, color="black", linestyle=":", linewidth=1)
-    if shared:
-        for ax in (grid[0, 0], grid[2, 0]):
-            ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize="small")
-    else:
-        _label_grid(panels, labels, input_labels)
-    reason = record.stopped[run]
+    labels = names(labels, "q", record.q.shape[-1], "labels")
+    inputs = names(input_labels, "u", record.u.shape[-1], "input_labels")
+    error = with_unit(ERROR, labels)
+    columns = control_panels({"reached": record}, labels, inputs, error=error)
+    reason, end = record.stopped[run], None
     if reason is not None:
-        end = samples_before_stop(record, run)
-        calm = slice(0, 1 + int(0.9 * (end - 1)))
-        # At the instant of a stop the law may have had no finite answer.
-        inputs = u[calm].nan_to_num(0.0, 0.0, 0.0)
-        signals = (torch.cat([q[calm], q_ref[:end]]), (q_ref - q)[calm], inputs)
-        for axes, values in zip(panels, signals, strict=True):
-            for k in range(values.shape[1]):
-                axes[k].set_ylim(*_limits(values if shared else values[:, k]))
-        for ax in grid.flat:
-            ax.axvline(float(t[end - 1]), color="black", linestyle="--", linewidth=1.2)
+        end = float(record.t[samples_before_stop(record, run) - 1])
         title += f"\nstopped: {reason}"
-    for ax in grid[-1]:
-        ax.set_xlabel("time (s)")
-    grid[0, 0].set_xlim(float(t[0]), float(t[-1]))
-    solid, dotted = (
-        figure.axes[0].plot([], [], style, color="black", linewidth=1.4)[0] for style in ("-", ":")
-    )
-    if not shared:
-        solid.set_color(_COLOURS[0])
-    figure.legend([solid, dotted], ["reached", "reference"], loc="outside lower center", ncols=2)
-    figure.suptitle(title)
-    figure.align_ylabels(grid)
-    return figure
+    return motion_png(columns, run, title=title, end=end)
 
 
 def controller_comparison_figure(
-    records: dict[str, ClosedLoopRecord],
-    *,
-    title: str,
-    label: str = r"$\|q_{ref} - q\|_2$",
+    records: Mapping[str, ClosedLoopRecord], *, title: str, label: str = ERROR
 ) -> Figure:
     """Error over time: per controller the mean over its runs and their 10-90 % band.
 
@@ -123,35 +116,8 @@ def controller_comparison_figure(
         title: plant and task.
         label: name and unit of the error.
     """
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    ax = figure.subplots()
-    floors = []
-    for index, (name, record) in enumerate(records.items()):
-        colour = _COLOURS[index % len(_COLOURS)]
-        lost = stopped_runs(record)
-        total, count = len(lost), int(lost.sum())
-        note = "" if count == 0 else f" ({count} of {total} stopped)"
-        if count == total:
-            ax.plot([], [], color=colour, label=name + note)
-            continue
-        error = (record.reference.q - record.q)[~lost].double().norm(dim=-1)
-        low, high = torch.quantile(error, torch.tensor([0.1, 0.9], dtype=error.dtype), dim=0)
-        mean = error.mean(dim=0)
-        ax.plot(record.t, mean, color=colour, linewidth=1.5, label=name + note)
-        ax.fill_between(record.t, low, high, color=colour, alpha=0.18, linewidth=0)
-        floors.append(float(mean.median()))
-    ax.set_yscale("log")
-    # Tracking may start at no error at all: three decades below the best are enough of that.
-    if floors and min(floors) > 0:
-        ax.set_ylim(bottom=1e-3 * min(floors))
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel(label)
-    ax.grid(True, which="major", alpha=0.3)
-    times = [record.t for record in records.values()]
-    ax.set_xlim(min(float(t[0]) for t in times), max(float(t[-1]) for t in times))
-    figure.legend(loc="outside lower center", ncols=3, title="mean over runs, 10-90 % band")
-    figure.suptitle(title)
-    return figure
+    note = "mean over runs, 10–90 % band"
+    return mean_png(control_error_panel(records, label), title=title, note=note, lost="stopped")
 
 
 def tip_path_figure(t: Tensor, paths: dict[str, Tensor], wanted: Tensor, *, title: str) -> Figure:
@@ -178,9 +144,9 @@ def tip_path_figure(t: Tensor, paths: dict[str, Tensor], wanted: Tensor, *, titl
     figure = Figure(figsize=(11, 5), layout="constrained")
     space = figure.add_subplot(1, 2, 1, projection="3d")
     ax = figure.add_subplot(1, 2, 2)
-    space.plot(*wanted.T.numpy(), color=_TRUTH, linewidth=5, label="wanted")
+    space.plot(*wanted.T.numpy(), color=TRUTH, linewidth=5, label="wanted")
     for index, (name, path) in enumerate(paths.items()):
-        colour = _COLOURS[index % len(_COLOURS)]
+        colour = look(index)[0]
         space.plot(*path.T.numpy(), color=colour, linewidth=1.3, label=name)
         distance = 1e3 * (path - wanted).norm(dim=-1)
         ax.plot(t, distance, color=colour, linewidth=1.3)
@@ -209,7 +175,7 @@ def tip_path_figure(t: Tensor, paths: dict[str, Tensor], wanted: Tensor, *, titl
 
 
 def steady_state_figure(
-    bound: Tensor, measured: Tensor, *, title: str, label: str = r"$\|q_{ref} - q\|_2$"
+    bound: Tensor, measured: Tensor, *, title: str, label: str = ERROR
 ) -> Figure:
     """Steady-state error of each set point against its predicted bound, on two log axes.
 
@@ -237,21 +203,17 @@ def steady_state_figure(
     above = y > x
     figure = Figure(figsize=(6.5, 6.0), layout="constrained")
     ax = figure.subplots()
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.scatter(x[~above], y[~above], s=28, color=_COLOURS[0], label="below its bound")
+    ax.set(xscale="log", yscale="log", aspect="equal")
+    ax.scatter(x[~above], y[~above], s=28, color=COLOURS[0], label="below its bound")
     if above.any():
-        ax.scatter(x[above], y[above], s=40, color=_WARNING, marker="x", label="above its bound")
+        ax.scatter(x[above], y[above], s=40, color=COLOURS[1], marker="x", label="above its bound")
     if len(x):
         both = torch.cat([x, y])
         ends = (0.5 * float(both.min()), 2 * float(both.max()))
         ax.plot(ends, ends, "--", color="0.4", linewidth=1, label="error = bound")
-        ax.set_xlim(ends)
-        ax.set_ylim(ends)
-    ax.set_aspect("equal")
+        ax.set(xlim=ends, ylim=ends)
     ax.grid(True, which="major", alpha=0.3)
-    ax.set_xlabel(f"predicted bound on {label}")
-    ax.set_ylabel(f"measured {label}")
+    ax.set(xlabel=f"predicted bound on {label}", ylabel=f"measured {label}")
     ax.legend(loc="upper left", fontsize="small")
     lines = [title, f"{int((~above).sum())} of {int(bounded.sum())} bounds hold"]
     unbounded, endless = int((~bounded).sum()), int((bounded & ~drawn).sum())
@@ -259,22 +221,3 @@ def steady_state_figure(
         lines.append(f"not drawn: {unbounded} without a bound, {endless} without a finite error")
     figure.suptitle("\n".join(lines), fontsize="medium")
     return figure
-
-
-def _make_room_for_spikes(ax: Axes, values: Tensor) -> None:
-    """A logarithmic axis beyond the usual values where a spike would flatten these."""
-    sizes = values.abs().nan_to_num(0.0, 0.0, 0.0).flatten()
-    usual = float(torch.quantile(sizes, 0.95))
-    if usual > 0 and float(sizes.max()) > _SPIKE * usual:
-        ax.set_yscale("symlog", linthresh=usual)
-        ax.set_ylabel(f"{ax.get_ylabel()}\nlogarithmic beyond ±{usual:.2g}")
-
-
-def _label_grid(panels: list[list[Axes]], labels: list[str], input_labels: list[str]) -> None:
-    """Names on the panels of a grid; panels that nothing is drawn in are hidden."""
-    for column, names in zip(panels, (labels, None, input_labels), strict=True):
-        for row, ax in enumerate(column):
-            if row >= len(labels if names is None else names):
-                ax.set_axis_off()
-            elif names is not None:
-                ax.set_ylabel(names[row], fontsize="small")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pinn_dyn.evaluation.prediction import Prediction
+from pinn_dyn.mechanics import Trajectory
 
 DIVERGENCE_FACTOR = 1e3
 """A roll-out has diverged once its error exceeds this many times the spread of the true q."""
@@ -157,6 +159,31 @@ def diverged_trajectories(prediction: Prediction) -> Tensor:
     bound = DIVERGENCE_FACTOR * float(spread) if spread > 0 else float("inf")
     # A non-finite q_hat gives a non-finite error, which no comparison with <= lets through.
     return ~((error <= bound) & torch.isfinite(error)).all(dim=1)
+
+
+def left_data(prediction: Prediction, train: Sequence[Trajectory]) -> dict[str, float]:
+    """Where roll-outs leave the data, which no model can know anything about.
+
+    A roll-out has left them once a predicted coordinate lies below ``low - (high - low)`` or above
+    ``high + (high - low)``, with low and high its ends over all training trajectories; one that
+    is not finite has left them too. ``left_data`` is how many of the K roll-outs did, and
+    ``left_data_after`` the time in s at which the first of them did, infinite if none.
+
+    Args:
+        prediction: K roll-outs.
+        train: the training trajectories, q ``(T, N)`` each.
+    """
+    low = torch.stack([item.q.amin(dim=0) for item in train]).amin(dim=0)
+    high = torch.stack([item.q.amax(dim=0) for item in train]).amax(dim=0)
+    width = high - low
+    q_hat = prediction.q_hat
+    inside = ((q_hat >= low - width) & (q_hat <= high + width)).all(dim=-1)
+    left = ~inside.all(dim=0)
+    first = float(prediction.t[int(left.int().argmax())] - prediction.t[0])
+    return {
+        "left_data": int((~inside.all(dim=1)).sum()),
+        "left_data_after": first if left.any() else float("inf"),
+    }
 
 
 def _valid_time(error: Tensor, t: Tensor, threshold: float) -> float:

@@ -19,7 +19,7 @@ class Prediction:
 
     Attributes:
         t: times, ``(T,)``, s.
-        q_hat: predicted configuration, ``(K, T, N)``; NaN where the roll-out broke down.
+        q_hat: predicted configuration, ``(K, T, N)``; not finite where the roll-out broke down.
         q: true configuration, ``(K, T, N)``.
         members: of an ensemble, what each of its E members predicts, ``(E, K, T, N)``; q_hat is
             their mean.
@@ -33,6 +33,13 @@ class Prediction:
     def error(self) -> Tensor:
         """e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
         return torch.linalg.vector_norm(self.q_hat - self.q, dim=-1)
+
+    def every(self, samples: int) -> Prediction:
+        """The same roll-outs at every ``samples``-th time, to be compared on a coarser grid."""
+        members = None if self.members is None else self.members[..., ::samples, :]
+        return Prediction(
+            self.t[::samples], self.q_hat[:, ::samples], self.q[:, ::samples], members
+        )
 
     def spread(self) -> Tensor:
         """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
@@ -54,7 +61,7 @@ def predict_trajectories(
 
     The roll-out runs in float64 on a copy of the model in evaluation mode; a long one takes
     compiled steps, which changes its numbers by rounding alone. Where a trajectory breaks down (a
-    mass matrix that is no longer positive definite), all of its q_hat is NaN.
+    mass matrix that is no longer positive definite), its q_hat is NaN from there on.
 
     Args:
         model: what predicts, with N coordinates and M inputs.
@@ -142,10 +149,7 @@ def model_for_roll_outs(
 
 @torch.no_grad()
 def _roll_out(model: Predictor, x0: Tensor, input: Signal, stride: int) -> Tensor:
-    """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; NaN rows where it broke down.
-
-    E is 1, but for an ensemble.
-    """
+    """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; E is 1, but for an ensemble."""
     t = input.t[::stride]
     if isinstance(model, Ensemble):
         states = x0.unsqueeze(-2) + model.member_increments(x0, t, input)

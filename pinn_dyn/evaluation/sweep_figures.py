@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pinn_dyn.evaluation.figures import _COLOURS
+from pinn_dyn.evaluation.drawing import COLOURS
 
 _MARKERS = ("o", "s")  # each with all colours
 _DECADE = 10.0
@@ -45,7 +45,7 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: list[str], y: str) -> Fig
             (_line_name(lines, key), rows)
             for key, rows in finite.groupby(lines, sort=False, dropna=False)
         ]
-    styles = [(colour, marker) for marker in _MARKERS for colour in _COLOURS]
+    styles = [(colour, marker) for marker in _MARKERS for colour in COLOURS]
     if len(groups) > len(styles):
         raise ValueError(
             f"{len(groups)} lines, one for each combination of {', '.join(lines)}, cannot be told "

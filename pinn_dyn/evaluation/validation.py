@@ -9,6 +9,7 @@ import torch
 from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
+from pinn_dyn.evaluation.floors import StandsStill
 from pinn_dyn.evaluation.learned_terms import compare_terms
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import (
@@ -21,9 +22,22 @@ from pinn_dyn.evaluation.prediction import (
 from pinn_dyn.evaluation.run_log import log_figures
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
+_PARTS = (1 / 20, 1 / 4)  # of the longest window
+_WORST = 10.0
+
 
 class RolloutValidator:
     """Figures of merit of roll-outs on validation trajectories.
+
+    ``error_windowed``, by which the best checkpoint is chosen, is the mean over windows W of a
+    twentieth, a quarter and the whole of ``window`` (of ``horizon`` if that is None) of::
+
+        mean over trajectories of min(10, mean over t of e_W(t) / mean of f_W)
+
+    e_W is the error with the state re-set to the measured one every W seconds, and f_W that of
+    standing still instead, over all times and trajectories. So 1 is what a model is worth that
+    predicts no motion; a trajectory that diverged counts as 10, and no long roll-out alone decides.
+    The windows are rounded to whole steps.
 
     Args:
         horizon: length of the trajectories, s.
@@ -84,7 +98,7 @@ class RolloutValidator:
         return predict_windows(model, truth, window=self.window, step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
-        """Error mean, median and worst, diverged count, and the seconds that it took.
+        """Error mean, median, worst and windowed, diverged count, and the seconds that it took.
 
         Of an ensemble these are of its mean prediction; with them come the mean error and the
         spread of its members.
@@ -99,7 +113,87 @@ class RolloutValidator:
         if prediction.members is not None:
             figures["member_error_mean"] = member_metrics(prediction)["member_error_mean"]
             figures["spread_mean"] = member_metrics(prediction)["spread_mean"]
+        figures["error_windowed"] = self._windowed(model, truth, prediction)
         return {**figures, "rollout_seconds": time.perf_counter() - start}
+
+    def _windowed(self, model: Predictor, truth: Trajectory, longest: Prediction) -> float:
+        """``error_windowed``; the roll-outs of the longest window are there already."""
+        step = model.fixed_step or self.step
+        truth = truth.until(self.horizon)
+        span = self.window or self.horizon
+        steps = {max(1, round(part * span / step)) for part in _PARTS} - {round(span / step)}
+        found = [longest]
+        found += [predict_windows(model, truth, window=n * step, step=step) for n in steps]
+        still = StandsStill(model.num_coordinates, model.num_inputs)
+        windows = [n * step for n in steps]
+        floors = [self.predict(still, truth)]
+        floors += [predict_windows(still, truth, window=w, step=step) for w in windows]
+        ratios = [
+            (item.error().mean(dim=1) / floor.error().mean()).nan_to_num(_WORST).clamp(max=_WORST)
+            for item, floor in zip(found, floors, strict=True)
+        ]
+        return float(torch.stack(ratios).mean())
+
+
+class ValidationHistory(L.Callback):
+    """Keeps the figures of every validation, to tell how the best checkpoint came about.
+
+    Attributes:
+        rows: of each validation the epoch, the mean training loss of that epoch, ``error_mean``
+            and ``error_windowed``.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, float]] = []
+        self._validated = False
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """The loss of the epoch is known only at its end."""
+        self._validated = True
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Keep the figures of this epoch, if it was validated."""
+        if self._validated:
+            names = ("train/loss", "val/error_mean", "val/error_windowed")
+            found = {n: float(trainer.callback_metrics.get(n, torch.nan)) for n in names}
+            self.rows.append({"epoch": trainer.current_epoch, **found})
+        self._validated = False
+
+    def state_dict(self) -> dict[str, list[dict[str, float]]]:
+        """The rows, for a training that is resumed."""
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state_dict: dict[str, list[dict[str, float]]]) -> None:
+        """The inverse of :meth:`state_dict`."""
+        self.rows = list(state_dict["rows"])
+
+    def summary(self) -> str:
+        """Best beside last; empty without a validation."""
+        if not self.rows:
+            return ""
+        best, last = self._best(), self.rows[-1]
+        return "; ".join(
+            f"{name} (epoch {row['epoch']:.0f}): windowed {row['val/error_windowed']:.3g}, "
+            f"mean {row['val/error_mean']:.3g}"
+            for name, row in (("best.ckpt", best), ("last.ckpt", last))
+        )
+
+    def warning(self) -> str | None:
+        """What to be wary of: a best at the first validation while the loss went on to fall."""
+        if len(self.rows) < 2 or self._best() is not self.rows[0]:
+            return None
+        first, last = self.rows[0]["train/loss"], self.rows[-1]["train/loss"]
+        if not last < first:
+            return None
+        return (
+            f"best.ckpt is of the first validation, while the training loss fell from {first:.3g} "
+            f"to {last:.3g} after it: the model fits its windows better and predicts worse. See "
+            "last.ckpt too (evaluate.py checkpoint=last), at longer windows (data.steps), or at "
+            "whether the validation motions are like the training ones"
+        )
+
+    def _best(self) -> dict[str, float]:
+        return min(self.rows, key=lambda row: row["val/error_windowed"])
 
 
 class RolloutFigures(L.Callback):

@@ -6,8 +6,11 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.image import imread
 
+from pinn_dyn.app.build import build_source
+from pinn_dyn.app.runs import read_config
 from tests.app.entry import NO_FIGURES, refused_text, run_script, train
 
 SHORT = ["horizon=0.1", "windows=[0.02,0.05]"]
@@ -45,21 +48,45 @@ def evaluation(tmp_path_factory, hnn_run, mlp_run):
 
 
 def test_tables_are_written_as_csv_and_json(evaluation):
-    summary = pd.read_csv(evaluation / "summary.csv")
-    assert summary["model"].tolist() == ["hnn", "mlp"]
+    every = pd.read_csv(evaluation / "summary.csv")
+    assert every["model"].tolist()[:4] == ["hnn", "mlp", "stands still", "keeps its velocity"]
+    assert every["floor"].tolist() == [False, False] + [True] * (len(every) - 2)
+    summary = every[~every["floor"]]
     assert np.isfinite(summary["error_mean"]).all()
     assert (summary["error_mean"] > 0).all()
     assert {"window_0.02s_error_mean", "window_0.05s_error_mean"} <= set(summary)
     assert (summary["pairs"] == 64).all()
     rows = json.loads((evaluation / "summary.json").read_text())
-    assert [row["error_mean"] for row in rows] == pytest.approx(summary["error_mean"].tolist())
+    assert [row["error_mean"] for row in rows] == pytest.approx(every["error_mean"].tolist())
     by_model = pd.read_csv(evaluation / "by_model.csv")
-    assert by_model["model"].tolist() == ["hnn", "mlp"]
+    assert by_model["model"].tolist() == every["model"].tolist()
+
+
+def test_the_floors_are_those_of_the_test_motions(evaluation, hnn_run):
+    """Computed again from the data, without the code that predicts."""
+    test = build_source(read_config(hnn_run)).load().test
+    still = [torch.linalg.vector_norm(x.q - x.q[:1], dim=-1)[:51:5] for x in test]
+    moving = [
+        torch.linalg.vector_norm(x.q - x.q[:1] - x.v[:1] * x.t[:, None], dim=-1)[:51:5]
+        for x in test
+    ]
+    rows = pd.read_csv(evaluation / "summary.csv").set_index("run")
+    for name, errors in (("stands still", still), ("keeps its velocity", moving)):
+        expected = float(torch.stack(errors).mean())
+        assert rows.loc[name, "error_mean"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_mechanical_models_have_a_torque_error_joint_by_joint(evaluation):
+    rows = pd.read_csv(evaluation / "summary.csv").set_index("run")
+    assert rows["torque_share"].notna().tolist()[:2] == [True, False]
+    joints = pd.read_csv(evaluation / "torque.csv")
+    assert len(joints) == 3
+    assert set(joints["run"]) == {"hnn"}
 
 
 def test_a_windowed_error_is_smaller_than_the_open_loop_one(evaluation):
     """Re-set every 0.02 s of 0.1 s, an untrained model has less time to drift."""
-    summary = pd.read_csv(evaluation / "summary.csv")
+    summary = pd.read_csv(evaluation / "summary.csv")[:2]
     assert (summary["window_0.02s_error_mean"] < summary["error_mean"]).all()
 
 
@@ -98,7 +125,7 @@ def test_the_validation_trajectories_are_evaluated_on_request(tmp_path, mlp_run,
     evaluate(tmp_path / "out", mlp_run, arguments=["split=validation", "step=0.01"])
     assert "2 validation trajectories, 0.1 s open loop" in capsys.readouterr().out
     assert "unseen test" not in (tmp_path / "out" / "report.html").read_text()
-    found = pd.read_csv(tmp_path / "out" / "summary.csv")["error_mean"].item()
+    found = pd.read_csv(tmp_path / "out" / "summary.csv")["error_mean"][0]
     recorded = json.loads((mlp_run / "metrics.json").read_text())["validation"]
     assert found == pytest.approx(recorded["val/error_mean"], rel=1e-5)
 
@@ -118,7 +145,7 @@ def test_seeds_of_a_model_are_grouped_and_globs_find_them(tmp_path, hnn_run, mlp
     capsys.readouterr()
     evaluate(tmp_path / "out", f"{runs}/*")
     summary = pd.read_csv(tmp_path / "out" / "summary.csv")
-    assert summary["model"].tolist() == ["hnn", "hnn", "mlp"]
+    assert summary["model"].tolist()[:3] == ["hnn", "hnn", "mlp"]
     assert summary["run"].is_unique
     by_model = pd.read_csv(tmp_path / "out" / "by_model.csv").set_index("model")
     assert by_model.loc["hnn", "mean_error_mean"] == pytest.approx(summary["error_mean"][:2].mean())
@@ -211,10 +238,52 @@ def test_runs_with_another_cache_folder_are_of_the_same_data_set(tmp_path, hnn_r
     assert str(cache) in text
     (run / "config.yaml").write_text(text.replace(str(cache), str(tmp_path / "cache")))
     evaluate(tmp_path / "out", hnn_run, run)
-    assert len(pd.read_csv(tmp_path / "out" / "summary.csv")) == 2
+    assert (~pd.read_csv(tmp_path / "out" / "summary.csv")["floor"]).sum() == 2
 
 
 def test_a_horizon_beyond_the_data_is_refused(hnn_run, capsys):
     text = refused(capsys, hnn_run, arguments=["horizon=3"])
     assert "horizon is 3" in text
     assert "lasts only 0.2 s" in text
+
+
+def test_horizon_and_windows_fit_the_data_by_themselves(tmp_path, mlp_run):
+    run_script("evaluate.py", f"runs=[{mlp_run}]", f"hydra.run.dir={tmp_path / 'out'}")
+    record = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    assert record["config"]["horizon"] == pytest.approx(0.2)  # as long as the motions are
+    assert record["config"]["windows"] == [0.1]
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ("horizon=nan", "horizon is nan, expected a number of seconds"),
+        ("horizon=long", "horizon is 'long', expected a number of seconds"),
+        ("step=-1", "step is -1, expected a number of seconds"),
+        ("windows=text", "windows is 'text', expected a list of seconds"),
+        ("windows=[0.1,nan]", "windows is [0.1, nan], expected a list of seconds"),
+        ("trajectory=9", "trajectory is 9, expected 0 to 1"),
+    ],
+)
+def test_settings_that_no_data_fit_are_refused_by_name(capsys, mlp_run, argument, words):
+    text = refused_text(capsys, "evaluate.py", f"runs=[{mlp_run}]", "hydra.run.dir=out", argument)
+    assert words in text
+
+
+def test_no_runs_are_refused_by_name(capsys):
+    text = refused_text(capsys, "evaluate.py", "runs=[]", "hydra.run.dir=out")
+    assert "runs is empty: give run folders" in text
+
+
+@pytest.mark.parametrize("damage", ["config.yaml", "metrics.json", "checkpoints/best.ckpt"])
+def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, capsys, damage):
+    whole, cut = copy(mlp_run, tmp_path / "a"), copy(mlp_run, tmp_path / "b")
+    content = (cut / damage).read_bytes()
+    (cut / damage).write_bytes(content[: len(content) // 2])
+    text = refused(capsys, cut, whole)
+    assert "1 of 2 runs could not be evaluated" in text
+    assert f"{cut}" in text
+    summary = pd.read_csv("out/summary.csv")
+    assert summary["run"].tolist()[0] == "mlp"
+    assert (~summary["floor"]).sum() == 1
+    assert "open report.html" in text

@@ -126,7 +126,6 @@ def test_settings_are_those_of_the_command_line_with_their_resolved_values():
         "threads=1",
         "name=arm/lnn",
         "~callbacks.figures",
-        "callbacks.best.filename=best",
     ]
     assert run_settings(config, overrides) == usual | {
         "model/damping": "constant",

@@ -101,7 +101,7 @@ def predictions(real, names=("hnn", "lnn")):
     return found
 
 
-def summary_of(found):
+def summary_of(found, floors=()):
     return summary_table(
         [
             RunResult(
@@ -110,6 +110,7 @@ def summary_of(found):
                 0,
                 rollout_metrics(item.q_hat, item.q, item.t, thresholds={"small": 0.01}).to_dict(),
                 {"pairs": 8000},
+                floor=name in floors,
             )
             for name, item in found.items()
         ]
@@ -122,11 +123,11 @@ def comparisons_of(names):
     return {name: compare_terms(heavier, arm, q, names=["bent", "more"]) for name in names}
 
 
-def prediction_page(names=("hnn", "lnn"), **changes):
+def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
     """The page, and the summary that it was made of."""
     real = truth()
-    found = predictions(real, names)
-    summary = summary_of(found)
+    found = predictions(real, (*names, *floors))
+    summary = summary_of(found, floors)
     arguments = {
         "title": "an arm",
         "trajectories": f"{real.q.shape[0]} unseen test trajectories",
@@ -138,6 +139,7 @@ def prediction_page(names=("hnn", "lnn"), **changes):
         "labels": LABELS,
         "input_labels": INPUTS,
         "comparisons": comparisons_of(names[:1]),
+        "joints": pd.DataFrame(),
         "origin": origin(names),
     }
     return prediction_report(**arguments | changes), summary

@@ -13,6 +13,7 @@ from pinn_dyn.evaluation import (
     terms_figure,
     trajectory_figure,
 )
+from pinn_dyn.evaluation.drawing import GREY
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 
@@ -53,15 +54,17 @@ def test_trajectories_keep_the_range_of_the_truth(truth, predictions, tmp_path):
         truth, predictions, trajectory=1, title="fake", labels=["x (m)", "y (rad)"]
     )
     check_picture(figure, tmp_path / "new" / "trajectories.png")
-    first, second, inputs = figure.axes
+    drawn = {ax.get_ylabel(): ax for ax in figure.axes if ax.axison}
+    first, inputs = drawn["x (m)"], drawn["u1"]
     assert first.get_ylim()[1] < 2 * float(truth.q.max())
     notes = first.get_title(loc="right")
     # exp(8 t) - 1 leaves a margin of some 0.4 within the first 0.1 s.
     assert "runaway leaves the panel at 0.1 s" in notes
-    assert "fragile broke down" in notes
+    assert "fragile broke down at 0 s" in notes
     assert "good" not in notes
-    assert [ax.get_ylabel() for ax in (first, second)] == ["x (m)", "y (rad)"]
-    assert inputs.get_xlabel() == "time (s)"
+    assert list(drawn) == ["x (m)", "u1", "y (rad)", "‖q̂ − q‖₂ [m, rad]"]
+    assert drawn["‖q̂ − q‖₂ [m, rad]"].get_yscale() == "log"
+    assert inputs.get_xlabel() == "time [s]"
     assert inputs.lines[0].get_drawstyle() == "steps-post"
     assert figure.get_suptitle() == "fake"
 
@@ -83,6 +86,20 @@ def test_error_over_time_counts_the_diverged(predictions, tmp_path):
     prediction = predictions["good"]
     np.testing.assert_allclose(good.get_ydata(), 0.01 * 2**0.5 * prediction.t[1:])
     np.testing.assert_allclose(fragile.get_ydata(), 0.02 * 2**0.5)
+
+
+def test_floors_are_thin_grey_lines_without_a_band(predictions, tmp_path):
+    models = {"good": predictions["good"]}
+    floors = {name: predictions["good"] for name in ("stands still", "ARX")}
+    figure = error_figure(models, floors=floors, title="fake")
+    check_picture(figure, tmp_path / "error.png")
+    (ax,) = figure.axes
+    model, *below = ax.lines
+    assert [line.get_label() for line in below] == ["stands still", "ARX"]
+    assert {line.get_color() for line in below} == {GREY}
+    assert all(line.get_linewidth() < model.get_linewidth() for line in below)
+    assert len({line.get_linestyle() for line in below}) == 2
+    assert len(ax.collections) == 1  # the band of the model
 
 
 def test_colours_follow_the_order_of_the_models(truth, predictions):

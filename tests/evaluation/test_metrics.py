@@ -6,6 +6,7 @@ import torch
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
     Prediction,
+    left_data,
     member_metrics,
     predict_trajectories,
     predict_windows,
@@ -102,6 +103,36 @@ def test_a_truth_that_never_moves_does_not_make_every_error_a_divergence():
     q = torch.ones(1, 4, 2)
     found = rollout_metrics(q + 0.1, q, torch.arange(4.0), thresholds={})
     assert found.diverged == 0
+
+
+def test_leaving_the_data_is_by_more_than_their_width():
+    """Training data from -1 to 1 and from 0 to 10: left beyond +-3, and below -10 or above 20."""
+    t = torch.arange(5.0)
+    q = torch.tensor([[-1.0, 0.0], [1.0, 10.0]])
+    train = [Trajectory(t[:2], q, q, q)]
+    inside = torch.tensor([[3.0, 0.0], [-3.0, 0.0], [0.0, 20.0], [0.0, -10.0], [0.0, 5.0]])
+    far = inside.clone()
+    far[3, 1] = -10.5
+    broken = inside.clone()
+    broken[2:, 0] = torch.nan
+    found = {
+        name: left_data(Prediction(t + 7, q_hat, q_hat), train)
+        for name, q_hat in {
+            "inside": torch.stack([inside, inside]),
+            "far": torch.stack([inside, far]),
+            "broken": torch.stack([broken, far]),
+        }.items()
+    }
+    assert found["inside"] == {"left_data": 0, "left_data_after": math.inf}
+    assert found["far"] == {"left_data": 1, "left_data_after": 3.0}
+    assert found["broken"] == {"left_data": 2, "left_data_after": 2.0}
+
+
+def test_every_other_time_of_a_prediction():
+    prediction = predict_trajectories(PointMass(gain=2.0), ramps()).every(3)
+    full = predict_trajectories(PointMass(gain=2.0), ramps())
+    assert torch.equal(prediction.t, full.t[::3])
+    assert torch.equal(prediction.error(), full.error()[:, ::3])
 
 
 def test_metrics_refuse_shapes_that_do_not_match():

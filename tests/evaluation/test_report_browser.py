@@ -139,15 +139,6 @@ def test_the_controls_of_an_evaluation_work(browser, prediction):
     assert len(alone) == len(last) - 4  # hnn is gone from three coordinates and the error
     page.slide("figure-trajectory", 0.01)
     assert len(page.changed("figure-trajectory", alone)) == len(alone)  # and stays away
-
-    cells = (
-        "return [...document.querySelectorAll('#figure-terms .heatmap-label')]"
-        ".map(cell => cell.textContent)"
-    )
-    before = browser.execute_script(cells)
-    assert len(before) == 3 * (3 * 9 + 3 + 9)
-    page.choose("figure-terms", "hnn, more")
-    page.wait(f"return (() => {{{cells}}})().join() !== {','.join(before)!r}")
     assert page.fine()
 
 
@@ -159,8 +150,6 @@ def test_the_controls_of_a_control_run_work(browser, control):
         last = page.changed(figure, first)
         page.choose(figure, "pd")
         assert len(page.changed(figure, last)) < len(last)
-    steady = "return document.querySelectorAll('#figure-stability .points path').length"
-    assert browser.execute_script(steady) == 3
     details = browser.find_element(By.CSS_SELECTOR, "details")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", details)
     assert not details.find_element(By.TAG_NAME, "table").is_displayed()

@@ -6,6 +6,7 @@ import pytest
 
 from pinn_dyn.evaluation import (
     RunResult,
+    beaten_by_floors,
     format_table,
     grouped_table,
     summary_table,
@@ -40,7 +41,7 @@ def row_of(text, name):
 
 def test_one_row_per_run(results):
     frame = summary_table(results)
-    assert list(frame.columns[:4]) == ["run", "model", "seed", "training_pairs"]
+    assert list(frame.columns[:5]) == ["run", "model", "seed", "floor", "training_pairs"]
     assert list(frame.run) == ["lagrangian-0", "lagrangian-1", "black_box-0", "black_box-1"]
     assert list(frame.error_mean) == [0.25, 0.75, 0.125, math.inf]
 
@@ -83,7 +84,7 @@ def test_files_round_trip(results, tmp_path):
     frame = summary_table(results)
     csv, records = write_table(frame, tmp_path / "new", "runs")
     assert (csv.name, records.name) == ("runs.csv", "runs.json")
-    pd.testing.assert_frame_equal(pd.read_csv(csv), frame)
+    pd.testing.assert_frame_equal(pd.read_csv(csv), frame.astype({"seed": "int64"}))
 
     def refuse(constant):
         raise AssertionError(f"{constant} is not JSON")
@@ -108,3 +109,76 @@ def test_errors_name_the_run():
         summary_table([])
     with pytest.raises(ValueError, match=r"run 'r' names \['seed', 'x'\] twice"):
         summary_table([RunResult("r", "m", 0, {"x": 1.0, "seed": 2}, {"x": 2.0})])
+
+
+# Floors.
+
+
+def table(models, floors, *, lost=()):
+    """Errors by name, of models and of floors; those named in lost have a trajectory diverged."""
+    rows = [
+        RunResult(
+            name,
+            name,
+            None if floor else 0,
+            {"error_mean": error, "error_std": 0.0, "diverged": int(name in lost)},
+            floor=floor,
+        )
+        for part, floor in ((models, False), (floors, True))
+        for name, error in part.items()
+    ]
+    return summary_table(rows)
+
+
+def stars(frame):
+    return [line.split()[0] for line in format_table(frame).splitlines() if "*" in line]
+
+
+FLOORS = {"stands still": 0.9, "ARX": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("models", "lost", "starred", "sentence"),
+    [
+        ({"lnn": 0.2, "mlp": 0.25}, (), ["lnn"], None),
+        # Better than one floor of two is not enough, and a tie is not better.
+        ({"lnn": 0.35, "mlp": 0.5}, (), [], "'ARX' has 0.3"),
+        ({"lnn": 0.3, "mlp": 0.5}, (), [], "'ARX' has 0.3"),
+        # The mean of a model leaves out what it lost: it does not beat a floor that lost nothing.
+        ({"lnn": 0.2, "mlp": 0.5}, ("lnn",), [], "'ARX' has 0.3"),
+        # A floor that lost trajectories of its own is no bar.
+        ({"lnn": 0.35, "mlp": 0.5}, ("ARX",), ["lnn"], None),
+        # A model that lost all has an infinite error and no star.
+        ({"lnn": math.inf, "mlp": 0.25}, ("lnn",), ["mlp"], None),
+    ],
+)
+def test_a_star_goes_to_a_model_that_beats_every_floor(models, lost, starred, sentence):
+    frame = table(models, FLOORS, lost=lost)
+    assert stars(frame) == starred
+    said = beaten_by_floors(frame)
+    assert len(said) == (sentence is not None)
+    assert all("No model beats every floor in error_mean" in text for text in said)
+    assert all(sentence in text for text in said)
+
+
+def test_a_floor_is_marked_in_the_file_and_bracketed_on_the_terminal(tmp_path):
+    frame = table({"lnn": 0.2}, FLOORS)
+    csv, records = write_table(frame, tmp_path, "summary")
+    read = pd.read_csv(csv)
+    assert read["floor"].tolist() == [False, True, True]
+    assert read["seed"].isna().tolist() == [False, True, True]
+    assert json.loads(records.read_text())[1]["seed"] is None
+    assert row_of(format_table(frame), "[ARX]").split()[2] == "-"
+    assert "floor" not in format_table(frame).splitlines()[0]
+    by_model = grouped_table(frame)
+    assert by_model["floor"].tolist() == [False, True, True]
+    assert "[stands still]" in format_table(by_model)
+
+
+def test_columns_of_what_went_wrong_appear_where_something_did():
+    assert "diverged" not in format_table(table({"lnn": 0.2}, FLOORS))
+    assert "diverged" in format_table(table({"lnn": 0.2}, FLOORS, lost=("lnn",)))
+
+
+def test_no_floor_needs_no_sentence(results):
+    assert beaten_by_floors(summary_table(results)) == []

@@ -3,18 +3,18 @@
 import pytest
 import torch
 
-from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation import RolloutValidator, ValidationHistory
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 
 T = 0.25 * torch.arange(17, dtype=torch.float64)
 
 
 class Drift(ContinuousPredictor):
-    """dq/dt = v + 1: a roll-out errs by the time since its start."""
+    """dq/dt = v + rate: a roll-out errs by the time since its start, times the rate."""
 
-    def __init__(self):
-        super().__init__(1, 1, "velocity")
-        self.rate = torch.nn.Parameter(torch.tensor(1.0))
+    def __init__(self, rate=1.0):
+        super().__init__(1, 1)
+        self.rate = torch.nn.Parameter(torch.tensor(rate))
 
     def state_derivative(self, x, u):
         return torch.cat([x[..., 1:] + self.rate, torch.zeros_like(u)], dim=-1)
@@ -66,3 +66,52 @@ def test_data_that_it_does_not_fit_are_refused_before_a_training(window, horizon
 def test_a_window_between_a_step_and_the_horizon_is_expected(window):
     with pytest.raises(ValueError, match=r"expected step <= window <= horizon, or window=null"):
         validator(window)
+
+
+@pytest.mark.parametrize("rate", [1.0, 0.01])
+def test_the_windowed_error_is_in_units_of_standing_still(rate):
+    """Speeds 0.5 and -1: standing still errs by their size times the time, 0.75 on the mean.
+
+    The drift errs by the rate times the same times in each window, so the ratio is rate / 0.75
+    whatever the windows are: 0.5 s (one step), 1 s (a quarter of the horizon) and 3 s.
+    """
+    figures = validator(None)(Drift(rate), truth())
+    assert figures["error_windowed"] == pytest.approx(rate / 0.75, rel=1e-6)
+
+
+def test_a_diverged_trajectory_counts_as_ten_times_standing_still():
+    figures = validator(None)(Drift(float("nan")), truth())
+    assert figures["error_windowed"] == 10.0
+    assert figures["error_mean"] == float("inf")
+
+
+def history(rows):
+    found = ValidationHistory()
+    names = ("epoch", "train/loss", "val/error_mean", "val/error_windowed")
+    found.load_state_dict({"rows": [dict(zip(names, row, strict=True)) for row in rows]})
+    return found
+
+
+def test_best_stands_beside_last():
+    found = history([(4, 0.9, 0.4, 0.30), (9, 0.5, 0.2, 0.10), (14, 0.4, 0.3, 0.125)])
+    assert found.summary() == (
+        "best.ckpt (epoch 9): windowed 0.1, mean 0.2; "
+        "last.ckpt (epoch 14): windowed 0.125, mean 0.3"
+    )
+    assert found.warning() is None
+    assert history([]).summary() == ""
+
+
+@pytest.mark.parametrize(
+    ("rows", "warned"),
+    [
+        ([(4, 0.9, 0.4, 0.1), (9, 0.5, 0.2, 0.2)], True),  # the loss falls, the error does not
+        ([(4, 0.9, 0.4, 0.1), (9, 0.9, 0.2, 0.2)], False),  # nothing is learned any more
+        ([(4, 0.9, 0.4, 0.2), (9, 0.5, 0.2, 0.1)], False),
+        ([(4, 0.9, 0.4, 0.2)], False),
+    ],
+)
+def test_a_best_at_the_first_validation_while_the_loss_falls_is_a_warning(rows, warned):
+    said = history(rows).warning()
+    assert (said is not None) == warned
+    assert not warned or "fell from 0.9 to 0.5" in said

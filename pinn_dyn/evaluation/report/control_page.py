@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
-import plotly.graph_objects as go
 import torch
 from markupsafe import Markup
-from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.stability_report import MEASUREMENT_TOLERANCE
+from pinn_dyn.evaluation.control_figures import (
+    ERROR,
+    control_error_panel,
+    control_errors,
+    control_panels,
+    steady_state_figure,
+)
 from pinn_dyn.evaluation.control_metrics import stopped_runs
+from pinn_dyn.evaluation.drawing import units, with_unit
 from pinn_dyn.evaluation.report.error_curves import error_figure
-from pinn_dyn.evaluation.report.motion import Line, Panel, motion_figure, shown_motions
+from pinn_dyn.evaluation.report.motion import motion_figure, shown_motions
 from pinn_dyn.evaluation.report.page import (
     Origin,
     Section,
     details,
+    drawing,
     figure,
     from_markdown,
     page,
@@ -28,9 +36,7 @@ from pinn_dyn.evaluation.report.page import (
     picture,
     table,
     turned,
-    units,
 )
-from pinn_dyn.evaluation.report.style import DARK, GREY, calm, colour, dash
 
 _ANIMATION = 5e6  # bytes of the largest animation that is embedded
 _HEADERS = {
@@ -170,11 +176,8 @@ def _step_header(name: str) -> str:
 
 
 def _errors(records: Mapping[str, ClosedLoopRecord], labels: Sequence[str]) -> list[Markup]:
-    curves = {
-        name: (record.t, _distance(record), stopped_runs(record))
-        for name, record in records.items()
-    }
-    drawn = error_figure(curves, label=_error_label(labels), one="run", lost="stopped")
+    panel = control_error_panel(records, with_unit(ERROR, labels))
+    drawn = error_figure(panel, one="run", lost="stopped")
     text = "A click on a name of the legend hides or shows it, a double click leaves it alone."
     return [figure(drawn, "figure-error"), paragraph(text)]
 
@@ -186,21 +189,11 @@ def _motions(
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Section]:
-    laws = [(name, record, colour(k), dash(k)) for k, (name, record) in enumerate(records.items())]
-    first = laws[0][1]
-    states = []
-    for k, label in enumerate(labels):
-        lines = [Line(name, r.t, r.q[..., k], c, d) for name, r, c, d in laws]
-        wanted = Line("reference", first.t, first.reference.q[..., k], DARK, "dot", always=True)
-        states.append(Panel(label, [*lines, wanted]))
-    errors = [Line(name, r.t, _distance(r), c, d) for name, r, c, d in laws]
-    states.append(Panel(_error_label(labels), errors, log=True))
-    inputs = [
-        Panel(label, [Line(name, r.t, r.u[..., k], c, d, held=held) for name, r, c, d in laws])
-        for k, label in enumerate(input_labels)
-    ]
-    shown = shown_motions(len(first.stopped), [run, *(int(_worst(r)) for _, r, _, _ in laws)])
-    stopped = torch.stack([stopped_runs(record) for _, record, _, _ in laws]).any(dim=0)
+    error = with_unit(ERROR, labels)
+    states, inputs = control_panels(records, labels, input_labels, error=error, held=held)
+    first = next(iter(records.values()))
+    shown = shown_motions(len(first.stopped), [run, *map(_worst, records.values())])
+    stopped = torch.stack([stopped_runs(record) for record in records.values()]).any(dim=0)
     names = {k: f"{k} stopped" if stopped[k] else f"{k}" for k in shown}
     count = len(first.stopped)
     rest = f" Shown are {len(shown)} of {count} runs." if len(shown) < count else ""
@@ -221,25 +214,16 @@ def _motions(
     return sections
 
 
-def _worst(record: ClosedLoopRecord) -> Tensor:
+def _worst(record: ClosedLoopRecord) -> int:
     """The run with the largest error."""
-    return _distance(record).nan_to_num(torch.inf).mean(dim=1).argmax()
-
-
-def _distance(record: ClosedLoopRecord) -> Tensor:
-    return (record.reference.q - record.q).double().norm(dim=-1)
-
-
-def _error_label(labels: Sequence[str]) -> str:
-    unit = units(labels)
-    return f"‖q_ref − q‖₂ [{unit}]" if unit else "‖q_ref − q‖₂"
+    return int(control_errors(record).nan_to_num(torch.inf).mean(dim=1).argmax())
 
 
 def _animation(path: Path, law: str, run: int) -> list[Markup]:
     if path.stat().st_size > _ANIMATION:
         return [paragraph(f"{path.name} is too large for this page; it lies beside it.")]
     text = f"run {run} under the law {law}"
-    return [picture(path, text), paragraph(f"In real time: {text}.")]
+    return [picture(path.read_bytes(), "gif", text), paragraph(f"In real time: {text}.")]
 
 
 def _stability(result: StabilityResult, labels: Sequence[str]) -> list[Markup]:
@@ -252,30 +236,12 @@ def _stability(result: StabilityResult, labels: Sequence[str]) -> list[Markup]:
         f"points; there {below} of {len(bounded)} measured steady-state errors are below the "
         "predicted bound."
     )
+    bound = torch.tensor(points["bound"].where(points["holds"], math.inf).tolist())
+    measured = torch.tensor(points["measured_error"].tolist())
+    error = with_unit(ERROR, labels)
+    drawn = steady_state_figure(bound, measured, title="Steady states", label=error)
     return [
         paragraph(text),
-        figure(_steady_states(bounded, labels), "figure-stability"),
+        drawing(drawn, "steady-state errors against their bounds"),
         details("The whole report (stability.md)", from_markdown(result.report)),
     ]
-
-
-def _steady_states(points: pd.DataFrame, labels: Sequence[str]) -> go.Figure:
-    """Measured steady-state errors against their bounds, on two logarithmic axes."""
-    drawn = go.Figure()
-    drawn.add_scatter(
-        x=points["bound"],
-        y=points["measured_error"],
-        customdata=points.index,
-        mode="markers",
-        marker={"color": colour(0), "size": 8, "opacity": 0.7},
-        name="set points",
-        hovertemplate="run %{customdata}<br>bound %{x:.3g}<br>measured %{y:.3g}<extra></extra>",
-    )
-    if len(points):
-        ends = [points["bound"].min(), points["bound"].max()]
-        grey = {"color": GREY, "dash": "dash", "width": 1}
-        drawn.add_scatter(x=ends, y=ends, mode="lines", name="error = bound", line=grey)
-    label = _error_label(labels)
-    drawn.update_xaxes(type="log", title=f"predicted bound on {label}")
-    drawn.update_yaxes(type="log", title=f"measured {label}")
-    return calm(drawn).update_layout(height=460, margin={"t": 20, "b": 90}, legend={"y": -0.2})

@@ -3,90 +3,78 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-import torch
 from torch import Tensor
 
-from pinn_dyn.evaluation.report.style import CURVE, POINTS, calm, colour, dash, simplify
+from pinn_dyn.evaluation.drawing import Panel
+from pinn_dyn.evaluation.report.style import CURVE, POINTS, calm, simplify
 
 _HEIGHT, _ABOVE, _BELOW = 500, 80, 90  # of the figure and its margins, px
 _TOLERANCE = 0.004  # decades, less than a pixel
 
 
-def error_figure(
-    curves: Mapping[str, tuple[Tensor, Tensor, Tensor]], *, label: str, one: str, lost: str
-) -> go.Figure:
+def error_figure(panel: Panel, *, one: str, lost: str) -> go.Figure:
     """Error over time: the mean over trajectories and their 10-90 % band, or every trajectory.
 
-    Those that were lost are left out and counted in the legend. The start is not drawn: its error
-    may be 0, which a logarithmic axis has not.
+    Those that were lost are left out and counted in the legend.
 
     Args:
-        curves: names, and of each the times ``(T,)``, the errors ``(K, T)`` and which of the K
-            trajectories were lost, ``(K,)``.
-        label: name and unit of the error.
+        panel: the errors, as :func:`pinn_dyn.evaluation.drawing.error_panel` makes it.
         one: what a trajectory is called.
-        lost: what happened to those, as "diverged".
+        lost: what happened to those that were lost, as "diverged".
     """
     drawn = go.Figure()
     means: list[bool] = []  # which traces each of the two buttons shows
     singles: list[bool] = []
-    floors: list[float] = []
-    tops: list[float] = []
-    for index, (name, (t, error, gone)) in enumerate(curves.items()):
-        count = int(gone.sum())
-        note = f" ({count} of {len(gone)} {lost})" if count else ""
-        style: dict[str, Any] = {
-            "name": html.escape(name) + note,
-            "legendgroup": f"{index}",
-            "mode": "lines",
-        }
-        line = {"color": colour(index), "dash": dash(index)}
-        if count == len(gone):  # in the legend only
-            drawn.add_scatter(x=[None], y=[None], line=line, **style)
-            means.append(True)
-            singles.append(True)
+
+    def add(x: Any, y: Any, shown: tuple[bool, bool], **settings: Any) -> None:
+        drawn.add_scatter(x=x, y=y, mode="lines", visible=shown[0], **settings)
+        means.append(shown[0])
+        singles.append(shown[1])
+
+    for index, line in enumerate(panel.lines):
+        style = {"name": html.escape(line.legend(lost)), "legendgroup": f"{index}"}
+        look = {"color": line.colour, "dash": line.dash}
+        found = line.statistics()
+        if found is None:  # in the legend only
+            add([None], [None], (True, True), line=look, **style)
             continue
-        t, kept = t[1:], error[~gone][:, 1:].double()
-        mean = kept.mean(dim=0)
-        low, high = torch.quantile(kept, torch.tensor([0.1, 0.9], dtype=kept.dtype), dim=0)
-        for edge, fill in ((low, None), (high, "tonexty")):
-            x, y = simplify(t, edge, tolerance=_TOLERANCE, log=True)
-            drawn.add_scatter(
-                x=x,
-                y=y,
+        mean, low, high = found
+        for edge, fill in ((low, None), (high, "tonexty")) if line.band else ():
+            edges = {"width": 0, "color": line.colour}
+            add(
+                *simplify(line.t, edge, tolerance=_TOLERANCE, log=True),
+                (True, False),
                 fill=fill,
-                fillcolor=_faint(colour(index)),
-                line={"width": 0, "color": colour(index)},
+                fillcolor=_faint(line.colour),
+                line=edges,
                 showlegend=False,
                 hoverinfo="skip",
                 **style,
             )
-        x, y = simplify(t, mean, tolerance=_TOLERANCE, log=True)
         hover = "%{y:.3g} at %{x:.3g} s"
-        drawn.add_scatter(x=x, y=y, line=line | {"width": 2}, hovertemplate=hover, **style)
-        x, y, which = _joined(t, kept, (~gone).nonzero()[:, 0].tolist(), len(curves))
-        drawn.add_scatter(
-            x=x,
-            y=y,
-            customdata=which,
-            line=line | {"width": 1},
-            visible=False,
-            hovertemplate="%{customdata}: " + hover,
-            **style,
-        )
-        means += [True, True, True, False]
-        singles += [False, False, False, True]
-        floors.append(float(mean.median()))
-        tops.append(float(kept.max()))
-    # The error starts from nothing: three decades below the best are enough of that.
-    ends = None
-    if floors and min(floors) > 0:
-        ends = [np.log10(1e-3 * min(floors)), np.log10(2 * max(tops))]
+        x, y = simplify(line.t, mean, tolerance=_TOLERANCE, log=True)
+        # A floor is its mean under both buttons.
+        both = (True, not line.band)
+        add(x, y, both, line=look | {"width": line.width}, hovertemplate=hover, **style)
+        if line.band:
+            numbers = range(len(line.y)) if line.lost is None else (~line.lost).nonzero()[:, 0]
+            x, y, which = _joined(line.t, line.kept(), [int(k) for k in numbers], len(panel.lines))
+            add(
+                x,
+                y,
+                (False, True),
+                customdata=which,
+                line=look | {"width": 1},
+                hovertemplate="%{customdata}: " + hover,
+                **style,
+            )
+    limits = panel.limits_of_means()
+    ends = None if limits is None else [np.log10(limit) for limit in limits]
     shown = [("mean, 10–90 %", means), (f"every {one}", singles)]
     scales = [
         ("log", {"yaxis.type": "log", "yaxis.range": ends}),
@@ -102,7 +90,7 @@ def error_figure(
         ],
     )
     drawn.update_xaxes(title="time [s]")
-    drawn.update_yaxes(type="log", range=ends, title=html.escape(label))
+    drawn.update_yaxes(type="log", range=ends, title=html.escape(panel.label))
     return drawn
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ import torch
 from plotly.subplots import make_subplots
 from torch import Tensor
 
+from pinn_dyn.evaluation.drawing import Line, Panel
 from pinn_dyn.evaluation.report.style import CURVE, POINTS, calm, simplify
 
 _SHOWN = 24  # motions to choose from, at most
@@ -21,48 +21,6 @@ _MENU, _SLIDER, _NOTHING = 60, 110, 20  # room above the panels, px
 _BELOW = 90  # room for the legend, px
 _TOLERANCE = 1e-3  # of the height of a panel, less than a pixel
 _FAR = 100  # a line is not drawn further from its panel than this many times its height
-_SPIKE = 20  # a peak this many times above the 95th percentile does not set the range
-
-
-@dataclass(frozen=True)
-class Line:
-    """One curve of a panel in each of K motions.
-
-    Attributes:
-        name: its name in the legend; lines of one name are shown and hidden together.
-        t: times, ``(T,)``, s.
-        y: values, ``(K, T)``.
-        colour, dash, width: how it is drawn.
-        held: whether a value holds until the next one.
-        always: whether the menu that chooses among the lines leaves it visible.
-    """
-
-    name: str
-    t: Tensor
-    y: Tensor
-    colour: str
-    dash: str = "solid"
-    width: float = 1.6
-    held: bool = False
-    always: bool = False
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Axes of a figure.
-
-    Attributes:
-        label: name and unit of the vertical axis.
-        lines: what is drawn.
-        leading: the line that sets the range, so that a runaway does not flatten the others; None
-            takes all lines.
-        log: whether the vertical axis is logarithmic.
-    """
-
-    label: str
-    lines: Sequence[Line]
-    leading: Line | None = None
-    log: bool = False
 
 
 def motion_figure(
@@ -188,7 +146,7 @@ def _motion(panels: Sequence[Panel], index: int, points: int) -> list[dict[str, 
     """The curves of one motion."""
     curves = []
     for panel in panels:
-        low, high = _limits(panel, index)
+        low, high = panel.limits(index)
         height = np.log10(high / low) if panel.log else high - low
         for line in panel.lines:
             t, y = line.t.double(), line.y[index].double()
@@ -210,32 +168,8 @@ def _stairs(t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _range(panel: Panel, index: int) -> dict[str, Any]:
-    low, high = _limits(panel, index)
+    low, high = panel.limits(index)
     return {"range": [np.log10(low), np.log10(high)] if panel.log else [low, high]}
-
-
-def _limits(panel: Panel, index: int) -> tuple[float, float]:
-    """The vertical range of a panel."""
-    lines = panel.lines if panel.leading is None else [panel.leading]
-    every = [y[torch.isfinite(y)] for y in (line.y[index].double() for line in lines)]
-    values = torch.cat(every)
-    if panel.log:
-        values = values[values > 0]
-        if not len(values):
-            return 0.1, 1.0
-        # An error may start from nothing and end anywhere: six decades around the best line.
-        best = min(float(y[y > 0].median()) for y in every if (y > 0).any())
-        return max(float(values.min()), 1e-2 * best) / 1.5, 1.5 * min(
-            float(values.max()), 1e4 * best
-        )
-    if not len(values):
-        return -1.0, 1.0
-    usual = float(torch.quantile(values.abs(), 0.95))
-    if float(values.abs().max()) > _SPIKE * usual > 0:
-        values = values.clamp(-2 * usual, 2 * usual)
-    low, high = float(values.min()), float(values.max())
-    margin = (0.3 if panel.leading else 0.08) * (high - low) or 0.1 * abs(high) or 1.0
-    return low - margin, high + margin
 
 
 def _choices(lines: Sequence[Line], everyone: str) -> list[dict[str, Any]]:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import base64
 import datetime
 import html
-import re
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import markdown
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
+from matplotlib import figure as figures
 from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 
-from pinn_dyn.evaluation.tables import _number
+from pinn_dyn.evaluation.tables import number
 
 # Whatever is put into a template is escaped, unless it is Markup that was made here.
 _TEMPLATES = Environment(
@@ -104,11 +104,17 @@ def from_markdown(text: str) -> Markup:
     )
 
 
-def picture(path: Path, text: str) -> Markup:
-    """A GIF or PNG, embedded."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    kind = path.suffix.removeprefix(".")
+def picture(content: bytes, kind: str, text: str) -> Markup:
+    """A ``gif`` or ``png``, embedded."""
+    data = base64.b64encode(content).decode()
     return Markup('<img src="data:image/{};base64,{}" alt="{}">').format(kind, data, text)
+
+
+def drawing(drawn: figures.Figure, text: str) -> Markup:
+    """A figure of matplotlib, embedded."""
+    file = io.BytesIO()
+    drawn.savefig(file, format="png", dpi=110)
+    return picture(file.getvalue(), "png", text)
 
 
 def table(
@@ -166,12 +172,6 @@ def figure(drawn: Figure, name: str, *, wide: bool = False) -> Markup:
     return Markup('<div class="wide">{}</div>').format(drawing) if wide else drawing
 
 
-def units(labels: Sequence[str]) -> str:
-    """The units of labels such as ``Δx [rad]`` or ``q1 (rad)``, each once; "" without any."""
-    found = [re.search(r"[\[(]([^\[\]()]+)[\])]\s*$", label) for label in labels]
-    return ", ".join(dict.fromkeys(match[1] for match in found if match))
-
-
 def _is_text(column: pd.Series) -> bool:
     return len(column) > 0 and all(isinstance(value, str) for value in column)
 
@@ -181,4 +181,4 @@ def _is_fraction(value: object) -> bool:
 
 
 def _cell(value: object) -> str:
-    return _number(float(value)) if isinstance(value, float) else str(value)
+    return number(float(value)) if isinstance(value, float) else str(value)

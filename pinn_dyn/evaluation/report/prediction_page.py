@@ -7,25 +7,25 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 from markupsafe import Markup
 
+from pinn_dyn.evaluation.drawing import units, with_unit
+from pinn_dyn.evaluation.figures import ERROR, prediction_errors, terms_figure, trajectory_panels
 from pinn_dyn.evaluation.learned_terms import TermComparison
 from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.prediction import Prediction
 from pinn_dyn.evaluation.report.error_curves import error_figure
-from pinn_dyn.evaluation.report.motion import Line, Panel, motion_figure, shown_motions
+from pinn_dyn.evaluation.report.motion import motion_figure, shown_motions
 from pinn_dyn.evaluation.report.page import (
     Origin,
     Section,
     details,
+    drawing,
     figure,
     page,
     paragraph,
     table,
     turned,
-    units,
 )
-from pinn_dyn.evaluation.report.style import DARK, GREY, colour, dash
-from pinn_dyn.evaluation.report.terms import terms_figure
-from pinn_dyn.evaluation.tables import _best
+from pinn_dyn.evaluation.tables import beaten_by_floors, best, bracketed
 from pinn_dyn.mechanics import Trajectory
 
 _HEADERS = {
@@ -36,6 +36,9 @@ _HEADERS = {
     "error_median": "median",
     "error_worst": "worst trajectory",
     "diverged": "diverged",
+    "left_data": "left the data",
+    "left_data_after": "first after [s]",
+    "torque_share": "torque error / spread",
     "training_seconds": "training [s]",
 }
 _GROUP_HEADERS = {
@@ -59,6 +62,7 @@ def prediction_report(
     labels: Sequence[str],
     input_labels: Sequence[str],
     comparisons: Mapping[str, TermComparison],
+    joints: pd.DataFrame,
     origin: Origin,
 ) -> str:
     """The page as HTML text.
@@ -69,60 +73,69 @@ def prediction_report(
         summary: one row per run, as :func:`pinn_dyn.evaluation.summary_table` makes it.
         grouped: one row per model, as :func:`pinn_dyn.evaluation.grouped_table` makes it.
         truth: the K trajectories stacked, q ``(K, T, N)``, over the horizon.
-        predictions: names of runs and their roll-outs of the same K trajectories.
+        predictions: names of runs and floors, and their roll-outs of the same K trajectories.
         trajectory: which of the K to show first.
         labels, input_labels: name and unit of each coordinate and input.
         comparisons: names of the runs that have terms, and these beside the true ones; empty
             where the truth is not known.
+        joints: torque errors, one row per run and joint; empty without any.
         origin: where the numbers come from.
     """
+    floors = set(summary["run"][summary["floor"]])
+    models = {name: item for name, item in predictions.items() if name not in floors}
+    trained = summary[~summary["floor"]]
     sections = [
         Section("Summary", _summary(summary, grouped, labels)),
-        Section("Error over time", _errors(predictions, labels)),
+        Section("Error over time", _errors(predictions, floors, labels)),
         Section(
             "Trajectories",
-            _trajectories(summary, truth, predictions, trajectory, labels, input_labels),
+            _trajectories(trained, truth, models, trajectory, labels, input_labels),
         ),
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
     ]
+    if len(joints):
+        sections.insert(3, Section("Torque", _torques(joints)))
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
 def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]) -> list[Markup]:
     headers = {name: text for name, text in _HEADERS.items() if name in summary}
     for name in summary:
+        if name.startswith("valid_time_"):
+            headers[name] = f"valid time, {name.removeprefix('valid_time_')} [s]"
         if name.startswith("window_") and name.endswith("_error_mean"):
             span = name.removeprefix("window_").removesuffix("s_error_mean")
             headers[name] = f"mean error, re-set every {span} s"
-    best = pd.DataFrame({name: _best(summary, name) for name in headers})
+    marks = pd.DataFrame({name: best(summary, name) for name in headers})
     unit = units(labels)
     parts = [
         paragraph(
             "The error is ‖q̂ − q‖₂"
             + (f", in the units of q ({unit})" if unit else ", in the units of q")
             + ", of roll-outs from the true initial state under the true input, over all times and "
-            "trajectories that did not diverge. The best figure of a column is bold; a "
-            "number under the pointer shows all its digits."
+            "trajectories that did not diverge. Rows in brackets are floors and rivals: what a "
+            "model has to beat, or its structure has brought nothing. The best model of a column "
+            "is bold if it beats them all. A number under the pointer shows all its digits."
         ),
-        table(summary, headers=headers, best=best, spread={"error_mean": "error_std"}),
+        table(bracketed(summary), headers=headers, best=marks, spread={"error_mean": "error_std"}),
+        *map(paragraph, beaten_by_floors(summary)),
     ]
     if len(grouped) < len(summary):
         shown = {name: text for name, text in _GROUP_HEADERS.items() if name in grouped}
-        marks = pd.DataFrame({name: _best(grouped, name) for name in shown})
-        parts.append(table(grouped, headers=shown, best=marks))
+        marks = pd.DataFrame({name: best(grouped, name) for name in shown})
+        parts.append(table(bracketed(grouped), headers=shown, best=marks))
     parts.append(details("All figures of every run (summary.csv)", table(turned(summary, "run"))))
     return parts
 
 
-def _errors(predictions: Mapping[str, Prediction], labels: Sequence[str]) -> list[Markup]:
-    curves = {
-        name: (item.t, item.error(), diverged_trajectories(item))
-        for name, item in predictions.items()
-    }
-    drawn = error_figure(
-        curves, label=_with_unit("‖q̂ − q‖₂", labels), one="trajectory", lost="diverged"
-    )
+def _errors(
+    predictions: Mapping[str, Prediction], floors: set[str], labels: Sequence[str]
+) -> list[Markup]:
+    models = {name: item for name, item in predictions.items() if name not in floors}
+    below = {name: item for name, item in predictions.items() if name in floors}
+    panel = prediction_errors(models, below, with_unit(ERROR, labels))
+    drawn = error_figure(panel, one="trajectory", lost="diverged")
     text = "A click on a name of the legend hides or shows it, a double click leaves it alone."
     return [figure(drawn, "figure-error"), paragraph(text)]
 
@@ -135,28 +148,16 @@ def _trajectories(
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Markup]:
-    panels = []
-    for k, label in enumerate(labels):
-        real = Line("truth", truth.t, truth.q[..., k], GREY, width=4, always=True)
-        guesses = [
-            Line(name, item.t, item.q_hat[..., k], colour(index), dash(index))
-            for index, (name, item) in enumerate(predictions.items())
-        ]
-        panels.append(Panel(label, [real, *guesses], leading=real))
-    distances = [
-        Line(name, item.t, item.error(), colour(index), dash(index))
-        for index, (name, item) in enumerate(predictions.items())
-    ]
-    panels.append(Panel(_with_unit("‖q̂ − q‖₂", labels), distances, log=True))
-    held = truth.input.interpolation == "hold"
-    for k, label in enumerate(input_labels):
-        line = Line("input", truth.t, truth.u[..., k], DARK, held=held, always=True)
-        panels.append(Panel(label, [line]))
+    states, inputs = trajectory_panels(
+        truth, predictions, labels, input_labels, with_unit(ERROR, labels)
+    )
     count = len(truth.q)
     worst = {int(row.worst_trajectory): row.run for row in summary.itertuples()}
     shown = shown_motions(count, [first, *worst])
     names = {k: f"{k}" for k in shown}
-    drawn = motion_figure(panels, names, first=first, what="trajectory", everyone="all runs")
+    drawn = motion_figure(
+        [*states, *inputs], names, first=first, what="trajectory", everyone="all runs"
+    )
     which = "; ".join(
         f"{run}: {index}"
         for run, index in zip(summary["run"], summary["worst_trajectory"], strict=True)
@@ -172,6 +173,21 @@ def _trajectories(
     if lost:
         text += f" Diverged: {'; '.join(lost)}. A line is not drawn far outside its panel."
     return [figure(drawn, "figure-trajectory"), paragraph(text)]
+
+
+def _torques(joints: pd.DataFrame) -> list[Markup]:
+    headers = {
+        "run": "run",
+        "joint": "joint",
+        "torque_rms": "RMS of τ̂ − τ",
+        "torque_spread": "spread of τ",
+        "torque_share": "RMS / spread",
+    }
+    text = (
+        "Inverse dynamics on the same motions, τ = A(q) u: an arm that hardly moves may predict "
+        "its torques well and its motion badly, or the other way round."
+    )
+    return [paragraph(text), table(joints, headers=headers)]
 
 
 def _terms(comparisons: Mapping[str, TermComparison]) -> list[Markup]:
@@ -195,25 +211,22 @@ def _terms(comparisons: Mapping[str, TermComparison]) -> list[Markup]:
         "relative_error_best_P": "|X_L − P X| / |X_L|",
         "P_min_eigenvalue": "smallest eigenvalue of P",
     }
-    points = next(iter(comparisons.values()))
-    where = "; ".join(
-        f"{name}: ({', '.join(f'{value:.4g}' for value in q.tolist())})"
-        for name, q in zip(points.names, points.q, strict=True)
-    )
+    drawn = [
+        (
+            f"{name}, {where}",
+            terms_figure(item, configuration=k, title=f"{name}: learned and true terms, {where}"),
+        )
+        for name, item in comparisons.items()
+        for k, where in enumerate(item.names)
+    ]
+    pictures = [details(text, drawing(picture, text)) for text, picture in drawn]
     return [
         paragraph(
             "An equation of motion does not change when it is multiplied by a matrix P(q), so a "
-            "model may learn P X in place of the true X: where the second and third columns agree, "
-            "the model moves like the truth (of M⁻¹ the third is (P M)⁻¹). Each row has one colour "
-            "scale, red for positive and blue for negative entries; the colour follows the square "
-            "root of an entry."
+            "model may learn P X in place of the true X: where the second and third rows agree, "
+            "the model moves like the truth. Each column has one colour scale, red for positive "
+            "and blue for negative entries; the colour follows the square root of an entry."
         ),
-        paragraph(f"Configurations q: {where}."),
-        figure(terms_figure(comparisons), "figure-terms", wide=True),
+        *pictures,
         details("Errors of the terms (terms_*.csv)", table(rows, headers=headers)),
     ]
-
-
-def _with_unit(text: str, labels: Sequence[str]) -> str:
-    unit = units(labels)
-    return f"{text} [{unit}]" if unit else text

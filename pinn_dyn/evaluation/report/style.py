@@ -8,28 +8,15 @@ import numpy as np
 import plotly.graph_objects as go
 from torch import Tensor
 
-from pinn_dyn.evaluation.figures import _COLOURS
+from pinn_dyn.evaluation.drawing import DARK
 
-GREY = "#9aa5ae"
-DARK = "#24303c"
 POINTS = 110_000
 """Points of all curves of a figure, about 1.2 MB, at most."""
 
 CURVE = 500
 """Points of one curve, at most."""
 
-_DASHES = ("solid", "dash", "dot", "dashdot")
 _GRID = "#e6eaee"
-
-
-def colour(index: int) -> str:
-    """The colour of the run with this index, the same in all figures."""
-    return _COLOURS[index % len(_COLOURS)]
-
-
-def dash(index: int) -> str:
-    """The line style of the run with this index, which changes when the colours repeat."""
-    return _DASHES[index // len(_COLOURS) % len(_DASHES)]
 
 
 def calm(drawn: go.Figure) -> go.Figure:

@@ -1,0 +1,95 @@
+"""Torque error: inverse dynamics of a mechanical model on measured motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+import torch
+from scipy.signal import savgol_filter
+from torch import Tensor
+
+from pinn_dyn.mechanics import MechanicalSystem, Trajectory, double_copy
+
+_SMOOTHED = 0.05  # s of velocity that one acceleration is fitted to, at least 5 samples
+_SAMPLES = 5_000  # at which the error is taken, at most
+
+
+@dataclass(frozen=True)
+class TorqueError:
+    """Of N joints, in the unit of the generalized force tau = A(q) u, N m or N::
+
+        tau_hat = M a + C v + G + D v + F(v),      all terms, A too, those of the model
+
+    Attributes:
+        mean: mean of |tau_hat - tau|_2 over samples.
+        share: sqrt(sum_i mean (tau_hat_i - tau_i)^2 / sum_i var tau_i), which a common factor of
+            all terms does not change; 1 is what a constant torque reaches.
+        rms: root mean square of tau_hat_i - tau_i, ``(N,)``.
+        spread: standard deviation of tau_i, ``(N,)``; 0 for a joint without a motor.
+    """
+
+    mean: float
+    share: float
+    rms: Tensor
+    spread: Tensor
+
+    def to_frame(self, labels: Sequence[str]) -> pd.DataFrame:
+        """One row per joint: rms, spread, and their ratio, missing where there is no motor."""
+        share = torch.where(self.spread > 0, self.rms / self.spread, torch.nan)
+        columns = {"torque_rms": self.rms, "torque_spread": self.spread, "torque_share": share}
+        return pd.DataFrame({"joint": list(labels)} | {k: v.numpy() for k, v in columns.items()})
+
+
+def torque_error(
+    model: MechanicalSystem, truth: Trajectory, *, system: MechanicalSystem | None
+) -> TorqueError:
+    """How far the model's inverse dynamics is from the force that was applied.
+
+    The acceleration is that of the true system where there is one. Of measured data it is the
+    slope of the velocity by local polynomials of degree 3 (Savitzky and Golay 1964), fitted to
+    0.05 s or 5 samples, whichever is longer; its noise is part of the error.
+
+    Args:
+        model: the learned system.
+        truth: K trajectories stacked, q ``(K, T, N)``.
+        system: the true system, or None for measured data.
+
+    Raises:
+        ValueError: if a measured trajectory has fewer than 5 samples or its sample time varies.
+    """
+    chosen = slice(None, None, -(-truth.q.shape[:2].numel() // _SAMPLES))
+    q, v, u = (x.double().flatten(0, 1)[chosen] for x in (truth.q, truth.v, truth.u))
+    learned = double_copy(model)
+    with torch.no_grad():
+        if system is None:
+            a = _slope(truth).flatten(0, 1)[chosen]
+        else:
+            a = double_copy(system).forward_dynamics(q, v, u).double()
+        # A(q) u, also of a model whose A depends on u.
+        tau = learned.inverse_dynamics(q, v, learned.forward_dynamics(q, v, u))
+        off = (learned.inverse_dynamics(q, v, a) - tau).nan_to_num(torch.inf)
+    spread = tau.std(dim=0, correction=0).nan_to_num(0.0)
+    spread = torch.where(spread > 1e-9 * spread.max(), spread, 0.0)
+    rms, total = off.square().mean(dim=0).sqrt(), float(spread.norm())
+    return TorqueError(
+        mean=float(off.norm(dim=-1).mean()),
+        share=float(rms.norm()) / total if total > 0 else float("inf"),
+        rms=rms,
+        spread=spread,
+    )
+
+
+def _slope(truth: Trajectory) -> Tensor:
+    """dv/dt, ``(K, T, N)``."""
+    steps = truth.t.double().diff()
+    step = float(steps.mean())
+    if len(truth.t) < 5 or float((steps - step).abs().max()) > 1e-3 * step:
+        raise ValueError(
+            f"the trajectories have {len(truth.t)} samples, {float(steps.min()):g} to "
+            f"{float(steps.max()):g} s apart: accelerations need at least 5 at a constant step"
+        )
+    length = min(max(5, 2 * round(_SMOOTHED / step / 2) + 1), 2 * ((len(truth.t) - 1) // 2) + 1)
+    slope = savgol_filter(truth.v.double().numpy(), length, 3, deriv=1, delta=step, axis=-2)
+    return torch.from_numpy(slope)

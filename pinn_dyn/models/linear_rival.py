@@ -1,0 +1,218 @@
+"""Linear rivals: ARX and EDMDc, fitted by ridge regression in a fraction of a second."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics import Predictor, Signal, Trajectory, stack
+
+_ROWS = 10_000  # windows of a fit, at most
+_FEATURES = 300  # of a fit, at most
+_STEPS = 500  # of the roll-outs that choose the lags
+_LAGS = {1: (1, 2, 4, 8), 2: (1, 2)}  # tried, by degree
+_RIDGES = (1e-12, 1e-7, 1e-3)  # tried, relative to the variance of the features
+
+
+class LinearRival(Predictor):
+    """ARX with the past of q and u (degree 1), or EDMDc of degree 2 with delays::
+
+        x_{k+1} = x_k + W (phi(s_k), u_k, u_{k+1}) + b,      x = (q, v)
+        s_k     = (x_k, x_{k-1}, ... x_{k-L+1}, u_{k-1}, ... u_{k-L+1})
+
+    L are the lags; phi(s) is s itself for degree 1, and s with all products of two of its entries
+    for degree 2. u_{k+1} is the input at the end of the step, seen from within it: held inputs
+    have not jumped there yet. W and b come from ridge regression on standardized features.
+
+    A roll-out is given the state (q, v) at its start and the input from there on, as every other
+    model is; what lies before the start is not known to it. The missing past of s_0 is estimated
+    from (x_0, u_0) by a linear map, fitted to the same training windows. So no rival sees a
+    measurement that a network does not see.
+
+    Sources: Ljung (1999), "System Identification", section 4.2 (ARX); Korda and Mezic (2018),
+    "Linear predictors for nonlinear dynamical systems" (EDMDc), here projected onto the state
+    after every step as in van Goor et al. (2023), "Reprojection methods for Koopman-based
+    modelling and prediction".
+
+    Args:
+        train: training trajectories, each q ``(T, N)`` at a constant sample time.
+        step: step of the model, s, an integer multiple of the sample time.
+        lags: L, at least 1.
+        degree: 1 or 2.
+        ridge: weight of the squared coefficients, relative to the variance of the features.
+
+    Raises:
+        ValueError: if no training trajectory is ``lags`` steps long, the step is no multiple of
+            the sample time, or there are more features than are worth fitting.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    weight: Tensor
+    bias: Tensor
+    past: Tensor
+    past_bias: Tensor
+
+    def __init__(
+        self, train: Sequence[Trajectory], *, step: float, lags: int, degree: int, ridge: float
+    ):
+        super().__init__(train[0].q.shape[-1], train[0].u.shape[-1])
+        self.fixed_step = step
+        self.lags, self.degree = lags, degree
+        state, ends, target = _windows(train, step, lags)
+        if degree == 2 and state.shape[1] ** 2 > 2 * _FEATURES:
+            raise ValueError(
+                f"{state.shape[1]} entries of the past give more than {_FEATURES} products: "
+                "expected fewer lags"
+            )
+        self.register_buffer("mean", state.mean(0))
+        self.register_buffer("scale", _spread(state))
+        features = torch.cat([self._lift(state), ends], dim=1)
+        weight, bias = _ridge(features, target, ridge)
+        self.register_buffer("weight", weight)
+        self.register_buffer("bias", bias)
+        # The past of the first state, from the start alone: its columns in s are the later ones.
+        known = torch.cat([state[:, : 2 * self.num_coordinates], ends[:, : self.num_inputs]], 1)
+        past, past_bias = _ridge(known, state[:, 2 * self.num_coordinates :], 1e-12)
+        self.register_buffer("past", past)
+        self.register_buffer("past_bias", past_bias)
+
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
+        """Apply the linear map step by step.
+
+        Raises:
+            ValueError: if ``t`` does not advance by the step the model was fitted for.
+        """
+        spacing = t.double().diff()
+        step = self.fixed_step
+        assert step is not None
+        if float((spacing - step).abs().max()) > 1e-3 * step:
+            raise ValueError(
+                f"this linear model predicts in steps of {step:g} s, but t advances by "
+                f"{float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
+            )
+        # The input at both ends of each step; of a held one the end still has the step's own.
+        ends = input.stages(t, (0.0, 1.0)).to(x0)
+        size, inputs = x0.shape[-1], self.num_inputs
+        known = torch.cat([x0, ends[0, 0]], dim=-1)
+        past_x, past_u = (known @ self.past + self.past_bias).split(
+            [(self.lags - 1) * size, (self.lags - 1) * inputs], dim=-1
+        )
+        x = x0
+        path = [torch.zeros_like(x0)]
+        for now, after in ends:
+            lifted = self._lift(torch.cat([x, past_x, past_u], dim=-1))
+            change = torch.cat([lifted, now, after], dim=-1) @ self.weight + self.bias
+            if self.lags > 1:
+                past_x = torch.cat([x, past_x[..., :-size]], dim=-1)
+                past_u = torch.cat([now, past_u[..., :-inputs]], dim=-1)
+            path.append(path[-1] + change)
+            x = x0 + path[-1]
+        return torch.stack(path, dim=-2)
+
+    def _lift(self, state: Tensor) -> Tensor:
+        """phi(s), standardized, ``(*batch, F)``."""
+        z = (state - self.mean) / self.scale
+        if self.degree == 1:
+            return z
+        first, second = torch.triu_indices(z.shape[-1], z.shape[-1], device=z.device)
+        return torch.cat([z, z[..., first] * z[..., second]], dim=-1)
+
+
+def fit_linear_rival(
+    train: Sequence[Trajectory], validation: Sequence[Trajectory], *, step: float, degree: int
+) -> LinearRival:
+    """The rival whose lags and ridge have the smallest error over the validation trajectories.
+
+    The error is the mean of |q_hat - q| of open-loop roll-outs over their whole length, up to 500
+    steps, started as the tests are.
+
+    Raises:
+        ValueError: if no number of lags can be fitted; see :class:`LinearRival`.
+    """
+    truth = stack(list(validation))
+    stride = _stride(truth.t, step)
+    truth = truth.until(min(truth.duration, step * _STEPS))
+    best: tuple[float, LinearRival] | None = None
+    reason = "the training data are empty"
+    for lags, ridge in itertools.product(_LAGS[degree], _RIDGES):
+        try:
+            rival = LinearRival(train, step=step, lags=lags, degree=degree, ridge=ridge)
+        except ValueError as problem:
+            reason = str(problem)
+            continue
+        x = rival.predict(
+            truth.states("qv", slice(1))[:, 0].double(),
+            truth.t[::stride].double(),
+            truth.input.to(truth.q.device, torch.float64),
+        )
+        off = x[..., : rival.num_coordinates] - truth.q[:, ::stride]
+        error = float(off.norm(dim=-1).mean().nan_to_num(torch.inf, torch.inf))
+        if best is None or error < best[0]:
+            best = error, rival
+    if best is None:
+        raise ValueError(f"no linear model can be fitted: {reason}")
+    return best[1]
+
+
+def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tensor, Tensor, Tensor]:
+    """States s, inputs (u_k, u_{k+1}) and increments x_{k+1} - x_k, a row for each window."""
+    strides = [_stride(item.t, step) for item in train]
+    counts = [len(item.t) - lags * k for item, k in zip(train, strides, strict=True)]
+    total = sum(max(count, 0) for count in counts)
+    if total < 2:
+        raise ValueError(
+            f"no training trajectory is as long as {lags} steps of {step:g} s and one more: "
+            "expected a shorter step or fewer lags"
+        )
+    thin = -(-total // _ROWS)
+    parts = []
+    for item, stride, count in zip(train, strides, counts, strict=True):
+        x, u = item.states("qv").double(), item.u.double()
+        now = torch.arange((lags - 1) * stride, (lags - 1) * stride + max(count, 0), thin)
+        after = now + stride
+        before = [now - j * stride for j in range(1, lags)]
+        past = [x[now], *(x[k] for k in before), *(u[k] for k in before)]
+        end = u[after - 1 if item.input.interpolation == "hold" else after]
+        parts.append((torch.cat(past, 1), torch.cat([u[now], end], 1), x[after] - x[now]))
+    state, ends, target = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
+    return state, ends, target
+
+
+def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
+    """W and b that minimize the mean of |y - z W - b|^2 + ridge |W s|^2, s the spread of z."""
+    centre, scale = features.mean(0), _spread(features)
+    z, mean = (features - centre) / scale, target.mean(0)
+    # z = Q R: only R and Q^T y are needed of the many rows, whose digits a Gram matrix would lose.
+    rows = torch.linalg.qr(torch.cat([z, target - mean], dim=1), mode="r").R[: z.shape[1]]
+    left, size, right = torch.linalg.svd(rows[:, : z.shape[1]], full_matrices=False)
+    shrunk = size / (size.square() + ridge * len(z))
+    weight = (right.T * shrunk) @ (left.T @ rows[:, z.shape[1] :]) / scale[:, None]
+    return weight, mean - centre @ weight
+
+
+def _spread(values: Tensor) -> Tensor:
+    """Standard deviations of columns, 1 where a column does not vary."""
+    spread = values.std(0, correction=0)
+    size = values.abs().amax(0)
+    return torch.where(spread > 1e-12 * size, spread, 1.0)
+
+
+def _stride(t: Tensor, step: float) -> int:
+    """Samples in a step.
+
+    Raises:
+        ValueError: unless it is an integer multiple of a constant sample time.
+    """
+    sample = t.double().diff()
+    stride = round(step / float(sample.mean()))
+    if stride < 1 or float((sample - step / stride).abs().max()) > 1e-3 * step / stride:
+        raise ValueError(
+            f"step is {step:g} s and the sample times are {float(sample.min()):g} to "
+            f"{float(sample.max()):g} s: expected a step that is an integer multiple of a constant "
+            "sample time"
+        )
+    return stride

@@ -1,0 +1,93 @@
+"""Torque errors against pendulums whose torques are known."""
+
+import math
+
+import pytest
+import torch
+
+from pinn_dyn.evaluation import torque_error
+from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
+
+
+class Pendulum(MechanicalSystem):
+    """m a + d v + k sin q = u for each of two joints; the second has no motor if told so."""
+
+    def __init__(self, mass=2.0, damping=0.5, stiffness=3.0, motors=2, factor=1.0):
+        super().__init__(2, motors)
+        self.mass, self.damping, self.stiffness = mass, damping, stiffness
+        self.factor = factor
+        self.anchor = torch.nn.Parameter(torch.zeros(()))
+
+    def mass_matrix(self, q):
+        eye = torch.eye(2, dtype=q.dtype).expand(*q.shape[:-1], 2, 2)
+        return self.factor * self.mass * eye + self.anchor * eye
+
+    def potential_energy(self, q):
+        return -self.factor * self.stiffness * torch.cos(q).sum(-1)
+
+    def damping_matrix(self, q):
+        eye = torch.eye(2, dtype=q.dtype).expand(*q.shape[:-1], 2, 2)
+        return self.factor * self.damping * eye
+
+    def input_matrix(self, q):
+        eye = torch.eye(2, self.num_inputs, dtype=q.dtype)
+        return self.factor * eye.expand(*q.shape[:-1], 2, self.num_inputs)
+
+
+def motion(motors=2, step=0.01):
+    """q = sin(w t) in either joint, and the torque of the standard pendulum that makes it."""
+    t = step * torch.arange(round(4 / step) + 1, dtype=torch.float64)
+    w = torch.tensor([2.0, 3.0], dtype=torch.float64)
+    q, v, a = (f(w * t[:, None]) for f in (torch.sin, torch.cos, torch.sin))
+    v, a = w * v, -(w**2) * a
+    u = 2.0 * a + 0.5 * v + 3.0 * torch.sin(q)
+    return Trajectory(q[None], v[None], Signal(t, u[None, :, :motors])), v, u
+
+
+def test_the_true_model_has_no_torque_error():
+    truth, _, _ = motion()
+    found = torque_error(Pendulum(), truth, system=Pendulum())
+    assert found.mean < 1e-9
+    assert found.share < 1e-9
+
+
+def test_a_wrong_damping_errs_by_its_share_of_the_velocity():
+    truth, v, u = motion()
+    for system, tolerance in ((Pendulum(), 1e-6), (None, 2e-3)):  # the slope of v by a polynomial
+        found = torque_error(Pendulum(damping=0.7), truth, system=system)
+        rms = 0.2 * v.square().mean(0).sqrt()
+        torch.testing.assert_close(found.rms, rms, rtol=tolerance, atol=tolerance)
+        spread = u.std(dim=0, correction=0)
+        torch.testing.assert_close(found.spread, spread, rtol=1e-6, atol=1e-6)
+        assert found.share == pytest.approx(float(rms.norm() / spread.norm()), rel=tolerance)
+        assert found.mean == pytest.approx(0.2 * float(v.norm(dim=-1).mean()), rel=tolerance)
+
+
+def test_a_common_factor_of_all_terms_does_not_change_the_share():
+    truth, _, _ = motion()
+    one, ten = (
+        torque_error(Pendulum(damping=0.7, factor=f), truth, system=Pendulum()) for f in (1, 10)
+    )
+    assert ten.share == pytest.approx(one.share, rel=1e-9)
+    assert ten.mean == pytest.approx(10 * one.mean, rel=1e-9)
+
+
+def test_a_joint_without_a_motor_has_no_share_but_counts():
+    truth, _, _ = motion(motors=1)
+    found = torque_error(Pendulum(motors=1), truth, system=None)
+    frame = found.to_frame(["shoulder", "elbow"])
+    assert frame["joint"].tolist() == ["shoulder", "elbow"]
+    assert frame["torque_share"].isna().tolist() == [False, True]
+    assert found.spread[1] == 0
+    # The motion of the second joint needs a torque, which nobody applies.
+    assert found.rms[1] > 0.5
+    assert math.isfinite(found.share)
+
+
+def test_accelerations_need_samples_at_a_constant_step():
+    truth, _, _ = motion()
+    with pytest.raises(ValueError, match="have 3 samples"):
+        torque_error(Pendulum(), truth.until(0.02), system=None)
+    uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
+    with pytest.raises(ValueError, match="accelerations need at least 5 at a constant step"):
+        torque_error(Pendulum(), uneven, system=None)
