@@ -56,11 +56,16 @@ def close_loop(
         progress: label of a progress bar; no bar if None.
 
     Raises:
-        ValueError: on sizes that do not agree, initial states that are not finite, or a duration
-            that is no multiple of 1 / rate.
+        ValueError: on sizes that do not agree, initial states that are not finite, a duration that
+            is no multiple of 1 / rate, or a delay that is longer.
     """
     run = _Run(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)
     queue = Delay(delay)
+    if delay >= len(run.t):
+        raise ValueError(
+            f"delay is {delay} instants, and the run has {len(run.t)}: no input would ever arrive; "
+            f"expected less than that, in instants of {1 / rate:g} s"
+        )
     if sensor is not None:
         sensor.reset()
     q, v, moving = q0.clone(), v0.clone(), run.running.clone()

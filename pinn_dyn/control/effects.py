@@ -130,14 +130,14 @@ class Delay:
         samples: dead time in control instants, at least 0.
 
     Raises:
-        ValueError: on a negative number of samples.
+        ValueError: on a number of samples that is negative or not whole.
     """
 
     samples: int
 
     def __post_init__(self) -> None:
-        if self.samples < 0:
-            raise ValueError(f"Delay: samples is {self.samples}, expected at least 0")
+        if not (self.samples >= 0 and self.samples == int(self.samples)):
+            raise ValueError(f"Delay: samples is {self.samples}, expected a whole number from 0")
         self.reset()
 
     def reset(self) -> None:

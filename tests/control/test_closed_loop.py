@@ -412,6 +412,8 @@ class Wide(PD):
         ({"reference": Wave(double([1.0]))}, "reference has 1 coordinates and the plant 2"),
         ({"reference": Wave(Q0[:2])}, r"reference's q has shape \(2, 2\), expected \(2,\) or"),
         ({"delay": -1}, "samples is -1"),
+        ({"delay": 1.5}, "samples is 1.5, expected a whole number"),
+        ({"delay": 21}, "delay is 21 instants, and the run has 21"),
     ],
 )
 def test_bad_arguments_are_named(changes, message):
