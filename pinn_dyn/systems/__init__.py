@@ -1,6 +1,7 @@
 """Analytic and simulated robots, the truth that models are compared with."""
 
 from pinn_dyn.systems.bullet_arm import BulletArm
+from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.soft_arm import SoftArm
 
-__all__ = ["BulletArm", "SoftArm"]
+__all__ = ["BulletArm", "RigidChain", "SoftArm"]
