@@ -20,7 +20,13 @@ from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.evaluation import RolloutValidator, RunDescription
 from pinn_dyn.mechanics import Ensemble, MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
-from pinn_dyn.training import DynamicsLearner, EnsembleLearner, IncrementLoss
+from pinn_dyn.training import (
+    DynamicsLearner,
+    EnsembleLearner,
+    IncrementLoss,
+    LeastSquares,
+    LeastSquaresLearner,
+)
 
 CHECKPOINTS = "checkpoints"
 STEPS_TO_COMPILE = 5000
@@ -125,10 +131,23 @@ def build_learner(
             f"ensemble is {config['ensemble']}, and {type(loss).__name__} trains one model at a "
             "time: take loss=increment, or train the seeds one by one (-m seed=0,1,2)"
         )
+    optimizer = _build("optimizer", config["optimizer"])
+    if isinstance(optimizer, LeastSquares):
+        try:
+            return LeastSquaresLearner(
+                model,  # type: ignore[arg-type]
+                solver=optimizer,
+                loss=loss,
+                validator=validator,
+                config=config,
+                statistics=statistics,
+            )
+        except TypeError as error:
+            raise ConfigError(f"optimizer: {error}") from error
     return (EnsembleLearner if ensemble else DynamicsLearner)(
         model,
         loss=loss,
-        optimizer=_build("optimizer", config["optimizer"]),
+        optimizer=optimizer,
         scheduler=_build("scheduler", config["scheduler"]),
         validator=validator,
         config=config,
