@@ -23,7 +23,7 @@ class Constants(nn.Module, abc.ABC):
 
     def __init__(self, shape: Sequence[int], names: Sequence[str]):
         super().__init__()
-        self.z = nn.Parameter(torch.zeros(*shape, dtype=torch.float64))
+        self.z = nn.Parameter(torch.zeros(*shape))
         self.names = list(names)
 
     @abc.abstractmethod
@@ -51,7 +51,7 @@ class PositiveConstants(Constants):
                 f"{names[0]} ...: start is {start.tolist()} and spread {spread}, expected positive"
             )
         super().__init__(start.shape, names)
-        self.register_buffer("start", start.double().clone())
+        self.register_buffer("start", start.float().clone())
         self.spread = spread
 
     def forward(self) -> Tensor:
@@ -70,7 +70,7 @@ class RealConstants(Constants):
 
     def __init__(self, spread: Tensor, names: Sequence[str]):
         super().__init__(spread.shape, names)
-        self.register_buffer("spread", spread.double().clone())
+        self.register_buffer("spread", spread.float().clone())
 
     def forward(self) -> Tensor:
         return self.spread * self.z
@@ -121,7 +121,7 @@ class PhysicalBodies(Constants):
         root = torch.zeros_like(start)
         root[:, :3, :3] = torch.linalg.cholesky(start[:, :3, :3] / mass - centre @ centre.mT)
         root[:, :3, 3:], root[:, 3, 3] = centre, 1
-        self.register_buffer("root", mass.sqrt() * root)
+        self.register_buffer("root", (mass.sqrt() * root).float())
         self.spread = spread
 
     def forward(self) -> Tensor:

@@ -96,9 +96,8 @@ class LeastSquares:
         velocity_weight: float = 1.0,
     ):
         settings = {"cutoff": cutoff, "samples": samples, "evaluations": evaluations}
-        for name, value in (
-            settings | {"chunk": chunk, "velocity_weight": velocity_weight}
-        ).items():
+        settings |= {"chunk": chunk, "velocity_weight": velocity_weight}
+        for name, value in settings.items():
             if not value > 0:
                 raise ValueError(f"least squares: {name} is {value}, expected a positive number")
         self.cutoff = cutoff

@@ -67,7 +67,8 @@ class LeastSquaresLearner(DynamicsLearner):
         """The fit, on all training trajectories and windows, in double precision."""
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(self.model, KnownMechanics)
-        self.result = self.solver.fit(self.model, data.splits.train, data.windows)
+        if self.result is None:
+            self.result = self.solver.fit(self.model, data.splits.train, data.windows)
         self.log_losses(torch.tensor(self.result.residual**2))
         self.optimizers().step()  # type: ignore[union-attr]  # no gradients: it only counts
 

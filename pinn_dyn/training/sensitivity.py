@@ -18,7 +18,7 @@ _BODIES = "model.bodies.z"
 class Sensitivity:
     """Derivatives of :class:`KnownMechanics` by its standardized parameters z ``(P,)``.
 
-    Its equation of motion is e(q, v, a, u; z) = Y(q, v, a) pi(z) + drive force(v, a, u; z) = 0, so ::
+    Its equation of motion is e(q, v, a, u; z) = Y(q, v, a) pi(z) + drive force(v, a, u; z) = 0::
 
         de/dz = Y dpi/dz + d(drive force)/dz        da/dz = -M^-1 de/dz at fixed q, v, u
 

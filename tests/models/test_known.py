@@ -79,7 +79,7 @@ def test_standardized_constants():
         real.z -= 2
     assert positive().tolist() == pytest.approx([2 * 1.6487213, 3 * 1.6487213])
     assert real().tolist() == [-8.0]
-    with pytest.raises(ValueError, match="start is .* expected positive"):
+    with pytest.raises(ValueError, match=r"start is .* expected positive"):
         PositiveConstants(torch.tensor([0.0]), 0.5, ["a"])
 
 
