@@ -119,7 +119,10 @@ class KnownMechanics(MechanicalSystem):
         self.structure = structure
         self.integrator: Integrator = integrator
         self.substeps = substeps
-        gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(size)
+        gain = torch.as_tensor(drive_gain, dtype=torch.float64)
+        if gain.shape not in ((), (size,)) or not bool((gain > 0).all()):
+            raise ValueError(f"drive_gain is {drive_gain}, expected one number or {size}, positive")
+        gain = gain.expand(size)
         force = gain * statistics.u_rms.double()
         acceleration = statistics.velocity_increment_std[0, size:].double() / statistics.step
         names = structure.joint_names
@@ -135,8 +138,6 @@ class KnownMechanics(MechanicalSystem):
         self.gain: PositiveConstants | None = None
         if gain_spread > 0:
             self.gain = PositiveConstants(gain, gain_spread, [f"drive gain of {n}" for n in names])
-        elif not bool((gain > 0).all()):
-            raise ValueError(f"drive_gain is {drive_gain}, expected positive numbers")
         self.register_buffer("fixed_gain", gain.clone())
         self.fixed_gain: Tensor
         self.float()
