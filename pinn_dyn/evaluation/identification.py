@@ -72,6 +72,7 @@ def undetermined(model: KnownMechanics, fit: Fit, most: int = 10) -> list[str]:
         if variance < _SHARE or len(found) == most:
             break
         order = direction.abs().argsort(descending=True).tolist()
+        direction = direction * direction[order[0]].sign()  # the first is named without a sign
         share, chosen = 0.0, []
         for k in order[:4]:
             if share > 0.8:
