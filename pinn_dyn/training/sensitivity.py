@@ -87,7 +87,7 @@ class Sensitivity:
         size = q.shape[-1]
         copies = [x.expand(size, *x.shape).clone().requires_grad_() for x in (q, v)]
         with torch.enable_grad():
-            force = self.model.inverse_dynamics(*copies, a.expand(size, *a.shape))
+            force = self.model.inverse_dynamics(copies[0], copies[1], a.expand(size, *a.shape))
             picked = force.diagonal(dim1=0, dim2=-1).sum()
             slopes = torch.autograd.grad(picked, copies)
         return torch.cat(slopes, dim=-1).movedim(0, -2)
