@@ -124,7 +124,9 @@ def evaluate(cfg: DictConfig) -> float:
     labels = _labels(runs)
     floors = build_floors(splits.train, splits.validation, step=grid)
     evaluations = []
-    for run, label, step in zip(tqdm(runs, desc="evaluating runs"), labels, steps, strict=True):
+    for run, label, step in zip(
+        tqdm(runs, desc="evaluating runs", disable=None), labels, steps, strict=True
+    ):
         recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
         extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
         row = RunResult(

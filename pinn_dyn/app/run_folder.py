@@ -6,6 +6,7 @@ import contextlib
 import glob
 import json
 import logging
+import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -33,6 +34,8 @@ DATA = "data.json"
 log = logging.getLogger(__name__)
 
 _PLACES = ("dataset.cache",)  # where things lie does not change what is learned
+# Of a record, beside those of its validation.
+_NUMBERS = ("pairs", "parameters", "steps", "training_seconds", "training_cpu_seconds")
 _MOST_CHANGES = 10  # that are shown
 
 
@@ -116,12 +119,27 @@ def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
         raise ConfigError(
             f"{path} holds weights of another model than {folder / CONFIG} describes: {error}"
         ) from error
+    return Run(folder, config, model.eval(), statistics, read_metrics(folder) or {})
+
+
+def read_metrics(folder: Path) -> dict[str, Any] | None:
+    """What a finished training recorded; None if it has not finished.
+
+    Raises:
+        ConfigError: if the record is damaged, or none of train.py.
+    """
     path = folder / METRICS
+    if not path.is_file():
+        return None
     try:
-        metrics = json.loads(path.read_text()) if path.is_file() else {}
-    except ValueError as error:
+        record = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path} cannot be read, it may be cut short: {error}") from error
-    return Run(folder, config, model.eval(), statistics, metrics)
+    if isinstance(record, dict) and isinstance(validation := record.get("validation", {}), dict):
+        numbers = [*validation.values(), *(record[key] for key in _NUMBERS if key in record)]
+        if all(isinstance(number, (int, float)) for number in numbers):
+            return record
+    raise ConfigError(f"{path} holds no record that train.py wrote")
 
 
 _WHAT = {"model": "model", "dataset": "data set"}
@@ -264,7 +282,5 @@ def _refuse_another(folder: Path, config: dict[str, Any]) -> None:
 
 def recorded_error(folder: Path) -> float | None:
     """The validation error that a finished training recorded; None if it has not finished."""
-    path = folder / METRICS
-    if not path.is_file():
-        return None
-    return json.loads(path.read_text())["validation"].get(VALIDATION_ERROR, float("nan"))
+    record = read_metrics(folder)
+    return None if record is None else record.get("validation", {}).get(VALIDATION_ERROR, math.nan)

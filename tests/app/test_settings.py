@@ -99,7 +99,9 @@ def test_keys_of_a_yaml_stay_as_they_are():
     assert completed("train", before) == before
 
 
-@pytest.mark.parametrize("mistake", ["+sede=1", "++sede=1", "+data.pair=3", "+model.substep=1"])
+@pytest.mark.parametrize(
+    "mistake", ["+sede=1", "++sede=1", "+data.pair=3", "+model.integrator.substep=1"]
+)
 def test_a_plus_does_not_hide_a_mistake(tmp_path, monkeypatch, capsys, mistake):
     monkeypatch.chdir(tmp_path)
     error = fails("train.py", mistake)
