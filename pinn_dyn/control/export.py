@@ -147,9 +147,9 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
             travel with it by more than 1e-5 of their norm.
     """
     path = Path(path)
-    if sha256 is not None and (found := _digest(path)) != sha256.strip().lower():
+    if sha256 is not None and (digest := _digest(path)) != sha256.strip().lower():
         raise ValueError(
-            f"{path} has the SHA-256 {found}, expected {sha256}: it is not the file that was "
+            f"{path} has the SHA-256 {digest}, expected {sha256}: it is not the file that was "
             "exported, do not load it"
         )
     info = _read_info(path)

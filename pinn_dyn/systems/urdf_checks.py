@@ -29,7 +29,7 @@ class _Builder(ET.TreeBuilder):
     def doctype(self, *_: str | None) -> None:
         raise ET.ParseError("it declares a document type, which no URDF needs: remove <!DOCTYPE>")
 
-    def start(self, tag: str, attrs: dict[str, str]) -> ET.Element:  # type: ignore[override]
+    def start(self, tag: str, attrs: dict[str, str]) -> ET.Element:
         self.depth += 1
         if self.depth > MOST_DEPTH:
             raise ET.ParseError(f"its elements are more than {MOST_DEPTH} levels deep")

@@ -24,7 +24,6 @@ def test_a_terminal_has_a_bar_instead(tmp_path, capsys, monkeypatch):
     assert "epoch 1 of" not in captured.out
 
 
-@pytest.mark.parametrize("between", [2])
 def test_epochs_between_validations_have_lines_too(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pinn_dyn.app.build.LONGEST_EPOCH", 1)
     train(tmp_path / "run", "model=lnn", "trainer.steps=2", NO_FIGURES)
