@@ -110,7 +110,7 @@ def evaluate(cfg: DictConfig) -> float:
     except ValueError as error:
         raise ConfigError(f"{source.name}: {error}") from error
     for run in runs:
-        check_data(run.folder, source)
+        check_data(run.folder, trained_on)
     grid = stride * truth.duration / (len(truth.t) - 1)
     if config["windows"] is None:
         config["windows"] = default_windows(config["horizon"], grid)
