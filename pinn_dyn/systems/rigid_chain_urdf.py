@@ -64,8 +64,8 @@ def read_tree(
             raise ValueError(f"{path} has no joint {name!r} to lock: its joints are {list(joints)}")
     children: dict[str, list[str]] = {}
     for name, joint in joints.items():
-        children.setdefault(joint.find("parent").get("link", "")  # type: ignore[union-attr], []).append(name)
-    behind = [joint.find("child").get("link", "")  # type: ignore[union-attr] for joint in joints.values()]
+        children.setdefault(_link(joint, "parent"), []).append(name)
+    behind = [_link(joint, "child") for joint in joints.values()]
     (root,) = (name for name in links if name not in behind)
     tip = tip or [name for name in behind if name not in children][-1]
     if tip not in links:
@@ -84,7 +84,7 @@ def read_tree(
                 inertia[body] += payload * np.outer(pose[:, 3], pose[:, 3])
         for name in children.get(link, []):
             joint = joints[name]
-            child = joint.find("child").get("link", "")  # type: ignore[union-attr]
+            child = _link(joint, "child")
             placement = pose @ _pose(joint.find("origin"))
             if joint.get("type") == "fixed" or name in locked_joints:
                 visit(child, body, placement)
@@ -117,6 +117,12 @@ def _parse(urdf: str) -> tuple[Path, ET.Element]:
         path = find_urdf(urdf, shipped)
         text = path.read_text()
     return path, parse_urdf(path, text.encode())
+
+
+def _link(joint: ET.Element, end: str) -> str:
+    element = joint.find(end)
+    assert element is not None  # parse_urdf has seen it
+    return element.get("link", "")
 
 
 def _axis(path: Path, name: str, joint: ET.Element) -> np.ndarray:
