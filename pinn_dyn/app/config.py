@@ -74,16 +74,15 @@ def completed(command: str, arguments: list[str]) -> list[str]:
         ConfigError: on a key that does not exist, with those that were probably meant. What Hydra
             itself explains, a group's wrong option say, is left to it.
     """
-    arguments = list(arguments)
-    while True:
-        unknown = _unknown_key(command, arguments)
-        if unknown is None:
-            return arguments
+    while (unknown := _unknown_key(command, arguments)) is not None:
         key, known = unknown
-        path, name = key.rpartition(".")[::2]
-        taken = _takes(command, known, path)
-        if name not in taken and path not in _OPEN:
-            keys = [*_keys(known), *(f"{path}.{one}" if path else one for one in taken)]
+        before = arguments
+        arguments = [f"++{x}" if _is_unlisted(command, known, x) else x for x in before]
+        if arguments == before:
+            path, _, name = key.rpartition(".")
+            taken = _takes(command, _at(known, path), path)
+            also = (f"{path}.{one}" if path else one for one in taken)
+            keys = list(dict.fromkeys([*_keys(known), *also]))
             close = did_you_mean(key, keys)
             if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
                 close = f": did you mean {' or '.join(same[:3])}?"
@@ -91,21 +90,34 @@ def completed(command: str, arguments: list[str]) -> list[str]:
                 f"the configuration has no key '{key}'{close or ': no key is like it.'} See all "
                 f"keys with 'python {command}.py --cfg job'."
             )
-        index = next(
-            k for k, word in enumerate(arguments) if re.match(rf"{re.escape(key)}[.=]", word)
-        )
-        arguments[index] = f"++{arguments[index]}"
+    return arguments
 
 
-def _takes(command: str, known: dict[str, Any], path: str) -> dict[str, Any]:
-    """What may be set at a place of the configuration, besides what is there."""
+def _is_unlisted(command: str, known: dict[str, Any], word: str) -> bool:
+    """Whether an argument sets a key that exists, but stands in no YAML."""
+    key, equals, _ = word.partition("=")
+    if not equals or not re.fullmatch(r"[A-Za-z]\w*(\.\w+)*", key):
+        return False
+    path, _, name = key.rpartition(".")
+    place = _at(known, path)
+    if not isinstance(place, dict) or name in place:
+        return False
+    return path in _OPEN or name in _takes(command, place, path)
+
+
+def _at(known: Any, path: str) -> Any:
+    """What is at a place of the configuration; None if there is nothing."""
+    for name in path.split(".") if path else ():
+        known = known.get(name) if isinstance(known, dict) else None
+    return known
+
+
+def _takes(command: str, place: Any, path: str) -> dict[str, Any]:
+    """What may be set at a place of the configuration."""
     if not path:
         return KEYS[command]
-    part: Any = known
-    for name in path.split("."):
-        part = part.get(name) if isinstance(part, dict) else None
-    if isinstance(part, dict) and "_target_" in part:
-        return arguments_of(part["_target_"], path)
+    if isinstance(place, dict) and "_target_" in place:
+        return arguments_of(place["_target_"], path)
     return {}
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -89,20 +88,21 @@ def evaluate(cfg: DictConfig) -> float:
 
     Raises:
         ConfigError: on settings that do not fit the data, and on runs that were trained on
-            different data. Run folders that cannot be loaded are passed over; when all else is
-            written, they end the program with this error too.
+            different data, or on other coordinates or inputs than those of ``dataset``. Run
+            folders that cannot be loaded are passed over; when all else is written, they end the
+            program with this error too.
     """
     config = checked("evaluate", cfg)
-    _check(config)
     split = config["split"]
     folder = Path(HydraConfig.get().runtime.output_dir)
     torch.set_num_threads(config["threads"])
     trust = packages(config.get("trust"))
     runs, damaged = _load_all(find_runs(config["runs"]), config["checkpoint"], trust)
-    source = build_source(_shared_dataset(runs))
+    trained_on = build_source(_shared_dataset(runs))
+    source = build_source(config) if config.get("dataset") else trained_on
     try:
-        splits = source.load()
-        truth = stack(getattr(splits, split))
+        training = trained_on.load()
+        truth = stack(getattr(source.load(), split))
         config["horizon"] = config["horizon"] or default_horizon(truth.duration)
         truth = truth.until(config["horizon"])
         steps = [run.model.fixed_step or config["step"] or run.statistics.step for run in runs]
@@ -117,10 +117,16 @@ def evaluate(cfg: DictConfig) -> float:
             f"trajectory is {config['trajectory']}, expected 0 to {len(truth.q) - 1}, one of the "
             f"{len(truth.q)} {_SPLITS[split]}"
         )
+    sizes = [len(source.labels), len(source.input_labels)]
+    if sizes != [len(trained_on.labels), len(trained_on.input_labels)]:
+        raise ConfigError(
+            f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, the runs "
+            f"were trained on {len(trained_on.labels)} and {len(trained_on.input_labels)}"
+        )
     log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], _SPLITS[split], source.name)
 
     labels = _labels(runs)
-    floors = build_floors(splits.train, splits.validation, step=grid)
+    floors = build_floors(training.train, training.validation, step=grid)
     evaluations = []
     for run, label, step in zip(tqdm(runs, desc="evaluating runs"), labels, steps, strict=True):
         recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
@@ -129,13 +135,13 @@ def evaluate(cfg: DictConfig) -> float:
             label, run.config["model_name"], run.config["seed"], {}, {**extra, "step": step}
         )
         try:
-            evaluations.append(_evaluate(run.model, row, truth, splits.train, stride, config))
+            evaluations.append(_evaluate(run.model, row, truth, training.train, stride, config))
         except ValueError as error:
             raise ConfigError(f"{run.folder}: {error}") from error
     trained = list(evaluations)
     for label, floor in floors.items():
         row = RunResult(label, label, None, {}, {"step": grid}, floor=True)
-        evaluations.append(_evaluate(floor, row, truth, splits.train, stride, config))
+        evaluations.append(_evaluate(floor, row, truth, training.train, stride, config))
     joints = _torque_errors(trained, truth, source)
     summary = summary_table([item.result for item in evaluations])
     write_table(summary, folder, "summary")
@@ -187,34 +193,6 @@ def evaluate(cfg: DictConfig) -> float:
             "missing from the tables:\n  " + "\n  ".join(damaged)
         )
     return float(summary["error_mean"][~summary["floor"]].min())
-
-
-def _check(config: dict[str, Any]) -> None:
-    """Refuse settings that no data could fit.
-
-    Raises:
-        ConfigError: naming the setting, what it is and what was expected.
-    """
-    if config["split"] not in _SPLITS:
-        raise ConfigError(f"split: {config['split']!r}, expected one of {', '.join(_SPLITS)}")
-    if not config["runs"]:
-        raise ConfigError("runs is empty: give run folders, as in runs=[runs/soft_arm_1/*/*]")
-    for name in ("horizon", "step"):
-        if config[name] is not None and not _positive(config[name]):
-            raise ConfigError(f"{name} is {config[name]!r}, expected a number of seconds or null")
-    windows = config["windows"]
-    if windows is not None and not (isinstance(windows, list) and all(map(_positive, windows))):
-        raise ConfigError(
-            f"windows is {windows!r}, expected a list of seconds, as in windows=[0.1,1.0], null "
-            "for those that fit, or [] for none"
-        )
-    if not isinstance(config["trajectory"], int):
-        raise ConfigError(f"trajectory is {config['trajectory']!r}, expected its number, from 0")
-
-
-def _positive(value: object) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and 0 < value < math.inf  # type: ignore[operator]
 
 
 def _load_all(

@@ -37,7 +37,7 @@ def test_a_terminated_training_ends_with_a_status_and_can_go_on(tmp_path, sweep)
     folder = tmp_path / "run"
     where = [f"hydra.run.dir={folder}"]
     if sweep:
-        where = ["-m", f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=run"]
+        where = [f"hydra.sweep.dir={tmp_path}", "hydra.sweep.subdir=run", "-m"]
     log = tmp_path / "log.txt"
     last = folder / "checkpoints" / "last.ckpt"
     with log.open("w") as output:
