@@ -15,7 +15,9 @@ EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
 
 
 @pytest.mark.parametrize(
-    "page", [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], ids=lambda page: page.name
+    "page",
+    [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *(ROOT / "docs").rglob("*.md")],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_a_page_speaks_to_its_reader_not_of_its_making(page):
     found = [line for line in page.read_text().splitlines() if re.search(DIARY, line)]
