@@ -1,4 +1,4 @@
-# make demo | reproduce | test | test-slow | test-notebooks | test-slurm | lint | docs | bench: each builds what it needs of the environment first.
+# make demo | reproduce | test | test-slow | test-notebooks | test-slurm | test-next | lint | docs | bench: each builds what it needs of the environment first.
 #
 #   PYTHON     the interpreter the environment is made from   (make test PYTHON=python3.11)
 #   VENV       where the environment lies
@@ -18,7 +18,7 @@ INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check --no-comp
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce test test-slow test-notebooks test-slurm lint docs notebooks bench clean $(VENV)
+.PHONY: help demo reproduce test test-slow test-notebooks test-slurm test-next lint docs notebooks bench clean $(VENV)
 
 help:  ## list the targets
 	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-14s %s\n", $$1, $$2 }'
@@ -26,7 +26,9 @@ help:  ## list the targets
 demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, compare them, control it
 	$(BIN)/python train.py -m 'experiment=soft_arm_1/demo/hnn,soft_arm_1/demo/lnn,soft_arm_1/demo/mlp' hydra.sweep.dir=runs/demo
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' hydra.run.dir=runs/demo-evaluation
-	$(BIN)/python control.py experiment=soft_arm_1/regulation run=runs/demo/1_lnn-seed0 hydra.run.dir=runs/demo-control
+	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' dataset=soft_arm_1_beyond hydra.run.dir=runs/demo-beyond
+	$(BIN)/python control.py experiment=soft_arm_1/demo run=runs/demo/1_lnn-seed0 hydra.run.dir=runs/demo-control
+	$(BIN)/python examples/demo_summary.py runs
 
 reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on where it stopped
 	$(BIN)/python reproduce.py
@@ -42,6 +44,10 @@ test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean ke
 
 test-slurm: $(VENV)/.installed-dev  ## test a sweep on a real SLURM; needs root, slurm-wlm and munge
 	$(BIN)/python -m pytest tests/slurm
+
+test-next: $(VENV)/.installed-dev  ## run the tests of the commands on the next Hydra and OmegaConf
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade --pre --target $(VENV)/next 'hydra-core>=1.4.0rc3,<1.5' 2>/dev/null
+	PYTHONPATH=$(VENV)/next $(BIN)/python -m pytest tests/app --numprocesses auto --dist loadfile -m "not slow"
 
 lint: $(VENV)/.installed-dev  ## check style, types and import order
 	$(BIN)/ruff check

@@ -23,7 +23,12 @@ from pinn_dyn.evaluation import RolloutValidator, RunDescription, ValidationHist
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
-from pinn_dyn.training import DynamicsLearner, WholeCheckpoints
+from pinn_dyn.training import (
+    DynamicsLearner,
+    LeastSquares,
+    LeastSquaresLearner,
+    WholeCheckpoints,
+)
 
 CHECKPOINTS = "checkpoints"
 LONGEST_EPOCH = 1000
@@ -139,10 +144,23 @@ def build_learner(
     ensemble = isinstance(model, Ensemble)
     single = model.member(0) if isinstance(model, Ensemble) else model
     loss = _build("loss", config["loss"], statistics=statistics, model=single)
+    optimizer = _build("optimizer", config["optimizer"])
+    if isinstance(optimizer, LeastSquares):
+        try:
+            return LeastSquaresLearner(
+                model,  # type: ignore[arg-type]
+                solver=optimizer,
+                loss=loss,
+                validator=validator,
+                config=config,
+                statistics=statistics,
+            )
+        except TypeError as error:
+            raise ConfigError(f"optimizer: {error}") from error
     return (EnsembleLearner if ensemble else DynamicsLearner)(
         model,
         loss=loss,
-        optimizer=_build("optimizer", config["optimizer"]),
+        optimizer=optimizer,
         scheduler=_build("scheduler", config["scheduler"]),
         validator=validator,
         config=config,

@@ -42,8 +42,11 @@ from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
+from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models import KnownMechanics
+from pinn_dyn.training import Fit, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
 
@@ -150,6 +153,8 @@ def _train(
             log.warning("interrupted; go on with: python train.py resume=%s", folder)
         raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
     seconds = time.perf_counter() - start
+    if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
+        _write_constants(model, learner.result, folder)
 
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
     error = metrics.get(VALIDATION_ERROR, float("nan"))
@@ -210,6 +215,15 @@ def _saved_steps(folder: Path) -> int:
 def _cpu_seconds() -> float:
     """Processor time of this process and of those that it has waited for."""
     return sum(os.times()[:4])
+
+
+def _write_constants(model: Predictor, result: Fit, folder: Path) -> None:
+    """Write the constants with their 95 % intervals, and what the data leave to the prior."""
+    assert isinstance(model, KnownMechanics)
+    constants_table(model, result).to_csv(folder / "constants.csv", index=False)
+    left = undetermined(model, result) or ["nothing: the data determine every parameter"]
+    (folder / "undetermined.md").write_text("".join(f"- {line}\n" for line in left))
+    log.info("constants and their intervals are in %s", folder / "constants.csv")
 
 
 def _write_report(source: LogSource, folder: Path) -> None:

@@ -8,6 +8,7 @@ from pinn_dyn.models.cholesky import (
     NetworkCholesky,
 )
 from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
+from pinn_dyn.models.friction_ladder import AsymmetricCoulomb, DriveCoulomb, Stribeck
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
 from pinn_dyn.models.initial_velocity import InitialVelocity, LearnedVelocity, MeasuredVelocity
 from pinn_dyn.models.input_matrix import (
@@ -17,6 +18,7 @@ from pinn_dyn.models.input_matrix import (
     NetworkInput,
     NonlinearInput,
 )
+from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.positivity import Bounded, Positive, Positivity
@@ -27,18 +29,21 @@ from pinn_dyn.models.statistics import Statistics
 __all__ = [
     "MLP",
     "AccelerationMLP",
+    "AsymmetricCoulomb",
     "Bounded",
     "ChainPotential",
     "CholeskyFactor",
     "ConstantCholesky",
     "ConstantInput",
     "CoulombFriction",
+    "DriveCoulomb",
     "FixedCholesky",
     "FixedInput",
     "Friction",
     "HamiltonianNetwork",
     "InitialVelocity",
     "InputMatrix",
+    "KnownMechanics",
     "LagrangianNetwork",
     "LearnedVelocity",
     "MeasuredVelocity",
@@ -52,4 +57,5 @@ __all__ = [
     "Positivity",
     "Scales",
     "Statistics",
+    "Stribeck",
 ]

@@ -2,6 +2,16 @@
 
 from pinn_dyn.systems.bullet_arm import BulletArm
 from pinn_dyn.systems.protocols import Drawable, HasLimits, HasTip, Rendered, Stepped
+from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.soft_arm import SoftArm
 
-__all__ = ["BulletArm", "Drawable", "HasLimits", "HasTip", "Rendered", "SoftArm", "Stepped"]
+__all__ = [
+    "BulletArm",
+    "Drawable",
+    "HasLimits",
+    "HasTip",
+    "Rendered",
+    "RigidChain",
+    "SoftArm",
+    "Stepped",
+]

@@ -1,0 +1,223 @@
+"""Known mechanics with learned constants: an analytic structure as a model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem
+from pinn_dyn.mechanics.arrays import spd_solve
+from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.known_constants import (
+    Constants,
+    PhysicalBodies,
+    PositiveConstants,
+    RealConstants,
+)
+from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.structured import FrictionHead
+
+Start = Literal["generic", "prior"]
+"""Where the bodies start: plausible rods along the links, or those of the description."""
+
+
+class Structure(Protocol):
+    """Rigid bodies with known kinematics: what :class:`KnownMechanics` needs of an analytic system.
+
+    ``inertia`` are pseudo-inertias ``(n, 4, 4)`` of the n bodies, in which all terms are linear.
+    """
+
+    num_coordinates: int
+    joint_names: list[str]
+    body_names: list[str]
+    inertia: Tensor
+
+    def generic_inertia(self) -> Tensor: ...
+
+    def parameters_of(self, inertia: Tensor) -> Tensor: ...
+
+    def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor: ...
+
+    def potential_energy(self, q: Tensor, inertia: Tensor) -> Tensor: ...
+
+    def mass_and_bias(self, q: Tensor, v: Tensor, inertia: Tensor) -> tuple[Tensor, Tensor]: ...
+
+    def rigid_force(
+        self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor, gravity: bool
+    ) -> Tensor: ...
+
+    def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor: ...
+
+
+class Named(NamedTuple):
+    """Constants in physical units: n names, their unit and values ``(n,)``."""
+
+    names: list[str]
+    unit: str
+    values: Tensor
+
+
+class KnownMechanics(MechanicalSystem):
+    """Rigid bodies with known kinematics, on drives; all constants are learned::
+
+        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = diag(k) u
+
+    M, C and G of the ``structure`` with bodies of learned pseudo-inertia; r armature (inertia of
+    the rotors, seen at the joint), o constant torque (a potential -o^T q), D = diag(d) viscous and
+    F dry friction, k drive gains from the input to the torque: Nm/A where currents are logged.
+    Every value of the parameters is a physical robot: bodies of positive density, r, d, k > 0.
+
+    Each parameter is a standard normal variate a priori (:mod:`.known_constants`). The scales of
+    the drives come from the data: with f_i the typical torque k_i u_i, d ~ f/v, F and o ~ f and
+    r ~ f/a.
+
+    Args:
+        statistics: scales of the data.
+        structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
+        start: ``"generic"`` starts from rods along the links, ``"prior"`` from the bodies of the
+            structure's description. For a simulated robot the latter would be the truth.
+        spread: how far bodies may be from their start, see :class:`PhysicalBodies`; 0.3 for a data
+            sheet, 1 for generic ones.
+        friction: builder of the dry friction.
+        drive_gain: k at its start, one number or N; learned if ``gain_spread`` is positive.
+        gain_spread: standard deviation of log k a priori; 0 where the input is a torque.
+        integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
+            friction outweighs inertia.
+
+    Raises:
+        ValueError: if the data have other coordinates than the structure, on bodies that are not
+            physical, or on gains that are not positive.
+    """
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        structure: Structure,
+        start: Start = "generic",
+        spread: float = 1.0,
+        friction: FrictionHead = NoFriction,
+        drive_gain: float | Sequence[float] = 1.0,
+        gain_spread: float = 0.0,
+        integrator: Integrator | None = None,
+    ):
+        size = structure.num_coordinates
+        if (statistics.num_coordinates, statistics.num_inputs) != (size, size):
+            raise ValueError(
+                f"the data have {statistics.num_coordinates} coordinates and "
+                f"{statistics.num_inputs} inputs, the structure has the {size} joints "
+                f"{', '.join(structure.joint_names)}: expected one coordinate and one input for "
+                "each; lock the others (structure.locked_joints)"
+            )
+        if start not in ("generic", "prior"):
+            raise ValueError(f"start is {start!r}, expected 'generic' or 'prior'")
+        super().__init__(size, size)
+        self.structure = structure
+        self.integrator = integrator or RK4()
+        gain = torch.as_tensor(drive_gain, dtype=torch.float64)
+        if gain.shape not in ((), (size,)) or not bool((gain > 0).all()):
+            raise ValueError(f"drive_gain is {drive_gain}, expected one number or {size}, positive")
+        gain = gain.expand(size)
+        force = gain * statistics.u_rms.double()
+        acceleration = statistics.acceleration.double()
+        names = structure.joint_names
+        bodies = structure.generic_inertia() if start == "generic" else structure.inertia
+        self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
+        self.armature = PositiveConstants(
+            0.03 * force / acceleration, 1.5, [f"armature of {name}" for name in names]
+        )
+        damping = 0.1 * force / statistics.v_std.double()
+        self.viscous = PositiveConstants(damping, 1.5, [f"viscous friction of {n}" for n in names])
+        self.offset = RealConstants(0.3 * force, [f"torque offset of {name}" for name in names])
+        self.friction = friction(Scales(statistics, force))
+        self.gain: PositiveConstants | None = None
+        if gain_spread > 0:
+            self.gain = PositiveConstants(gain, gain_spread, [f"drive gain of {n}" for n in names])
+        self.register_buffer("fixed_gain", gain.clone())
+        self.fixed_gain: Tensor
+        self.float()
+
+    # What is learned.
+
+    def drive_gain(self) -> Tensor:
+        """k, ``(N,)``."""
+        return self.fixed_gain if self.gain is None else self.gain()
+
+    def parameter_names(self) -> list[str]:
+        """What each standardized parameter means, in the order of ``parameters()``."""
+        return [name for part in self._constants() for name in part.names]
+
+    def physical_constants(self) -> list[Named]:
+        """All constants in SI units: masses, m c, moments of inertia, armature, friction, gains."""
+        table = self.body_parameters()
+        found = []
+        labels = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+        for column, label in enumerate(labels):
+            unit = "kg" if column == 0 else "kg m" if column < 4 else "kg m^2"
+            names = [f"{label} of {body}" for body in self.structure.body_names]
+            found.append(Named(names, unit, table[:, column]))
+        others = [part for part in self._constants() if part is not self.bodies]
+        return found + [Named(part.names, "SI", part()) for part in others]
+
+    def body_parameters(self) -> Tensor:
+        """pi ``(n, 10)``: the inertial parameters, with M a + C v + G = Y(q, v, a) pi."""
+        return self.structure.parameters_of(self.bodies())
+
+    def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """r a + D v + F(v) - o - k u, ``(*batch, N)``: what is not of the bodies, on one side.
+
+        The equation of motion is Y pi + drive force = 0. The drive of a joint depends on the
+        constants of that joint alone.
+        """
+        resistance = self.armature() * a + self.viscous() * v + self.friction(v)
+        return resistance - self.offset() - self.drive_gain() * u
+
+    def _constants(self) -> Iterator[Constants]:
+        parts: Iterator[nn.Module] = self.modules()
+        return (part for part in parts if isinstance(part, Constants))
+
+    # The contract of a mechanical system.
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """M(q) + diag(r), ``(*batch, N, N)``."""
+        self._check(q=q)
+        return self.structure.mass_matrix(q, self.bodies()) + torch.diag(self.armature())
+
+    def potential_energy(self, q: Tensor) -> Tensor:
+        """V(q) - o^T q, ``(*batch,)``, J."""
+        self._check(q=q)
+        return self.structure.potential_energy(q, self.bodies()) - (self.offset() * q).sum(-1)
+
+    def damping_matrix(self, q: Tensor) -> Tensor:
+        """D = diag(d), ``(*batch, N, N)``."""
+        return torch.diag_embed(self.viscous().expand_as(q))
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """A = diag(k), ``(*batch, N, N)``."""
+        return torch.diag_embed(self.drive_gain().expand_as(q))
+
+    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
+        return self.drive_gain() * u
+
+    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)
+        return force + self.armature() * a
+
+    def _potential_force(self, q: Tensor) -> Tensor:
+        rest = torch.zeros_like(q)
+        return (
+            self.structure.rigid_force(q, rest, rest, self.bodies(), gravity=True) - self.offset()
+        )
+
+    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+        mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
+        return spd_solve(mass + torch.diag(self.armature()), force + self.offset() - bias)
+
+    def _friction_force(self, v: Tensor) -> Tensor:
+        return self.friction(v)
+
+    def _friction_slope(self, v: Tensor) -> Tensor:
+        return self.friction.slope(v)

@@ -1,0 +1,286 @@
+"""A rigid robot with a fixed base, from a URDF, in batched and differentiable torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import matvec, spd_solve
+from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, rod
+from pinn_dyn.systems.rigid_chain_urdf import read_tree
+
+
+class Kinematics(NamedTuple):
+    """Poses of the N bodies in the world, and the twists of the N joints about its origin.
+
+    ``poses`` T ``(*batch, N, 4, 4)`` maps a body's frame to the world's. ``twists`` xi
+    ``(*batch, N, 4, 4)`` is the velocity field of a joint at unit speed: a point x = (x, y, z, 1)
+    that the joint moves has the velocity xi x.
+    """
+
+    poses: Tensor
+    twists: Tensor
+
+
+class RigidChain(MechanicalSystem):
+    """A chain or tree of N rigid bodies on revolute, continuous and prismatic joints::
+
+        M(q) a + C(q, v) v + G(q) + D v = u
+
+    Let T_k be the pose of body k, J_k its pseudo-inertia (:mod:`pinn_dyn.systems.inertia`) in the
+    world's frame, xi_j the twist of joint j as a 4 x 4 matrix, <A, B> = sum_il A_il B_il, and
+    j <= k say that joint j moves body k. With composite bodies Jc_j = sum over k >= j of J_k
+    (composite-rigid-body algorithm)::
+
+        M_jk  = <xi_j, xi_k Jc_k>                           for j <= k, symmetric
+        Xi_k  = sum over j <= k of xi_j v_j                 velocity of body k
+        Xi'_k = sum over j <= k of xi_j a_j + (Xi_j xi_j - xi_j Xi_j) v_j
+        tau_j = <xi_j, sum over k >= j of (Xi'_k + Xi_k^2 - Gamma) J_k>
+
+    where Gamma holds gravity in its last column: the recursive Newton-Euler algorithm. The sums
+    over the tree are products with one constant matrix, so all bodies are computed at once and only
+    the poses need a loop over the chain; there is no automatic differentiation in it, and no
+    branch on data. As J enters linearly, so do the ten inertial parameters of each body
+    (:meth:`regressor`). Every function takes another ``inertia`` than the URDF's: that is what a
+    model learns.
+
+    adam-robotics 0.5 (BSD-3) has M and the bias force in torch too. It loops over the links, which
+    takes ten times as long for 256 states of a 7-joint arm and thirty times for one, and has no
+    regressor (``studies/2026-11-24-known-mechanics.md``); so it is not used here.
+
+    Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; the 4 x 4 matrices are
+    those of Legnani et al. 1996, "A homogeneous matrix approach to 3D kinematics and dynamics".
+
+    Args:
+        urdf: path of the URDF, one that ships with PyBullet (``franka_panda/panda.urdf``), or the
+            text of a URDF.
+        locked_joints: names of joints that are held at zero.
+        damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
+        gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
+        tip: link that carries the payload; None for the last one without a joint behind it.
+        payload: point mass at the origin of the tip's frame, kg.
+
+    Attributes:
+        joint_names, body_names: N names each; a body is a link with all that is fixed to it.
+        inertia: pseudo-inertias, ``(N, 4, 4)``, in the frames of the joints; the URDF's.
+
+    Raises:
+        FileNotFoundError: if there is no such URDF.
+        ValueError: on a URDF that is no such robot (:func:`read_tree`), or a damping, gravity or
+            payload that is none.
+    """
+
+    inertia: Tensor
+    _gravity: Tensor
+    _placements: Tensor
+    _axes: Tensor
+    _turning: Tensor
+    _moved: Tensor
+    _damping: Tensor
+    _screws: Tensor
+    _basis: Tensor
+
+    def __init__(
+        self,
+        urdf: str,
+        *,
+        locked_joints: Sequence[str] = (),
+        damping: float | Sequence[float] = 0.0,
+        gravity: Sequence[float] = (0.0, 0.0, -9.81),
+        tip: str | None = None,
+        payload: float = 0.0,
+    ):
+        tree = read_tree(urdf, locked_joints=locked_joints, tip=tip, payload=payload)
+        size = len(tree.joints)
+        super().__init__(num_coordinates=size, num_inputs=size)
+        double = torch.float64
+        acceleration = torch.tensor(list(gravity), dtype=double)
+        resistance = torch.as_tensor(damping, dtype=double)
+        if acceleration.shape != (3,) or not acceleration.isfinite().all():
+            raise ValueError(f"gravity is {list(gravity)}, expected 3 finite numbers in m/s^2")
+        if resistance.shape not in ((), (size,)) or not (resistance >= 0).all():
+            raise ValueError(f"damping is {damping}, expected one number or {size}, at least 0")
+        if not 0 <= payload < float("inf"):
+            raise ValueError(f"payload is {payload}, expected a finite number of at least 0 in kg")
+        self.joint_names, self.body_names = tree.joints, tree.bodies
+        self.parents = tuple(tree.parents)
+        # The pose of a joint is F0 + s F1 + c F2, with s = sin q and c = 1 - cos q (Rodrigues'
+        # formula), or s = q and c = 0 where it slides.
+        turning = torch.tensor(tree.turning)
+        axes = torch.where(turning[:, None], tree.axes, 0)
+        cross = torch.zeros(size, 4, 4, dtype=double)
+        units = torch.eye(3, dtype=double).expand(size, 3, 3)
+        cross[:, :3, :3] = torch.linalg.cross(axes[:, None].expand_as(units), units).mT
+        slide = torch.zeros(size, 4, 4, dtype=double)
+        slide[:, :3, 3] = tree.axes - axes
+        start = torch.eye(4, dtype=double).expand(size, 4, 4)
+        placements = tree.placements @ torch.stack([start, cross + slide, cross @ cross])
+        moved = torch.eye(size, dtype=double)  # row j: the bodies that joint j moves
+        for k, parent in enumerate(tree.parents):
+            if parent >= 0:
+                moved[:, k] += moved[:, parent]
+        self.register_buffer("inertia", tree.inertia)
+        self.register_buffer("_gravity", acceleration)
+        self.register_buffer("_placements", placements, persistent=False)
+        self.register_buffer("_axes", tree.axes, persistent=False)
+        self.register_buffer("_turning", turning.to(double)[:, None], persistent=False)
+        self.register_buffer("_moved", moved, persistent=False)
+        self.register_buffer("_damping", resistance.expand(size).clone())
+        self.register_buffer("_screws", _screw_basis(), persistent=False)
+        self.register_buffer("_basis", pseudo_inertia_basis(), persistent=False)
+        smallest = float(torch.linalg.eigvalsh(self.mass_matrix(torch.zeros(size).double()))[0])
+        if not smallest > 0:
+            raise ValueError(
+                f"{urdf[:80]}: M has the eigenvalue {smallest:g} at q = 0, expected positive ones: "
+                "give the moving links mass and inertia"
+            )
+
+    # The algorithms.
+
+    def kinematics(self, q: Tensor) -> Kinematics:
+        """Poses and twists at q ``(*batch, N)``."""
+        turning = self._turning.squeeze(-1)
+        first = turning * torch.sin(q) + (1 - turning) * q
+        second = turning * (1 - torch.cos(q))
+        start, along, across = self._placements
+        local = start + first[..., None, None] * along + second[..., None, None] * across
+        poses: list[Tensor] = []
+        for parent, step in zip(self.parents, local.unbind(-3), strict=True):
+            poses.append(step if parent < 0 else poses[parent] @ step)
+        stacked = torch.stack(poses, dim=-3)
+        axis = matvec(stacked[..., :3, :3], self._axes)
+        moment = torch.linalg.cross(stacked[..., :3, 3], axis)
+        turn = self._turning
+        screws = torch.cat([turn * axis, turn * moment + (1 - turn) * axis], dim=-1)
+        return Kinematics(stacked, (screws @ self._screws.flatten(1)).unflatten(-1, (4, 4)))
+
+    def mass_and_bias(
+        self, q: Tensor, v: Tensor, inertia: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """M(q) and C(q, v) v + G(q) with the bodies ``inertia`` ``(N, 4, 4)``, the URDF's if None.
+
+        One pass over the chain for both: what forward dynamics needs.
+        """
+        at = self.kinematics(q)
+        bodies = self._in_world(at, inertia)
+        bias = self._force(at, self._accelerations(at, v, None, self._gravity), bodies)
+        return self._mass(at, bodies), bias
+
+    def rigid_force(
+        self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None, gravity: bool = True
+    ) -> Tensor:
+        """tau = M a + C v + G, ``(*batch, N)``; without G if ``gravity`` is false."""
+        at = self.kinematics(q)
+        pull = self._gravity if gravity else torch.zeros_like(self._gravity)
+        return self._force(at, self._accelerations(at, v, a, pull), self._in_world(at, inertia))
+
+    def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """Y ``(*batch, N, 10 N)`` with M a + C v + G = Y pi.
+
+        pi ``(10 N,)`` are the ten inertial parameters of each body, in the order of
+        :data:`pinn_dyn.systems.inertia.PARAMETERS`, body after body.
+        """
+        at = self.kinematics(q)
+        moving = self._accelerations(at, v, a, self._gravity) @ at.poses
+        per_joint = at.twists.unsqueeze(-3) @ at.poses.unsqueeze(-4)  # (*batch, j, k, 4, 4)
+        per_body = moving.unsqueeze(-4).mT @ per_joint * self._moved[..., None, None]
+        return (per_body.flatten(-2) @ self._basis.flatten(1).T).flatten(-2)
+
+    def parameters_of(self, inertia: Tensor | None = None) -> Tensor:
+        """Ten inertial parameters of each body, ``(N, 10)``: kg, kg m, kg m^2."""
+        return inertial_parameters(self.inertia if inertia is None else inertia)
+
+    def generic_inertia(self, density: float = 1000.0) -> Tensor:
+        """Pseudo-inertias ``(N, 4, 4)`` from the kinematics alone: a rod for each body.
+
+        It goes from the body's joint to its farthest next one, or, at the end of the chain and
+        where both coincide, along the joint's axis by the mean length of the others (0.1 m if there
+        are none); its radius is a sixth of its length.
+        """
+        starts = self._placements[0, :, :3, 3].double()
+        ends: list[Tensor | None] = []
+        for k in range(self.num_coordinates):
+            behind = [starts[j] for j, parent in enumerate(self.parents) if parent == k]
+            farthest = max(behind, key=lambda p: float(p.norm()), default=None)
+            ends.append(farthest if farthest is not None and farthest.norm() > 0.02 else None)
+        lengths = [float(end.norm()) for end in ends if end is not None]
+        usual = sum(lengths) / len(lengths) if lengths else 0.1
+        bodies = []
+        for end, axis in zip(ends, self._axes.double(), strict=True):
+            end = usual * axis if end is None else end
+            radius = float(end.norm()) / 6
+            bodies.append(rod(torch.zeros_like(end), end, radius=radius, density=density))
+        return torch.stack(bodies)
+
+    # The contract of a mechanical system.
+
+    def mass_matrix(self, q: Tensor, inertia: Tensor | None = None) -> Tensor:
+        """M(q), ``(*batch, N, N)``, with the bodies ``inertia``, the URDF's if None."""
+        self._check(q=q)
+        at = self.kinematics(q)
+        return self._mass(at, self._in_world(at, inertia))
+
+    def potential_energy(self, q: Tensor, inertia: Tensor | None = None) -> Tensor:
+        """V(q) = -sum over k of g^T h_k, ``(*batch,)``, J, with h_k = m_k c_k in the world."""
+        self._check(q=q)
+        bodies = self._in_world(self.kinematics(q), inertia)
+        return -matvec(bodies[..., :3, 3], self._gravity).sum(-1)
+
+    def damping_matrix(self, q: Tensor) -> Tensor:
+        """D, ``(*batch, N, N)``, constant."""
+        return torch.diag_embed(self._damping.expand_as(q))
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """A = I: u are forces and torques at the joints."""
+        return torch.eye(q.shape[-1]).to(q).expand(*q.shape, q.shape[-1])
+
+    def _potential_force(self, q: Tensor) -> Tensor:
+        return self.rigid_force(q, torch.zeros_like(q), torch.zeros_like(q))
+
+    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        return self.rigid_force(q, v, a, gravity=False)
+
+    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+        mass, bias = self.mass_and_bias(q, v)
+        return spd_solve(mass, force - bias)
+
+    def _in_world(self, at: Kinematics, inertia: Tensor | None) -> Tensor:
+        return at.poses @ (self.inertia if inertia is None else inertia) @ at.poses.mT
+
+    def _tree_sum(self, matrix: Tensor, values: Tensor) -> Tensor:
+        """sum over k of matrix_jk values_k, ``(*batch, N, 4, 4)``."""
+        return (matrix @ values.flatten(-2)).unflatten(-1, (4, 4))
+
+    def _mass(self, at: Kinematics, bodies: Tensor) -> Tensor:
+        composite = self._tree_sum(self._moved, bodies)
+        momenta = (at.twists @ composite).flatten(-2)
+        upper = at.twists.flatten(-2) @ momenta.mT * self._moved
+        return upper + upper.triu(1).mT
+
+    def _accelerations(self, at: Kinematics, v: Tensor, a: Tensor | None, pull: Tensor) -> Tensor:
+        """Xi' + Xi^2 - Gamma of every body, ``(*batch, N, 4, 4)``."""
+        own = at.twists * v[..., None, None]
+        velocity = self._tree_sum(self._moved.mT, own)
+        change = velocity @ own - own @ velocity
+        if a is not None:
+            change = change + at.twists * a[..., None, None]
+        gravity = torch.nn.functional.pad(pull.unsqueeze(-1), (3, 0, 0, 1))
+        return self._tree_sum(self._moved.mT, change) + velocity @ velocity - gravity
+
+    def _force(self, at: Kinematics, accelerations: Tensor, bodies: Tensor) -> Tensor:
+        forces = self._tree_sum(self._moved, accelerations @ bodies)
+        return (at.twists * forces).sum((-2, -1))
+
+
+def _screw_basis() -> Tensor:
+    """The 4 x 4 matrices of the six unit twists, ``(6, 4, 4)``: turns about x, y, z, and slides."""
+    basis = torch.zeros(6, 4, 4, dtype=torch.float64)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        basis[k, j, i], basis[k, i, j] = 1, -1
+        basis[3 + k, k, 3] = 1
+    return basis

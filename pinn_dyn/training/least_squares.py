@@ -1,0 +1,253 @@
+"""Least squares for models of few parameters: from inverse dynamics, then on roll-outs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from scipy.signal import butter, sosfiltfilt
+from torch import Tensor
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from pinn_dyn.data.windows import Windows
+from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.models.known import KnownMechanics
+from pinn_dyn.training.sensitivity import Sensitivity
+
+log = logging.getLogger(__name__)
+
+_MOST_PARAMETERS = 500
+_FIRST_NOISE = 0.1
+"""Of the normalized residuals, before any are known."""
+_BROKEN = 1e4
+"""Residual of a roll-out that breaks down."""
+
+
+class Motion(NamedTuple):
+    """Samples of filtered motion, ``(K, N)`` each: what inverse dynamics is compared on."""
+
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    u: Tensor
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a least-squares fit found.
+
+    Attributes:
+        covariance: of the standardized parameters z, ``(P, P)``, prior included.
+        information: of z from the data alone, ``(P, P)``: the prior's is the identity.
+        residual: root mean square of the normalized data residuals.
+        iterations: of Gauss-Newton.
+    """
+
+    covariance: Tensor
+    information: Tensor
+    residual: float
+    iterations: int
+
+
+class LeastSquares:
+    """Maximum a posteriori fit by Gauss-Newton (a trust region, ``scipy.optimize``)::
+
+        min over z of  |r(z)|^2 / s^2 + |z|^2
+
+    z are the standardized parameters of the model, so |z|^2 is its prior. Two stages, each started
+    where the one before ended:
+
+    1. inverse dynamics: r = k^-1 (M a + C v + G + D v + F - o) - u, each input in units of its
+       spread, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
+       same filter on q, v, a and u leaves a linear law as it is. This is the classical
+       identification, here with bodies that stay physical;
+    2. roll-outs: r = predicted less measured increments of the windows, each in units of its
+       spread, as of the loss of increments. Derivatives by forward mode through the integrator.
+
+    s, by residual, is the root mean square of what remains, found by repeating each stage. The
+    residuals within a window, and of windows that overlap, count as one for each coordinate, as
+    they are far from independent.
+
+    Args:
+        cutoff: of the filter before the inverse dynamics, Hz: above the motion, below the noise.
+        rollouts: whether to take the second stage; without it the result is the identification.
+        samples: samples of the inverse dynamics.
+        evaluations: most evaluations of the residuals in a stage.
+        chunk: windows whose derivatives are rolled out at once; bounds the memory.
+        velocity_weight: weight of the velocity half in the roll-outs, as of the loss.
+
+    Raises:
+        ValueError: on a cutoff, samples, evaluations, chunk or weight that is not positive.
+    """
+
+    def __init__(
+        self,
+        *,
+        cutoff: float,
+        rollouts: bool = True,
+        samples: int = 2000,
+        evaluations: int = 15,
+        chunk: int = 500,
+        velocity_weight: float = 1.0,
+    ):
+        settings = {"cutoff": cutoff, "samples": samples, "evaluations": evaluations}
+        settings |= {"chunk": chunk, "velocity_weight": velocity_weight}
+        for name, value in settings.items():
+            if not value > 0:
+                raise ValueError(f"least squares: {name} is {value}, expected a positive number")
+        self.cutoff = cutoff
+        self.rollouts = rollouts
+        self.samples = samples
+        self.evaluations = evaluations
+        self.chunk = chunk
+        self.velocity_weight = velocity_weight
+
+    def fit(
+        self, model: KnownMechanics, trajectories: Sequence[Trajectory], windows: Windows
+    ) -> Fit:
+        """Fit the model in place; it comes back in the precision it had.
+
+        Args:
+            model: what is fitted.
+            trajectories: the training trajectories, for the inverse dynamics.
+            windows: the training windows, for the roll-outs.
+
+        Raises:
+            ValueError: on a model without parameters or with more than 500, or trajectories that
+                are too short for the filter.
+        """
+        count = sum(p.numel() for p in model.parameters())
+        if not 0 < count <= _MOST_PARAMETERS:
+            raise ValueError(
+                f"the model has {count} parameters, least squares takes 1 to {_MOST_PARAMETERS}: "
+                "take a gradient method (optimizer=adamw) or a smaller model"
+            )
+        precision = next(model.parameters()).dtype
+        model.double()
+        found = self._identify(model, filtered_motion(trajectories, self.cutoff, self.samples))
+        if self.rollouts:
+            found = self._roll_out(model, windows.to(torch.device("cpu"), torch.float64))
+        model.to(precision)
+        return found
+
+    def _identify(self, model: KnownMechanics, motion: Motion) -> Fit:
+        q, v, a, u = motion
+        regressor, spread = model.structure.regressor(q, v, a), u.std(0)
+
+        def residuals(derivative: bool) -> Tensor:
+            gain = model.drive_gain()
+            error = regressor @ model.body_parameters().flatten() + model.drive_force(v, a, u)
+            found = error / gain / spread
+            if not derivative:
+                return found
+            slope = Sensitivity(model)
+            by_gain = (error / gain).unsqueeze(-1) * slope.gain()
+            return (slope.force(regressor, v, a, u) - by_gain) / (gain * spread).unsqueeze(-1)
+
+        return self._solve("inverse dynamics", model, residuals, correlated=1)
+
+    def _roll_out(self, model: KnownMechanics, windows: Windows) -> Fit:
+        scale = windows.statistics().qv_increment_std.clone()
+        scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
+        x0, measured = windows.start("qv"), windows.increments("qv")
+        # Where dq/dt = v holds by construction, q says nothing over a single step.
+        first = model.num_coordinates if measured.shape[1] == 1 else 0
+
+        def residuals(derivative: bool) -> Tensor:
+            if derivative:
+                parts = [Sensitivity(model).rollout(part) for part in windows.split(self.chunk)]
+                return (torch.cat(parts) / scale.unsqueeze(-1))[:, :, first:]
+            predicted = model.increments(x0, windows.t, windows.input)
+            return ((predicted[:, 1:] - measured) / scale)[..., first:]
+
+        return self._solve("roll-outs", model, residuals, correlated=measured.shape[1])
+
+    def _solve(
+        self,
+        stage: str,
+        model: KnownMechanics,
+        residuals: Callable[[bool], Tensor],
+        *,
+        correlated: int,
+    ) -> Fit:
+        """Two fits, the second with the noise that the first left; the model is set in place.
+
+        ``residuals`` gives those of the model as it is, ``(..., R)``, or their derivatives
+        ``(..., R, P)``; ``correlated`` of them count as one.
+        """
+        z = parameters_to_vector(model.parameters()).detach()
+        noise, steps = _FIRST_NOISE, 0
+        for _ in range(2):
+            weight = 1 / (noise * correlated**0.5)
+
+            def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
+                return np.concatenate([weight * _evaluate(model, at, residuals, False), at])
+
+            def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
+                data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
+                return np.concatenate([data, np.eye(len(at))])
+
+            limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
+            found = least_squares(value, z.numpy(), slope, **limit)
+            z = torch.from_numpy(found.x)
+            noise = float(np.sqrt(np.mean(_evaluate(model, found.x, residuals, False) ** 2)))
+            steps += int(found.njev)
+            log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
+        slopes = torch.from_numpy(found.jac[: -len(z)])
+        information = slopes.T @ slopes
+        covariance = torch.linalg.inv(information + torch.eye(len(z)).to(z))
+        return Fit(covariance, information, noise, steps)
+
+
+def _evaluate(
+    model: KnownMechanics, z: np.ndarray, residuals: Callable[[bool], Tensor], derivative: bool
+) -> np.ndarray:
+    """Residuals at z, flattened; a roll-out that breaks down is a bad step, not an error."""
+    with torch.no_grad():
+        vector_to_parameters(torch.from_numpy(z), model.parameters())
+        found = residuals(derivative)
+    bad = 0.0 if derivative else _BROKEN
+    return np.nan_to_num(found.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
+
+
+def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
+    """At most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
+
+    A Butterworth filter of fourth order, forwards and backwards, on each trajectory; a is the
+    derivative of the filtered v, by differences. Half a period of the cutoff is left out at both
+    ends. Samples are spread evenly.
+
+    Raises:
+        ValueError: if the cutoff is above half the sample rate, or no trajectory is longer than
+            three periods of it.
+    """
+    parts: list[Motion] = []
+    for item in trajectories:
+        rate = 1 / float(item.t[1] - item.t[0])
+        if not cutoff < rate / 2:
+            raise ValueError(
+                f"least squares: cutoff is {cutoff} Hz, expected less than half the sample rate of "
+                f"{rate:g} Hz"
+            )
+        if item.duration < 3 / cutoff:
+            continue
+        low_pass = butter(4, cutoff, fs=rate, output="sos")
+        smooth = [sosfiltfilt(low_pass, getattr(item, name).numpy(), axis=0) for name in "qvu"]
+        q, v, u = (torch.from_numpy(x.copy()).double() for x in smooth)
+        (a,) = torch.gradient(v, spacing=1 / rate, dim=0)
+        edge = max(int(0.5 * rate / cutoff), 1)
+        parts.append(Motion(*(x[edge:-edge] for x in (q, v, a, u))))
+    if not parts:
+        longest = max(item.duration for item in trajectories)
+        raise ValueError(
+            f"least squares: the longest training trajectory has {longest:g} s, expected at least "
+            f"three periods of the cutoff of {cutoff} Hz"
+        )
+    joined = Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    keep = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
+    return Motion(*(x[keep] for x in joined))

@@ -1,0 +1,77 @@
+"""Least squares as a LightningModule: one training step is the whole fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.optim import SGD
+
+from pinn_dyn.data.windows import Windows
+from pinn_dyn.models.known import KnownMechanics
+from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.training.learner import DynamicsLearner, Validator
+from pinn_dyn.training.least_squares import Fit, LeastSquares
+from pinn_dyn.training.losses import WindowLoss
+
+
+class LeastSquaresLearner(DynamicsLearner):
+    """Fits a model by least squares where others take many steps of an optimizer.
+
+    So a fit has the run folder, checkpoints, validation and logs of every training. The trainer has
+    ``max_epochs: 1``, ``gradient_clip_val: null`` and one batch of all windows in an epoch.
+
+    Args:
+        model: what is fitted.
+        solver: the fit.
+        loss, validator, config, statistics: as of :class:`DynamicsLearner`.
+
+    Attributes:
+        result: of the fit, once it is done.
+
+    Raises:
+        TypeError: unless the model is one of known mechanics.
+    """
+
+    result: Fit | None = None
+
+    def __init__(
+        self,
+        model: KnownMechanics,
+        *,
+        solver: LeastSquares,
+        loss: WindowLoss,
+        validator: Validator,
+        config: dict[str, Any],
+        statistics: Statistics,
+    ):
+        if not isinstance(model, KnownMechanics):
+            raise TypeError(
+                f"least squares fits known mechanics (model=known), not {type(model).__name__}: "
+                "take optimizer=adamw"
+            )
+        super().__init__(
+            model,
+            loss=loss,
+            optimizer=SGD,
+            scheduler=torch.optim.lr_scheduler.ConstantLR,
+            validator=validator,
+            config=config,
+            statistics=statistics,
+            compile=False,
+        )
+        self.automatic_optimization = False
+        self.solver = solver
+
+    def training_step(self, batch: Windows, batch_idx: int) -> None:  # type: ignore[override]
+        """The fit, on all training trajectories and windows, in double precision."""
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        assert isinstance(self.model, KnownMechanics)
+        if self.result is None:
+            self.result = self.solver.fit(self.model, data.splits.train, data.windows)
+        self.log_losses(torch.tensor(self.result.residual**2))
+        self.optimizers().step()  # type: ignore[union-attr]  # no gradients: it only counts
+
+    def configure_optimizers(self) -> Any:
+        """One that does nothing, as the trainer counts its steps."""
+        return SGD(self.model.parameters(), lr=0.0)

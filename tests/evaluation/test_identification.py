@@ -1,0 +1,49 @@
+"""Intervals of constants, directions that stay open, and errors of inverse dynamics."""
+
+import pytest
+import torch
+
+from pinn_dyn.evaluation.identification import constants_table, input_errors, undetermined
+from pinn_dyn.training import Fit
+from tests.support.known import known_model, motion
+
+
+def fit_with(model, variances):
+    covariance = torch.diag(torch.as_tensor(variances, dtype=torch.float64))
+    return Fit(covariance, torch.linalg.inv(covariance) - 1, 0.0, 1)
+
+
+@pytest.fixture
+def model():
+    return known_model(friction=None, gain_spread=0.5, drive_gain=2.0)
+
+
+def test_intervals_follow_from_the_covariance(model):
+    names = model.parameter_names()
+    variances = [0.01 if name == "drive gain of turn" else 0.25 for name in names]
+    table = constants_table(model, fit_with(model, variances)).set_index("name")
+    gain = table.loc["drive gain of turn"]
+    # k = 2 exp(0.5 z) at z = 0 has the slope 1.
+    assert gain.value == pytest.approx(2.0)
+    assert gain.high - gain.value == pytest.approx(1.96 * 0.1)
+    assert gain.known == pytest.approx(0.99)
+    # m ~ exp(2 a): of the ten parameters of a body the mass depends on one.
+    mass = table.loc["mass of slider"]
+    assert mass.high - mass.value == pytest.approx(1.96 * 0.5 * 2 * mass.value)
+    assert mass.unit == "kg"
+
+
+def test_open_directions_are_named(model):
+    names = model.parameter_names()
+    open_ones = {"mass of slider": 0.95, "armature of bend": 0.7}
+    words = undetermined(model, fit_with(model, [open_ones.get(name, 0.01) for name in names]))
+    assert [text.split(":")[0] for text in words] == list(open_ones)
+    assert "95%" in words[0]
+
+
+def test_a_true_model_explains_its_inputs(model):
+    runs = [motion(model, seconds=2.0)]
+    assert input_errors(model, runs, cutoff=20.0).max() < 0.1
+    with torch.no_grad():
+        model.gain.z += 1
+    assert input_errors(model, runs, cutoff=20.0).max() > 0.2

@@ -1,0 +1,135 @@
+"""Known mechanics with learned constants: physical for every parameter, and passive."""
+
+import pytest
+import torch
+
+from pinn_dyn.models import AsymmetricCoulomb, DriveCoulomb, KnownMechanics, Stribeck
+from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
+from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems.inertia import inertial_parameters
+from tests.contracts.mechanical_system import MechanicalSystemContract
+from tests.support.known import known_model, statistics, unit_scales
+from tests.support.rigid_chains import TREE
+
+LADDER = [DriveCoulomb, AsymmetricCoulomb, Stribeck]
+
+
+def anywhere(module, std=1.0, seed=0):
+    """The module with parameters far from their start."""
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter, std=std, generator=generator)
+    return module.double()
+
+
+class TestKnownMechanicsContract(MechanicalSystemContract):
+    """With every kind of constant, away from the start."""
+
+    @pytest.fixture
+    def system(self):
+        model = known_model(friction=None, gain_spread=0.5, drive_gain=2.0)
+        return anywhere(model, std=0.2)
+
+
+def test_the_prior_start_is_the_urdfs_robot():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    model = known_model(start="prior", friction=None)
+    q, v, a = torch.randn(3, 20, 4).double()
+    drives = model.armature() * a + model.viscous() * v - model.offset()
+    expected = chain.inverse_dynamics(q, v, a) + drives
+    assert torch.allclose(model.inverse_dynamics(q, v, a), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_the_generic_start_ignores_the_urdfs_inertias():
+    heavy = TREE.replace('mass value="2.0"', 'mass value="200.0"')
+    one, other = known_model(), known_model(heavy)
+    assert torch.equal(one.body_parameters(), other.body_parameters())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_parameter_is_a_body_of_positive_density(seed):
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    bodies = anywhere(PhysicalBodies(chain.inertia, 1.0, chain.body_names), std=1.5, seed=seed)
+    for m, mx, my, mz, *moments in inertial_parameters(bodies()).tolist():
+        centre = torch.tensor([mx, my, mz]).double() / m
+        ixx, ixy, iyy, ixz, iyz, izz = moments
+        about_origin = torch.tensor([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]).double()
+        shift = centre @ centre * torch.eye(3) - torch.outer(centre, centre)
+        principal = torch.linalg.eigvalsh(about_origin - m * shift)
+        assert m > 0
+        assert principal[0] > 0
+        assert principal[2] < principal[0] + principal[1]  # the triangle inequality
+
+
+def test_a_body_that_cannot_be_is_named():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    impossible = chain.inertia.clone()
+    impossible[2, 0, 0] = -0.1
+    with pytest.raises(ValueError, match=r"body 'elbow' has a pseudo-inertia with the eigenvalue"):
+        PhysicalBodies(impossible, 1.0, chain.body_names)
+
+
+def test_standardized_constants():
+    positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"])
+    real = RealConstants(torch.tensor([4.0]), ["c"])
+    assert positive().tolist() == [2.0, 3.0]
+    assert real().tolist() == [0.0]
+    with torch.no_grad():
+        positive.z += 1
+        real.z -= 2
+    assert positive().tolist() == pytest.approx([2 * 1.6487213, 3 * 1.6487213])
+    assert real().tolist() == [-8.0]
+    with pytest.raises(ValueError, match=r"start is .* expected positive"):
+        PositiveConstants(torch.tensor([0.0]), 0.5, ["a"])
+
+
+@pytest.mark.parametrize("law", LADDER)
+def test_friction_is_passive_for_every_parameter(law):
+    for seed in range(20):
+        friction = anywhere(law(unit_scales(3)), std=1.5, seed=seed)
+        v = torch.linspace(-3, 3, 301).double()[:, None].expand(-1, 3)
+        assert (v * friction(v) >= 0).all()
+        assert not friction(0 * v).any()
+
+
+@pytest.mark.parametrize("law", LADDER)
+def test_the_slope_of_friction_is_its_derivative(law):
+    friction = anywhere(law(unit_scales(2), width=0.3), std=0.3)
+    v = torch.tensor([[-1.0, 0.4], [0.2, -0.1], [0.02, 2.0]]).double()
+    expected = torch.func.jvp(friction, (v,), (torch.ones_like(v),))[1]
+    assert torch.allclose(friction.slope(v), expected, rtol=1e-9)
+
+
+def test_each_rung_has_what_its_name_says():
+    fast = torch.tensor([[50.0], [-50.0]]).double()
+    asymmetric = anywhere(AsymmetricCoulomb(unit_scales(1)))
+    forward, back = asymmetric(fast).flatten().tolist()
+    assert forward > 0 > back
+    assert abs(forward) != pytest.approx(abs(back))
+    stribeck = Stribeck(unit_scales(1), width=0.001).double()
+    slow = torch.tensor([[0.05]]).double()
+    assert float(stribeck(slow)) > float(stribeck(fast[:1]))
+
+
+def test_names_and_units_of_all_constants():
+    model = known_model(gain_spread=0.5)
+    count = sum(p.numel() for p in model.parameters())
+    assert len(model.parameter_names()) == count == len(set(model.parameter_names()))
+    constants = model.physical_constants()
+    for item in constants:
+        assert len(item.names) == len(item.values)
+    assert "drive gain of turn" in [name for item in constants for name in item.names]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"start": "truth"}, "start is 'truth'"),
+        ({"drive_gain": -1.0}, "drive_gain is"),
+        ({"locked_joints": ()}, "the data have 4 coordinates"),
+    ],
+)
+def test_a_wrong_description_is_refused_by_name(settings, message):
+    locked = settings.pop("locked_joints", ["wrist"])
+    with pytest.raises(ValueError, match=message):
+        KnownMechanics(statistics(4), RigidChain(TREE, locked_joints=locked), **settings)

@@ -1,0 +1,66 @@
+"""Known mechanics of the small tree, and motions of it."""
+
+from functools import partial
+
+import torch
+
+from pinn_dyn.data.windows import draw_windows
+from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.models import KnownMechanics, Scales, Statistics, Stribeck
+from pinn_dyn.systems import RigidChain
+from tests.support.rigid_chains import TREE
+
+
+def statistics(size):
+    one = torch.ones(size, dtype=torch.float64)
+    return Statistics(
+        q_mean=0 * one,
+        q_std=one,
+        q_low=-3 * one,
+        q_high=3 * one,
+        v_std=one,
+        p_std=one,
+        u_mean=0 * one,
+        u_std=5 * one,
+        qv_increment_std=torch.full((1, 2 * size), 0.05, dtype=torch.float64),
+        qp_increment_std=torch.ones(1, 2 * size, dtype=torch.float64),
+        step=0.01,
+    )
+
+
+def unit_scales(size):
+    """Typical speeds and forces of one."""
+    return Scales(statistics(size), torch.ones(size, dtype=torch.float64))
+
+
+def known_model(urdf=TREE, locked_joints=("wrist",), friction=Stribeck, **settings):
+    """Generic bodies on the joints of the tree, in float64."""
+    structure = RigidChain(urdf, locked_joints=locked_joints)
+    friction = partial(friction, width=0.3) if friction else None
+    heads = {"friction": friction} if friction else {}
+    scales = statistics(structure.num_coordinates)
+    model = KnownMechanics(scales, structure, **heads, **settings).double()
+    # The model is built in single precision, in which rotations are no longer exact.
+    model.structure = RigidChain(urdf, locked_joints=locked_joints)
+    return model
+
+
+def motion(model, *, seconds=2.0, rate=200.0, seed=0):
+    """A motion of the model under a random smooth input, ``(T, N)``."""
+    generator = torch.Generator().manual_seed(seed)
+    n = model.num_coordinates
+    t = torch.arange(int(seconds * rate) + 1, dtype=torch.float64) / rate
+    u = torch.zeros(len(t), n, dtype=torch.float64)
+    for k in range(1, 6):
+        weight, phase = torch.rand(2, n, generator=generator).double()
+        u += 4 * (weight - 0.5) * torch.sin(2 * torch.pi * 0.5 * k * t[:, None] + 6 * phase)
+    start = torch.rand(2 * n, generator=generator).double() - 0.5
+    with torch.no_grad():
+        q, v = model.predict(start, t, Signal(t, u)).chunk(2, dim=-1)
+    return Trajectory(q, v, Signal(t, u))
+
+
+def windows_of(model, *, count, steps, stride=2):
+    return draw_windows(
+        [motion(model, seconds=0.3)], count=count, steps=steps, stride=stride, seed=0
+    )

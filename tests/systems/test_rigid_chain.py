@@ -1,0 +1,190 @@
+"""Rigid chains from a URDF against Pinocchio, Bullet and each other."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia, rod
+from tests.contracts.mechanical_system import MechanicalSystemContract
+from tests.support.rigid_chains import TREE, joint, link, robot
+
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+STATES = 100
+
+
+def urdf_file(name):
+    """A URDF that ships with PyBullet, or that of the UR10e among the logs."""
+    if name == "ur10e":
+        path = Path(os.environ.get("PINN_DYN_LOGS", "logs")) / "ur10e" / "ur10e.urdf"
+        if not path.is_file():
+            pytest.skip(f"no {path}: the folder of the logs is PINN_DYN_LOGS")
+        return path
+    package = pytest.importorskip("pybullet_data", reason="the panda extra is not installed")
+    return Path(package.getDataPath()) / name
+
+
+def states(size, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [4 * torch.rand(STATES, size, generator=generator).double() - 2 for _ in range(3)]
+
+
+def assert_same(actual, expected):
+    expected = torch.as_tensor(np.array(expected))
+    assert (actual - expected).abs().max() <= 1e-10 * expected.abs().max()
+
+
+class PinocchioRobot:
+    """The same robot in Pinocchio; its continuous joints are given by cosine and sine."""
+
+    def __init__(self, text, locked):
+        self.pin = pytest.importorskip("pinocchio", reason="the dev extra is not installed")
+        model = self.pin.buildModelFromXML(text)
+        if locked:
+            ids = [model.getJointId(name) for name in locked]
+            model = self.pin.buildReducedModel(model, ids, self.pin.neutral(model))
+        self.model, self.data = model, model.createData()
+        self.names = list(model.names)[1:]
+
+    def __call__(self, function, q, *others):
+        """Results of one of Pinocchio's functions at each state."""
+        results = []
+        for row, *rest in zip(q.numpy(), *(x.numpy() for x in others), strict=True):
+            values = []
+            for angle, item in zip(row, list(self.model.joints)[1:], strict=True):
+                values += [angle] if item.nq == 1 else [np.cos(angle), np.sin(angle)]
+            results.append(function(self.model, self.data, np.array(values), *rest).copy())
+        return np.stack(results)
+
+
+@pytest.mark.parametrize(
+    ("name", "locked"),
+    [
+        ("franka_panda/panda.urdf", FINGERS),
+        ("kuka_iiwa/model.urdf", ()),
+        ("ur10e", ()),
+        ("tree", ("wrist",)),
+    ],
+)
+def test_a_chain_equals_pinocchio(name, locked):
+    text = TREE if name == "tree" else urdf_file(name).read_text()
+    chain, other = RigidChain(text, locked_joints=locked), PinocchioRobot(text, locked)
+    # Pinocchio sorts the branches of a tree by name.
+    order = [other.names.index(joint) for joint in chain.joint_names]
+    back = [chain.joint_names.index(joint) for joint in other.names]
+    q, v, a = states(chain.num_coordinates)
+    pin = other.pin
+    theirs = [x[:, back] for x in (q, v, a)]
+    mass = other(pin.crba, theirs[0])
+    mass = np.triu(mass) + np.triu(mass, 1).transpose(0, 2, 1)
+    assert_same(chain.mass_matrix(q), mass[:, order][:, :, order])
+    force = other(pin.rnea, *theirs)[:, order]
+    assert_same(chain.inverse_dynamics(q, v, a), force)
+    assert_same(chain.potential_force(q), other(pin.computeGeneralizedGravity, theirs[0])[:, order])
+    assert_same(chain.forward_dynamics(q, v, a), other(pin.aba, *theirs)[:, order])
+    regressor = other(pin.computeJointTorqueRegressor, *theirs)[:, order]
+    regressor = regressor.reshape(STATES, len(order), -1, 10)[:, :, order].reshape(
+        STATES, len(order), -1
+    )
+    assert_same(chain.regressor(q, v, a), regressor)
+    assert_same(chain.regressor(q, v, a) @ chain.parameters_of().flatten(), force)
+
+
+@pytest.mark.panda
+@pytest.mark.parametrize("name", ["franka_panda/panda.urdf", "kuka_iiwa/model.urdf", "ur10e"])
+def test_a_chain_equals_bullet(name):
+    pytest.importorskip("pybullet", reason="the panda extra is not installed")
+    from pinn_dyn.systems import BulletArm
+
+    path = str(urdf_file(name))
+    locked = FINGERS if "panda" in name else ()
+    settings = {"locked_joints": locked, "damping": 0.5, "payload": 1.5}
+    chain, arm = RigidChain(path, **settings), BulletArm(path, **settings)
+    assert chain.joint_names == arm.joint_names
+    q, v, a = states(chain.num_coordinates, seed=1)
+    assert_same(chain.mass_matrix(q), arm.mass_matrix(q))
+    assert_same(chain.potential_force(q), arm.potential_force(q))
+    assert_same(chain.inverse_dynamics(q, v, a), arm.inverse_dynamics(q, v, a))
+
+
+class TestRigidChainContract(MechanicalSystemContract):
+    @pytest.fixture
+    def system(self):
+        return RigidChain(TREE, locked_joints=["wrist"], damping=[0.1, 0.2, 0.0, 0.4])
+
+
+def test_a_sliding_mass_is_newtons_law():
+    text = robot(link("base"), link("car", 3.0), joint("rail", "prismatic", "base", "car"))
+    chain = RigidChain(text, gravity=[0, 0, 0], damping=2.0)
+    x, v, u = torch.tensor([[0.4]]), torch.tensor([[1.5]]), torch.tensor([[6.0]])
+    a = chain.forward_dynamics(x.double(), v.double(), u.double())
+    assert float(a) == pytest.approx((6 - 2 * 1.5) / 3)
+
+
+def test_derivatives_by_autograd_and_a_compilable_graph():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    q, v, u = (x[:3].requires_grad_() for x in states(4))
+    assert torch.autograd.gradcheck(chain.forward_dynamics, (q, v, u))
+    torch.export.export(_Dynamics(chain), (q.detach(), v.detach(), u.detach()), strict=False)
+
+
+class _Dynamics(torch.nn.Module):
+    def __init__(self, chain):
+        super().__init__()
+        self.chain = chain
+
+    def forward(self, q, v, u):
+        return self.chain.forward_dynamics(q, v, u)
+
+
+def test_parameters_and_pseudo_inertia_are_each_others_inverse():
+    parameters = torch.randn(5, 10, dtype=torch.float64)
+    assert torch.allclose(inertial_parameters(pseudo_inertia(parameters)), parameters)
+
+
+def test_a_rod_has_the_moments_of_a_cylinder():
+    start, end = torch.zeros(3).double(), torch.tensor([0.0, 0.0, 0.6]).double()
+    m, mx, my, mz, ixx, _, iyy, _, _, izz = inertial_parameters(
+        rod(start, end, radius=0.05, density=1000.0)
+    ).tolist()
+    assert m == pytest.approx(1000 * np.pi * 0.05**2 * 0.6)
+    assert (mx, my, mz) == pytest.approx((0, 0, 0.3 * m))
+    assert izz == pytest.approx(m * 0.05**2 / 2)
+    assert ixx == iyy == pytest.approx(m * (0.05**2 / 4 + 0.6**2 / 3))
+
+
+def test_generic_bodies_come_from_the_kinematics_alone():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    other = RigidChain(
+        TREE.replace('mass value="2.0"', 'mass value="9.0"'), locked_joints=["wrist"]
+    )
+    assert torch.equal(chain.generic_inertia(), other.generic_inertia())
+    assert torch.linalg.eigvalsh(chain.generic_inertia()).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "message"),
+    [
+        (TREE, {"locked_joints": ["wirst"]}, "no joint 'wirst' to lock"),
+        (TREE, {"tip": "foot"}, "tip is 'foot'"),
+        (TREE, {"gravity": [0, 0]}, "gravity is"),
+        (TREE, {"damping": [1.0]}, "damping is"),
+        (TREE, {"payload": -1.0}, "payload is"),
+        ("<robot name='x'/>", {}, "at least one <joint>"),
+        ("<robot", {}, "not valid XML"),
+        (TREE.replace('type="continuous"', 'type="floating"'), {}, "'bend' is 'floating'"),
+        (TREE.replace('xyz="1 2 2"', 'xyz="0 0 0"'), {}, "'slide' has the axis"),
+        (TREE.replace('xyz="0.2 0 0.1"', 'xyz="0.2 0"'), {}, "three finite numbers"),
+    ],
+)
+def test_a_wrong_description_is_refused_by_name(text, settings, message):
+    with pytest.raises(ValueError, match=message):
+        RigidChain(text, **settings)
+
+
+def test_a_missing_file_is_named():
+    with pytest.raises(FileNotFoundError, match=r"no_such\.urdf"):
+        RigidChain("no_such.urdf")

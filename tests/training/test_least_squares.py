@@ -1,0 +1,97 @@
+"""Least squares finds the constants that made the data, and leaves what no data determine."""
+
+import pytest
+import torch
+
+from pinn_dyn.data.windows import draw_windows
+from pinn_dyn.models import DriveCoulomb
+from pinn_dyn.training import LeastSquares
+from pinn_dyn.training.least_squares import filtered_motion
+from tests.support.known import known_model, motion
+from tests.support.rigid_chains import joint, link, robot
+
+PENDULUM = robot(
+    link("base"),
+    link("rod", 2.0),
+    link("tip", 0.5),
+    joint("swing", "revolute", "base", "rod", rpy="0 0 0", axis="0 1 0"),
+    joint("bend", "revolute", "rod", "tip", rpy="0 0 0", axis="0 1 0"),
+)
+
+
+def robot_model(start, seed=None):
+    model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, start=start)
+    if seed is not None:
+        generator = torch.Generator().manual_seed(seed)
+        for parameter in model.parameters():
+            torch.nn.init.normal_(parameter, std=0.5, generator=generator)
+    return model
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return robot_model("prior", seed=1)
+
+
+@pytest.fixture(scope="module")
+def runs(truth):
+    return [motion(truth, seconds=3.0, rate=100.0, seed=k) for k in range(2)]
+
+
+def held_out_error(model, truth):
+    """Of the acceleration, as a share of its spread, at states of another motion."""
+    run = motion(truth, seconds=1.0, rate=100.0, seed=9)
+    with torch.no_grad():
+        a, expected = (m.forward_dynamics(run.q, run.v, run.u) for m in (model, truth))
+    return float((a - expected).norm() / expected.norm())
+
+
+@pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "roll-outs"])
+def test_the_dynamics_are_found_from_a_generic_start(truth, runs, rollouts):
+    windows = draw_windows(runs, count=40, steps=4, stride=2, seed=0)
+    model = robot_model("generic")
+    before = held_out_error(model, truth)
+    result = LeastSquares(cutoff=20.0, rollouts=rollouts).fit(model, runs, windows)
+    assert before > 0.3
+    assert held_out_error(model, truth) < (0.01 if rollouts else 0.05)
+    assert result.residual < (0.001 if rollouts else 0.05)
+    # The base parameters of a planar chain are fewer than ten for each body: the rest is held by
+    # the prior, and says so.
+    assert torch.linalg.eigvalsh(result.information).min() < 0.1
+    assert torch.linalg.eigvalsh(result.covariance).max() <= 1.001
+    assert torch.linalg.eigvalsh(result.covariance).min() > 0
+
+
+def test_the_filter_keeps_the_motion_and_takes_its_derivative(runs):
+    q, _, a, _ = filtered_motion(runs[:1], 20.0, samples=10_000)
+    run = runs[0]
+    edge = 2  # half a period of 20 Hz at 100 Hz
+    assert len(q) == len(run.q) - 2 * edge
+    inner = slice(20, -20)
+    assert torch.allclose(q[inner], run.q[edge:-edge][inner], atol=1e-2)
+    expected = torch.gradient(run.v, spacing=0.01, dim=0)[0][edge:-edge]
+    assert (a - expected)[inner].norm() < 0.1 * expected[inner].norm()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"cutoff": 0.0}, "cutoff is 0.0"), ({"cutoff": 5.0, "samples": 0}, "samples is 0")],
+)
+def test_settings_are_checked(settings, message):
+    with pytest.raises(ValueError, match=message):
+        LeastSquares(**settings)
+
+
+def test_data_that_do_not_fit_the_filter_are_refused(runs):
+    with pytest.raises(ValueError, match="less than half the sample rate"):
+        filtered_motion(runs, 50.0, samples=10)
+    with pytest.raises(ValueError, match="at least three periods"):
+        filtered_motion(runs, 0.5, samples=10)
+
+
+def test_a_model_that_is_too_large_is_refused(runs):
+    model = robot_model("generic")
+    model.register_parameter("much", torch.nn.Parameter(torch.zeros(501)))
+    windows = draw_windows(runs, count=2, steps=1, stride=1, seed=0)
+    with pytest.raises(ValueError, match="least squares takes 1 to 500"):
+        LeastSquares(cutoff=5.0).fit(model, runs, windows)
