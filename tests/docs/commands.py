@@ -118,6 +118,7 @@ def compose(program, overrides, folder):
         del cfg["hydra"]
     if not OmegaConf.missing_keys(cfg):
         with pytest.MonkeyPatch.context() as patch:
-            patch.syspath_prepend(str(folder))  # classes of the page itself
+            for place in (folder, folder.parent):  # classes of the page itself
+                patch.syspath_prepend(str(place))
             return checked(program, cfg)
     return OmegaConf.to_container(cfg, resolve=False)
