@@ -5,7 +5,7 @@
     python reproduce.py --only panda/lnn      some entries
 
 Each entry has a folder in runs/reproduce: its trainings and, in evaluation/, their tables. An
-interrupted training goes on from its last epoch; one whose configuration has changed since is
+interrupted training goes on from its last checkpoint; one whose configuration has changed since is
 refused, with the keys that differ. An entry that fails does not stop the others.
 """
 

@@ -18,6 +18,7 @@ from config_reference import config_reference  # noqa: E402
 TOP_LEVEL = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
+    "security.md": "SECURITY.md",
     "benchmarks.md": "benchmarks/README.md",
 }
 PAGES = {source: page for page, source in TOP_LEVEL.items()} | {"README.md": "index.md"}

@@ -14,14 +14,17 @@ from pathlib import Path
 
 import hydra
 import pandas as pd
-import torch
 from omegaconf import OmegaConf
-from torch import Tensor
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import CONF
-from pinn_dyn.evaluation import predict_trajectories, predict_windows, rollout_metrics
-from pinn_dyn.mechanics import Predictor, Signal, stack
+from pinn_dyn.evaluation import (
+    KeepsVelocity,
+    predict_trajectories,
+    predict_windows,
+    rollout_metrics,
+)
+from pinn_dyn.mechanics import stack
 
 FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
 _ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.validation=1")
@@ -35,14 +38,6 @@ SETS = {
     "soft_neck": (11.0, 0.1, (0.1, 1.0), ()),
     "trunk": (10.0, 0.1, (0.1, 1.0), ()),
 }
-
-
-class KeepsVelocity(Predictor):
-    """q(t) = q(0) + v(0) t."""
-
-    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        v = x0[..., None, self.num_coordinates :]
-        return torch.cat([v * (t - t[0])[:, None], torch.zeros_like(v * t[:, None])], dim=-1)
 
 
 def floor(name: str) -> dict[str, object]:

@@ -38,9 +38,9 @@ def floors() -> pd.DataFrame:
 
 def read_log(name: str) -> pd.DataFrame:
     """The evaluations of one log."""
-    files = sorted(RESULTS.glob(f"logs/{name}/summary.csv"))
-    files += sorted(RESULTS.glob(f"logs/{name}_mlp/summary.csv"))
-    return pd.concat([pd.read_csv(path) for path in files])
+    folders = [RESULTS / "logs" / f"{name}{rest}" for rest in ("", "_mlp", "_known")]
+    files = [folder / "summary.csv" for folder in folders]
+    return pd.concat([pd.read_csv(path) for path in files if path.is_file()])
 
 
 def rows_of(entry: str) -> pd.DataFrame:
@@ -93,13 +93,15 @@ def logs() -> str:
     for name, unit in LOGS.items():
         data, floor = read_log(name), floors().loc[name]
         means = data.groupby("model")[WINDOWS].mean()
-        for index, model in enumerate(("lnn", "acceleration", "mlp")):
+        present = [m for m in ("lnn", "known", "acceleration", "mlp") if m in means.index]
+        for index, model in enumerate(present):
             runs = data[data["model"] == model]
             cells = []
             for column in WINDOWS:
                 mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
                 best = mean == means[column].min() and mean < floor[column]
-                cells.append(f"{bold(_precise(mean), best)} ({_precise(low)}–{_precise(high)})")
+                spread = f"{_precise(low)}–{_precise(high)}" if len(runs) > 1 else "one seed"
+                cells.append(f"{bold(_precise(mean), best)} ({spread})")
             rows.append([f"`{name}`, {unit}" if index == 0 else "", f"`{model}`", *cells])
         rows.append(["", "keeps its velocity", *(_floor(floor[c], means[c]) for c in WINDOWS)])
     return table(["log", "model", "0.1 s windows", "1 s windows", "open loop"], rows)

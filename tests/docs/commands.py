@@ -7,11 +7,12 @@ import re
 import hydra
 import pytest
 import tomllib
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import MissingConfigException
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, open_dict
 
-from pinn_dyn.app.config import CONF
+from pinn_dyn.app.config import checked, completed, config_folder
 from tests.docs.blocks import ROOT
 
 PROGRAMS = ("train", "evaluate", "control", "gather")
@@ -98,14 +99,26 @@ def _choices(word):
 
 
 def compose(program, overrides, folder):
-    """The configuration of a command line, with the configuration folders below a folder."""
+    """The configuration of a command line, with the configuration folders below a folder.
+
+    Types and ranges are checked too, unless a value is missing, which no command of ours gives.
+    """
     candidates = [folder, *sorted(path for path in folder.glob("*conf") if path.is_dir())]
     paths = ",".join(f"file://{path}" for path in candidates)
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+    words = completed(program, [f"hydra.searchpath=[{paths}]", *overrides])
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(program))):
         try:
-            cfg = hydra.compose(program, overrides=[f"hydra.searchpath=[{paths}]", *overrides])
+            cfg = hydra.compose(program, overrides=words, return_hydra_config=True)
         except MissingConfigException as error:
             if re.search(r"hydra/(launcher|sweeper)", str(error)):
                 pytest.skip(f"needs a plugin of Hydra: {error}")
             raise
+    HydraConfig.instance().set_config(cfg)
+    with open_dict(cfg):
+        del cfg["hydra"]
+    if not OmegaConf.missing_keys(cfg):
+        with pytest.MonkeyPatch.context() as patch:
+            for place in (folder, folder.parent):  # classes of the page itself
+                patch.syspath_prepend(str(place))
+            return checked(program, cfg)
     return OmegaConf.to_container(cfg, resolve=False)

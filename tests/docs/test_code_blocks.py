@@ -14,7 +14,7 @@ import yaml
 from hydra.errors import ConfigCompositionException
 from hydra.utils import get_object
 
-from pinn_dyn.app.config import CONF
+from pinn_dyn.app.config import CONF, ConfigError, config_folder
 from tests.docs.blocks import PAGES, PLAYED, ROOT, blocks
 from tests.docs.commands import check_command, compose
 
@@ -91,8 +91,8 @@ def test_yaml_is_a_configuration(block, files, tmp_path):
         (tmp_path / "dataset" / "of_the_docs.yaml").write_text(text)
         composed = compose("train", ["dataset=of_the_docs"], tmp_path)
     else:
-        composed = values
-    check_targets(composed, str(files[block.page]))
+        composed = {"dataset": values}
+    check_targets(composed["dataset"], str(files[block.page]))
 
 
 def _location(folder, title):
@@ -136,6 +136,8 @@ def test_commands_exist(block, files):
         "python train.py data.pair=4",
         "python train.py -m model=lnn,lmm",
         "python train.py data.pairs",
+        "python train.py trainer.max_epochs=3",
+        "python train.py model.integrator=rosenbrock",
         "python nothing.py",
         "python benchmarks/training_step.py --none",
         "pinn-dyn-learn model=lnn",
@@ -145,14 +147,16 @@ def test_commands_exist(block, files):
     ],
 )
 def test_a_wrong_command_is_seen(command, tmp_path):
-    with pytest.raises((AssertionError, ConfigCompositionException)):
+    with pytest.raises((AssertionError, ConfigCompositionException, ConfigError)):
         check_command(command.split(), tmp_path)
 
 
+FOLDERS = [config_folder(program) for program in ("train", "control")]
 GROUPS = {
-    path.relative_to(CONF).as_posix()
-    for path in CONF.rglob("*")
-    if path.is_dir() and "experiment/" not in f"{path.relative_to(CONF)}"
+    path.relative_to(folder).as_posix()
+    for folder in FOLDERS
+    for path in folder.rglob("*")
+    if path.is_dir() and "experiment/" not in f"{path.relative_to(folder)}"
 }
 MENTION = re.compile(r"(?<![\w./@+])\+?(" + "|".join(sorted(GROUPS)) + r")=([\w/]+)(?![\w/.({\[<])")
 
@@ -165,4 +169,5 @@ def test_options_that_the_text_names_exist(page, files):
     for group, option in MENTION.findall(page.read_text()):
         path = f"{group}/{option}.yaml"
         plugin = group.startswith("hydra/")
-        assert (CONF / path).is_file() or path in own or plugin, f"no option {group}={option}"
+        ours = any((folder / path).is_file() for folder in FOLDERS)
+        assert ours or path in own or plugin, f"no option {group}={option}"

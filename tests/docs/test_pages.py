@@ -8,14 +8,16 @@ import pytest
 import yaml
 
 from pinn_dyn.app.config import CONF
-from tests.docs.blocks import ROOT
+from tests.docs.blocks import ROOT, blocks
 
 DIARY = r"(?i)\b(asked|missed|met|allowed|private (script|loop|code)|(an)?other job|busy machine)\b"
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
 
 
 @pytest.mark.parametrize(
-    "page", [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")], ids=lambda page: page.name
+    "page",
+    [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *(ROOT / "docs").rglob("*.md")],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_a_page_speaks_to_its_reader_not_of_its_making(page):
     found = [line for line in page.read_text().splitlines() if re.search(DIARY, line)]
@@ -52,6 +54,17 @@ def test_every_equation_has_its_code_or_its_tests():
             assert "- Tests: `tests/" in section, section.splitlines()[0]
 
 
+def test_the_recipes_of_contributing_are_diffs_of_the_files():
+    diffs = [b for b in blocks(ROOT / "CONTRIBUTING.md") if b.language == "diff"]
+    assert len(diffs) == 5
+    for block in diffs:
+        for line in block.text.splitlines():
+            if line.startswith("+++ "):
+                text = (ROOT / line.removeprefix("+++ ")).read_text()
+            else:
+                assert line.removeprefix("+") in text, f"{block}: {line}"
+
+
 def reference():
     pytest.importorskip("griffe", reason="the configuration reference is made with the docs extra")
     path = ROOT / "docs" / "config_reference.py"
@@ -82,7 +95,7 @@ def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments(
     kind, text = "a list, each a whole number", "widths of the hidden layers."
     assert f"| `model.mass.hidden` | `[32, 32, 32]` | {kind} | {text} |" in page
     # From the comment beside the key.
-    assert "| `gains.position` | `100.0` | | K\\_P. |" in page
+    assert "| `gains.position` | `100.0` |  | K\\_P. |" in page
     # From the comment above the key.
     above = "Control instants per second, with the input held in between;"
     assert f"| `rate` | `1000.0` | a number above 0 or null | {above}" in page

@@ -66,7 +66,10 @@ def test_a_page_runs_from_start_to_end(name, tmp_path, monkeypatch):
 
 def play(name, words):
     script, *overrides = words
-    small = [*(SMALL_DATA[name] if script == "train.py" else []), *SMALL[script]]
+    data = SMALL_DATA[name] if script == "train.py" else []
+    if script == "evaluate.py" and any(word.startswith("dataset=") for word in overrides):
+        data = [word for word in SMALL_DATA[name] if word.startswith("dataset.")]
+    small = [*data, *SMALL[script]]
     if Path("my_conf").is_dir() and not any("--config-dir" in word for word in overrides):
         small.append("--config-dir=my_conf")
     run_script(script, *overrides, *small, checked=True)
