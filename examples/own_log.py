@@ -33,5 +33,7 @@ for name, run in log[log.run.isin(model.source.test.names)].groupby("run"):
     predicted = model.predict(run)
     start = predicted.iloc[0].to_numpy()
     floor = start[:3] + start[3:] * (run.t.to_numpy() - run.t.iloc[0])[:, None]
-    errors = [np.abs(x - run[columns]).mean().round(1).to_dict() for x in (predicted[columns], floor)]
+    errors = [
+        np.abs(x - run[columns]).mean().round(1).to_dict() for x in (predicted[columns], floor)
+    ]
     print(f"{name}: mean error {errors[0]}, of one that keeps its velocity {errors[1]}")

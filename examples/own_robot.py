@@ -40,4 +40,6 @@ model = pinn_dyn.fit(source, model="lnn", steps=steps, overrides=[*own, *sys.arg
 
 learned, true = model.terms([1.0]), source.system.double().terms(torch.ones(1).double())
 for name in ("M", "D", "G"):
-    print(f"{name} learned {getattr(learned, name).item():.3f}, true {getattr(true, name).item():.3f}")
+    print(
+        f"{name} learned {getattr(learned, name).item():.3f}, true {getattr(true, name).item():.3f}"
+    )

@@ -10,7 +10,9 @@ import numpy as np
 import pinn_dyn
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("run", help="a run folder of model=lnn or hnn, with as many inputs as coordinates")
+parser.add_argument(
+    "run", help="a run folder of model=lnn or hnn, with as many inputs as coordinates"
+)
 model = pinn_dyn.load(parser.parse_args().run)
 
 # From one configuration of the training data to another, at rest at both ends, in a second.

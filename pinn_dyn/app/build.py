@@ -64,7 +64,7 @@ def _cache(dataset: dict[str, Any]) -> dict[str, str]:
 
 
 def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:
-    """The data module of ``config["data"]``, on the data source of ``config["dataset"]`` if None."""
+    """The data module of ``config["data"]``, on a source or else that of ``config["dataset"]``."""
     source = build_source(config) if source is None else source
     part = {"seed": config["seed"], **config["data"], "_partial_": True}
     _, batches, _ = epochs(config)

@@ -58,7 +58,7 @@ def main(command: str) -> None:
 
 
 def hush() -> None:
-    """Keep from users what they cannot act on: loggers, hardware, our libraries about each other."""
+    """Keep from users what they cannot act on: hardware, and our libraries about each other."""
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
     warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")

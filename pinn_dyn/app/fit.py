@@ -20,7 +20,7 @@ from pinn_dyn.app.run_folder import CONFIG, claimed
 from pinn_dyn.app.train import train_in
 from pinn_dyn.data import DataSource
 
-STEPS = 2000
+STEPS = 1000
 """Of the optimizer, on a data frame: a minute or two."""
 _VALIDATIONS = 10  # at most, in such a training
 
@@ -54,7 +54,7 @@ def fit(
         time: column of the time, as q; a name alone is in s.
         run: column that tells runs apart; None where all rows are one run.
         model: ``"lnn"``, ``"hnn"``, ``"acceleration"`` or ``"mlp"``.
-        steps: of the optimizer; None: 2,000 for a data frame, else as train.py.
+        steps: of the optimizer; None: 1,000 for a data frame, else as train.py.
         seed: of the weights and the batches, and of the choice of runs.
         folder: run folder that is written, for load, evaluate.py and control.py; None: none stays.
         overrides: anything else, in the words of a command line: ``["optimizer.lr=0.002"]``.
@@ -65,9 +65,9 @@ def fit(
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
     with contextlib.ExitStack() as stack:
+        temporary = folder is None
         if folder is None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="pinn_dyn-"))
-            overrides = ["~callbacks.figures", *overrides]  # which nobody could see
         place = Path(folder).expanduser().resolve()
         if (place / CONFIG).exists():
             raise ConfigError(f"folder is {place}, which holds a training: give another one")
@@ -80,7 +80,9 @@ def fit(
             if steps is None:
                 steps = STEPS
         elif any(given is not None for given in (q, u, v, run)):
-            raise TypeError("q, u, v and run describe a data frame: leave them out beside a data set")
+            raise TypeError(
+                "q, u, v and run describe a data frame: leave them out beside a data set"
+            )
         elif isinstance(data, str):
             words.append(f"dataset={data}")
         else:
@@ -88,6 +90,8 @@ def fit(
         if steps is not None:
             words += [f"trainer.steps={steps}", f"trainer.validations={_validations(steps)}"]
         config = composed("train", [*words, *overrides])
+        if temporary:
+            config["callbacks"].pop("figures", None)  # which nobody could see
         source = data if isinstance(data, DataSource) else None
         if source is not None:
             # An object has no configuration: what the run folder can say of it.

@@ -21,7 +21,8 @@ _SHARE = 0.15  # of the runs, or of each run, for the test, and again for valida
 _PIECE = 5.0  # s, the longest roll-out of validation and test
 _GUARD = 0.5  # s, at most, between training, validation and test of one run
 _HORIZON = 2.0  # s, at most, of the roll-outs by which the best checkpoint is chosen
-_PAIRS, _WINDOW, _BATCH = 10000, 10, 128  # of data=multi_step
+_PAIRS, _BATCH = 10000, 128  # at most, as data=multi_step
+_STEPS, _STEP = 2, 0.02  # of a training window: so many steps, each of about so many s
 
 
 def frame_dataset(
@@ -51,7 +52,7 @@ def frame_dataset(
 
     folder.mkdir(parents=True, exist_ok=True)
     frame.to_csv(folder / FRAME, index=False)
-    split, horizon, pairs = _split(runs, seed)
+    split, settings = _split(runs, seed)
     dataset = {
         "defaults": ["csv_log", "_self_"],
         "name": "frame",
@@ -71,9 +72,7 @@ def frame_dataset(
         f"hydra.searchpath=['file://{place}']",
         "dataset=frame",
         "data=multi_step",
-        f"data.pairs={pairs}",
-        f"data.batch_size={min(_BATCH, pairs)}",
-        f"validator.horizon={horizon}",
+        *(f"{key}={value}" for key, value in settings.items()),
     ]
 
 
@@ -86,8 +85,8 @@ def _described(name: str, given: Signals) -> dict[str, Any]:
     return {"columns": given if isinstance(given, str) else list(given), "unit": unit}
 
 
-def _split(runs: dict[str, np.ndarray], seed: int) -> tuple[dict[str, Any], float, int]:
-    """Validation and test of a data set, the validation's horizon in s, and the pairs.
+def _split(runs: dict[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, float]]:
+    """Validation and test of a data set, and the windows and roll-outs that fit it.
 
     Of five runs or more, 15 % are the test and as many the validation, whole, drawn among those of
     at least the median length. Of fewer, the ends of each: all in pieces of at most 5 s.
@@ -128,5 +127,13 @@ def _split(runs: dict[str, np.ndarray], seed: int) -> tuple[dict[str, Any], floa
         }
         kept = 2 * (seconds + guard) / step + 2
         rows = [int(len(t) - kept) for t in runs.values()]
-    starts = sum(max(count - _WINDOW, 0) for count in rows)
-    return split, min(_HORIZON, size), max(min(_PAIRS, starts), 1)
+    stride = max(round(_STEP / step), 1)
+    starts = sum(max(count - _STEPS * stride, 0) for count in rows)
+    pairs = max(min(_PAIRS, starts), 1)
+    return split, {
+        "data.steps": _STEPS,
+        "data.stride": stride,
+        "data.pairs": pairs,
+        "data.batch_size": min(_BATCH, pairs),
+        "validator.horizon": min(_HORIZON, size),
+    }

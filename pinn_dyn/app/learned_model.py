@@ -10,15 +10,15 @@ from typing import NamedTuple, cast, overload
 import numpy as np
 import pandas as pd
 import torch
+from lightning.pytorch.utilities.seed import isolate_rng
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pinn_dyn.app.build import VALIDATION_ERROR, build_source
+from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.app.run_folder import Run, load_run, require_finished
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
-from pinn_dyn.data.logs import Recording
-from pinn_dyn.data.logs.step import sample_time
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.arrays import require_finite
@@ -57,7 +57,8 @@ def load(
     folder = Path(run_folder).expanduser()
     require_finished(folder)
     trusted = packages(trust if isinstance(trust, str) else list(trust))
-    return LearnedModel(load_run(folder, checkpoint, trusted))
+    with isolate_rng():  # models draw their first weights when they are built
+        return LearnedModel(load_run(folder, checkpoint, trusted))
 
 
 class LearnedModel:
@@ -152,7 +153,12 @@ class LearnedModel:
         if isinstance(start, pd.DataFrame):
             if u is not None or t is not None:
                 raise TypeError("predict(frame) takes the inputs from the frame: leave out u and t")
-            return self._predict_frame(start)
+            if self.source is None:
+                raise ValueError(
+                    f"predict(frame): the model was trained on {self.config['dataset'].get('name')}"
+                    ", which is no log with columns: use predict(start, u, t)"
+                )
+            return predict_frame(self.model, self.source, start)
         if u is None:
             raise TypeError("predict(start) lacks the input: expected predict(start, u, t)")
         x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
@@ -193,42 +199,6 @@ class LearnedModel:
             )
         interpolation = self.config["dataset"].get("interpolation", "linear")
         return Signal(times, samples, interpolation), times
-
-    def _predict_frame(self, frame: pd.DataFrame) -> pd.DataFrame:
-        source = self.source
-        if source is None:
-            raise ValueError(
-                f"predict(frame): the model was trained on {self.config['dataset'].get('name')}, "
-                "which is no log with columns: use predict(start, u, t)"
-            )
-        rates = [f"d{name}/dt" for name in source.q.columns] if source.v is None else []
-        names = source.q.columns + (rates if source.v is None else source.v.columns)
-        values = np.full((len(frame), len(names)), np.nan)
-        for rows, raw, clean in source.recordings(frame):
-            q, v = np.split(self._along(raw, clean), 2, axis=1)
-            v = v / source.q.factors if source.v is None else source.v.from_si(v)
-            values[rows] = np.hstack([source.q.from_si(q), v])
-        return pd.DataFrame(values, index=frame.index, columns=names)
-
-    def _along(self, raw: Recording, clean: Recording) -> np.ndarray:
-        """The prediction along a cleaned run at the times of its rows, ``(T, 2N)``, SI units."""
-        assert self.source is not None and clean.v is not None
-        step = sample_time(clean, "predict")
-        samples = (self.model.fixed_step or step) / step
-        if abs(samples - round(samples)) > 1e-3 * samples:
-            raise ValueError(
-                f"{raw.place}: the model predicts in steps of {self.model.fixed_step:g} s, no "
-                f"multiple of the sample time, {step:g} s: give rows at the rate of the training"
-            )
-        clock = torch.arange(len(clean), dtype=torch.float64) * step
-        times = clock[:: round(samples)]
-        start = torch.from_numpy(np.hstack([clean.q[0], clean.v[0]]))
-        signal = Signal(clock, torch.from_numpy(clean.u.copy()), self.source.interpolation)
-        states = self.model.predict(start, times, signal).numpy()
-        # The uniform clock of the data, at the log's own times.
-        now = np.interp(raw.t, clean.t, clock.numpy(), left=np.nan, right=np.nan)
-        columns = [np.interp(now, times.numpy(), x, right=np.nan) for x in states.T]
-        return np.column_stack(columns)
 
     # Terms of the equation of motion.
 

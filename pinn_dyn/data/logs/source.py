@@ -206,8 +206,7 @@ class LogSource(DataSource):
             groups = self._runs(frame, path)
         raws = self._recordings(frame, path, groups, Report(self.name))
         return [
-            (rows, raw, self._clean_alone(raw))
-            for (_, rows), raw in zip(groups, raws, strict=True)
+            (rows, raw, self._clean_alone(raw)) for (_, rows), raw in zip(groups, raws, strict=True)
         ]
 
     def _clean_alone(self, raw: Recording) -> Recording:
