@@ -72,9 +72,9 @@ def _cache(dataset: dict[str, Any]) -> dict[str, str]:
     return {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")}
 
 
-def build_data(config: dict[str, Any]) -> DynamicsData:
-    """The data module of ``config["data"]`` on the data source."""
-    source = build_source(config)
+def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:
+    """The data module of ``config["data"]``, on a source or else that of ``config["dataset"]``."""
+    source = build_source(config) if source is None else source
     part = {"seed": config["seed"], **config["data"], "_partial_": True}
     _, batches, _ = epochs(config)
     return _build("data", part, source=source, batches_per_epoch=batches)

@@ -46,10 +46,7 @@ def main(command: str) -> None:
                 raise  # SweepCallback then goes on with the other jobs
             raise SystemExit(f"Error: {error}") from error
 
-    # What a user cannot act on: loggers and hardware, and our libraries about each other.
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
-    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
+    hush()
     try:
         folder = str(config_folder(command))
         hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
@@ -58,6 +55,13 @@ def main(command: str) -> None:
     finally:
         if hint := how_to_go_on():
             print(hint, file=sys.stderr)
+
+
+def hush() -> None:
+    """Keep from users what they cannot act on: hardware, and our libraries about each other."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
+    warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
 
 
 train = partial(main, "train")

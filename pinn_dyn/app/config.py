@@ -10,7 +10,7 @@ from typing import Any
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
-from hydra.errors import ConfigCompositionException, OverrideParseException
+from hydra.errors import ConfigCompositionException, HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -62,6 +62,21 @@ def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
     config = plain(cfg)
     check(command, config)
     return config
+
+
+def composed(command: str, overrides: list[str]) -> dict[str, Any]:
+    """The checked configuration of a command with the words of a command line, as plain values.
+
+    Raises:
+        ConfigError: as :func:`checked` and :func:`completed`, or with what Hydra said.
+    """
+    words = completed(command, overrides)
+    folder = str(config_folder(command))
+    try:
+        with hydra.initialize_config_dir(version_base="1.3", config_dir=folder):
+            return checked(command, hydra.compose(command, overrides=words))
+    except HydraException as error:
+        raise ConfigError(str(error)) from error
 
 
 def completed(command: str, arguments: list[str]) -> list[str]:
@@ -148,7 +163,12 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
             folder = config_folder(command)
+<<<<<<< HEAD
             groups = [o for o in overrides if _is_group(folder, o) or "hydra.searchpath" in o]
+=======
+            places = [o for o in overrides if o.startswith("hydra.searchpath=")]
+            groups = [*places, *(o for o in overrides if _is_group(folder, o))]
+>>>>>>> api/api
             known = OmegaConf.to_container(hydra.compose(command, overrides=groups))
             assert isinstance(known, dict)
             return key, {str(name): value for name, value in known.items()}

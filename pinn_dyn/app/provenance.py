@@ -15,6 +15,7 @@ import pandas as pd
 import torch
 import yaml
 
+from pinn_dyn import __version__
 from pinn_dyn.app.run_folder import Run
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.cache import cache_key
@@ -38,6 +39,7 @@ def provenance() -> dict[str, str]:
     commit = _git("rev-parse", "--short", "HEAD")
     changed = _git("status", "--porcelain", "--untracked-files=no")
     return {
+        "pinn_dyn": __version__,
         "commit": commit or "unknown",
         "uncommitted_changes": "unknown" if not commit else "yes" if changed else "no",
         "torch": torch.__version__,

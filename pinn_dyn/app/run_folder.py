@@ -18,6 +18,7 @@ import torch
 import yaml
 from filelock import FileLock, Timeout
 
+from pinn_dyn import __version__
 from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.trust import read_foreign
@@ -28,10 +29,14 @@ from pinn_dyn.models import Statistics
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
+<<<<<<< HEAD
 DATA = "data.json"
 """The fingerprint of the data that the run was trained on."""
 
 log = logging.getLogger(__name__)
+=======
+_LOCK = ".lock"
+>>>>>>> api/api
 
 _PLACES = ("dataset.cache",)  # where things lie does not change what is learned
 # Of a record, beside those of its validation.
@@ -72,6 +77,29 @@ def read_config(folder: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
     return read_foreign(path, trust)
 
 
+def require_finished(folder: Path) -> None:
+    """Refuse a run folder whose training has not ended.
+
+    Raises:
+        ConfigError: saying whether it is in progress, or was interrupted.
+    """
+    if (folder / METRICS).is_file() or not (folder / CONFIG).is_file():
+        return
+    try:
+        if (folder / _LOCK).is_file():
+            with FileLock(folder / _LOCK, timeout=0):
+                pass
+    except Timeout as error:
+        raise ConfigError(
+            f"{folder} holds a training in progress, expected one that has ended and written "
+            f"{METRICS}: wait for it"
+        ) from error
+    raise ConfigError(
+        f"{folder} holds a training that was interrupted, expected one that has ended and written "
+        f"{METRICS}: go on with it by 'python train.py resume={folder}', or train again"
+    )
+
+
 def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
     """Load a run's model from one of its checkpoints, ``best`` or ``last``.
 
@@ -82,8 +110,31 @@ def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
 
     Raises:
         ConfigError: if the folder is no run folder, the checkpoint is missing or damaged, or it
-            belongs to another model or data set than the configuration says.
+            belongs to another model or data set than the configuration says; if another version
+            of this program made the run, it says which.
     """
+    try:
+        return _load_run(folder, checkpoint, trust)
+    except ConfigError as error:
+        made_by = _version(folder)
+        if made_by in (None, __version__):
+            raise
+        raise ConfigError(
+            f"{error}. The run was made by pinn_dyn {made_by}, and this is {__version__}: load it "
+            "with that version, or train it again"
+        ) from error
+
+
+def _version(folder: Path) -> str | None:
+    """The version that made a run; None where there is no whole record of it."""
+    try:
+        record = json.loads((folder / METRICS).read_text())
+        return record.get("pinn_dyn", "0.2 or before")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
     config = read_config(folder, trust)
     for key, kind in (("dataset", dict), ("model", dict), ("model_name", str), ("seed", int)):
         if not isinstance(config.get(key), kind):
@@ -254,7 +305,7 @@ def claimed(folder: Path, config: dict[str, Any]) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder / ".lock", timeout=0):
+        with FileLock(folder / _LOCK, timeout=0):
             # A training that failed before its first checkpoint leaves nothing to be mixed up.
             if (folder / METRICS).is_file() or (folder / CHECKPOINTS / "last.ckpt").is_file():
                 _refuse_another(folder, config)

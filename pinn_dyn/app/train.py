@@ -43,7 +43,7 @@ from pinn_dyn.app.run_folder import (
 )
 from pinn_dyn.app.schema import KEYS, check_value
 from pinn_dyn.app.trust import packages
-from pinn_dyn.data import LogSource
+from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
 from pinn_dyn.evaluation.identification import constants_table, undetermined
@@ -111,6 +111,7 @@ def train(cfg: DictConfig) -> float:
         if error is not None and cfg.get("resume") is None:
             log.info("already trained, to train again delete %s", folder)
             return error
+<<<<<<< HEAD
         return _train(folder, config, _whole(folder, checkpoint), trust)
 
 
@@ -146,16 +147,44 @@ def _step(checkpoint: Path) -> int:
     if missing := [key for key in ("global_step", "loops", "optimizer_states") if key not in saved]:
         raise ConfigError(f"{checkpoint} has no {', '.join(missing)}: it holds weights alone")
     return saved["global_step"]
+=======
+        if last.is_file():
+            log.info("going on with the training in %s", folder)
+        try:
+            return train_in(folder, config, last if last.is_file() else None, trust)
+        except SystemExit as stop:  # Lightning's end of an interrupted training
+            if HydraConfig.get().mode == RunMode.RUN:
+                log.warning("interrupted; go on with: python train.py resume=%s", folder)
+            # SIGTERM has no status.
+            raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
+>>>>>>> api/api
 
 
-def _train(
-    folder: Path, config: dict[str, Any], last: Path | None, trust: tuple[str, ...]
+def train_in(
+    folder: Path,
+    config: dict[str, Any],
+    last: Path | None = None,
+    trust: tuple[str, ...] = (),
+    source: DataSource | None = None,
 ) -> float:
-    """Train in a folder, from a checkpoint if there is one."""
+    """Train in a folder that is claimed, and write the record; returns the last validation error.
+
+    Args:
+        folder: the run folder.
+        config: the resolved configuration.
+        last: the checkpoint to go on from, if any.
+        trust: packages whose classes the run of ``start_from`` may build.
+        source: the data; None builds those of ``config["dataset"]``.
+
+    Raises:
+        ConfigError: on data, or a model, that do not fit together.
+        NonFiniteLossError: if the loss becomes NaN or infinite.
+        SystemExit: if it was interrupted.
+    """
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
 
-    data = build_data(config)
+    data = build_data(config, source)
     log.info("%s: loading data", config["name"])
     try:
         statistics = data.statistics
@@ -188,14 +217,9 @@ def _train(
     batches = EnsembleData(data, model.size) if isinstance(model, Ensemble) else data
 
     start, start_cpu = time.perf_counter(), _cpu_seconds()
-    try:
-        trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
-        if last is not None and not trainer.callback_metrics:  # ended just before its record
-            trainer.validate(learner, batches, verbose=False)
-    except SystemExit as stop:  # Lightning's end of an interrupted training; SIGTERM has no status
-        if HydraConfig.get().mode == RunMode.RUN:
-            log.warning("interrupted; go on with: python train.py resume=%s", folder)
-        raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
+    trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
+    if last is not None and not trainer.callback_metrics:  # ended just before its record
+        trainer.validate(learner, batches, verbose=False)
     seconds = time.perf_counter() - start
     if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
         _write_constants(model, learner.result, folder)

@@ -97,7 +97,7 @@ def test_the_wheel_holds_every_module_template_and_configuration(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
     modules = {
         str(p.relative_to(ROOT))
-        for kind in ("*.py", "*.html")
+        for kind in ("*.py", "*.html", "py.typed")
         for p in (ROOT / "pinn_dyn").rglob(kind)
     }
     assert any(name.endswith(".html") for name in modules)

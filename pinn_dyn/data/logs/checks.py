@@ -40,8 +40,8 @@ def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: 
         k = int(back.argmax())
         raise LogError(
             f"{path}, line {lines[k + 1]}, column {name!r}: the time goes back from {t[k]:.9g} to "
-            f"{t[k + 1]:.9g} s: if a new run starts there, name its column in 'trajectory' or add "
-            "a SplitGaps step; otherwise repair the file"
+            f"{t[k + 1]:.9g} s: if a new run starts there, name its column in 'trajectory' "
+            "(run=... of pinn_dyn.fit) or add a SplitGaps step; otherwise repair the file"
         )
     repeated = spacing == 0
     if repeated.any() and Deduplicate not in kinds:

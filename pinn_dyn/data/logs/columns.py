@@ -97,6 +97,10 @@ class Columns:
         """Raw columns ``(T, K)`` in SI units."""
         return (raw - self.offsets) * self.factors
 
+    def from_si(self, values: np.ndarray) -> np.ndarray:
+        """Columns ``(T, K)`` in SI units as the file has them."""
+        return values / self.factors + self.offsets
+
     def _each(self, name: str, value: Any) -> list[Any]:
         """One value per column."""
         if isinstance(value, Sequence) and not isinstance(value, str):

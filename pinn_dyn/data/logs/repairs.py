@@ -179,6 +179,10 @@ class InputDelay(Step):
                 "more, and more than 0"
             )
 
+    @property
+    def learns(self) -> bool:
+        return self.delay is None
+
     def fit(self, training: list[Recording]) -> Step:
         if self.delay is not None:
             return self

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from pinn_dyn.data.fingerprint import describe
@@ -170,6 +171,55 @@ class LogSource(DataSource):
         """
         return self._load()[0]
 
+    def recordings(self, frame: pd.DataFrame) -> list[tuple[np.ndarray, Recording, Recording]]:
+        """The runs of a table with the columns and units of the log, before and after the cleaning.
+
+        They are read with the checks of a file and cleaned alone, by the steps of this source. A
+        frame without the column of the trajectory is one run.
+
+        Args:
+            frame: the columns of time, q, u, and v where the log has it.
+
+        Returns:
+            For each run which rows of the frame are its own, ``(rows,)``, these rows in SI units,
+            and what the cleaning made of them.
+
+        Raises:
+            LogError: on a frame that cannot be used, as on a file; or naming a step that needs the
+                training runs, or leaves other than one stretch of a run.
+        """
+        if not len(frame):
+            raise LogError("the frame has no rows, expected at least two")
+        for name, step in self.steps.items():
+            if step.learns:
+                raise LogError(
+                    f"steps.{name}: {step} takes something from the training runs, which a frame "
+                    "does not have: give it in the configuration, and train again"
+                )
+        path = Path("the frame")
+        groups = [("the frame", np.full(len(frame), True))]
+        if self.trajectory in frame.columns:
+            groups = self._runs(frame, path)
+        raws = self._recordings(frame, path, groups, Report(self.name))
+        return [
+            (rows, raw, self._clean_alone(raw)) for (_, rows), raw in zip(groups, raws, strict=True)
+        ]
+
+    def _clean_alone(self, raw: Recording) -> Recording:
+        """A run after all steps, which keep it in one piece."""
+        clean = raw
+        for name, step in self.steps.items():
+            parts, text = step.apply(clean)
+            if len(parts) != 1:
+                raise LogError(
+                    f"{raw.place}: steps.{name} leaves {len(parts)} stretches of it ({text}), "
+                    "expected one: give each in a frame of its own"
+                )
+            (clean,) = parts
+        if clean.v is None:
+            ((clean,), _) = SavitzkyGolayVelocity().apply(clean)
+        return clean
+
     def fingerprint(self) -> dict[str, object]:
         """Files (name, size, SHA-256), rows, columns, cleaning, and the stretches of each split."""
         root = Path(self.root).expanduser()
@@ -232,50 +282,62 @@ class LogSource(DataSource):
         for path in paths:
             table = read_table(path, self.time.columns[0])
             stem = run_name(path, self.root)
-            groups = [(stem, slice(None))]
+            groups = [(stem, np.full(len(table), True))]
             if self.trajectory is not None:
-                ids = column(table, path, self.trajectory, "trajectory")
-                if ids.isna().any():
-                    raise LogError(
-                        f"{path}, line {table.index[ids.isna()][0]}, column {self.trajectory!r} "
-                        "(trajectory): is empty, expected the name of a run"
-                    )
-                ids = ids.astype(str)
                 prefix = f"{stem}:" if len(paths) > 1 else ""
-                groups = [(f"{prefix}{run}", (ids == run).to_numpy()) for run in ids.unique()]
-            lines = table.index.to_numpy()
-            values = {
-                signal: columns.to_si(numbers(table, path, columns.columns, signal))
-                for signal, columns in (
-                    ("time", self.time),
-                    ("q", self.q),
-                    ("v", self.v),
-                    ("u", self.u),
-                )
-                if columns is not None
-            }
-            for run, rows in groups:
-                t, *others = values["time"][rows].T
-                steps = list(self.steps.values())
-                check_clock(t, lines[rows], path, self.time.columns[0], steps)
-                for name, other in zip(self.time.columns[1:], others, strict=True):
-                    names = (self.time.columns[0], name)
-                    check_second_clock(t, other, lines[rows], path, names)
-                for signal, columns in (("q", self.q), ("v", self.v), ("u", self.u)):
-                    if columns is not None:
-                        signal_rows = Rows(path, lines[rows], signal, columns, values[signal][rows])
-                        repaired = any(
-                            isinstance(step, RemoveJumps) and signal in step.signals
-                            for step in steps
-                        )
-                        check_rows(signal_rows, t, report, jumps_are_removed=repaired)
-                v = values["v"][rows] if "v" in values else None
-                recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
-                report.add(
-                    "Read",
-                    run,
-                    f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}",
-                )
+                groups = [(f"{prefix}{run}", rows) for run, rows in self._runs(table, path)]
+            recordings += self._recordings(table, path, groups, report)
+        return recordings
+
+    def _runs(self, table: pd.DataFrame, path: Path) -> list[tuple[str, np.ndarray]]:
+        """Names of the runs of a table, in order, and which of its rows are theirs."""
+        assert self.trajectory is not None
+        ids = column(table, path, self.trajectory, "trajectory")
+        if ids.isna().any():
+            raise LogError(
+                f"{path}, line {table.index[ids.isna()][0]}, column {self.trajectory!r} "
+                "(trajectory): is empty, expected the name of a run"
+            )
+        ids = ids.astype(str)
+        return [(run, (ids == run).to_numpy()) for run in ids.unique()]
+
+    def _recordings(
+        self,
+        table: pd.DataFrame,
+        path: Path,
+        groups: list[tuple[str, np.ndarray]],
+        report: Report,
+    ) -> list[Recording]:
+        """The runs of a table in SI units, checked."""
+        lines = table.index.to_numpy()
+        values = {
+            signal: columns.to_si(numbers(table, path, columns.columns, signal))
+            for signal, columns in (
+                ("time", self.time),
+                ("q", self.q),
+                ("v", self.v),
+                ("u", self.u),
+            )
+            if columns is not None
+        }
+        steps = list(self.steps.values())
+        recordings = []
+        for run, rows in groups:
+            t, *others = values["time"][rows].T
+            check_clock(t, lines[rows], path, self.time.columns[0], steps)
+            for name, other in zip(self.time.columns[1:], others, strict=True):
+                names = (self.time.columns[0], name)
+                check_second_clock(t, other, lines[rows], path, names)
+            for signal, columns in (("q", self.q), ("v", self.v), ("u", self.u)):
+                if columns is not None:
+                    signal_rows = Rows(path, lines[rows], signal, columns, values[signal][rows])
+                    repaired = any(
+                        isinstance(step, RemoveJumps) and signal in step.signals for step in steps
+                    )
+                    check_rows(signal_rows, t, report, jumps_are_removed=repaired)
+            v = values["v"][rows] if "v" in values else None
+            recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
+            report.add("Read", run, f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}")
         return recordings
 
     def _clean(self, parts: dict[str, list[Recording]], report: Report) -> list[Cleaned]:

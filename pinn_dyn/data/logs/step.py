@@ -26,6 +26,11 @@ _LEFT = 0.5
 class Step(abc.ABC):
     """One step of the cleaning: a recording in, one or several out, and a line for the report."""
 
+    @property
+    def learns(self) -> bool:
+        """Whether :meth:`fit` takes something from the training runs."""
+        return False
+
     def fit(self, training: list[Recording]) -> Step:
         """The step with what it must learn from the data, taken from the training runs alone."""
         return self

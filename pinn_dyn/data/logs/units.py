@@ -13,6 +13,7 @@ _DEGREE = math.pi / 180
 UNITS: dict[str, tuple[str, float]] = {
     "1": ("1", 1.0),
     "%": ("1", 0.01),
+    "1/s": ("1/s", 1.0),
     "s": ("s", 1.0),
     "ms": ("s", 1e-3),
     "us": ("s", 1e-6),

@@ -1,0 +1,113 @@
+"""Training from Python, without a configuration file: what train.py does, on a data frame."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+import torch
+from lightning.pytorch.utilities.seed import isolate_rng
+
+from pinn_dyn.app.command import hush
+from pinn_dyn.app.config import ConfigError, composed
+from pinn_dyn.app.frame import Signals, frame_dataset
+from pinn_dyn.app.learned_model import LearnedModel, load
+from pinn_dyn.app.run_folder import CONFIG, claimed
+from pinn_dyn.app.train import train_in
+from pinn_dyn.data import DataSource
+
+STEPS = 1000
+"""Of the optimizer, on a data frame: a minute or two."""
+_VALIDATIONS = 10  # at most, in such a training
+
+
+def fit(
+    data: pd.DataFrame | DataSource | str,
+    *,
+    q: Signals | None = None,
+    u: Signals | None = None,
+    v: Signals | None = None,
+    time: Signals = "t",
+    run: str | None = None,
+    model: str = "lnn",
+    steps: int | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    overrides: Sequence[str] = (),
+) -> LearnedModel:
+    """Train a model, as train.py does, and return it.
+
+    A data frame is read, checked and cleaned as the log reader does it with a file, one row per
+    sample. Of five runs or more, some are kept whole for validation and test, as
+    ``config["dataset"]`` then says; of fewer, the last 15 % of each are for the test and the 15 %
+    before them for validation. What is returned did best in roll-outs of the validation.
+
+    Args:
+        data: a data frame; or a data source, or the name of a data set, such as ``"soft_arm_1"``.
+        q, u, v: columns of the configuration, the input and, where it was measured, the velocity:
+            ``{"columns": [...], "unit": "deg"}``, with one unit for all or one for each, and what
+            else :class:`~pinn_dyn.data.logs.Columns` takes; or names alone, taken in SI units.
+        time: column of the time, as q; a name alone is in s.
+        run: column that tells runs apart; None where all rows are one run.
+        model: ``"lnn"``, ``"hnn"``, ``"acceleration"`` or ``"mlp"``.
+        steps: of the optimizer; None: 1,000 for a data frame, else as train.py.
+        seed: of the weights and the batches, and of the choice of runs.
+        folder: run folder that is written, for load, evaluate.py and control.py; None: none stays.
+        overrides: anything else, in the words of a command line: ``["optimizer.lr=0.002"]``.
+
+    Raises:
+        TypeError: if q or u is missing beside a data frame, or given beside other data.
+        ValueError: on columns, units, clocks or settings that cannot be used; names them.
+        NonFiniteLossError: if the loss becomes NaN or infinite.
+    """
+    with contextlib.ExitStack() as stack:
+        temporary = folder is None
+        if folder is None:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="pinn_dyn-"))
+        place = Path(folder).expanduser().resolve()
+        if (place / CONFIG).exists():
+            raise ConfigError(f"folder is {place}, which holds a training: give another one")
+        words = [f"model={model}", f"model_name={model}", f"seed={seed}"]
+        if isinstance(data, pd.DataFrame):
+            if q is None or u is None:
+                raise TypeError("fit(frame) lacks columns: expected fit(frame, q=[...], u=[...])")
+            signals = {"time": time, "q": q, "u": u} | ({} if v is None else {"v": v})
+            words += frame_dataset(data, signals, run, seed, place)
+            if steps is None:
+                steps = STEPS
+        elif any(given is not None for given in (q, u, v, run)):
+            raise TypeError(
+                "q, u, v and run describe a data frame: leave them out beside a data set"
+            )
+        elif isinstance(data, str):
+            words.append(f"dataset={data}")
+        else:
+            words.append(f"dataset.name={data.name}")
+        if steps is not None:
+            words += [f"trainer.steps={steps}", f"trainer.validations={_validations(steps)}"]
+        config = composed("train", [*words, *overrides])
+        if temporary:
+            config["callbacks"].pop("figures", None)  # which nobody could see
+        source = data if isinstance(data, DataSource) else None
+        if source is not None:
+            # An object has no configuration: what the run folder can say of it.
+            labels = {"labels": list(source.labels), "input_labels": list(source.input_labels)}
+            config["dataset"] = {"name": source.name, **labels}
+        threads = torch.get_num_threads()
+        stack.callback(torch.set_num_threads, threads)
+        try:
+            with isolate_rng(), warnings.catch_warnings(), claimed(place, config):
+                hush()
+                train_in(place, config, source=source)
+        except SystemExit as stop:  # Lightning's end of an interrupted training
+            raise KeyboardInterrupt from stop
+        return load(place)
+
+
+def _validations(steps: int) -> int:
+    """The most validations, up to ten, that divide the steps evenly."""
+    return max(count for count in range(1, _VALIDATIONS + 1) if steps % count == 0)

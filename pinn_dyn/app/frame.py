@@ -1,0 +1,139 @@
+"""A data frame as a log: its file, its configuration, and a split and a length that fit it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from pinn_dyn.data.logs import Columns, LogError
+from pinn_dyn.data.logs.reader import column, numbers
+
+Signals = str | Sequence[str] | Mapping[str, Any]
+
+FRAME = "frame.csv"
+_WHOLE_RUNS = 5  # from so many on some are kept whole for validation and test
+_SHARE = 0.15  # of the runs, or of each run, for the test, and again for validation
+_PIECE = 5.0  # s, the longest roll-out of validation and test
+_GUARD = 0.5  # s, at most, between training, validation and test of one run
+_HORIZON = 2.0  # s, at most, of the roll-outs by which the best checkpoint is chosen
+_PAIRS, _BATCH = 10000, 128  # at most, as data=multi_step
+_STEPS, _STEP = 2, 0.02  # of a training window: so many steps, each of about so many s
+
+
+def frame_dataset(
+    frame: pd.DataFrame, signals: Mapping[str, Signals], run: str | None, seed: int, folder: Path
+) -> list[str]:
+    """Write a frame and ``dataset/frame.yaml`` to a folder; returns the overrides that use them.
+
+    Args:
+        frame: the log.
+        signals: columns of time, q, u and, where there is one, v.
+        run: column that tells runs apart, or None.
+        seed: of the choice of runs.
+        folder: the run folder.
+
+    Raises:
+        LogError: on columns that are not there or hold no numbers, or too few rows.
+    """
+    described = {name: _described(name, given) for name, given in signals.items()}
+    columns = {name: Columns.from_config(name, given) for name, given in described.items()}
+    path = Path("the frame")
+    values = {name: numbers(frame, path, x.columns, name) for name, x in columns.items()}
+    if not len(frame):
+        raise LogError("the frame has no rows, expected a log")
+    t = columns["time"].to_si(values["time"])[:, 0]
+    ids = ["frame"] * len(frame) if run is None else column(frame, path, run, "run")
+    runs = {str(key): x.to_numpy() for key, x in pd.Series(t).groupby(np.asarray(ids), sort=False)}
+
+    folder.mkdir(parents=True, exist_ok=True)
+    frame.to_csv(folder / FRAME, index=False)
+    split, settings = _split(runs, seed)
+    dataset = {
+        "defaults": ["csv_log", "_self_"],
+        "name": "frame",
+        "root": str(folder),
+        "files": FRAME,
+        "trajectory": run,
+        **described,
+        **split,
+    }
+    group = folder / "dataset"
+    group.mkdir(exist_ok=True)
+    (group / "frame.yaml").write_text(
+        yaml.safe_dump(dataset, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    )
+    place = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    return [
+        f"hydra.searchpath=['file://{place}']",
+        "dataset=frame",
+        "data=multi_step",
+        *(f"{key}={value}" for key, value in settings.items()),
+    ]
+
+
+def _described(name: str, given: Signals) -> dict[str, Any]:
+    """A signal as a configuration has it; names alone have SI units."""
+    if isinstance(given, Mapping):
+        plain = (str, int, float)
+        return {k: x if isinstance(x, plain) else list(x) for k, x in given.items()}
+    unit = {"time": "s", "v": "1/s"}.get(name, "1")
+    return {"columns": given if isinstance(given, str) else list(given), "unit": unit}
+
+
+def _split(runs: dict[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, float]]:
+    """Validation and test of a data set, and the windows and roll-outs that fit it.
+
+    Of five runs or more, 15 % are the test and as many the validation, whole, drawn among those of
+    at least the median length. Of fewer, the ends of each: all in pieces of at most 5 s.
+
+    Args:
+        runs: times of each run, s.
+        seed: of the choice.
+    """
+    spacing = np.concatenate([np.diff(t) for t in runs.values()])
+    step = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
+    lengths = {name: float(np.ptp(t)) for name, t in runs.items()}
+
+    def piece(longest: float) -> float:
+        """At most so long, and a multiple of the sample time."""
+        return round(max(int(min(_PIECE, longest) / step + 1e-6), 1) * step, 9)
+
+    if len(runs) >= _WHOLE_RUNS:
+        median = float(np.median([*lengths.values()]))
+        long = [name for name, length in lengths.items() if length >= median - 0.5 * step]
+        count = max(round(_SHARE * len(runs)), 1)
+        drawn = [long[k] for k in np.random.default_rng(seed).permutation(len(long))]
+        test, validation = sorted(drawn[:count]), sorted(drawn[count : 2 * count])
+        size = piece(median)
+        split: dict[str, Any] = {
+            "validation": {"runs": validation, "piece": size},
+            "test": {"runs": test, "piece": size},
+        }
+        rows = [len(t) for name, t in runs.items() if name not in [*test, *validation]]
+    else:
+        shortest = min(lengths.values())
+        seconds, guard = piece(_SHARE * shortest), min(_GUARD, 0.02 * shortest)
+        seconds = max(_SHARE * shortest, seconds)
+        size = piece(seconds)
+        split = {
+            "validation": {"seconds": seconds, "piece": size},
+            "test": {"seconds": seconds, "piece": size},
+            "guard": guard,
+        }
+        kept = 2 * (seconds + guard) / step + 2
+        rows = [int(len(t) - kept) for t in runs.values()]
+    stride = max(round(_STEP / step), 1)
+    starts = sum(max(count - _STEPS * stride, 0) for count in rows)
+    pairs = max(min(_PAIRS, starts), 1)
+    return split, {
+        "data.steps": _STEPS,
+        "data.stride": stride,
+        "data.pairs": pairs,
+        "data.batch_size": min(_BATCH, pairs),
+        "validator.horizon": min(_HORIZON, size),
+    }
