@@ -163,12 +163,8 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
             folder = config_folder(command)
-<<<<<<< HEAD
-            groups = [o for o in overrides if _is_group(folder, o) or "hydra.searchpath" in o]
-=======
             places = [o for o in overrides if o.startswith("hydra.searchpath=")]
             groups = [*places, *(o for o in overrides if _is_group(folder, o))]
->>>>>>> api/api
             known = OmegaConf.to_container(hydra.compose(command, overrides=groups))
             assert isinstance(known, dict)
             return key, {str(name): value for name, value in known.items()}

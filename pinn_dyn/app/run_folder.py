@@ -29,14 +29,12 @@ from pinn_dyn.models import Statistics
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
-<<<<<<< HEAD
 DATA = "data.json"
 """The fingerprint of the data that the run was trained on."""
 
-log = logging.getLogger(__name__)
-=======
 _LOCK = ".lock"
->>>>>>> api/api
+
+log = logging.getLogger(__name__)
 
 _PLACES = ("dataset.cache",)  # where things lie does not change what is learned
 # Of a record, beside those of its validation.

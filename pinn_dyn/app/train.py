@@ -111,8 +111,13 @@ def train(cfg: DictConfig) -> float:
         if error is not None and cfg.get("resume") is None:
             log.info("already trained, to train again delete %s", folder)
             return error
-<<<<<<< HEAD
-        return _train(folder, config, _whole(folder, checkpoint), trust)
+        try:
+            return train_in(folder, config, _whole(folder, checkpoint), trust)
+        except SystemExit as stop:  # Lightning's end of an interrupted training
+            if HydraConfig.get().mode == RunMode.RUN:
+                log.warning("interrupted; go on with: python train.py resume=%s", folder)
+            # SIGTERM has no status.
+            raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
 
 
 def _whole(folder: Path, checkpoint: Path) -> Path | None:
@@ -147,17 +152,6 @@ def _step(checkpoint: Path) -> int:
     if missing := [key for key in ("global_step", "loops", "optimizer_states") if key not in saved]:
         raise ConfigError(f"{checkpoint} has no {', '.join(missing)}: it holds weights alone")
     return saved["global_step"]
-=======
-        if last.is_file():
-            log.info("going on with the training in %s", folder)
-        try:
-            return train_in(folder, config, last if last.is_file() else None, trust)
-        except SystemExit as stop:  # Lightning's end of an interrupted training
-            if HydraConfig.get().mode == RunMode.RUN:
-                log.warning("interrupted; go on with: python train.py resume=%s", folder)
-            # SIGTERM has no status.
-            raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
->>>>>>> api/api
 
 
 def train_in(
