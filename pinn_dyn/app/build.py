@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.progress import EpochLines
 from pinn_dyn.app.schema import Part, arguments, check_value
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
@@ -233,9 +235,10 @@ def build_trainer(
         ValidationHistory(),
     ]
     part = {key: x for key, x in config["trainer"].items() if key not in ("steps", "validations")}
-    if part.get("enable_progress_bar", True):
-        # Drawing at every step takes a tenth of the time of a small network's step.
-        callbacks.append(TQDMProgressBar(refresh_rate=20))
+    part["enable_progress_bar"] = part.get("enable_progress_bar", True) and sys.stdout.isatty()
+    # Drawing at every step takes a tenth of the time of a small network's step.
+    bar = part["enable_progress_bar"]
+    callbacks.append(TQDMProgressBar(refresh_rate=20) if bar else EpochLines(VALIDATION_ERROR))
     loggers = [_build_logger(name, x, folder) for name, x in config["logger"].items()]
     count, batches, every = epochs(config)
     return _build(

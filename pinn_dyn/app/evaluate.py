@@ -17,7 +17,7 @@ from tqdm import tqdm
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
-from pinn_dyn.app.run_folder import CONFIG, Run, find_runs, load_run
+from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource
 from pinn_dyn.evaluation import (
@@ -88,9 +88,9 @@ def evaluate(cfg: DictConfig) -> float:
 
     Raises:
         ConfigError: on settings that do not fit the data, and on runs that were trained on
-            different data, or on other coordinates or inputs than those of ``dataset``. Run
-            folders that cannot be loaded are passed over; when all else is written, they end the
-            program with this error too.
+            different data, on data that have changed since, or on other coordinates or inputs than
+            those of ``dataset``. Run folders that cannot be loaded are passed over; when all else
+            is written, they end the program with this error too.
     """
     config = checked("evaluate", cfg)
     split = config["split"]
@@ -109,6 +109,8 @@ def evaluate(cfg: DictConfig) -> float:
         stride = common_stride(steps, truth.t)
     except ValueError as error:
         raise ConfigError(f"{source.name}: {error}") from error
+    for run in runs:
+        check_data(run.folder, trained_on)
     grid = stride * truth.duration / (len(truth.t) - 1)
     if config["windows"] is None:
         config["windows"] = default_windows(config["horizon"], grid)
@@ -128,7 +130,9 @@ def evaluate(cfg: DictConfig) -> float:
     labels = _labels(runs)
     floors = build_floors(training.train, training.validation, step=grid)
     evaluations = []
-    for run, label, step in zip(tqdm(runs, desc="evaluating runs"), labels, steps, strict=True):
+    for run, label, step in zip(
+        tqdm(runs, desc="evaluating runs", disable=None), labels, steps, strict=True
+    ):
         recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
         extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
         row = RunResult(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from pinn_dyn.evaluation.sweep_table import (
     told_apart,
     varied_parameters,
 )
+
+log = logging.getLogger(__name__)
 
 _LATEST_EVALUATIONS = "runs/evaluation/*"
 _FEW = 6  # parameters beside the folder of a lost job
@@ -127,7 +130,11 @@ def _test_figures(
                 f"evaluations: '{pattern}' has no summary.csv; give folders that evaluate.py wrote"
             )
         for folder in sorted(folders, key=_summarized_at, reverse=True):
-            summary = pd.read_csv(folder / "summary.csv")
+            try:
+                summary = pd.read_csv(folder / "summary.csv")
+            except ValueError as error:
+                log.warning("passed over: %s cannot be read: %s", folder / "summary.csv", error)
+                continue
             known = {job.folder: row for job in jobs if (row := _row_of(job, summary)) is not None}
             if not known:
                 continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import glob
-import json
+import logging
 import math
 import os
 import re
@@ -14,13 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.run_folder import CHECKPOINTS, CONFIG, METRICS
-from pinn_dyn.app.sweep import ERROR
+from pinn_dyn.app.run_folder import CHECKPOINTS, CONFIG, METRICS, read_metrics
+from pinn_dyn.app.sweep import ERROR, first_line
 from pinn_dyn.app.trust import read_yaml
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 
+MANY_FOLDERS = 2_000
 MOST_FOLDERS = 50_000
 """Looked through below a place; a large sweep has some thousand."""
+
+log = logging.getLogger(__name__)
 
 _HYDRA_CONFIG = Path(".hydra") / "config.yaml"
 
@@ -81,13 +84,14 @@ def _read_job(folder: Path) -> Job | None:
     derived |= {k for k, v in config.items() if k.endswith(".seed") and v == config.get("seed")}
     record, problem = None, ""
     try:
-        record = json.loads((folder / METRICS).read_text())
-        if not resolved:
-            record, problem = None, f"failed: {CONFIG} cannot be read"
-    except FileNotFoundError:
-        problem = _last_words(folder)
-    except ValueError:
+        record = read_metrics(folder)
+    except ConfigError:
         problem = f"failed: {METRICS} cannot be read, it may be cut short"
+    else:
+        if record is None:
+            problem = _last_words(folder)
+        elif not resolved or not isinstance(config.get("seed"), int):
+            record, problem = None, f"failed: {CONFIG} cannot be read"
     return Job(folder, config, derived, record, problem)
 
 
@@ -98,6 +102,8 @@ def _configs_below(place: Path, pattern: str) -> Iterator[Path]:
         ConfigError: if there are so many folders that these can hardly be runs alone.
     """
     for count, (folder, below, files) in enumerate(os.walk(place)):
+        if count == MANY_FOLDERS:
+            log.warning("runs: looking through all folders below %s", place)
         if count == MOST_FOLDERS:
             raise ConfigError(
                 f"runs: '{pattern}' has more than {MOST_FOLDERS} folders below it, expected run "
@@ -119,7 +125,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 def _last_words(folder: Path) -> str:
     """How a job without a record ended: its error, or else the last line of its log."""
     if (folder / ERROR).is_file():
-        return f"failed: {(folder / ERROR).read_text().splitlines()[0]}"
+        return f"failed: {first_line(folder / ERROR)}"
     lines = []
     for path in sorted(folder.glob("*.log")):
         lines += [line for line in path.read_text(errors="replace").splitlines() if line.strip()]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import glob
 import json
+import logging
+import math
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,14 +21,22 @@ from filelock import FileLock, Timeout
 from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.trust import read_foreign
+from pinn_dyn.data import DataSource, fingerprint_changes
 from pinn_dyn.evaluation.sweep_table import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
+DATA = "data.json"
+"""The fingerprint of the data that the run was trained on."""
+
+log = logging.getLogger(__name__)
 
 _PLACES = ("dataset.cache",)  # where things lie does not change what is learned
+# Of a record, beside those of its validation.
+_NUMBERS = ("pairs", "parameters", "steps", "training_seconds", "training_cpu_seconds")
+_MOST_CHANGES = 10  # that are shown
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,7 @@ def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
                 f"{folder / CONFIG}: {key} is {config.get(key)!r}, expected what train.py writes"
             )
     path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
-    saved = _read_checkpoint(path)
+    saved = read_checkpoint(path)
     parameters = saved["hyper_parameters"]
     for part in ("model", "dataset"):
         there = {k: v for k, v in parameters["config"][part].items() if k != "cache"}
@@ -109,12 +119,27 @@ def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
         raise ConfigError(
             f"{path} holds weights of another model than {folder / CONFIG} describes: {error}"
         ) from error
+    return Run(folder, config, model.eval(), statistics, read_metrics(folder) or {})
+
+
+def read_metrics(folder: Path) -> dict[str, Any] | None:
+    """What a finished training recorded; None if it has not finished.
+
+    Raises:
+        ConfigError: if the record is damaged, or none of train.py.
+    """
     path = folder / METRICS
+    if not path.is_file():
+        return None
     try:
-        metrics = json.loads(path.read_text()) if path.is_file() else {}
-    except ValueError as error:
+        record = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path} cannot be read, it may be cut short: {error}") from error
-    return Run(folder, config, model.eval(), statistics, metrics)
+    if isinstance(record, dict) and isinstance(validation := record.get("validation", {}), dict):
+        numbers = [*validation.values(), *(record[key] for key in _NUMBERS if key in record)]
+        if all(isinstance(number, (int, float)) for number in numbers):
+            return record
+    raise ConfigError(f"{path} holds no record that train.py wrote")
 
 
 _WHAT = {"model": "model", "dataset": "data set"}
@@ -127,7 +152,7 @@ def _differing(here: dict[str, Any], there: dict[str, Any]) -> str:
     return f"{key} is {one.get(key, 'absent')}, the checkpoint has {other.get(key, 'absent')}"
 
 
-def _read_checkpoint(path: Path) -> dict[str, Any]:
+def read_checkpoint(path: Path) -> dict[str, Any]:
     """What a checkpoint holds: tensors and plain values, no code.
 
     Raises:
@@ -157,6 +182,47 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
     ):
         raise ConfigError(f"{path} is no checkpoint that train.py wrote")
     return saved
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write a record that is whole or absent."""
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_text(json.dumps(values, indent=2))
+    partial.replace(path)
+
+
+def check_data(folder: Path, source: DataSource) -> None:
+    """Refuse data that are not those that a run was trained on; warn where the run does not say.
+
+    An added or edited file moves runs between training, validation and test, so that a test motion
+    may be one that the training saw.
+
+    Raises:
+        ConfigError: with what has changed since.
+    """
+    path = folder / DATA
+    if not path.is_file():
+        log.warning(
+            "%s has no %s, as an earlier version trained it: nobody knows whether %s has changed "
+            "since",
+            *(folder, DATA, source.name),
+        )
+        return
+    now = source.fingerprint()
+    try:
+        changes = fingerprint_changes(json.loads(path.read_text()), now)
+    except (ValueError, AttributeError, KeyError, TypeError, RecursionError) as error:
+        raise ConfigError(f"{path} cannot be read, it may be damaged: {error}") from error
+    if changes:
+        shown = changes[:_MOST_CHANGES]
+        if len(changes) > len(shown):
+            shown.append(f"and {len(changes) - len(shown)} more")
+        raise ConfigError(
+            f"{source.name} has changed since {folder} was trained:\n  "
+            + "\n  ".join(shown)
+            + "\nBring the data back as they were, or train again. To use them all the same, "
+            f"delete {path}"
+        )
 
 
 def find_runs(patterns: list[str] | str) -> list[Path]:
@@ -216,7 +282,5 @@ def _refuse_another(folder: Path, config: dict[str, Any]) -> None:
 
 def recorded_error(folder: Path) -> float | None:
     """The validation error that a finished training recorded; None if it has not finished."""
-    path = folder / METRICS
-    if not path.is_file():
-        return None
-    return json.loads(path.read_text())["validation"].get(VALIDATION_ERROR, float("nan"))
+    record = read_metrics(folder)
+    return None if record is None else record.get("validation", {}).get(VALIDATION_ERROR, math.nan)

@@ -59,6 +59,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "threads": Threads,
         "start_from": str | None,
         "resume": str | None,
+        "resume_from": Literal["last", "best"] | None,
         "trust": Names | None,
         **dict.fromkeys(
             ("dataset", "data", "model", "loss", "optimizer", "scheduler", "validator", "trainer"),

@@ -47,7 +47,11 @@ class SweepCallback(Callback):
             error = job_return._return_value  # the public property would raise it
             said = f"{type(error).__name__}: {error}"
             details = "".join(traceback.format_exception(error))
-            (Path(config.hydra.runtime.output_dir) / ERROR).write_text(f"{said}\n\n{details}")
+            path = Path(config.hydra.runtime.output_dir) / ERROR
+            try:
+                path.write_text(f"{said}\n\n{details}")
+            except OSError as problem:  # a full disk leaves an empty file, which counts too
+                log.error("%s cannot be written: %s", path, problem)
             if sweep:
                 log.error("failed: %s", said)
                 job_return.status = JobStatus.COMPLETED
@@ -67,9 +71,15 @@ class SweepCallback(Callback):
         if failures:
             lines = [f"{len(failures)} {'job' if len(failures) == 1 else 'jobs'} failed:"]
             for path in failures:
-                lines += [f"  {path.parent}", f"    {path.read_text().splitlines()[0]}"]
+                lines += [f"  {path.parent}", f"    {first_line(path)}"]
             lines.append(f"run what is missing with: {_same_command(folder)}")
             raise SystemExit("\n".join(lines))
+
+
+def first_line(path: Path) -> str:
+    """The message in an ``error.txt``."""
+    lines = path.read_text(errors="replace").splitlines()
+    return lines[0] if lines else "without a word: was the disk full?"
 
 
 def how_to_go_on() -> str | None:

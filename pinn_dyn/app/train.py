@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
@@ -32,12 +31,17 @@ from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     CONFIG,
+    DATA,
     METRICS,
+    check_data,
     claimed,
     load_run,
+    read_checkpoint,
     read_config,
     recorded_error,
+    write_json,
 )
+from pinn_dyn.app.schema import KEYS, check_value
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
 from pinn_dyn.ensembles import Ensemble, EnsembleData
@@ -74,38 +78,74 @@ def train(cfg: DictConfig) -> float:
 
     Raises:
         ConfigError: on a configuration that cannot be used, a folder that holds another training,
-            or nothing to resume from.
+            nothing to resume from, or data that have changed since.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
+    name = cfg.get("resume_from") or "last"
     if cfg.get("resume") is None:
         config = checked("train", cfg)
+        if config.get("resume_from"):
+            raise ConfigError("resume_from says from which checkpoint: give resume=<run> with it")
         trust = packages(config.get("trust"))
     else:
         folder, trust = Path(cfg.resume), packages(cfg.get("trust"))
         others = [
             word
             for word in HydraConfig.get().overrides.task
-            if not word.lstrip("+").startswith(("resume=", "trust="))
+            if not word.lstrip("+").startswith(("resume=", "resume_from=", "trust="))
         ]
         if others:
             raise ConfigError(
                 f"resume goes on with the run's own configuration: leave out {', '.join(others)}"
             )
+        check_value("resume_from", name, KEYS["train"]["resume_from"])
         config = read_config(folder, trust)
         epochs(config)  # an old run says so
         check("train", config)
-    last = folder / CHECKPOINTS / "last.ckpt"
-    if cfg.get("resume") is not None and not last.is_file():
-        raise ConfigError(f"nothing to resume from: {last} does not exist")
+    checkpoint = folder / CHECKPOINTS / f"{name}.ckpt"
+    if cfg.get("resume") is not None and not checkpoint.is_file():
+        raise ConfigError(f"nothing to resume from: {checkpoint} does not exist")
     with claimed(folder, config):
         error = recorded_error(folder)
         if error is not None and cfg.get("resume") is None:
             log.info("already trained, to train again delete %s", folder)
             return error
-        if last.is_file():
-            log.info("going on with the training in %s", folder)
-        return _train(folder, config, last if last.is_file() else None, trust)
+        return _train(folder, config, _whole(folder, checkpoint), trust)
+
+
+def _whole(folder: Path, checkpoint: Path) -> Path | None:
+    """The checkpoint that the training of a folder goes on from; None if it starts anew.
+
+    Raises:
+        ConfigError: if the checkpoint is damaged; says from which other one to go on.
+    """
+    if not checkpoint.is_file():
+        return None
+    try:
+        step = _step(checkpoint)
+    except ConfigError as error:
+        best = checkpoint.with_name("best.ckpt")
+        try:
+            step = _step(best)
+        except ConfigError:
+            raise ConfigError(
+                f"{error}\n{best} is no better: delete {folder} and train again"
+            ) from error
+        raise ConfigError(
+            f"{error}\nGo on from the best checkpoint, of step {step}, with: python train.py "
+            f"resume={folder} resume_from=best"
+        ) from error
+    log.info("going on with the training in %s from step %d", folder, step)
+    return checkpoint
+
+
+def _step(checkpoint: Path) -> int:
+    """The training step of a checkpoint that holds all that a training needs to go on."""
+    saved = read_checkpoint(checkpoint)
+    if missing := [key for key in ("global_step", "loops", "optimizer_states") if key not in saved]:
+        raise ConfigError(f"{checkpoint} has no {', '.join(missing)}: it holds weights alone")
+    return saved["global_step"]
 
 
 def _train(
@@ -121,6 +161,10 @@ def _train(
         statistics = data.statistics
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem
+    if last is None:
+        write_json(folder / DATA, data.source.fingerprint())
+    else:
+        check_data(folder, data.source)
     if isinstance(data.source, LogSource):
         _write_report(data.source, folder)
     validator = build_validator(config, statistics.step)
@@ -170,9 +214,7 @@ def _train(
         "validation": metrics,
         **provenance(),
     }
-    partial = folder / f"{METRICS}.partial"
-    partial.write_text(json.dumps(record, indent=2))
-    partial.replace(folder / METRICS)  # a record is whole or absent
+    write_json(folder / METRICS, record)
     histories = [one for one in trainer.callbacks if isinstance(one, ValidationHistory)]  # type: ignore[attr-defined]
     log.info(
         "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s",

@@ -73,7 +73,8 @@ def close_loop(
     try:
         with torch.no_grad():
             plant.start(q0, v0)
-            for k in tqdm(range(len(run.t)), desc=progress, disable=progress is None):
+            quiet = progress is None or None  # None: unless on a terminal
+            for k in tqdm(range(len(run.t)), desc=progress, disable=quiet):
                 if not torch.equal(moving, run.running):
                     moving = run.running.clone()
                     plant.start(q[moving], v[moving])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,8 @@ INPUTS = ("q", "v", "q_ref", "v_ref", "a_ref")
 TOLERANCE = 1e-5
 _CHECKS = 10  # states that travel with the file
 _KEY = "pinn_dyn_law"
+_INFO = frozenset(("law", "num_coordinates", "num_inputs", "torch", "check"))
+_MOST_BYTES = 10_000_000  # of what a file says about itself
 
 
 class CompiledLaw:
@@ -56,7 +61,8 @@ def export_law(controller: Controller, path: str | Path) -> Path:
     """Compile u = law(q, v, q_ref, v_ref, a_ref) for one state and write it to a ``.pt2`` file.
 
     The file holds machine code from torch.export and AOTInductor, and needs nothing but PyTorch
-    to run (docs/realtime.md)::
+    to run; the SHA-256 of the file stands beside it in ``<path>.sha256``, to be given to
+    :func:`load_law`, or to ``sha256sum --check`` (docs/realtime.md)::
 
         law = torch._inductor.aoti_load_package("law.pt2").loader
         (u,) = law.run([q, v, q_ref, v_ref, a_ref])
@@ -118,19 +124,34 @@ def export_law(controller: Controller, path: str | Path) -> Path:
     except RuntimeError:
         path.unlink()
         raise
+    path.with_name(f"{path.name}.sha256").write_text(f"{_digest(path)}  {path.name}\n")
     return path
 
 
-def load_law(path: str | Path) -> CompiledLaw:
+def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
     """Load a compiled law and check it against the values that it was exported with.
+
+    The file is machine code: loading it runs whatever its author wrote, with your rights. Load
+    files from people you trust only, and give the checksum that the export wrote, which you got on
+    another way than the file, so that nobody can have exchanged it.
+
+    Args:
+        path: the ``.pt2`` file.
+        sha256: the 64 hexadecimal digits of ``<path>.sha256``, compared before anything is loaded.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file was not written by :func:`export_law`.
+        ValueError: if the file has another checksum, holds entries that lead out of the folder that
+            it is unpacked in, or was not written by :func:`export_law`.
         RuntimeError: if it was exported by another version of PyTorch, or misses the values that
             travel with it by more than 1e-5 of their norm.
     """
     path = Path(path)
+    if sha256 is not None and (digest := _digest(path)) != sha256.strip().lower():
+        raise ValueError(
+            f"{path} has the SHA-256 {digest}, expected {sha256}: it is not the file that was "
+            "exported, do not load it"
+        )
     info = _read_info(path)
     if info["torch"] != torch.__version__:
         raise RuntimeError(
@@ -184,13 +205,42 @@ def _read_info(path: Path) -> dict[str, Any]:
     """What the file says about itself, read before any of its code is loaded."""
     try:
         with zipfile.ZipFile(path) as archive:
-            for name in archive.namelist():
-                if name.endswith("_metadata.json"):
-                    metadata = json.loads(archive.read(name))
-                    if _KEY in metadata:
-                        return json.loads(metadata[_KEY])
-    except zipfile.BadZipFile as error:
+            for entry in archive.infolist():
+                _check_entry(path, entry.orig_filename)
+            if damaged := archive.testzip():
+                raise zipfile.BadZipFile(f"{damaged} has another checksum")
+            described = [
+                archive.read(entry)
+                for entry in archive.infolist()
+                if entry.filename.endswith("_metadata.json") and entry.file_size <= _MOST_BYTES
+            ]
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted
         raise ValueError(f"{path} is no exported law, or it is cut short: {error}") from error
+    for text in described:
+        try:
+            info = json.loads(json.loads(text)[_KEY])
+        except (ValueError, TypeError, KeyError, RecursionError):
+            continue
+        if isinstance(info, dict) and info.keys() >= _INFO:
+            return info
     raise ValueError(
         f"{path} is a package, but no law that export_law wrote: it does not hold the entry {_KEY}"
     )
+
+
+def _check_entry(path: Path, name: str) -> None:
+    """Refuse a file that, unpacked, would be written elsewhere than into the folder meant for it.
+
+    Raises:
+        ValueError: naming the entry.
+    """
+    parts = re.split(r"[/\\]", name)
+    if ".." in parts or parts[0] == "" or ":" in parts[0] or "\0" in name:
+        raise ValueError(
+            f"{path} holds the entry {name!r}, expected names inside the archive, without '..' and "
+            "not absolute: it is no file that export_law wrote, do not load it"
+        )
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -45,7 +45,7 @@ class StiffLoop:
         with tqdm(
             total=len(everyone) * float(self._t[-1]),
             desc=progress,
-            disable=progress is None,
+            disable=progress is None or None,  # None: unless on a terminal
             bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
         ) as bar:
             while pending:

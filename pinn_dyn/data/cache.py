@@ -7,7 +7,6 @@ import hashlib
 import json
 import logging
 import os
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -50,14 +49,7 @@ def load_or_make(
         if path.exists():
             try:
                 return _read(path, description)
-            except (
-                OSError,
-                ValueError,
-                EOFError,
-                KeyError,
-                RuntimeError,
-                zipfile.BadZipFile,
-            ) as error:
+            except Exception as error:  # a damaged archive raises nearly anything
                 aside = path.with_suffix(".damaged")
                 os.replace(path, aside)
                 log.warning(

@@ -176,7 +176,7 @@ class RobotSource(DataSource):
         t = np.arange(round(self.duration / self.step) + 2) * self.step
         record = functools.partial(_record, self.robot, self.excitations, t, self.seed)
         progress = functools.partial(
-            tqdm, total=len(tasks), desc=f"recording {self.name}", unit="trajectory"
+            tqdm, total=len(tasks), desc=f"recording {self.name}", unit="trajectory", disable=None
         )
         if self.workers == 1:
             records = list(progress(map(record, tasks)))

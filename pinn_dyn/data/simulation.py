@@ -99,7 +99,7 @@ def simulate(
     with tqdm(
         total=float(t[-1] - t[0]),
         desc=progress,
-        disable=progress is None,
+        disable=progress is None or None,  # None: unless on a terminal
         bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
     ) as bar:
         while solver.status == "running":

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pinn_dyn.systems.inertia import pseudo_inertia
-from pinn_dyn.systems.urdf import _end, _number, find_urdf
+from pinn_dyn.systems.urdf import find_urdf
+from pinn_dyn.systems.urdf_checks import number, parse_urdf
 
 _TURNING = ("revolute", "continuous")
 _SLIDING = ("prismatic",)
@@ -51,8 +52,8 @@ def read_tree(
 
     Raises:
         ValueError: on text that is no URDF, an unknown locked joint or tip, a joint that is neither
-            revolute, continuous, prismatic nor fixed, a mimic joint, no joint that moves, or links
-            that are no tree.
+            revolute, continuous, prismatic nor fixed, a mimic joint, no joint that moves, or what
+            :func:`~pinn_dyn.systems.urdf_checks.parse_urdf` refuses.
         FileNotFoundError: if there is no such file.
     """
     path, robot = _parse(urdf)
@@ -63,11 +64,9 @@ def read_tree(
             raise ValueError(f"{path} has no joint {name!r} to lock: its joints are {list(joints)}")
     children: dict[str, list[str]] = {}
     for name, joint in joints.items():
-        children.setdefault(_end(path, joint, "parent", links), []).append(name)
-    behind = [_end(path, joint, "child", links) for joint in joints.values()]
-    roots = [name for name in links if name not in behind]
-    if len(roots) != 1 or len(set(behind)) != len(behind):
-        raise ValueError(f"{path}: the links that no joint moves are {roots}, expected one base")
+        children.setdefault(_link(joint, "parent"), []).append(name)
+    behind = [_link(joint, "child") for joint in joints.values()]
+    (root,) = (name for name in links if name not in behind)
     tip = tip or [name for name in behind if name not in children][-1]
     if tip not in links:
         raise ValueError(f"{path}: tip is {tip!r}, expected one of its links: {list(links)}")
@@ -85,8 +84,8 @@ def read_tree(
                 inertia[body] += payload * np.outer(pose[:, 3], pose[:, 3])
         for name in children.get(link, []):
             joint = joints[name]
-            child = _end(path, joint, "child", links)
-            placement = pose @ _pose(path, name, joint.find("origin"))
+            child = _link(joint, "child")
+            placement = pose @ _pose(joint.find("origin"))
             if joint.get("type") == "fixed" or name in locked_joints:
                 visit(child, body, placement)
                 continue
@@ -99,7 +98,7 @@ def read_tree(
             found.turning.append(joint.get("type") in _TURNING)
             visit(child, len(found.joints) - 1, np.eye(4))
 
-    visit(roots[0], -1, np.eye(4))
+    visit(root, -1, np.eye(4))
     if not found.joints:
         raise ValueError(f"{path} has no joint that moves (locked: {list(locked_joints)})")
     return found._replace(
@@ -117,13 +116,13 @@ def _parse(urdf: str) -> tuple[Path, ET.Element]:
         shipped = Path(package.origin).parent if package and package.origin else Path()
         path = find_urdf(urdf, shipped)
         text = path.read_text()
-    try:
-        robot = ET.fromstring(text)
-    except ET.ParseError as error:
-        raise ValueError(f"{path} is not valid XML: {error}; expected a URDF") from error
-    if robot.tag != "robot" or robot.find("joint") is None:
-        raise ValueError(f"{path} holds <{robot.tag}>, expected <robot> with at least one <joint>")
-    return path, robot
+    return path, parse_urdf(path, text.encode())
+
+
+def _link(joint: ET.Element, end: str) -> str:
+    element = joint.find(end)
+    assert element is not None  # parse_urdf has seen it
+    return element.get("link", "")
 
 
 def _axis(path: Path, name: str, joint: ET.Element) -> np.ndarray:
@@ -133,34 +132,21 @@ def _axis(path: Path, name: str, joint: ET.Element) -> np.ndarray:
             f"{path}: joint {name!r} is {kind}, expected revolute, continuous, prismatic or fixed: "
             "add it to locked_joints"
         )
-    axis = _triple(path, name, joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
-    length = float(np.linalg.norm(axis))
-    if not length > 0:
-        raise ValueError(f"{path}: joint {name!r} has the axis {axis}, expected one of length 1")
-    return axis / length
+    axis = _triple(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
+    return axis / np.linalg.norm(axis)
 
 
-def _pose(path: Path, name: str, origin: ET.Element | None) -> np.ndarray:
+def _pose(origin: ET.Element | None) -> np.ndarray:
     pose = np.eye(4)
-    rpy = _triple(path, name, origin, "rpy", (0.0, 0.0, 0.0))
+    rpy = _triple(origin, "rpy", (0.0, 0.0, 0.0))
     pose[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
-    pose[:3, 3] = _triple(path, name, origin, "xyz", (0.0, 0.0, 0.0))
+    pose[:3, 3] = _triple(origin, "xyz", (0.0, 0.0, 0.0))
     return pose
 
 
-def _triple(
-    path: Path, owner: str, element: ET.Element | None, key: str, default: tuple[float, ...]
-) -> np.ndarray:
+def _triple(element: ET.Element | None, key: str, default: tuple[float, ...]) -> np.ndarray:
     text = None if element is None else element.get(key)
-    if text is None:
-        return np.array(default)
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.array([np.nan])
-    if values.shape != (3,) or not np.isfinite(values).all():
-        raise ValueError(f"{path}: {owner!r} has {key}={text!r}, expected three finite numbers")
-    return values
+    return np.array(default if text is None else [float(word) for word in text.split()])
 
 
 def _pseudo_inertia(path: Path, link: ET.Element) -> np.ndarray:
@@ -170,8 +156,8 @@ def _pseudo_inertia(path: Path, link: ET.Element) -> np.ndarray:
         return np.zeros((4, 4))
     mass, moments = inertial.find("mass"), inertial.find("inertia")
     keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-    values = [0.0 if mass is None else _number(path, name, mass, "value"), 0.0, 0.0, 0.0]
-    values += [0.0 if moments is None else _number(path, name, moments, key) for key in keys]
-    pose = _pose(path, name, inertial.find("origin"))
+    values = [0.0 if mass is None else number(path, name, mass, "value"), 0.0, 0.0, 0.0]
+    values += [0.0 if moments is None else number(path, name, moments, key) for key in keys]
+    pose = _pose(inertial.find("origin"))
     own = pseudo_inertia(torch.tensor(values, dtype=torch.float64)).numpy()
     return pose @ own @ pose.T

@@ -10,6 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
+
+from pinn_dyn.systems.urdf_checks import end_of, number, parse_urdf
+
 Inertia = Literal["file", "collision"]
 """Whether inertias are those of the URDF, or those that Bullet computes from collision shapes."""
 
@@ -67,21 +71,14 @@ def read_urdf(
     of the file's joints that has no other joint behind it.
 
     Raises:
-        ValueError: on text that is no URDF, an unknown locked joint or tip, a joint that moves and
-            is not revolute, no revolute joint, or a moving link without mass, inertia or shape.
+        ValueError: on text that is no URDF of a body (see :func:`~.urdf_checks.parse_urdf`), an
+            unknown locked joint or tip, a joint that moves and is not revolute, no revolute joint,
+            or a moving link without mass, inertia or shape.
         FileNotFoundError: if a mesh that is needed is missing.
     """
     content = path.read_bytes()
-    try:
-        robot = ET.fromstring(content)
-    except ET.ParseError as error:
-        raise ValueError(f"{path} is not valid XML: {error}; expected a URDF file") from error
+    robot = parse_urdf(path, content, inertias=inertia == "file")
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
-    if robot.tag != "robot" or not joints:
-        raise ValueError(
-            f"{path} holds <{robot.tag}> with {len(joints)} joints, expected <robot> with at least "
-            "one: is it a URDF?"
-        )
     for name in locked_joints:
         if name not in joints:
             raise ValueError(
@@ -111,6 +108,7 @@ def read_urdf(
     digest = hashlib.sha256(content)
     for name, joint in joints.items():
         joint.set("type", "continuous" if name in moving else "fixed")
+        _make_unit(joint.find("axis"))
     for link in robot.findall("link"):
         _remove(link, "visual", *(["collision"] if inertia == "file" else []))
         for mesh in link.iter("mesh"):
@@ -146,7 +144,7 @@ def find_urdf(urdf: str, folder: Path) -> Path:
 def _limits(path: Path, name: str, joint: ET.Element) -> JointLimits:
     """A continuous joint may turn without end; what is then explored is one turn."""
     limit = joint.find("limit")
-    values = {} if limit is None else {key: _number(path, name, limit, key) for key in limit.attrib}
+    values = {} if limit is None else {key: number(path, name, limit, key) for key in limit.attrib}
     low, high = values.get("lower", 0.0), values.get("upper", 0.0)
     if joint.get("type") == "continuous":
         low, high = -math.pi, math.pi
@@ -162,12 +160,12 @@ def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Iner
     """Every body that moves, a link with all that is fixed to it, needs a mass and an inertia."""
     links = {link.get("name", ""): link for link in robot.findall("link")}
     joints = robot.findall("joint")
-    starts = {joint.get("name", ""): _end(path, joint, "child", links) for joint in joints}
+    starts = {joint.get("name", ""): end_of(path, joint, "child", list(links)) for joint in joints}
     rigid: dict[str, list[str]] = {}
     for joint in joints:
         if joint.get("name") not in moving:
-            parent = _end(path, joint, "parent", links)
-            rigid.setdefault(parent, []).append(_end(path, joint, "child", links))
+            parent = end_of(path, joint, "parent", list(links))
+            rigid.setdefault(parent, []).append(end_of(path, joint, "child", list(links)))
     for joint_name, start in starts.items():
         if joint_name not in moving:
             continue
@@ -197,9 +195,9 @@ def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Iner
 def _tip(path: Path, robot: ET.Element, tip: str | None) -> str:
     links = {link.get("name", ""): link for link in robot.findall("link")}
     joints = robot.findall("joint")
-    children = [_end(path, joint, "child", links) for joint in joints]
+    children = [end_of(path, joint, "child", list(links)) for joint in joints]
     if tip is None:
-        parents = {_end(path, joint, "parent", links) for joint in joints}
+        parents = {end_of(path, joint, "parent", list(links)) for joint in joints}
         return [name for name in children if name not in parents][-1]
     if tip not in children:
         raise ValueError(
@@ -208,12 +206,21 @@ def _tip(path: Path, robot: ET.Element, tip: str | None) -> str:
     return tip
 
 
+def _make_unit(axis: ET.Element | None) -> None:
+    """Bullet turns by the direction of an axis, and multiplies speeds by its length."""
+    if axis is not None and axis.get("xyz") is not None:
+        values = np.array(axis.get("xyz", "").split(), dtype=float)
+        length = np.linalg.norm(values)
+        if abs(length - 1) > 1e-12:
+            axis.set("xyz", " ".join(repr(float(x)) for x in values / length))
+
+
 def _scale_masses(path: Path, robot: ET.Element, factor: float) -> None:
     for link in robot.findall("link"):
         for tag in ("mass", "inertia"):
             for element in link.findall(f"inertial/{tag}"):
                 for key in element.attrib:
-                    value = _number(path, link.get("name", ""), element, key)
+                    value = number(path, link.get("name", ""), element, key)
                     element.set(key, repr(factor * value))
 
 
@@ -226,45 +233,16 @@ def _add_point_mass(robot: ET.Element, link: str, mass: float) -> None:
     ET.SubElement(joint, "child", link=POINT_MASS)
 
 
-def _end(path: Path, joint: ET.Element, end: str, links: dict[str, ET.Element]) -> str:
-    element = joint.find(end)
-    name = "" if element is None else element.get("link", "")
-    if name not in links:
-        raise ValueError(
-            f"{path}: joint {joint.get('name')!r} has the {end} {name!r}, which is no link: "
-            f"expected one of {', '.join(links)}"
-        )
-    return name
-
-
 def _mass(path: Path, link: ET.Element) -> float:
     mass = link.find("inertial/mass")
-    value = 0.0 if mass is None else _number(path, link.get("name", ""), mass, "value")
-    if value < 0:
-        raise ValueError(
-            f"{path}: link {link.get('name')!r} has mass {value} kg, expected at least 0"
-        )
-    return value
+    return 0.0 if mass is None else number(path, link.get("name", ""), mass, "value")
 
 
 def _moments(path: Path, link: ET.Element) -> float:
     inertia = link.find("inertial/inertia")
     if inertia is None:
         return 0.0
-    return sum(_number(path, link.get("name", ""), inertia, key) for key in ("ixx", "iyy", "izz"))
-
-
-def _number(path: Path, owner: str, element: ET.Element, key: str) -> float:
-    text = element.get(key, "")
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(
-            f"{path}: {owner!r} has <{element.tag} {key}={text!r}>, expected a finite number"
-        )
-    return value
+    return sum(number(path, link.get("name", ""), inertia, key) for key in ("ixx", "iyy", "izz"))
 
 
 def _find_mesh(path: Path, filename: str) -> Path:

@@ -72,7 +72,9 @@ def added(word):
     """An override that adds its key where it is not there."""
     key = word.split("=")[0]
     dotted = re.fullmatch(r"(?!hydra\.)\w+\.[\w.]+", key)
-    return f"++{word}" if dotted or key in ("start_from", "resume", "trust") else word
+    return (
+        f"++{word}" if dotted or key in ("start_from", "resume", "resume_from", "trust") else word
+    )
 
 
 def train(folder, *arguments):

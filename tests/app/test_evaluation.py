@@ -10,7 +10,7 @@ import torch
 from matplotlib.image import imread
 
 from pinn_dyn.app.build import build_source
-from pinn_dyn.app.runs import read_config
+from pinn_dyn.app.run_folder import read_config
 from tests.app.entry import NO_FIGURES, refused_text, run_script, train
 
 SHORT = ["horizon=0.1", "windows=[0.02,0.05]"]

@@ -65,7 +65,8 @@ def test_a_run_on_a_log_keeps_the_report_and_a_picture_of_the_cleaning(run):
 def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, capsys):
     run_script("evaluate.py", *evaluation_of(run, tmp_path / "out"))
     assert "example_log: 2 unseen test trajectories, 5 s open loop" in capsys.readouterr().out
-    (row,) = json.loads((tmp_path / "out" / "summary.json").read_text())
+    row, *floors = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert all(one["floor"] for one in floors)
     assert row["model"] == "lnn"
     # q wanders by some tenths of a rad; an untrained model is no better than that.
     assert 0 < row["error_mean"] < 2

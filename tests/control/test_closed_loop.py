@@ -1,5 +1,7 @@
 """Closed loops, against matrix exponentials, and what happens when something goes wrong."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -373,9 +375,12 @@ def test_a_fault_at_a_sample_ends_a_copy_of_a_continuous_loop():
     assert record.u[[0, 2]].isfinite().all()
 
 
-def test_a_progress_bar_is_shown_only_with_a_label(capsys):
+def test_a_progress_bar_is_shown_only_with_a_label_and_on_a_terminal(capsys, monkeypatch):
     sampled()
     assert capsys.readouterr().err == ""
+    sampled(progress="three springs")
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     sampled(progress="three springs")
     assert "three springs: 100%" in capsys.readouterr().err
 

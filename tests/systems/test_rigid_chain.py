@@ -173,7 +173,7 @@ def test_generic_bodies_come_from_the_kinematics_alone():
         (TREE, {"gravity": [0, 0]}, "gravity is"),
         (TREE, {"damping": [1.0]}, "damping is"),
         (TREE, {"payload": -1.0}, "payload is"),
-        ("<robot name='x'/>", {}, "at least one <joint>"),
+        ("<robot name='x'/>", {}, "at least one: is it a URDF"),
         ("<robot", {}, "not valid XML"),
         (TREE.replace('type="continuous"', 'type="floating"'), {}, "'bend' is 'floating'"),
         (TREE.replace('xyz="1 2 2"', 'xyz="0 0 0"'), {}, "'slide' has the axis"),

@@ -4,6 +4,7 @@ import signal
 import time
 
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.app.entry import NO_FIGURES, TINY, run_script, start_process
 
@@ -27,6 +28,11 @@ def epoch_of(path):
         return -1
 
 
+def validations(log):
+    """The steps of the validations in a log file of TensorBoard."""
+    return [event.step for event in EventAccumulator(str(log)).Reload().Scalars("val/error_mean")]
+
+
 def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monkeypatch):
     monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "cache"))
     whole, killed = tmp_path / "whole", tmp_path / "killed"
@@ -44,6 +50,7 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
         assert not (killed / "metrics.json").exists()
         cut = torch.load(last, weights_only=True)
         assert 1 <= cut["epoch"] < EPOCHS - 1
+        logs = set(killed.rglob("events.out.tfevents.*"))
         process = start_process("train.py", f"resume={killed}", **at)
         try:
             run_script("train.py", *LONG, f"hydra.run.dir={whole}")
@@ -55,6 +62,11 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
     )
     assert first["global_step"] == second["global_step"] == EPOCHS * BATCHES
     assert first["state_dict"].keys() == second["state_dict"].keys()
+    # It took up where the checkpoint was, and did the rest alone: a restart ends the same.
+    step = cut["global_step"]
+    assert f"from step {step}" in log.read_text()
+    (resumed,) = set(killed.rglob("events.out.tfevents.*")) - logs
+    assert validations(resumed) == list(range(step + BATCHES - 1, EPOCHS * BATCHES, BATCHES))
     moved = False
     for key, value in first["state_dict"].items():
         assert torch.equal(value, second["state_dict"][key]), key

@@ -22,7 +22,7 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     """The files of names or glob patterns in a folder, in order of their names.
 
     Raises:
-        LogError: if the folder does not exist, or a pattern finds nothing there.
+        LogError: if the folder does not exist, or a pattern finds nothing there or leads out of it.
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
@@ -31,8 +31,11 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
             "as dataset.root=..., or set the variable PINN_DYN_LOGS where the data set uses it"
         )
     found: set[Path] = set()
-    for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        if Path(pattern).is_absolute():
+    given = [patterns] if isinstance(patterns, str) else list(patterns)
+    if not all(given) or not given:
+        raise LogError(f"files is {patterns!r}, expected names or patterns, as '*.csv'")
+    for pattern in given:
+        if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
             raise LogError(f"files has {pattern!r}, expected paths from the folder root")
         matches = [path for path in folder.glob(pattern) if path.is_file()]
         if not matches:
@@ -159,7 +162,7 @@ def _read_mat(path: Path, time: str) -> pd.DataFrame:
         raise LogError(
             f"{path}: is a MATLAB 7.3 file, which SciPy cannot read: save it with '-v7'"
         ) from error
-    except (ValueError, TypeError, OSError) as error:
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
     arrays: dict[str, np.ndarray] = {}
     unusable: dict[str, str] = {}

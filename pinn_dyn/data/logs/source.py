@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -134,7 +135,7 @@ class LogSource(DataSource):
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self.validation = Part.from_config("validation", validation)
         self.test = Part.from_config("test", test)
-        if guard < 0 or shortest < 0:
+        if not (0 <= guard < math.inf and 0 <= shortest < math.inf):
             raise LogError(f"guard is {guard} and shortest {shortest} s, expected 0 or more")
         self.guard = guard
         self.shortest = shortest

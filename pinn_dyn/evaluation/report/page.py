@@ -32,6 +32,11 @@ _FIGURE_OPTIONS = {
     # Nothing on the page may send it anywhere.
     "modeBarButtonsToRemove": ["sendChartToCloud", "lasso2d", "select2d"],
 }
+# Patterns of Markdown that make links and load pictures.
+_LINKS = (
+    *("link", "reference", "short_reference", "autolink", "automail"),
+    *("image_link", "image_reference", "short_image_ref"),
+)
 
 
 @dataclass(frozen=True)
@@ -92,15 +97,18 @@ def details(summary: str, content: Markup) -> Markup:
 
 
 def from_markdown(text: str) -> Markup:
-    """A Markdown report with its tables; its headings become the third level and below."""
+    """A Markdown report with its tables; its headings become the third level and below.
+
+    HTML and links stay the text that they are: names in it come from files of others.
+    """
+    reader = markdown.Markdown(
+        extensions=["tables", "toc"], extension_configs={"toc": {"baselevel": 3}}
+    )
+    for pattern in _LINKS:
+        reader.inlinePatterns.deregister(pattern)
+    reader.parser.blockprocessors.deregister("reference")
     return Markup('<div class="document">{}</div>').format(
-        Markup(
-            markdown.markdown(
-                html.escape(text, quote=False),
-                extensions=["tables", "toc"],
-                extension_configs={"toc": {"baselevel": 3}},
-            )
-        )
+        Markup(reader.convert(html.escape(text, quote=False)))
     )
 
 

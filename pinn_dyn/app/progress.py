@@ -1,0 +1,42 @@
+"""The progress of a training where there is no terminal to draw a bar on: a line per epoch."""
+
+from __future__ import annotations
+
+import logging
+
+import lightning as L
+
+log = logging.getLogger(__name__)
+
+
+class EpochLines(L.Callback):
+    """Logs the training loss of every epoch, and the error where the epoch was validated.
+
+    Args:
+        error: the name under which the validation logs its error.
+    """
+
+    def __init__(self, error: str):
+        self.error = error
+        self._validated = False
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """The loss of the epoch is known only at its end."""
+        self._validated = True
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Log the line of this epoch."""
+        names = {"train/loss": "training loss"}
+        if self._validated:
+            names[self.error] = "validation error"
+        self._validated = False
+        found = [
+            f"{text} {float(trainer.callback_metrics[name]):.4g}"
+            for name, text in names.items()
+            if name in trainer.callback_metrics
+        ]
+        if trainer.is_global_zero:
+            epoch, epochs = trainer.current_epoch + 1, trainer.max_epochs
+            log.info(
+                "epoch %d of %s, step %d: %s", epoch, epochs, trainer.global_step, ", ".join(found)
+            )

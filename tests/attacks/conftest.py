@@ -1,0 +1,34 @@
+"""Every attack works in an empty folder, and under a watch on what would run foreign code."""
+
+import sys
+
+import pytest
+
+from tests.app.conftest import cache, hnn_run, lnn_run  # noqa: F401
+
+# Events of Python itself (PEP 578), raised by whatever starts a program or calls somebody.
+WATCHED = {
+    *("os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "os.startfile"),
+    *("subprocess.Popen", "pty.spawn", "socket.connect", "webbrowser.open", "ctypes.dlopen"),
+}
+_seen: list[str] | None = None
+
+
+def _watch(event, arguments):
+    if _seen is not None and event in WATCHED and arguments[:1] != ("git",):  # provenance
+        _seen.append(f"{event} {arguments}")
+
+
+sys.addaudithook(_watch)
+
+
+@pytest.fixture(autouse=True)
+def nothing_runs(tmp_path, monkeypatch):
+    """No program is started, nobody is called, and nothing named ``was_here`` appears."""
+    global _seen
+    monkeypatch.chdir(tmp_path)
+    _seen = []
+    yield
+    seen, _seen = _seen, None
+    assert not seen
+    assert not list(tmp_path.rglob("was_here*"))

@@ -1,0 +1,104 @@
+"""Names in a report that would be code in a browser: all of them stay text."""
+
+import re
+
+import pandas as pd
+import pytest
+from plotly import graph_objects
+
+from pinn_dyn.evaluation.report import page as pages
+from pinn_dyn.evaluation.report.page import (
+    Section,
+    details,
+    figure,
+    from_markdown,
+    page,
+    paragraph,
+    preformatted,
+    table,
+)
+from tests.evaluation.report_pages import Page
+
+SCRIPTS = [
+    "<script>alert(1)</script>",
+    "</script><script>alert(1)</script>",
+    "<img src=x onerror=alert(1)>",
+    "<svg/onload=alert(1)>",
+    "<iframe src=javascript:alert(1)>",
+    "<a href='javascript:alert(1)'>x</a>",
+    "' onmouseover='alert(1)",
+    '" onmouseover="alert(1)',
+    "{{ 7 * 7 }}{% raw %}",
+    "<!--",
+    "</title><base href=//localhost>",
+    "</pre></details><meta http-equiv=refresh content=0>",
+]
+LINKS = [
+    "[x](javascript:alert(1))",
+    "[x](JaVaScRiPt:alert(1))",
+    "[x](java&#115;cript:alert(1))",
+    "[x]( javascript:alert(1) 'title')",
+    "[x](<javascript:alert(1)>)",
+    "[x](data:text/html,<script>alert(1)</script>)",
+    "[x](vbscript:msgbox)",
+    "[x](//localhost/x)",
+    "[x](https://localhost/x)",
+    "![x](javascript:alert(1))",
+    "![x](https://localhost/x.png)",
+    "[x][1]\n\n[1]: javascript:alert(1)",
+    "[x]\n\n[x]: javascript:alert(1)",
+    "![x][1]\n\n[1]: https://localhost/x.png",
+    "![x]\n\n[x]: https://localhost/x.png",
+    "<javascript:alert(1)>",
+    "<https://localhost/x>",
+    "<somebody@localhost>",
+    "| a |\n|---|\n| [x](javascript:alert(1)) |",
+    "# [x](javascript:alert(1))",
+    "- [x](javascript:alert(1))",
+]
+
+
+def assert_harmless(text, said):
+    """No tag but ours, no attribute that runs or loads; and the words are still there."""
+    harmless = {"html", "head", "meta", "title", "style", "script", "body", "header", "h1", "h2"}
+    harmless |= {"h3", "div", "nav", "a", "main", "section", "p", "pre", "details", "summary"}
+    harmless |= {"table", "thead", "tbody", "tr", "th", "td", "ul", "li", "em"}
+    shown = Page(text)
+    for tag, attributes in shown.tags:
+        assert tag in harmless
+        assert not [name for name in attributes if name.startswith("on") or name == "http-equiv"]
+        assert attributes.get("href", "#").startswith("#")
+        assert "src" not in attributes
+    # The library, and one script for each figure.
+    assert sum(tag == "script" for tag, _ in shown.tags) <= 3
+    assert " ".join(said.split()) in shown.text
+
+
+@pytest.mark.parametrize("name", SCRIPTS + LINKS[:3])
+def test_a_name_is_text_wherever_it_stands(monkeypatch, name):
+    monkeypatch.setattr(pages, "get_plotlyjs", lambda: "")
+    frame = pd.DataFrame({name: [name], "x": [1.5]})
+    drawn = graph_objects.Figure(graph_objects.Scatter(x=[1], y=[1], name=name))
+    drawn.update_layout(height=300, title=name)
+    parts = [paragraph(name), preformatted(name), details(name, paragraph(name)), table(frame)]
+    sections = [Section(name, [*parts, figure(drawn, "drawn")])]
+    text = page(name, name, sections)
+    assert_harmless(text, name)
+    # Nothing ends the script of the figure but its end.
+    assert len(re.findall(r"</script", text, re.IGNORECASE)) == text.count("<script")
+
+
+@pytest.mark.parametrize("text", SCRIPTS + LINKS)
+def test_markdown_has_no_links_and_no_html(text):
+    html = str(from_markdown(text))
+    tags = {tag for tag, _ in Page(html).tags}
+    assert not tags & {"a", "img", "script", "svg", "iframe", "base", "meta"}
+    for _, attributes in Page(html).tags:
+        assert not attributes.keys() & {"href", "src", "onerror", "onmouseover", "onload"}
+
+
+def test_a_heading_still_has_its_place():
+    html = str(from_markdown("# Stability\n\nIt *is*.\n\n| a | b |\n|---|---|\n| 1 | 2 |"))
+    assert '<h3 id="stability">Stability</h3>' in html
+    assert "<em>is</em>" in html
+    assert [tag for tag, _ in Page(html).tags].count("td") == 2

@@ -1,0 +1,155 @@
+"""Run folders from strangers: nothing that their configurations name is run, or written to."""
+
+import time
+
+import pytest
+
+from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.run_folder import load_run
+from tests.app.entry import TINY, refused_text
+from tests.attacks.targets import calls
+from tests.support.foreign_runs import foreign
+
+MARK = "was_here"
+CALLS = range(len(calls("")))
+
+
+def at_the_top(config, part):
+    config["dataset"] = part
+
+
+def as_an_argument(config, part):
+    config["dataset"]["system"]["mass"] = part
+
+
+def in_a_list(config, part):
+    config["dataset"]["excitation"]["parts"].append([[part]])
+
+
+def in_a_model(config, part):
+    config["model"]["damping"] = {**part, "_partial_": True}
+
+
+def beside_all_others(config, part):
+    config["nobody_reads_this"] = {"deep": {"down": [part]}}
+
+
+PLACES = [at_the_top, as_an_argument, in_a_list, in_a_model, beside_all_others]
+
+
+@pytest.mark.parametrize("index", CALLS, ids=[str(name) for name, _ in calls("")])
+def test_nothing_foreign_is_run(tmp_path, lnn_run, index):
+    """At one place of five in turn, so that every place sees a sixth of the tricks."""
+    mark = tmp_path / MARK
+    target, arguments = calls(str(mark))[index]
+    place = PLACES[index % len(PLACES)]
+    run = foreign(lnn_run, tmp_path / "run", lambda c: place(c, {"_target_": target, **arguments}))
+    with pytest.raises(ConfigError, match=r"may name the classes of pinn_dyn|an expression|_args_"):
+        load_run(run, "best")
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("key", ["_args_", "_recursive_", "_convert_", "_call_", "__class__", 3])
+def test_other_keys_of_hydra_are_refused(tmp_path, lnn_run, place, key):
+    part = {"_target_": "pinn_dyn.systems.SoftArm", key: ["os.system"]}
+    run = foreign(lnn_run, tmp_path / "run", lambda config: place(config, part))
+    with pytest.raises(ConfigError, match="which no configuration of a run has"):
+        load_run(run, "best")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "control", "resume", "start_from"])
+def test_every_program_says_why(tmp_path, monkeypatch, capsys, lnn_run, command):
+    monkeypatch.chdir(tmp_path)
+    part = {"_target_": "os.mkdir", "path": str(tmp_path / MARK)}
+    run = foreign(lnn_run, tmp_path / "run", lambda config: as_an_argument(config, part))
+    words = {
+        "evaluate": ["evaluate.py", f"runs=[{run}]"],
+        "control": ["control.py", f"run={run}", "reference.q=[0,0,0]"],
+        "resume": ["train.py", f"resume={run}"],
+        "start_from": ["train.py", "model=lnn", f"start_from={run}", *TINY],
+    }
+    text = " ".join(refused_text(capsys, *words[command], "hydra.run.dir=out").split())
+    assert "dataset.system.mass._target_ is 'os.mkdir'" in text
+    assert "trust=os" in text
+    assert not (tmp_path / MARK).exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda c: c["dataset"].update(name="../../out"), "dataset.name"),
+        (lambda c: c["dataset"].update(name=".."), "dataset.name"),
+        (lambda c: c["dataset"].update(name=7), "dataset.name"),
+        (lambda c: c.update(model_name="../out"), "model_name"),
+        (lambda c: c["dataset"]["configurations"].update({"../x": [0, 0, 0]}), "configurations"),
+        (lambda c: c["model"].update(cache="/tmp/x"), "where something is written"),
+        (
+            lambda c: c["callbacks"].update(
+                more={"_target_": "lightning.pytorch.callbacks.ModelCheckpoint", "dirpath": "/tmp"}
+            ),
+            "callbacks.more.dirpath is '/tmp'",
+        ),
+        (
+            lambda c: c["logger"].update(
+                mlflow={
+                    "_target_": "lightning.pytorch.loggers.MLFlowLogger",
+                    "tracking_uri": "https://example.org",
+                }
+            ),
+            "logger.mlflow.tracking_uri",
+        ),
+        (lambda c: c["trainer"].update(default_root_dir="/"), "trainer.default_root_dir"),
+        (lambda c: c["dataset"].update(name="${oc.env:HOME}"), "an expression"),
+        (lambda c: c.pop("model"), "model is None"),
+        (lambda c: c.update(seed="x"), "seed is 'x'"),
+        (lambda c: c["model"]["integrator"].update(substeps=0), "integrator.substeps is 0"),
+        (lambda c: c["model"]["integrator"].update(substeps="many"), "substeps is 'many'"),
+        (lambda c: c["model"].update(nothing=1), "takes no 'nothing'"),
+    ],
+)
+def test_what_leads_out_of_the_folder_or_fits_nothing_is_refused(
+    tmp_path, lnn_run, change, expected
+):
+    run = foreign(lnn_run, tmp_path / "run", change)
+    with pytest.raises(ConfigError, match=expected):
+        load_run(run, "best")
+
+
+def test_the_folder_does_not_choose_the_cache(tmp_path, lnn_run):
+    elsewhere = str(tmp_path / "elsewhere")
+    run = foreign(lnn_run, tmp_path / "run", lambda c: c["dataset"].update(cache=elsewhere))
+    assert "cache" not in load_run(run, "best").config["dataset"]
+
+
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{chr(98 + k)}: &{chr(98 + k)} [{','.join(['*' + chr(97 + k)] * 9)}]\n" for k in range(20)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (BOMB, "values once its aliases are written out"),
+        ("a: &a [*a]\n", "values once its aliases are written out"),
+        ("a: &a {b: *a}\n", "values once its aliases are written out"),
+        ("x: " + "[" * 5000 + "]" * 5000, "30 levels deep"),
+        ("x: " + "y" * 2_000_000, "expected a configuration of at most"),
+        ("- a list\n", "holds no configuration"),
+        ("", "holds no configuration"),
+        ("1: 2\n", "holds no configuration"),
+        ("a: [1, 2\n", "cannot be read"),
+        ("\x00\x01\x02", "cannot be read"),
+        ("x: !!python/object/apply:os.system ['true']\n", "cannot be read"),
+        ("x: !!python/name:os.system\n", "cannot be read"),
+        ("x: *nothing\n", "cannot be read"),
+    ],
+    ids=range(13),
+)
+def test_a_hostile_file_ends_in_a_sentence(tmp_path, text, expected):
+    (tmp_path / "config.yaml").write_text(text)
+    start = time.perf_counter()
+    with pytest.raises(ConfigError, match=expected) as caught:
+        load_run(tmp_path, "best")
+    assert time.perf_counter() - start < 10
+    assert str(tmp_path) in str(caught.value)
