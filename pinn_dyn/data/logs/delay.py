@@ -322,7 +322,9 @@ class _Remainder:
             ] * np.eye(len(rows))
             product = self.with_motion[:, rows]
             explained = (product * np.linalg.solve(gram, product)).sum(axis=1)
-            shares.append(((self.motion - explained) / self.squares[1]).mean(axis=1))
+            shares.append(
+                ((self.motion - explained) / self.squares[1].clip(min=1e-300)).mean(axis=1)
+            )
         return np.stack(shares, axis=1).clip(1e-12, 1)
 
 
@@ -349,7 +351,7 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
     elif best >= len(candidates) - 2:
         reason = f"the residual still falls at the longest delay, {candidates[-1]:.3g} s"
     elif best == 0:
-        reason = "the input seems to come after the motion: have they the same clock?"
+        reason = "the input is logged after the motion: a filtered measurement, or another clock"
     delay = max(_minimum(candidates, whole), 0.0)
     return DelayCurve(candidates, whole, None if reason else delay, spread, form, reason)
 
