@@ -138,7 +138,7 @@ def _read(
 def _time(message: Any, stamp: int) -> float:
     header = getattr(message, "header", None)
     if header is not None and (header.stamp.sec or header.stamp.nanosec):
-        return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
+        stamp = 10**9 * header.stamp.sec + header.stamp.nanosec  # rounded once, as the other is
     return 1e-9 * stamp
 
 
