@@ -20,7 +20,7 @@ from pinn_dyn.app.schema import KEYS, ConfigError, arguments, find, words
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
-PROGRAMS = ("train", "evaluate", "control", "gather")
+PROGRAMS = ("train", "evaluate", "control", "gather", "check")
 PLAIN = (bool, int, float, str, tuple, type(None))
 # Keys of the programs that stand in no YAML.
 OPTIONAL = {

@@ -1,4 +1,4 @@
-"""The commands: what train.py, evaluate.py, control.py, gather.py and the installed scripts call.
+"""The commands: what train.py, check.py and the others, and the installed scripts call.
 
 A command is the function of its name in the module of its name beside this one, and its
 configuration is ``conf/<name>.yaml``.
@@ -22,7 +22,7 @@ from pinn_dyn.app.sweep import how_to_go_on
 
 
 def main(command: str) -> None:
-    """Run train, evaluate, control or gather on the configuration that the command line asks for.
+    """Run a command, as train, on the configuration that the command line asks for.
 
     A misspelt key ends the program before anything is written, with the keys that were probably
     meant; so does an error that the user can mend, without a traceback.
@@ -68,3 +68,4 @@ train = partial(main, "train")
 evaluate = partial(main, "evaluate")
 control = partial(main, "control")
 gather = partial(main, "gather")
+check = partial(main, "check")

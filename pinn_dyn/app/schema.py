@@ -109,6 +109,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "reference": Part,
         "plant": Part,
     },
+    "check": {"dataset": Part, "longest_delay": Seconds},
     "gather": {
         "runs": Names,
         "evaluations": Names | None,

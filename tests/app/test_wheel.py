@@ -107,7 +107,7 @@ def test_the_wheel_holds_every_module_template_and_configuration(wheel):
 
 
 def test_every_command_teaches(installed, tmp_path):
-    names = ["train", "evaluate", "control", "gather"]
+    names = ["train", "evaluate", "control", "gather", "check"]
     *helps, composed, completion = call_many(
         installed,
         tmp_path,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.ndimage
-from scipy.signal import correlate, filtfilt
+from scipy.signal import filtfilt
 
 from pinn_dyn.data.logs import (
     Butterworth,
@@ -223,26 +223,6 @@ def test_subtract_start_starts_at_zero():
     np.testing.assert_array_equal(done.q[:, 0], [-1.0, 1.0, 6.0])
 
 
-def test_estimated_delay_is_the_peak_of_the_cross_correlation():
-    u = scipy.ndimage.gaussian_filter1d(RNG.normal(size=2000), 5)
-    q = np.r_[np.zeros(17), 3 * u[:-17]] + 0.02 * RNG.normal(size=2000)
-    item = recording(q, u=u)
-    products = correlate(q - q.mean(), u - u.mean())
-    peak = int(products.argmax()) - (len(u) - 1)
-    assert peak == 17
-    done, text = only(InputDelay(longest=0.5).fit([item]), item)
-    np.testing.assert_array_equal(done.u[:, 0], u[:-peak])
-    np.testing.assert_array_equal(done.q[:, 0], q[peak:])
-    assert "17 samples (0.17 s), estimated" in text
-
-
-def test_delay_is_found_for_a_mixture_of_inputs():
-    u = scipy.ndimage.gaussian_filter1d(RNG.normal(size=(2000, 3)), 5, axis=0)
-    q = np.vstack([np.zeros((9, 2)), (u @ RNG.normal(size=(3, 2)))[:-9]])
-    _, text = only(InputDelay().fit([recording(q, u=u)]), recording(q, u=u))
-    assert "9 samples" in text
-
-
 def test_given_delay_shifts_by_whole_samples():
     done, text = only(InputDelay(delay=0.021).fit([]), recording(np.arange(10), u=np.arange(10)))
     np.testing.assert_array_equal(done.q - done.u, 2)
@@ -291,6 +271,7 @@ def test_steps_that_count_samples_refuse_a_jittered_clock(step):
         lambda: SubtractStart(samples=0),
         lambda: InputDelay(delay=-1.0),
         lambda: InputDelay(longest=9.0).fit([recording(NOISE)]),
+        lambda: InputDelay(delay=[0.0, 0.1]).apply(recording(NOISE)),
     ],
 )
 def test_impossible_settings_are_refused(make):

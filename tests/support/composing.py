@@ -11,6 +11,7 @@ GIVEN = {
     "evaluate": ["runs=[x]"],
     "control": ["run=x", "reference.q=[0,0,0]"],
     "gather": ["runs=[x]"],
+    "check": [],
 }
 
 

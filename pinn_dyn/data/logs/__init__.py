@@ -2,6 +2,7 @@
 
 from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.delay import DelayCurve, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
     Butterworth,
@@ -10,8 +11,9 @@ from pinn_dyn.data.logs.filters import (
     PolynomialFit,
     SavitzkyGolayVelocity,
 )
+from pinn_dyn.data.logs.input_delay import InputDelay
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.repairs import InputDelay, InterpolateHeld, RemoveJumps, SubtractStart
+from pinn_dyn.data.logs.repairs import InterpolateHeld, RemoveJumps, SubtractStart
 from pinn_dyn.data.logs.source import Cleaned, LogSource
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.step import Step
@@ -23,6 +25,7 @@ __all__ = [
     "Cleaned",
     "Columns",
     "Deduplicate",
+    "DelayCurve",
     "InputDelay",
     "InputRates",
     "InterpolateHeld",
@@ -38,4 +41,5 @@ __all__ = [
     "SplitGaps",
     "Step",
     "SubtractStart",
+    "input_delays",
 ]

@@ -1,4 +1,4 @@
-"""Reads the columns of log files: CSV, also compressed by gzip, and MATLAB through SciPy."""
+"""Finds log files and reads their columns, CSV here and the other formats by their own modules."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.io import loadmat
 
+from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
+from pinn_dyn.data.logs.bags import is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.parquet import read_parquet
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
@@ -37,7 +39,7 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     for pattern in given:
         if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
             raise LogError(f"files has {pattern!r}, expected paths from the folder root")
-        matches = [path for path in folder.glob(pattern) if path.is_file()]
+        matches = [path for path in folder.glob(pattern) if path.is_file() or is_bag(path)]
         if not matches:
             raise LogError(f"files: nothing matches {pattern!r} in the folder {folder.absolute()}")
         found.update(matches)
@@ -45,18 +47,36 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
 
 
 def run_name(path: Path, root: str) -> str:
-    """The name of a file's run: its path from the folder, without ``.csv``, ``.gz`` or ``.mat``."""
+    """The name of a file's run: its path from the folder, without its suffix."""
     inside = path.relative_to(Path(root).expanduser())
     return (inside.with_suffix("") if inside.suffix == ".gz" else inside).with_suffix("").as_posix()
 
 
-def read_table(path: Path, time: str) -> pd.DataFrame:
-    """All columns of a file; the index is the line in the file (the row, in a ``.mat`` file).
+def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) -> pd.DataFrame:
+    """Columns of a file; the index is the line in the file, the row or the message.
+
+    ``attrs`` has ``unusable``, why there is no such column, and ``notes``, what was dropped.
+
+    Args:
+        path: the file.
+        time: column of the time.
+        columns: what will be asked for; files whose columns cost little give all that they have.
+        max_age: how old a message of another topic of a bag may be, s.
 
     Raises:
         LogError: if the file cannot be read or is empty.
     """
-    return _read_mat(path, time) if path.suffix == ".mat" else _read_csv(path)
+    if is_bag(path):
+        return read_bag(path, time, columns, max_age)
+    if path.suffix == ".mat":
+        return read_mat(path, time)
+    if path.suffix in (".h5", ".hdf5"):
+        return read_hdf5(path, time)
+    if path.suffix == ".npz":
+        return read_npz(path, time)
+    if path.suffix == ".parquet":
+        return read_parquet(path)
+    return _read_csv(path)
 
 
 def numbers(table: pd.DataFrame, path: Path, columns: Sequence[str], signal: str) -> np.ndarray:
@@ -153,59 +173,3 @@ def _read_csv(path: Path) -> pd.DataFrame:
     if not len(filled):
         raise LogError(f"{path}: has no rows, expected a header line and rows of numbers")
     return table.iloc[: filled[-1] + 1]
-
-
-def _read_mat(path: Path, time: str) -> pd.DataFrame:
-    try:
-        content = loadmat(path, squeeze_me=False, struct_as_record=True)
-    except NotImplementedError as error:
-        raise LogError(
-            f"{path}: is a MATLAB 7.3 file, which SciPy cannot read: save it with '-v7'"
-        ) from error
-    except Exception as error:  # a damaged file raises nearly anything
-        raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
-    arrays: dict[str, np.ndarray] = {}
-    unusable: dict[str, str] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            _flatten(name, value, arrays, unusable)
-    if time in unusable:
-        raise LogError(f"{path}, variable {time!r} (time): {unusable[time]}, expected real numbers")
-    if time not in arrays:
-        names = ", ".join(f"{name} {value.shape}" for name, value in arrays.items())
-        close = difflib.get_close_matches(time, arrays, n=1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
-        raise LogError(f"{path}: no variable {time!r} for the time: {hint}the file has {names}")
-    samples = arrays[time].size
-    columns: dict[str, np.ndarray] = {}
-    for name, value in arrays.items():
-        rows = value if value.shape[0] == samples else value.T
-        if rows.shape[0] != samples:  # parameters and the like
-            unusable[name] = f"is {' by '.join(map(str, value.shape))}, and the time has {samples}"
-            unusable[name] += " samples"
-            continue
-        if rows.shape[1] == 1:
-            columns[name] = rows[:, 0]
-        else:
-            columns |= {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
-    table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
-    table.attrs["unusable"] = unusable
-    return table
-
-
-def _flatten(
-    name: str, value: np.ndarray, arrays: dict[str, np.ndarray], unusable: dict[str, str]
-) -> None:
-    """Real matrices of a variable and of the fields of its structs, as ``log.q``; else why not."""
-    if value.dtype.names:
-        for field in value.dtype.names:
-            if value.size == 1:
-                _flatten(f"{name}.{field}", value.flat[0][field], arrays, unusable)
-            else:
-                unusable[f"{name}.{field}"] = f"is a field of an array of {value.size} structs"
-    elif value.ndim == 2 and value.dtype.kind in "fiub":
-        arrays[name] = value
-    else:
-        kinds = {"c": "holds complex numbers", "O": "is a cell array, such as of ragged rows"}
-        kinds |= {"U": "is a text", "S": "is a text"}
-        unusable[name] = kinds.get(value.dtype.kind, f"has {value.ndim} dimensions")

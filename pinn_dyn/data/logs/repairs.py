@@ -10,7 +10,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.step import Step, change, check_signals, sample_time
+from pinn_dyn.data.logs.step import Step, change, check_signals
 
 # Share of the rows that may be jumps; more are noise or motion.
 _MANY = 0.05
@@ -152,91 +152,3 @@ class SubtractStart(Step):
         start = recording.q[: self.samples].mean(axis=0)
         shown = ", ".join(f"{value:.4g}" for value in start)
         return [replace(recording, q=recording.q - start)], f"subtracted ({shown}) from q"
-
-
-@dataclass(frozen=True)
-class InputDelay(Step):
-    """Shifts the input to where it acts: u(t) becomes u(t - d), on a uniform clock.
-
-    A delay that is not given is the lag at which the input explains q best on the training runs:
-    the largest squared correlation of q(t) with the best affine function of u(t - d), averaged over
-    the coordinates. With one input and one coordinate that is the peak of the cross-correlation. It
-    suits inputs that q follows, such as motor angles of a tendon drive; the lag of the robot itself
-    is in it.
-
-    Args:
-        delay: d, s, rounded to whole samples; None estimates it.
-        longest: longest delay that is tried, s.
-    """
-
-    delay: float | None = None
-    longest: float = 0.5
-
-    def __post_init__(self) -> None:
-        if (self.delay is not None and self.delay < 0) or not self.longest > 0:
-            raise LogError(
-                f"InputDelay: delay is {self.delay} s and longest {self.longest} s, expected 0 or "
-                "more, and more than 0"
-            )
-
-    @property
-    def learns(self) -> bool:
-        return self.delay is None
-
-    def fit(self, training: list[Recording]) -> Step:
-        if self.delay is not None:
-            return self
-        step = sample_time(training[0], "InputDelay")
-        most = round(self.longest / step)
-        long = [recording for recording in training if len(recording) > 2 * most]
-        if not long:
-            raise LogError(
-                f"InputDelay: no training run is longer than twice {self.longest} s, the longest "
-                "delay to be tried: lower longest, or give delay"
-            )
-        scores = [self._explained(long, lag, most) for lag in range(most + 1)]
-        return _EstimatedDelay(int(np.argmax(scores)) * step, self.longest, max(scores), scores[0])
-
-    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        assert self.delay is not None
-        step = sample_time(recording, "InputDelay")
-        lag = round(self.delay / step)
-        if len(recording) - lag < 2:
-            raise LogError(
-                f"{recording.place}: shorter than the input delay, {self.delay:.4g} s: drop the run"
-            )
-        later = recording.rows(slice(lag, None))
-        shifted = replace(later, u=recording.u[: len(recording) - lag])
-        return [shifted], f"u delayed by {lag} samples ({lag * step:.4g} s), {self._origin()}"
-
-    def _origin(self) -> str:
-        return "as given"
-
-    @staticmethod
-    def _explained(recordings: list[Recording], lag: int, most: int) -> float:
-        """Mean squared multiple correlation of q(t) with u(t - lag)."""
-        # Every lag is judged on the same samples of q.
-        q = np.vstack([item.q[most:] - item.q[most:].mean(0) for item in recordings])
-        u = np.vstack([item.u[most - lag : len(item) - lag] for item in recordings])
-        affine = np.column_stack([u, np.ones(len(u))])
-        rest = q - affine @ np.linalg.lstsq(affine, q, rcond=None)[0]
-        spread = q.var(axis=0)
-        moving = spread > 0
-        return float((1 - rest.var(axis=0)[moving] / spread[moving]).mean()) if moving.any() else 0
-
-
-@dataclass(frozen=True)
-class _EstimatedDelay(InputDelay):
-    """A delay that was estimated, with how well the input explains q with and without it."""
-
-    explained: float = 0.0
-    explained_before: float = 0.0
-
-    def _origin(self) -> str:
-        text = (
-            f"estimated on the training runs: u explains {100 * self.explained:.1f} % of q, "
-            f"without it {100 * self.explained_before:.1f} %"
-        )
-        if self.delay is not None and self.delay >= self.longest - 1e-9:
-            text += "; this is the longest that was tried, so raise longest"
-        return text

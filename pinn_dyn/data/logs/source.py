@@ -40,7 +40,7 @@ from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
 # What the trajectories depend on beside the files.
 _SETTINGS = (
-    *("time", "q", "v", "u", "trajectory", "steps", "validation", "test"),
+    *("time", "q", "v", "u", "trajectory", "max_age", "steps", "validation", "test"),
     *("guard", "shortest", "seed", "interpolation"),
 )
 
@@ -61,7 +61,7 @@ class Cleaned:
 
 
 class LogSource(DataSource):
-    """Trajectories from CSV or MATLAB logs.
+    """Trajectories from logs: CSV, MATLAB, HDF5, NPZ, Parquet and bags of ROS.
 
     Runs are split, or cut with a guard, before the steps: no filter sees both sides of a border.
     Then the steps are applied in order, validation and test are cut into pieces of one length, and
@@ -76,6 +76,7 @@ class LogSource(DataSource):
         q: columns of the configuration, N.
         u: columns of the input, M.
         v: columns of the velocity, N, or None.
+        max_age: how old a message of another topic of a bag may be at a row, s.
         trajectory: column that tells the runs of a file apart, or None where a file is one run.
         steps: names and steps of the cleaning, in order; None entries are left out.
         validation, test: whole runs, ``{runs: 2, piece: 5.0}``, or the ends of runs,
@@ -104,6 +105,7 @@ class LogSource(DataSource):
         u: Columns | Mapping[str, Any],
         v: Columns | Mapping[str, Any] | None = None,
         trajectory: str | None = None,
+        max_age: float = 0.1,
         steps: Mapping[str, Step | None] | None = None,
         validation: Part | Mapping[str, Any],
         test: Part | Mapping[str, Any],
@@ -133,6 +135,9 @@ class LogSource(DataSource):
         _check_units("q", self.q, ("rad", "m", "1"))
         _check_units("u", self.u, sorted({unit for unit, _ in UNITS.values()} - {"s"}))
         self.trajectory = trajectory
+        if not max_age > 0:
+            raise LogError(f"max_age is {max_age} s, expected more than 0")
+        self.max_age = max_age
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self.validation = Part.from_config("validation", validation)
         self.test = Part.from_config("test", test)
@@ -228,7 +233,8 @@ class LogSource(DataSource):
                 "bytes": path.stat().st_size,
                 "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
             }
-            for path in find_files(self.root, self.files)
+            for found in find_files(self.root, self.files)
+            for path in ([found] if found.is_file() else sorted(found.iterdir()))
         }
         splits: dict[str, list[str]] = {split: [] for split in SPLITS}
         for part in self.cleaned:
@@ -240,6 +246,11 @@ class LogSource(DataSource):
     def report(self) -> str:
         """What each step did, and all warnings, as Markdown."""
         return str(self._load()[1])
+
+    @property
+    def warnings(self) -> list[str]:
+        """What looked wrong, a sentence each."""
+        return self._load()[1].warnings
 
     @property
     def cleaned(self) -> list[Cleaned]:
@@ -279,9 +290,14 @@ class LogSource(DataSource):
     def _read(self, report: Report) -> list[Recording]:
         paths = find_files(self.root, self.files)
         recordings = []
+        signals = [x for x in (self.time, self.q, self.v, self.u) if x is not None]
+        asked = [name for signal in signals for name in signal.columns]
+        asked += [] if self.trajectory is None else [self.trajectory]
         for path in paths:
-            table = read_table(path, self.time.columns[0])
+            table = read_table(path, self.time.columns[0], asked, self.max_age)
             stem = run_name(path, self.root)
+            for note in table.attrs.get("notes", []):
+                report.warn(f"{path.name}: {note}")
             groups = [(stem, np.full(len(table), True))]
             if self.trajectory is not None:
                 prefix = f"{stem}:" if len(paths) > 1 else ""

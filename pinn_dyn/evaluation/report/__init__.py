@@ -1,5 +1,6 @@
-"""Self-contained HTML pages of an evaluation and of a control run, with interactive figures."""
+"""Self-contained HTML pages of an evaluation, a control run and a log, with interactive figures."""
 
+from pinn_dyn.evaluation.report.check_page import check_report
 from pinn_dyn.evaluation.report.control_page import (
     StabilityResult,
     control_report,
@@ -11,6 +12,7 @@ from pinn_dyn.evaluation.report.prediction_page import prediction_report
 __all__ = [
     "Origin",
     "StabilityResult",
+    "check_report",
     "control_report",
     "measured_model_report",
     "prediction_report",

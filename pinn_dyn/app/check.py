@@ -1,0 +1,44 @@
+"""Look at a log before a training, as check.py does."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from pinn_dyn.app.build import build_source
+from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.provenance import command_line
+from pinn_dyn.app.run_folder import write_config
+from pinn_dyn.data.logs import LogError, LogSource
+from pinn_dyn.evaluation.log_check import check_log
+from pinn_dyn.evaluation.report import check_report
+
+log = logging.getLogger(__name__)
+
+
+def check(cfg: DictConfig) -> None:
+    """Print what is in a log and whether it suffices, and write a page of it.
+
+    Raises:
+        ConfigError: if the data set is no log or cannot be used, or a training makes no sense.
+    """
+    config = checked("check", cfg)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    source = build_source(config)
+    if not isinstance(source, LogSource):
+        raise ConfigError(
+            f"dataset {source.name} is simulated, expected a log, such as dataset=example_log"
+        )
+    try:
+        found = check_log(source, longest_delay=config["longest_delay"])
+    except LogError as error:
+        raise ConfigError(f"{source.name}: {error}") from error
+    write_config(folder, config)
+    (folder / "check.html").write_text(check_report(found, source, command=command_line()))
+    (folder / "log_report.md").write_text(source.report)
+    print(f"\n{found}\n\nthe page is {folder / 'check.html'}")
+    if found.problems:
+        raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(found.problems)}")

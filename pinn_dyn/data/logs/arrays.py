@@ -1,0 +1,158 @@
+"""Files of named arrays as tables: MATLAB, HDF5 and NPZ.
+
+An array with as many rows as the time is a column; one with several columns is ``name_1``,
+``name_2`` and so on. Parts of structs and groups are joined: ``log.q`` in MATLAB,
+``log/q`` in HDF5.
+"""
+
+from __future__ import annotations
+
+import difflib
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.io import loadmat
+
+from pinn_dyn.data.logs.bags import optional
+from pinn_dyn.data.logs.errors import LogError
+
+_KINDS = {
+    "c": "holds complex numbers",
+    "O": "is a cell array, such as of ragged rows",
+    "U": "is a text",
+    "S": "is a text",
+}
+
+
+def read_mat(path: Path, time: str) -> pd.DataFrame:
+    """The variables of a MATLAB file, of version 7.3 too.
+
+    Raises:
+        LogError: if it cannot be read, or has no such time.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    unusable: dict[str, str] = {}
+    try:
+        content = loadmat(path, squeeze_me=False, struct_as_record=True)
+    except NotImplementedError:  # version 7.3 is HDF5
+        content = _read_mat73(path)
+    except Exception as error:  # a damaged file raises nearly anything
+        raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
+    for name, value in content.items():
+        if not name.startswith("__"):
+            _flatten(name, value, arrays, unusable)
+    return _table(path, time, arrays, unusable)
+
+
+def _read_mat73(path: Path) -> Mapping[str, Any]:
+    try:
+        return optional("pymatreader", path).read_mat(str(path))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise LogError(f"{path}: cannot be read as a MATLAB 7.3 file: {error}") from error
+
+
+def read_hdf5(path: Path, time: str) -> pd.DataFrame:
+    """The data sets of an HDF5 file, by their paths.
+
+    Raises:
+        LogError: if it cannot be read, or has no such time.
+    """
+    h5py = optional("h5py", path)
+    arrays: dict[str, np.ndarray] = {}
+    unusable: dict[str, str] = {}
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Group):
+            unusable[name] = f"is a group that holds {', '.join(item) or 'nothing'}"
+        elif item.dtype.names or item.dtype.kind not in "fiub":
+            unusable[name] = f"has the type {item.dtype}"
+        else:
+            _add(name, np.asarray(item[()]), arrays, unusable)
+
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(visit)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise LogError(f"{path}: cannot be read as HDF5, it may be cut short: {error}") from error
+    return _table(path, time, arrays, unusable)
+
+
+def read_npz(path: Path, time: str) -> pd.DataFrame:
+    """The arrays of an NPZ file; arrays of objects are never unpickled.
+
+    Raises:
+        LogError: if it cannot be read, or has no such time.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    unusable: dict[str, str] = {}
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            for name in file.files:
+                try:
+                    _add(name, file[name], arrays, unusable)
+                except ValueError:
+                    unusable[name] = "holds Python objects, which are never unpickled"
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise LogError(f"{path}: cannot be read as NPZ, it may be cut short: {error}") from error
+    return _table(path, time, arrays, unusable)
+
+
+def _flatten(
+    name: str, value: Any, arrays: dict[str, np.ndarray], unusable: dict[str, str]
+) -> None:
+    """Real matrices of a variable and of the fields of its structs, as ``log.q``; else why not."""
+    if isinstance(value, Mapping):
+        for field, inner in value.items():
+            _flatten(f"{name}.{field}", inner, arrays, unusable)
+        return
+    value = np.asarray(value, dtype=None if not isinstance(value, list) else object)
+    if value.dtype.names:
+        for field in value.dtype.names:
+            if value.size == 1:
+                _flatten(f"{name}.{field}", value.flat[0][field], arrays, unusable)
+            else:
+                unusable[f"{name}.{field}"] = f"is a field of an array of {value.size} structs"
+    else:
+        _add(name, value, arrays, unusable)
+
+
+def _add(
+    name: str, value: np.ndarray, arrays: dict[str, np.ndarray], unusable: dict[str, str]
+) -> None:
+    if value.dtype.kind not in "fiub":
+        unusable[name] = _KINDS.get(value.dtype.kind, f"has the type {value.dtype}")
+    elif value.ndim not in (1, 2):
+        unusable[name] = f"has {value.ndim} dimensions"
+    else:
+        arrays[name] = value.reshape(len(value), -1)
+
+
+def _table(
+    path: Path, time: str, arrays: dict[str, np.ndarray], unusable: dict[str, str]
+) -> pd.DataFrame:
+    if time in unusable:
+        raise LogError(f"{path}, variable {time!r} (time): {unusable[time]}, expected real numbers")
+    if time not in arrays:
+        names = ", ".join(f"{name} {value.shape}" for name, value in arrays.items())
+        close = difflib.get_close_matches(time, arrays, n=1)
+        hint = f"did you mean {close[0]!r}? " if close else ""
+        raise LogError(f"{path}: no variable {time!r} for the time: {hint}the file has {names}")
+    samples = arrays[time].size
+    columns: dict[str, np.ndarray] = {}
+    for name, value in arrays.items():
+        rows = value if value.shape[0] == samples else value.T
+        if rows.shape[0] != samples:  # parameters and the like
+            unusable[name] = f"is {' by '.join(map(str, value.shape))}, and the time has {samples}"
+            unusable[name] += " samples"
+            continue
+        if rows.shape[1] == 1:
+            columns[name] = rows[:, 0]
+        else:
+            columns |= {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
+    table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+    table.attrs["unusable"] = unusable
+    return table

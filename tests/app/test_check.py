@@ -1,0 +1,51 @@
+"""check.py: a verdict on a log, its page, and an error where a training makes no sense."""
+
+import numpy as np
+import pandas as pd
+
+from tests.app.entry import fails, run_script
+from tests.support.delayed_robots import log
+
+COLUMNS = [
+    "dataset.q.columns=[q1,q2]",
+    "dataset.q.unit=rad",
+    "dataset.u.columns=[u1,u2]",
+    "dataset.u.unit=Nm",
+    "+dataset.validation.seconds=2.0",
+    "dataset.validation.piece=1.0",
+    "+dataset.test.seconds=2.0",
+    "dataset.test.piece=1.0",
+]
+
+
+def arguments(folder, **columns):
+    """A log of the arm whose torques act 50 ms late, some columns changed, and how to read it."""
+    item = log("arm", 0, 0.05)
+    table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
+    table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
+    pd.DataFrame(table | columns).to_csv(folder / "arm.csv", index=False)
+    given = ["dataset=csv_log", f"dataset.root='{folder}'", "dataset.files=arm.csv", *COLUMNS]
+    return [*given, f"hydra.run.dir={folder / 'out'}"]
+
+
+def test_a_log_gets_a_verdict_a_page_and_a_step_to_copy(tmp_path, capsys):
+    run_script("check.py", *arguments(tmp_path))
+    text = capsys.readouterr().out
+    assert "Verdict: a training makes sense" in text
+    assert "delay: {_target_: pinn_dyn.data.logs.InputDelay, delay: 0.05}" in text
+    page = (tmp_path / "out" / "check.html").read_text()
+    assert "Inputs and their delays" in page
+    assert "delay: 0.05" in page
+    assert page.count("<img") >= 4
+
+
+def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    noise = {f"u{k}": rng.normal(size=1201) for k in (1, 2)}
+    error = fails("check.py", *arguments(tmp_path, **noise))
+    assert "the inputs explain" in str(error.code)
+    assert (tmp_path / "out" / "check.html").is_file()
+
+
+def test_a_simulated_data_set_is_refused():
+    assert "is simulated, expected a log" in str(fails("check.py", "dataset=soft_arm_1").code)

@@ -1,0 +1,69 @@
+"""Delays between input and motion: found where the data tell, refused where they do not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pinn_dyn.data.logs import InputDelay, input_delays
+from tests.support.delayed_robots import log
+
+
+@pytest.mark.parametrize("kind", ["pendulum", "arm", "tendons"])
+@pytest.mark.parametrize(("seed", "delay"), [(0, 0.0), (1, 0.043), (2, 0.1)])
+def test_a_known_delay_is_found_within_a_sample(kind, seed, delay):
+    for curve in input_delays([log(kind, seed, delay)]):
+        assert curve.delay == pytest.approx(delay, abs=0.01), str(curve)
+
+
+@pytest.mark.parametrize("kind", ["pendulum", "arm", "tendons"])
+def test_a_slow_sine_gets_no_answer(kind):
+    for curve in input_delays([log(kind, 0, 0.04, highest=0.1, number=1)]):
+        assert curve.delay is None
+        assert curve.reason
+
+
+def test_inputs_may_have_delays_of_their_own():
+    item = log("arm", 3, 0.1)
+    shifted = np.column_stack([item.u[:-6, 0], item.u[6:, 1]])
+    first, second = input_delays([replace(item, t=item.t[:-6], q=item.q[:-6], u=shifted)])
+    assert first.delay == pytest.approx(0.1, abs=0.01)
+    assert second.delay == pytest.approx(0.16, abs=0.01)
+    shared = input_delays([log("arm", 3, 0.05)], common=True)
+    assert shared[0] is shared[1] or shared[0].delay == shared[1].delay
+    assert shared[0].delay == pytest.approx(0.05, abs=0.01)
+
+
+def test_noise_for_an_input_gets_no_answer():
+    item = log("arm", 4, 0.05)
+    noise = np.random.default_rng(0).normal(size=item.u.shape)
+    assert all(curve.delay is None for curve in input_delays([replace(item, u=noise)]))
+
+
+def test_the_step_shifts_by_what_it_found_and_says_so():
+    item = log("pendulum", 1, 0.043)
+    step = InputDelay().fit([item])
+    (shifted,), text = step.apply(item)
+    assert len(shifted) == len(item) - 4
+    np.testing.assert_array_equal(shifted.u, item.u[:-4])
+    np.testing.assert_array_equal(shifted.q, item.q[4:])
+    assert "4 samples (0.04 s), found on the training runs" in text
+    assert "0 ms" in text  # the curve
+    assert not step.losses([item], [shifted])
+
+
+def test_the_step_warns_where_it_shifts_nothing():
+    item = log("pendulum", 1, 0.04, highest=0.1, number=1)
+    step = InputDelay().fit([item])
+    (shifted,), _ = step.apply(item)
+    np.testing.assert_array_equal(shifted.u, item.u)
+    (warning,) = step.losses([item], [shifted])
+    assert "input 1 is not shifted" in warning
+    assert "single sine" in warning
+
+
+def test_given_delays_shift_each_input():
+    item = log("arm", 0, 0.0)
+    (shifted,), _ = InputDelay(delay=[0.02, 0.05]).apply(item)
+    np.testing.assert_array_equal(shifted.u[:, 0], item.u[3:-2, 0])
+    np.testing.assert_array_equal(shifted.u[:, 1], item.u[:-5, 1])

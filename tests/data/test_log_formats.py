@@ -1,0 +1,191 @@
+"""Bags, HDF5, MATLAB 7.3, NPZ and Parquet give the trajectories that the same CSV gives."""
+
+import h5py
+import numpy as np
+import pytest
+
+from pinn_dyn.data.logs import LogError
+from tests.data import log_formats as formats
+from tests.data.logs_files import motion, source, write
+
+TABLE = motion(6.0)
+
+
+def trajectories(log):
+    splits = log.load()
+    return [*splits.train, *splits.validation, *splits.test]
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("csv")
+    write(folder, TABLE)
+    return trajectories(source(folder))
+
+
+def assert_same(found, expected):
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        for name in ("t", "q", "v", "u"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("files", "options"),
+    [
+        ("run/*.mcap", {}),
+        ("run", {}),
+        ("run", {"mcap": False}),
+        ("run", {"empty_every": 7}),  # another node publishes on the topic, without velocities
+        ("run.bag", {"version": 1}),
+    ],
+)
+def test_bags_map_joints_by_name_whatever_their_order(tmp_path, expected, files, options):
+    formats.write_bag(tmp_path / ("run.bag" if "version" in options else "run"), TABLE, **options)
+    log = source(tmp_path, files=files, **formats.BAG)
+    assert_same(trajectories(log), expected)
+    assert ("lack a joint" in log.report) == ("empty_every" in options)
+    assert log.fingerprint()["files"]
+
+
+def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
+    formats.write_bag(tmp_path / "run", TABLE, late=0.004)
+    log = source(tmp_path, files="run", **formats.BAG)
+    first = log.load().train[0]
+    # The command of a row is received 4 ms after it: the next row is the first that has it.
+    np.testing.assert_allclose(first.u[:50], TABLE[["u1", "u2"]].to_numpy()[:50], atol=1e-9)
+    np.testing.assert_allclose(first.q[:50], TABLE[["q1", "q2"]].to_numpy()[1:51], atol=1e-9)
+    assert "1 rows are dropped: 1 messages of /joint_states have none of /commands" in log.report
+    with pytest.raises(LogError, match="no row is left"):
+        source(tmp_path, files="run", max_age=0.005, **formats.BAG).load()
+
+
+def bag_with(**changes):
+    return {**formats.BAG, **changes}
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        (["/joint_state/position/elbow"] * 1, "no topic .* /joint_states .sensor_msgs/msg/Joint"),
+        (["/joint_states/position/wrist"], "'position/wrist': its joints are elbow, shoulder"),
+        (["/joint_states/angle/elbow"], "no 'angle/elbow': their fields are header, name"),
+        (["/joint_states/effort/elbow"], "no message has a value of 'effort/elbow'"),
+    ],
+)
+def test_what_a_bag_does_not_have_is_named_beside_what_it_has(tmp_path, columns, said):
+    formats.write_bag(tmp_path / "run", TABLE)
+    q = dict(columns=columns, unit="rad")
+    with pytest.raises(LogError, match=f"run.*{said}"):
+        source(tmp_path, files="run", **bag_with(q=q, v=None)).load()
+
+
+def test_clocks_that_never_overlap_are_told(tmp_path):
+    formats.write_bag(tmp_path / "run", TABLE, late=1e6)
+    with pytest.raises(LogError, match="/joint_states and /commands never overlap"):
+        source(tmp_path, files="run", **formats.BAG).load()
+
+
+@pytest.mark.parametrize(
+    ("version", "name"), [(2, "run/run.mcap"), (1, "run.bag")], ids=["mcap", "ros1"]
+)
+def test_a_bag_cut_short_is_named(tmp_path, version, name):
+    formats.write_bag(tmp_path / name.split("/")[0], TABLE, version=version)
+    path = tmp_path / name
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(LogError, match=f"{path.name}: cannot be read as a bag, it may be cut"):
+        source(tmp_path, files=name, **formats.BAG).load()
+
+
+MATRICES = dict(
+    time=dict(columns="log/t", unit="s"),
+    q=dict(columns=["log/q_1", "log/q_2"], unit="rad"),
+    v=dict(columns=["log/v_1", "log/v_2"], unit="rad/s"),
+    u=dict(columns=["log/u_1", "log/u_2"], unit="Nm"),
+)
+
+
+def renamed(separator):
+    return {
+        key: {
+            "columns": [
+                c.replace("log/", separator) for c in np.atleast_1d(value["columns"]).tolist()
+            ],
+            "unit": value["unit"],
+        }
+        for key, value in MATRICES.items()
+    }
+
+
+def test_hdf5_by_paths(tmp_path, expected):
+    formats.write_hdf5(tmp_path / "run.h5", TABLE)
+    assert_same(trajectories(source(tmp_path, files="*.h5", **MATRICES)), expected)
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        ("log", "is a group that holds .*q.*t"),
+        ("log/gains", "is 3 by 3, and the time has 601 samples"),
+        ("log/w", "did you mean|no column 'log/w'"),
+    ],
+)
+def test_hdf5_paths_that_are_no_columns(tmp_path, column, said):
+    formats.write_hdf5(tmp_path / "run.h5", TABLE)
+    u = dict(columns=[column], unit="Nm")
+    with pytest.raises(LogError, match=f"run.h5.*{said}"):
+        source(tmp_path, files="*.h5", **{**MATRICES, "u": u}).load()
+
+
+def test_matlab_73_is_read_too(tmp_path, expected):
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        for name in "tqvu":
+            columns = ["t"] if name == "t" else [f"{name}1", f"{name}2"]
+            data = file.create_dataset(f"log/{name}", data=TABLE[columns].to_numpy().T)
+            data.attrs["MATLAB_class"] = np.bytes_("double")
+        file["log"].attrs["MATLAB_class"] = np.bytes_("struct")
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    content = (tmp_path / "run.mat").read_bytes()
+    (tmp_path / "run.mat").write_bytes(head + content[len(head) :])
+    assert_same(trajectories(source(tmp_path, files="*.mat", **renamed("log."))), expected)
+
+
+def test_npz_without_unpickling(tmp_path, expected):
+    formats.write_npz(tmp_path / "run.npz", TABLE, notes=np.array([{"a": 1}], dtype=object))
+    assert_same(trajectories(source(tmp_path, files="*.npz", **renamed(""))), expected)
+    u = dict(columns=["notes"], unit="Nm")
+    with pytest.raises(LogError, match=r"run.npz, variable 'notes'.*never unpickled"):
+        source(tmp_path, files="*.npz", **{**renamed(""), "u": u}).load()
+
+
+LEROBOT = dict(
+    files="data/*/*.parquet",
+    trajectory="episode_index",
+    time=dict(columns="timestamp", unit="s"),
+    q=dict(columns=["observation.state/shoulder", "observation.state/elbow"], unit="rad"),
+    v=None,
+    u=dict(columns=["action/shoulder", "action/elbow"], unit="Nm"),
+)
+
+
+def test_lerobot_folders_have_episodes_and_named_entries(tmp_path):
+    formats.write_lerobot(tmp_path, TABLE)
+    found = source(tmp_path, **LEROBOT).cleaned
+    assert len({part.raw.run for part in found}) == 3
+    np.testing.assert_allclose(found[0].raw.q[:, 0], TABLE["q1"][: len(found[0].raw)])
+    np.testing.assert_allclose(found[0].raw.u[:, 1], TABLE["u2"][: len(found[0].raw)])
+
+
+def test_parquet_without_episodes_is_told(tmp_path):
+    formats.write_lerobot(tmp_path, TABLE)
+    with pytest.raises(LogError, match=r"file-000.parquet: no column 'episode', which trajectory"):
+        source(tmp_path, **{**LEROBOT, "trajectory": "episode"}).load()
+    with pytest.raises(LogError, match="the time goes back"):
+        source(tmp_path, **{**LEROBOT, "trajectory": None}).load()
+
+
+@pytest.mark.parametrize("name", ["run.h5", "run.npz", "run.parquet"])
+def test_a_damaged_file_is_named(tmp_path, name):
+    (tmp_path / name).write_bytes(b"PAR1 not a file")
+    with pytest.raises(LogError, match=f"{name}: cannot be read as"):
+        source(tmp_path, files=name).load()

@@ -1,0 +1,72 @@
+"""Robots that are driven by an input that acts late, with noise in what is measured."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from pinn_dyn.data.logs import Recording
+
+SECONDS = 12.0
+
+
+def pendulum(q, v, u):
+    """0.5 kg at 0.4 m, with viscous damping."""
+    return (u - 0.5 * 9.81 * 0.4 * np.sin(q) - 0.1 * v) / (0.5 * 0.4**2)
+
+
+def arm_torque(q, v, a):
+    """Torques of two rods of 1 and 0.8 kg, 0.5 and 0.4 m, in the vertical plane, ``(T, 2)``."""
+    m1, m2, l1, l2 = 1.0, 0.8, 0.5, 0.4
+    c, s = (m2 * l1 * l2 / 2 * f(q[:, 1]) for f in (np.cos, np.sin))
+    m22 = m2 * l2**2 / 3
+    m12 = m22 + c
+    m11 = m1 * l1**2 / 3 + m2 * l1**2 + m22 + 2 * c
+    tip = np.sin(q.sum(axis=1)) * m2 * 9.81 * l2 / 2
+    base = np.sin(q[:, 0]) * 9.81 * (m1 / 2 + m2) * l1
+    first = m11 * a[:, 0] + m12 * a[:, 1] - s * (2 * v[:, 0] + v[:, 1]) * v[:, 1] + tip + base
+    second = m12 * a[:, 0] + m22 * a[:, 1] + s * v[:, 0] ** 2 + tip
+    return np.stack([first, second], axis=1) + 0.3 * v + 0.2 * np.tanh(20 * v)
+
+
+def tendons(q, u):
+    """Two bends that follow three motor angles with time constants of 0.15 and 0.2 s."""
+    pull = np.array([[1.0, -0.5, -0.5], [0.0, 0.87, -0.87]]) @ u
+    return (0.5 * np.tanh(pull) - q - 0.3 * q**3) / np.array([0.15, 0.2])
+
+
+def sines(rng, count, *, size, lowest=0.1, highest=2.0, number=6):
+    """Sums of sines of random frequencies in Hz, ``(..., count)``, and their derivatives, of t."""
+    w = 2 * np.pi * rng.uniform(lowest, highest, (number, count))
+    phase = rng.uniform(0, 2 * np.pi, (number, count))
+
+    def value(t, order=0):
+        angle = w * np.asarray(t)[..., None, None] + phase + order * np.pi / 2
+        return size * np.sqrt(2 / number) * (w**order * np.sin(angle)).sum(axis=-2)
+
+    return value
+
+
+def log(kind, seed, delay, *, rate=100.0, noise=1e-3, highest=2.0, number=6):
+    """A recording whose input acts ``delay`` s after it was logged.
+
+    The arm follows sines, and has the torques that they need; the others follow from their input.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(SECONDS * rate) + 1) / rate
+    drawn = {"highest": highest, "lowest": min(0.1, highest), "number": number}
+    if kind == "arm":
+        motion = sines(rng, 2, size=0.5, **drawn)
+        q = motion(t)
+        u = arm_torque(*(motion(t + delay, order) for order in range(3)))
+    else:
+        signal = sines(rng, 1 if kind == "pendulum" else 3, size=1.0, **drawn)
+        n = 1 if kind == "pendulum" else 2
+
+        def rate_of_change(t, x):
+            u = signal(t - delay)
+            if kind == "tendons":
+                return tendons(x, u)
+            return np.concatenate([x[1:], pendulum(x[:1], x[1:], u)])
+
+        x = solve_ivp(rate_of_change, (0, t[-1]), np.zeros(2), t_eval=t, rtol=1e-6, atol=1e-8)
+        q, u = x.y.T[:, :n], signal(t)
+    return Recording("run", t, q + noise * np.ptp(q, axis=0) * rng.normal(size=q.shape), None, u)
