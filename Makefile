@@ -27,7 +27,7 @@ demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, comp
 	$(BIN)/python train.py -m 'experiment=soft_arm_1/demo/hnn,soft_arm_1/demo/lnn,soft_arm_1/demo/mlp' hydra.sweep.dir=runs/demo
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' step=0.01 hydra.run.dir=runs/demo-evaluation
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' dataset=soft_arm_1_beyond step=0.01 hydra.run.dir=runs/demo-beyond
-	$(BIN)/python control.py experiment=soft_arm_1/demo run=runs/demo/1_lnn-seed0 hydra.run.dir=runs/demo-control
+	$(BIN)/python control.py experiment=soft_arm_1/demo run=runs/demo/0_hnn-seed0 hydra.run.dir=runs/demo-control
 	$(BIN)/python examples/demo_summary.py runs
 
 reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on where it stopped
