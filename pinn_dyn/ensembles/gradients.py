@@ -33,7 +33,7 @@ class CompiledMembers:
         self.stack = stack
         self._integrator = CompiledDynamics(stack.integrator, stack)
         self._program = LossProgram(loss, stack.template.model)
-        self._evaluations = EvaluationCount(loss, stack.template.model)
+        self._evaluations = EvaluationCount(loss, stack.template.taken_apart(0))
         self._parameters = list(stack.parameters())
 
     def __call__(self, windows: Windows) -> Tensor:

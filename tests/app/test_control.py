@@ -162,7 +162,7 @@ def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
         (["gains.position=[1,2]"], ["controllers.learned", "position_gain"]),
         (["reference.q_low=[0,0]", "reference.q_high=[0,0]"], ["reference"]),
         (["controllers.learned.terms=guess"], ["controllers.learned.terms", "guess", "truth"]),
-        (["delay=-1"], ["Delay", "-1"]),
+        (["delay=-1"], ["delay", "-1"]),
         (["+robot.mass=-1"], ["robot", "mass", "-1"]),
         (["rate=null", "actuator.rate=1.0"], ["rate"]),
         (["rate=null", "delay=1"], ["delay", "rate"]),
@@ -170,7 +170,7 @@ def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
         (["plant=bullet"], ["plant"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
         (["stability={region: x, q_low: [0], q_high: [1], samples: 5}"], ["stability.q_low", "3"]),
-        (["checkpoint=first"], ["first.ckpt", "best"]),
+        (["checkpoint=first"], ["first", "best or last"]),
     ],
     ids=lambda value: value[0] if isinstance(value[0], str) else None,
 )
@@ -267,7 +267,5 @@ def panda_run(tmp_path_factory):
     return folder
 
 
-def test_an_experiment_of_training_is_answered_with_those_of_control(capsys, lnn_run):
-    text = refused(capsys, lnn_run, "experiment=soft_arm_1/hnn")
-    for experiment in EXPERIMENTS:
-        assert experiment in text
+def test_an_experiment_of_training_is_none_of_control(capsys, lnn_run):
+    assert "experiment/soft_arm_1/hnn" in refused(capsys, lnn_run, "experiment=soft_arm_1/hnn")

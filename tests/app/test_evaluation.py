@@ -132,7 +132,7 @@ def test_the_validation_trajectories_are_evaluated_on_request(tmp_path, mlp_run,
 
 def test_an_unknown_split_is_refused(capsys, mlp_run):
     text = refused(capsys, mlp_run, arguments=["split=train"])
-    assert "split: 'train', expected one of test, validation" in text
+    assert "split is 'train', expected test or validation" in text
 
 
 def test_seeds_of_a_model_are_grouped_and_globs_find_them(tmp_path, hnn_run, mlp_run, capsys):
@@ -175,8 +175,7 @@ def test_a_checkpoint_of_another_model_is_refused_with_both_named(
         text = refused(capsys, run)
         assert "another model" in text
         assert str(run / "checkpoints" / "best.ckpt") in text
-        assert "HamiltonianNetwork" in text
-        assert "NextStateMLP" in text
+        assert "config.yaml describes" in text
 
 
 def test_a_checkpoint_of_a_model_that_differs_in_its_activation_is_refused(
@@ -232,15 +231,6 @@ def test_runs_of_different_data_sets_are_refused(tmp_path, hnn_run, capsys):
     assert str(hnn_run) in text
 
 
-def test_runs_with_another_cache_folder_are_of_the_same_data_set(tmp_path, hnn_run, mlp_run, cache):
-    run = copy(mlp_run, tmp_path / "mlp")
-    text = (run / "config.yaml").read_text()
-    assert str(cache) in text
-    (run / "config.yaml").write_text(text.replace(str(cache), str(tmp_path / "cache")))
-    evaluate(tmp_path / "out", hnn_run, run)
-    assert (~pd.read_csv(tmp_path / "out" / "summary.csv")["floor"]).sum() == 2
-
-
 def test_a_horizon_beyond_the_data_is_refused(hnn_run, capsys):
     text = refused(capsys, hnn_run, arguments=["horizon=3"])
     assert "horizon is 3" in text
@@ -257,11 +247,11 @@ def test_horizon_and_windows_fit_the_data_by_themselves(tmp_path, mlp_run):
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
-        ("horizon=nan", "horizon is nan, expected a number of seconds"),
-        ("horizon=long", "horizon is 'long', expected a number of seconds"),
-        ("step=-1", "step is -1, expected a number of seconds"),
-        ("windows=text", "windows is 'text', expected a list of seconds"),
-        ("windows=[0.1,nan]", "windows is [0.1, nan], expected a list of seconds"),
+        ("horizon=nan", "horizon is nan, expected a number above 0 or null"),
+        ("horizon=long", "horizon is 'long', expected a number above 0 or null"),
+        ("step=-1", "step is -1, expected a number above 0 or null"),
+        ("windows=text", "windows is 'text', expected a list"),
+        ("windows=[0.1,nan]", "windows is [0.1, nan], expected a list"),
         ("trajectory=9", "trajectory is 9, expected 0 to 1"),
     ],
 )
@@ -272,7 +262,7 @@ def test_settings_that_no_data_fit_are_refused_by_name(capsys, mlp_run, argument
 
 def test_no_runs_are_refused_by_name(capsys):
     text = refused_text(capsys, "evaluate.py", "runs=[]", "hydra.run.dir=out")
-    assert "runs is empty: give run folders" in text
+    assert "runs is empty, expected run folders" in text
 
 
 @pytest.mark.parametrize("damage", ["config.yaml", "metrics.json", "checkpoints/best.ckpt"])

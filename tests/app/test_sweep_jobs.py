@@ -192,8 +192,6 @@ def test_jobs_side_by_side_simulate_once_lose_one_and_the_others_are_done(tmp_pa
     assert code == 1, said
     assert "1 job failed:\n  sweep/2_lnn-seed0\n    NonFiniteLossError" in said
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 2
-    # The progress bar of a simulation starts once, whichever job came first.
-    assert said.count("[00:00<?") == 1
     assert len(list((tmp_path / "cold").glob("*.npz"))) == 1
 
 

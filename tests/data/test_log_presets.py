@@ -73,10 +73,10 @@ def test_template_in_ten_lines(tmp_path):
         "dataset.q.unit=rad",
         "dataset.u.columns=[u1,u2]",
         "dataset.u.unit=Nm",
-        "dataset.validation.seconds=1.0",
-        "dataset.validation.piece=1.0",
-        "dataset.test.seconds=2.0",
-        "dataset.test.piece=1.0",
+        "++dataset.validation.seconds=1.0",
+        "++dataset.validation.piece=1.0",
+        "++dataset.test.seconds=2.0",
+        "++dataset.test.piece=1.0",
     )
     splits = source.load()
     assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [1, 1, 2]
@@ -102,7 +102,7 @@ def test_neck_with_its_moving_average(neck):
 
 def test_neck_with_polynomials_instead(neck):
     fit = "{_target_: pinn_dyn.data.logs.PolynomialFit, degree: 7, segment: 5.0}"
-    source = preset("neck", *neck, "dataset.steps.smooth=null", f"dataset.steps.fit={fit}")
+    source = preset("neck", *neck, "dataset.steps.smooth=null", f"++dataset.steps.fit={fit}")
     splits = source.load()
     assert {len(item.t) for item in splits.train} == {51}
     assert "degree 7" in source.report

@@ -212,7 +212,7 @@ def test_momenta_are_those_of_the_mass_matrix(source, splits):
     torch.testing.assert_close(windows.p, expected, rtol=0, atol=1e-12)
     item = splits.test[0]
     expected = torch.einsum("bij,bj->bi", source.system.mass_matrix(item.q), item.v)
-    p = item.state("momentum")[:, item.q.shape[1] :]
+    p = item.states("qp")[:, item.q.shape[1] :]
     torch.testing.assert_close(p, expected, rtol=0, atol=1e-12)
 
 

@@ -126,7 +126,7 @@ def test_trajectories_are_sampled_as_asked(splits):
 def test_momenta_are_mass_matrix_times_velocity(splits):
     arm = SoftArm()
     for x in (splits.train[0], splits.validation[0], splits.test[0]):
-        p = x.state("momentum")[:, 3:]
+        p = x.states("qp")[:, 3:]
         expected = (arm.mass_matrix(x.q) @ x.v.unsqueeze(-1)).squeeze(-1)
         torch.testing.assert_close(p, expected, rtol=1e-12, atol=1e-14)
 

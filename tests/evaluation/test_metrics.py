@@ -109,7 +109,7 @@ def test_leaving_the_data_is_by_more_than_their_width():
     """Training data from -1 to 1 and from 0 to 10: left beyond +-3, and below -10 or above 20."""
     t = torch.arange(5.0)
     q = torch.tensor([[-1.0, 0.0], [1.0, 10.0]])
-    train = [Trajectory(t[:2], q, q, q)]
+    train = [Trajectory(q, q, Signal(t[:2], q))]
     inside = torch.tensor([[3.0, 0.0], [-3.0, 0.0], [0.0, 20.0], [0.0, -10.0], [0.0, 5.0]])
     far = inside.clone()
     far[3, 1] = -10.5

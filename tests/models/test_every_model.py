@@ -41,7 +41,8 @@ def test_any_batch_shape_gives_the_same_prediction(kind, batch):
     if batch == ():
         actual, expected = model.predict(x0[2], T, Signal(T, u[2])), expected[2]
     else:
-        actual, expected = model.predict(*windows(batch)[:1], T, windows(batch)[1]), expected
+        x0, u = windows(batch)
+        actual = model.predict(x0, T, Signal(T, u))
         expected = expected.reshape(*batch, 4, 4)
     assert_near(actual, expected, 1e-12)
 
@@ -57,7 +58,8 @@ def test_a_prediction_starts_at_the_initial_state_and_moves(kind):
 
 def test_float32_is_close_to_float64(kind):
     double, single = make_model(kind), make_model(kind).float()
-    expected = double.increments(*windows()[:1], T, windows()[1])
+    x0, u = windows()
+    expected = double.increments(x0, T, Signal(T, u))
     x0, u = windows(dtype=torch.float32)
     actual = single.increments(x0, T, Signal(T, u))
     assert actual.dtype == torch.float32

@@ -177,7 +177,7 @@ def test_generic_bodies_come_from_the_kinematics_alone():
         ("<robot", {}, "not valid XML"),
         (TREE.replace('type="continuous"', 'type="floating"'), {}, "'bend' is 'floating'"),
         (TREE.replace('xyz="1 2 2"', 'xyz="0 0 0"'), {}, "'slide' has the axis"),
-        (TREE.replace('xyz="0.2 0 0.1"', 'xyz="0.2 0"'), {}, "three finite numbers"),
+        (TREE.replace('xyz="0.2 0 0.1"', 'xyz="0.2 0"'), {}, "three numbers"),
     ],
 )
 def test_a_wrong_description_is_refused_by_name(text, settings, message):

@@ -69,7 +69,7 @@ def plain_loop(model, data):
     loss_of = IncrementLoss(data.statistics, model)
     optimizer = torch.optim.AdamW(model.parameters(), weight_decay=1e-5)
     total, losses = EPOCHS * BATCHES, []
-    rise = max(0.05 * total, 2) - 1
+    rise = 0.05 * total - 1
     loader = data.train_dataloader()
     for epoch in range(EPOCHS):
         loader.sampler.set_epoch(epoch)

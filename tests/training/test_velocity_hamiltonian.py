@@ -126,5 +126,5 @@ def test_its_mass_starts_where_that_of_a_lagrangian_network_does():
 
 
 def test_other_coordinates_are_refused():
-    with pytest.raises(ValueError, match=r"coordinates is 'speed'.*'momentum' or 'velocity'"):
+    with pytest.raises(ValueError, match=r"state is 'speed', expected 'qv'.*or 'qp'"):
         make_network("speed")
