@@ -315,7 +315,7 @@ def run_settings(config: dict[str, Any], overrides: list[str]) -> dict[str, Cell
 
     The whole configuration has some hundred values that hardly ever differ. So these are: model,
     data set, the usual ones, and every value or group that was given on the command line, in a
-    sweep too, such as ``model.substeps=2`` and ``model/damping=constant``.
+    sweep too, such as ``model.integrator.substeps=2`` and ``model/damping=constant``.
     """
     flat = flatten(config)
     settings = {

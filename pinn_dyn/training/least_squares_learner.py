@@ -19,7 +19,7 @@ class LeastSquaresLearner(DynamicsLearner):
     """Fits a model by least squares where others take many steps of an optimizer.
 
     So a fit has the run folder, checkpoints, validation and logs of every training. The trainer has
-    ``max_epochs: 1``, ``gradient_clip_val: null`` and one batch of all windows in an epoch.
+    ``steps: 1``, ``validations: 1`` and ``gradient_clip_val: null``; one batch holds all windows.
 
     Args:
         model: what is fitted.
