@@ -128,7 +128,7 @@ def _version(folder: Path) -> str | None:
     try:
         record = json.loads((folder / METRICS).read_text())
         return record.get("pinn_dyn", "0.2 or before")
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return None
 
 
