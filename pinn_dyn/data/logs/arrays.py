@@ -128,7 +128,7 @@ def _add(
     elif value.ndim not in (1, 2):
         unusable[name] = f"has {value.ndim} dimensions"
     else:
-        arrays[name] = value.reshape(len(value), -1)
+        arrays[name] = value if value.ndim == 2 else value[:, None]
 
 
 def _table(
