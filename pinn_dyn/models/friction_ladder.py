@@ -44,6 +44,10 @@ class DriveCoulomb(Friction):
         self.width = PositiveConstants(
             width * v_std, spread, [f"width of the friction of joint {k}" for k in joints]
         )
+        self._add_constants(scales, joints)
+
+    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
+        """What a law of a higher rung has besides level and width."""
 
     def forward(self, v: Tensor) -> Tensor:
         """F(v)."""
@@ -66,20 +70,12 @@ class DriveCoulomb(Friction):
 class AsymmetricCoulomb(DriveCoulomb):
     """F_i(v) = c+_i tanh(v_i / w_i) for v_i > 0, c-_i tanh(v_i / w_i) for v_i < 0.
 
-    A level for each direction, as worn and preloaded gears have.
+    A level for each direction, as worn and preloaded gears have. Arguments as of the rung below.
     """
 
-    def __init__(
-        self,
-        scales: Scales,
-        *,
-        level: float = 0.1,
-        width: float = 0.03,
-        spread: float = 1.0,
-    ):
-        super().__init__(scales, level=level, width=width, spread=spread)
+    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
         # c+ and c- are the level times e^r and e^-r.
-        names = [f"asymmetry of the friction of joint {k + 1}" for k in range(scales.size)]
+        names = [f"asymmetry of the friction of joint {k}" for k in joints]
         self.ratio = PositiveConstants(torch.ones(scales.size), 0.5, names)
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,25 +87,16 @@ class Stribeck(AsymmetricCoulomb):
     """F_i(v) = (c_i + s_i exp(-(v_i / b_i)^2)) tanh(v_i / w_i), c_i by the direction.
 
     Lubrication sets in with speed: friction is larger by s_i > 0 near rest, and falls off at the
-    Stribeck speed b_i. Armstrong-Helouvry, Dupont and Canudas de Wit 1994, sec. 2.
+    Stribeck speed b_i. Armstrong-Helouvry, Dupont and Canudas de Wit 1994, sec. 2. Arguments as of
+    the rungs below.
     """
 
-    def __init__(
-        self,
-        scales: Scales,
-        *,
-        level: float = 0.1,
-        width: float = 0.03,
-        spread: float = 1.0,
-    ):
-        super().__init__(scales, level=level, width=width, spread=spread)
-        joints = [str(k + 1) for k in range(scales.size)]
-        self.rise = PositiveConstants(
-            0.03 * scales.value, 1.0, [f"Stribeck rise of joint {k}" for k in joints]
-        )
-        self.speed = PositiveConstants(
-            0.3 * scales.statistics.v_std, 1.0, [f"Stribeck speed of joint {k}" for k in joints]
-        )
+    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
+        super()._add_constants(scales, joints)
+        rises = [f"Stribeck rise of joint {k}" for k in joints]
+        speeds = [f"Stribeck speed of joint {k}" for k in joints]
+        self.rise = PositiveConstants(0.03 * scales.value, 1.0, rises)
+        self.speed = PositiveConstants(0.3 * scales.statistics.v_std, 1.0, speeds)
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
         level, _ = super()._level(v)

@@ -17,17 +17,17 @@ class DataSourceContract:
     @pytest.fixture
     def source(self) -> DataSource:
         """A small source."""
-        raise NotImplementedError
+        raise NotImplementedError("override this fixture")
 
     @pytest.fixture
     def again(self) -> DataSource:
         """The same source, built anew as another process would."""
-        raise NotImplementedError
+        raise NotImplementedError("override this fixture")
 
     @pytest.fixture
     def changed(self) -> DataSource:
         """A source of other data that has the same class and name."""
-        raise NotImplementedError
+        raise NotImplementedError("override this fixture")
 
     def test_names_units_and_angles_belong_to_the_coordinates_and_inputs(self, source):
         for split in SPLITS:
