@@ -1,6 +1,7 @@
 """Calls of the entry scripts, in this process or another one, on a data set that takes no time."""
 
 import contextlib
+import json
 import logging
 import os
 import re
@@ -10,9 +11,28 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hydra
 import pytest
 
+from pinn_dyn.app.config import CONF
+
 ROOT = Path(__file__).parents[2]
+
+# Set points of control.py in the middle of the tiny data.
+LOW, HIGH = "[-0.2,-0.2,0.15]", "[0.2,0.2,0.3]"
+BOX = f"{{_target_: pinn_dyn.data.InitialStates, q_low: {LOW}, q_high: {HIGH}, v_max: [0, 0, 0]}}"
+SET_POINTS = [
+    "reference=random_set_points",
+    f"reference.q_low={LOW}",
+    f"reference.q_high={HIGH}",
+    f"initial_states={BOX}",
+    "runs=3",
+    "duration=0.05",
+    "settled_after=0.03",
+    "gains.position=5",
+    "gains.velocity=0.5",
+    "animate=false",
+]
 
 TINY_DATA = [
     "dataset.duration=0.2",
@@ -112,3 +132,17 @@ def start_process(script, *arguments, folder, output, **options):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **options,
     )
+
+
+def compose(*overrides):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return hydra.compose("train", overrides=list(overrides))
+
+
+def assert_trained(folder, steps=2):
+    """Weights have been written, and a finite validation error."""
+    assert (folder / "checkpoints" / "best.ckpt").is_file()
+    assert (folder / "checkpoints" / "last.ckpt").is_file()
+    record = json.loads((folder / "metrics.json").read_text())
+    assert record["steps"] == steps
+    assert 0 < record["validation"]["val/error_mean"] < 10

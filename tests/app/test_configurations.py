@@ -1,8 +1,5 @@
 """Every experiment, every model and every head composes and trains through the entry point."""
 
-import json
-
-import hydra
 import pytest
 
 from pinn_dyn.app.config import CONF
@@ -13,12 +10,14 @@ from tests.app.entry import (
     TINY,
     TINY_DATA,
     TINY_TRAINING,
+    assert_trained,
+    compose,
     fails,
     run_script,
     train,
 )
 from tests.app.hardware_logs import write_neck, write_panda
-from tests.data.test_log_presets import LOGS, needs_logs
+from tests.support.recorded_logs import LOGS, needs_logs
 
 # Known mechanics need a rigid robot: the experiments on logs train them.
 MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml") if path.stem != "known")
@@ -37,20 +36,6 @@ VALUES = {
     "damping/fixed": "model.damping.value=[[0.1,0,0],[0,0.1,0],[0,0,0.1]]",
     "potential/chain": "model.angles=[0,1,2]",
 }
-
-
-def compose(*overrides):
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        return hydra.compose("train", overrides=list(overrides))
-
-
-def assert_trained(folder, steps=2):
-    """Weights have been written, and a finite validation error."""
-    assert (folder / "checkpoints" / "best.ckpt").is_file()
-    assert (folder / "checkpoints" / "last.ckpt").is_file()
-    record = json.loads((folder / "metrics.json").read_text())
-    assert record["steps"] == steps
-    assert 0 < record["validation"]["val/error_mean"] < 10
 
 
 def said(error, capsys):

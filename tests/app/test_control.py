@@ -11,27 +11,23 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from pinn_dyn.app.config import CONF, checked, config_folder
 from pinn_dyn.models import LagrangianNetwork
-from tests.app.entry import NO_FIGURES, STRIDE, TINY_TRAINING, refused_text, run_script, train
+from tests.app.entry import (
+    HIGH,
+    LOW,
+    NO_FIGURES,
+    SET_POINTS,
+    STRIDE,
+    TINY_TRAINING,
+    refused_text,
+    run_script,
+    train,
+)
 
 FOLDER = config_folder("control")
 EXPERIMENTS = sorted(
     str(path.relative_to(FOLDER / "experiment").with_suffix(""))
     for path in (FOLDER / "experiment").rglob("*.yaml")
 )
-LOW, HIGH = "[-0.2,-0.2,0.15]", "[0.2,0.2,0.3]"
-BOX = f"{{_target_: pinn_dyn.data.InitialStates, q_low: {LOW}, q_high: {HIGH}, v_max: [0, 0, 0]}}"
-SET_POINTS = [
-    "reference=random_set_points",
-    f"reference.q_low={LOW}",
-    f"reference.q_high={HIGH}",
-    f"initial_states={BOX}",
-    "runs=3",
-    "duration=0.05",
-    "settled_after=0.03",
-    "gains.position=5",
-    "gains.velocity=0.5",
-    "animate=false",
-]
 
 
 def control(folder, run, *arguments):

@@ -12,8 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.models import LagrangianNetwork
-from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
-from tests.app.test_control import SET_POINTS
+from tests.app.entry import NO_FIGURES, SET_POINTS, TINY, refused_text, run_script, train
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,15 @@ import pandas as pd
 import pytest
 from matplotlib.image import imread
 
-from tests.app.entry import NO_FIGURES, ROOT, TINY_TRAINING, fails, run_script
-from tests.app.test_configurations import assert_trained, compose
+from tests.app.entry import (
+    NO_FIGURES,
+    ROOT,
+    TINY_TRAINING,
+    assert_trained,
+    compose,
+    fails,
+    run_script,
+)
 
 EXAMPLES = ROOT / "examples"
 TINY = ["experiment=example_log/lnn", "compile=false", *TINY_TRAINING, NO_FIGURES]

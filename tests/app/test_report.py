@@ -9,8 +9,7 @@ import pytest
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.provenance import command_line, data_hash, provenance
 from pinn_dyn.app.run_folder import read_config
-from tests.app.entry import run_script
-from tests.app.test_control import SET_POINTS
+from tests.app.entry import SET_POINTS, run_script
 from tests.evaluation.report_pages import Page
 
 

@@ -12,8 +12,8 @@ from pinn_dyn.control import Controller, Motion, Plant, Reference
 from pinn_dyn.control.closed_loop import close_loop, close_loop_continuous
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.plants import SystemPlant
-from tests.control.test_plants import Vanishing
 from tests.support.linear import LinearSystem
+from tests.support.vanishing import Vanishing
 
 K_P, K_D = 30.0, 4.0
 

@@ -19,8 +19,7 @@ from pinn_dyn.control.laws import (
 from pinn_dyn.models import NetworkCholesky, Positive
 from pinn_dyn.systems import SoftArm
 from tests.contracts.controller import ControllerContract, states
-from tests.models.builders import make_model, make_structured
-from tests.models.test_equal_terms import InverseOf
+from tests.models.builders import InverseOf, make_model, make_structured
 from tests.support.cart_pole import CartPole
 from tests.support.finite_differences import assert_near
 from tests.support.linear import LinearSystem, unit_masses

@@ -9,31 +9,12 @@ from scipy.integrate import solve_ivp
 
 from pinn_dyn.control import plants
 from pinn_dyn.control.plants import BulletPlant, SystemPlant
-from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
 from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
+from tests.support.vanishing import Vanishing
 
 PANDA = "franka_panda/panda.urdf"
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
-
-
-class Vanishing(MechanicalSystem):
-    """A free mass 1 - q that is gone at q = 1."""
-
-    def __init__(self):
-        super().__init__(num_coordinates=1, num_inputs=1)
-
-    def mass_matrix(self, q):
-        return (1 - q).unsqueeze(-1)
-
-    def potential_energy(self, q):
-        return 0 * q[..., 0]
-
-    def damping_matrix(self, q):
-        return 0 * q.unsqueeze(-1)
-
-    def input_matrix(self, q):
-        return torch.ones_like(q).unsqueeze(-1)
 
 
 def double(values):

@@ -1,6 +1,5 @@
 """The presets: four recorded data sets where they are at hand, and the templates."""
 
-import os
 import re
 from pathlib import Path
 
@@ -13,14 +12,9 @@ from omegaconf import OmegaConf
 from pinn_dyn.data import draw_windows, logs
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, write
+from tests.support.recorded_logs import LOGS, needs_logs
 
 ROOT = Path(__file__).resolve().parents[2]
-LOGS = Path(os.environ.get("PINN_DYN_LOGS", ROOT.parent / "shared" / "data"))
-
-needs_logs = pytest.mark.skipif(
-    not LOGS.is_dir(),
-    reason=f"no recorded logs: set PINN_DYN_LOGS to their folder ({LOGS} does not exist)",
-)
 
 
 def preset(name, *overrides):

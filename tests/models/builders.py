@@ -9,6 +9,7 @@ from pinn_dyn.models import (
     AccelerationMLP,
     Bounded,
     ChainPotential,
+    CholeskyFactor,
     ConstantCholesky,
     ConstantInput,
     CoulombFriction,
@@ -85,6 +86,26 @@ def positive_matrix(n):
 def input_values(n, m):
     """A full N x M matrix."""
     return (0.2 * torch.arange(n * m).reshape(n, m) - 0.5).tolist()
+
+
+class InverseOf(CholeskyFactor):
+    """The Cholesky factor of M(q)^-1 for another head's M(q)."""
+
+    def __init__(self, head):
+        super().__init__()
+        self.head = head
+
+    def factor(self, q):
+        return torch.linalg.cholesky(torch.linalg.inv(self.head.matrix(q)))
+
+    def linearize(self, q):
+        return self.factor(q), (q,)
+
+    def pushforward(self, tape, dq):
+        return torch.func.jvp(self.factor, tape, (dq,))[1]
+
+    def pullback(self, tape, cotangent):
+        return torch.func.vjp(self.factor, *tape)[1](cotangent)[0]
 
 
 def make_structured(

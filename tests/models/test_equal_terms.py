@@ -8,7 +8,6 @@ import torch
 
 from pinn_dyn.mechanics import MechanicalSystem, Signal, rollout
 from pinn_dyn.models import (
-    CholeskyFactor,
     FixedCholesky,
     FixedInput,
     NetworkCholesky,
@@ -16,6 +15,7 @@ from pinn_dyn.models import (
     Positive,
 )
 from tests.models.builders import (
+    InverseOf,
     input_values,
     make_statistics,
     make_structured,
@@ -26,26 +26,6 @@ from tests.support.finite_differences import assert_near
 from tests.support.linear import LinearSystem, exact_solution
 
 T = torch.linspace(0, 0.6, 61, dtype=torch.float64)
-
-
-class InverseOf(CholeskyFactor):
-    """The Cholesky factor of M(q)^-1 for another head's M(q)."""
-
-    def __init__(self, head):
-        super().__init__()
-        self.head = head
-
-    def factor(self, q):
-        return torch.linalg.cholesky(torch.linalg.inv(self.head.matrix(q)))
-
-    def linearize(self, q):
-        return self.factor(q), (q,)
-
-    def pushforward(self, tape, dq):
-        return torch.func.jvp(self.factor, tape, (dq,))[1]
-
-    def pullback(self, tape, cotangent):
-        return torch.func.vjp(self.factor, *tape)[1](cotangent)[0]
 
 
 class HandBuilt(MechanicalSystem):
