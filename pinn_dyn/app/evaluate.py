@@ -38,7 +38,6 @@ from pinn_dyn.evaluation import (
     predict_trajectories,
     predict_windows,
     rollout_metrics,
-    samples_of,
     save,
     spread_figure,
     summary_table,
@@ -50,7 +49,7 @@ from pinn_dyn.evaluation import (
 from pinn_dyn.evaluation.drawing import with_unit
 from pinn_dyn.evaluation.figures import ERROR
 from pinn_dyn.evaluation.report import prediction_report
-from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory, stack
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory, samples_of, stack
 
 log = logging.getLogger(__name__)
 

@@ -34,7 +34,6 @@ from pinn_dyn.evaluation.prediction import (
     Prediction,
     predict_trajectories,
     predict_windows,
-    samples_of,
 )
 from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.evaluation.tables import (
@@ -83,7 +82,6 @@ __all__ = [
     "predict_trajectories",
     "predict_windows",
     "rollout_metrics",
-    "samples_of",
     "save",
     "spread_figure",
     "steady_state_figure",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from pinn_dyn.evaluation.prediction import samples_of
+from pinn_dyn.mechanics import samples_of
 
 LONGEST = 5.0
 """Length of a roll-out in s that is taken where the trajectories are longer."""

@@ -1,38 +1,16 @@
-"""How well constants are known, and how well they explain the inputs of unseen motions."""
+"""How well the data determine the constants of a known mechanism."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import pandas as pd
 import torch
-from torch import Tensor
 
-from pinn_dyn.mechanics import Trajectory, double_copy
+from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.known import KnownMechanics
-from pinn_dyn.training.least_squares import Fit, filtered_motion
+from pinn_dyn.training.least_squares import Fit
 
 _SHARE = 0.5
 """Variance of a direction, as a part of that of the prior, from which the data leave it open."""
-
-
-def input_errors(
-    model: KnownMechanics, trajectories: Sequence[Trajectory], cutoff: float
-) -> Tensor:
-    """Error of the inverse dynamics for each input, as a share of the input's spread, ``(N,)``::
-
-        rms of k^-1 (M a + C v + G + D v + F - o) - u   over   standard deviation of u
-
-    on the motion after a low-pass filter of ``cutoff`` Hz. 1 is no better than the mean input.
-
-    Raises:
-        ValueError: on trajectories that are too short for the filter.
-    """
-    model = double_copy(model)
-    q, v, a, u = filtered_motion(trajectories, cutoff, samples=20_000)
-    with torch.no_grad():
-        found = model.inverse_dynamics(q, v, a) / model.drive_gain()
-    return (found - u).square().mean(0).sqrt() / u.std(0)
 
 
 def constants_table(model: KnownMechanics, fit: Fit) -> pd.DataFrame:

@@ -9,7 +9,14 @@ from torch import Tensor
 
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Signal, Trajectory, double_copy
+from pinn_dyn.mechanics import (
+    ContinuousPredictor,
+    Predictor,
+    Signal,
+    Trajectory,
+    double_copy,
+    samples_of,
+)
 from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop
 
 
@@ -181,25 +188,3 @@ def samples_of_window(window: float, step: float | None, t: Tensor) -> tuple[int
             "multiple of the step"
         )
     return stride, samples
-
-
-def samples_of(name: str, duration: float, t: Tensor) -> int:
-    """How many sample times of t, ``(T,)``, a duration in s holds.
-
-    Raises:
-        ValueError: unless that is a positive integer, and the sample time constant.
-    """
-    steps = t.double().diff()
-    sample_time = float(steps.mean())
-    if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:
-        raise ValueError(
-            f"{name} is {duration} s, but the sample time varies between {float(steps.min()):g} "
-            f"and {float(steps.max()):g} s: {name} needs a constant one, resample the data first"
-        )
-    count = round(duration / sample_time)
-    if count < 1 or abs(duration / sample_time - count) > 1e-3:
-        raise ValueError(
-            f"{name} is {duration} s and the sample time of the data is {sample_time:g} s: "
-            f"expected a {name} that is a positive integer multiple of it"
-        )
-    return count

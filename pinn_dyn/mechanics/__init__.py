@@ -5,7 +5,7 @@ from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor, double_
 from pinn_dyn.mechanics.rollout import rollout
 from pinn_dyn.mechanics.signal import Interpolation, Signal
 from pinn_dyn.mechanics.system import MechanicalSystem, Terms
-from pinn_dyn.mechanics.trajectory import State, Trajectory, stack
+from pinn_dyn.mechanics.trajectory import State, Trajectory, samples_of, stack
 
 __all__ = [
     "RK4",
@@ -21,5 +21,6 @@ __all__ = [
     "Trajectory",
     "double_copy",
     "rollout",
+    "samples_of",
     "stack",
 ]

@@ -139,3 +139,25 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         v=torch.stack([item.v for item in trajectories]),
         input=stacked([item.input for item in trajectories], first.t - first.t[0]),
     )
+
+
+def samples_of(name: str, duration: float, t: Tensor) -> int:
+    """How many sample times of t, ``(T,)``, a duration in s holds.
+
+    Raises:
+        ValueError: unless that is a positive integer, and the sample time constant.
+    """
+    steps = t.double().diff()
+    sample_time = float(steps.mean())
+    if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:
+        raise ValueError(
+            f"{name} is {duration} s, but the sample time varies between {float(steps.min()):g} "
+            f"and {float(steps.max()):g} s: {name} needs a constant one, resample the data first"
+        )
+    count = round(duration / sample_time)
+    if count < 1 or abs(duration / sample_time - count) > 1e-3:
+        raise ValueError(
+            f"{name} is {duration} s and the sample time of the data is {sample_time:g} s: "
+            f"expected a {name} that is a positive integer multiple of it"
+        )
+    return count

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import Predictor, Signal, Trajectory, stack
+from pinn_dyn.mechanics import Predictor, Signal, Trajectory, samples_of, stack
 
 _ROWS = 10_000  # windows of a fit, at most
 _FEATURES = 300  # of a fit, at most
@@ -134,7 +134,7 @@ def fit_linear_rival(
         ValueError: if no number of lags can be fitted; see :class:`LinearRival`.
     """
     truth = stack(list(validation))
-    stride = _stride(truth.t, step)
+    stride = samples_of("step", step, truth.t)
     truth = truth.until(min(truth.duration, step * _STEPS))
     best: tuple[float, LinearRival] | None = None
     reason = "the training data are empty"
@@ -160,7 +160,7 @@ def fit_linear_rival(
 
 def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tensor, Tensor, Tensor]:
     """States s, inputs (u_k, u_{k+1}) and increments x_{k+1} - x_k, a row for each window."""
-    strides = [_stride(item.t, step) for item in train]
+    strides = [samples_of("step", step, item.t) for item in train]
     counts = [len(item.t) - lags * k for item, k in zip(train, strides, strict=True)]
     total = sum(max(count, 0) for count in counts)
     if total < 2:
@@ -199,20 +199,3 @@ def _spread(values: Tensor) -> Tensor:
     spread = values.std(0, correction=0)
     size = values.abs().amax(0)
     return torch.where(spread > 1e-12 * size, spread, 1.0)
-
-
-def _stride(t: Tensor, step: float) -> int:
-    """Samples in a step.
-
-    Raises:
-        ValueError: unless it is an integer multiple of a constant sample time.
-    """
-    sample = t.double().diff()
-    stride = round(step / float(sample.mean()))
-    if stride < 1 or float((sample - step / stride).abs().max()) > 1e-3 * step / stride:
-        raise ValueError(
-            f"step is {step:g} s and the sample times are {float(sample.min()):g} to "
-            f"{float(sample.max()):g} s: expected a step that is an integer multiple of a constant "
-            "sample time"
-        )
-    return stride

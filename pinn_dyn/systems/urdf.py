@@ -211,7 +211,7 @@ def _make_unit(axis: ET.Element | None) -> None:
     if axis is not None and axis.get("xyz") is not None:
         values = np.array(axis.get("xyz", "").split(), dtype=float)
         length = np.linalg.norm(values)
-        if abs(length - 1) > 1e-12:
+        if length > 0 and abs(length - 1) > 1e-12:  # a fixed joint may state 0 0 0
             axis.set("xyz", " ".join(repr(float(x)) for x in values / length))
 
 

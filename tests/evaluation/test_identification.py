@@ -1,11 +1,11 @@
-"""Intervals of constants, directions that stay open, and errors of inverse dynamics."""
+"""Intervals of constants, and directions that stay open."""
 
 import pytest
 import torch
 
-from pinn_dyn.evaluation.identification import constants_table, input_errors, undetermined
+from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.training import Fit
-from tests.support.known import known_model, motion
+from tests.support.known import known_model
 
 
 def fit_with(model, variances):
@@ -39,11 +39,3 @@ def test_open_directions_are_named(model):
     words = undetermined(model, fit_with(model, [open_ones.get(name, 0.01) for name in names]))
     assert [text.split(":")[0] for text in words] == list(open_ones)
     assert "95%" in words[0]
-
-
-def test_a_true_model_explains_its_inputs(model):
-    runs = [motion(model, seconds=2.0)]
-    assert input_errors(model, runs, cutoff=20.0).max() < 0.1
-    with torch.no_grad():
-        model.gain.z += 1
-    assert input_errors(model, runs, cutoff=20.0).max() > 0.2
