@@ -29,6 +29,7 @@ from pinn_dyn.training import (
     DynamicsLearner,
     LeastSquares,
     LeastSquaresLearner,
+    Penalized,
     WholeCheckpoints,
 )
 
@@ -146,6 +147,8 @@ def build_learner(
     ensemble = isinstance(model, Ensemble)
     single = model.member(0) if isinstance(model, Ensemble) else model
     loss = _build("loss", config["loss"], statistics=statistics, model=single)
+    if single.penalized:
+        loss = Penalized(loss)
     optimizer = _build("optimizer", config["optimizer"])
     if isinstance(optimizer, LeastSquares):
         try:

@@ -79,6 +79,11 @@ def control(cfg: DictConfig) -> float:
             f"run: {run.folder} has a force that is not linear in the input (model/input=nonlinear)"
             ", and the control laws invert A(q): train with model/input=network"
         )
+    if model.has_residual:
+        raise ConfigError(
+            f"run: {run.folder} has a residual force (model/residual=network), which the "
+            "control laws cannot invert: train with model/residual=none"
+        )
     learned = double_copy(model)
     source = build_source(run.config)
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}

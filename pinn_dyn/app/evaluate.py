@@ -35,8 +35,10 @@ from pinn_dyn.evaluation import (
     grouped_table,
     left_data,
     member_metrics,
+    part_shares,
     predict_trajectories,
     predict_windows,
+    residual_share,
     rollout_metrics,
     save,
     spread_figure,
@@ -49,7 +51,7 @@ from pinn_dyn.evaluation import (
 from pinn_dyn.evaluation.drawing import with_unit
 from pinn_dyn.evaluation.figures import ERROR
 from pinn_dyn.evaluation.report import prediction_report
-from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory, samples_of, stack
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, Sum, Trajectory, samples_of, stack
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +65,7 @@ _SHOWN = (
     "left_data",
     "left_data_after",
     "torque_share",
+    "residual_share",
     "member_error_mean",
     "member_error_std",
     "spread_over_error",
@@ -146,12 +149,15 @@ def evaluate(cfg: DictConfig) -> float:
         row = RunResult(label, label, None, {}, {"step": grid}, floor=True)
         evaluations.append(_evaluate(floor, row, truth, training.train, stride, config))
     joints = _torque_errors(trained, truth, source)
+    parts = _shares(trained, truth)
     summary = summary_table([item.result for item in evaluations])
     write_table(summary, folder, "summary")
     grouped = grouped_table(summary)
     write_table(grouped, folder, "by_model")
     if len(joints):
         write_table(joints, folder, "torque")
+    if len(parts):
+        write_table(parts, folder, "parts")
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
     (folder / "provenance.json").write_text(
         json.dumps({"config": config, "dataset": runs[0].config["dataset"], **record}, indent=2)
@@ -166,7 +172,7 @@ def evaluate(cfg: DictConfig) -> float:
     trajectories = f"{truth.q.shape[0]} {_SPLITS[split]}"
     print(f"{source.name}: {trajectories}, {config['horizon']:g} s open loop")
     headers = {name: name.removesuffix("_error_mean") for name in summary if "window_" in name}
-    headers |= {"left_data_after": "after", "torque_share": "torque"}
+    headers |= {"left_data_after": "after", "torque_share": "torque", "residual_share": "residual"}
     print(format_table(summary[[name for name in shown if name in summary]], headers))
     verdict = beaten_by_floors(summary)
     notes = ["* best; only a model that beats all in brackets; valid_time and after in s"]
@@ -186,6 +192,7 @@ def evaluate(cfg: DictConfig) -> float:
         input_labels=source.input_labels,
         comparisons=comparisons,
         joints=joints,
+        parts=parts,
         origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
     )
     (folder / "report.html").write_text(report, encoding="utf-8")
@@ -291,6 +298,17 @@ def _torque_errors(
                 break
             item.result.metrics.update(torque_error=found.mean, torque_share=found.share)
             tables.append(found.to_frame(source.labels).assign(run=item.label))
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def _shares(evaluations: list[Evaluation], truth: Trajectory) -> pd.DataFrame:
+    """Give models with a residual force its share; returns what the parts of sums contribute."""
+    tables = []
+    for item in evaluations:
+        if isinstance(item.model, MechanicalSystem) and item.model.has_residual:
+            item.result.metrics["residual_share"] = residual_share(item.model, truth)
+        if isinstance(item.model, Sum):
+            tables.append(part_shares(item.model, truth).assign(run=item.label))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 

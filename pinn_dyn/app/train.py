@@ -49,7 +49,7 @@ from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figu
 from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models import KnownMechanics
+from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.training import Fit, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
@@ -256,6 +256,8 @@ def _take_weights(model: Predictor, folder: Path, trust: tuple[str, ...]) -> Non
         trained = load_run(folder, "best", trust).model
     except ConfigError as error:
         raise ConfigError(f"start_from: {error}") from error
+    if isinstance(model, KnownAndNetwork) and isinstance(trained, KnownMechanics):
+        model = model.known
     try:
         model.load_state_dict(trained.state_dict())
     except RuntimeError as error:

@@ -58,7 +58,12 @@ class ContinuousStack(ContinuousPredictor):
         super().__init__(first.num_coordinates, first.num_inputs, first.state)
         self.integrator = first.integrator
         self.learns_initial_state = first.learns_initial_state
+        self.penalized = first.penalized
         self.template: Template[ContinuousPredictor] = Template(members)
+
+    def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """Of each member, ``(E,)``."""
+        return self.template.mapped(lambda model, *at: model.penalty(*at), q, v, a, u)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """dx/dt of every member, ``(E, *batch, S)``."""

@@ -36,6 +36,7 @@ from pinn_dyn.evaluation.prediction import (
     predict_windows,
 )
 from pinn_dyn.evaluation.run_log import RunDescription
+from pinn_dyn.evaluation.shares import part_shares, residual_share
 from pinn_dyn.evaluation.tables import (
     RunResult,
     beaten_by_floors,
@@ -78,9 +79,11 @@ __all__ = [
     "grouped_table",
     "left_data",
     "member_metrics",
+    "part_shares",
     "pose_strip",
     "predict_trajectories",
     "predict_windows",
+    "residual_share",
     "rollout_metrics",
     "save",
     "spread_figure",

@@ -20,6 +20,7 @@ from pinn_dyn.evaluation.prediction import (
     samples_of_window,
 )
 from pinn_dyn.evaluation.run_log import log_figures
+from pinn_dyn.evaluation.shares import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
@@ -100,6 +101,7 @@ class RolloutValidator:
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
         """Error mean, median, worst and windowed, diverged count, and the seconds that it took.
 
+        With a residual force comes its share, see :func:`.residual_share`.
         Of an ensemble these are of its mean prediction; with them come the mean error and the
         spread of its members.
         """
@@ -113,6 +115,8 @@ class RolloutValidator:
         if prediction.members is not None:
             figures["member_error_mean"] = member_metrics(prediction)["member_error_mean"]
             figures["spread_mean"] = member_metrics(prediction)["spread_mean"]
+        if isinstance(model, MechanicalSystem) and model.has_residual:
+            figures["residual_share"] = residual_share(model, truth.until(self.horizon))
         figures["error_windowed"] = self._windowed(model, truth, prediction)
         return {**figures, "rollout_seconds": time.perf_counter() - start}
 

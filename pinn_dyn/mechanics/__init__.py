@@ -4,6 +4,7 @@ from pinn_dyn.mechanics.integrators import RK4, Integrator, Rosenbrock
 from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor, double_copy
 from pinn_dyn.mechanics.rollout import rollout
 from pinn_dyn.mechanics.signal import Interpolation, Signal
+from pinn_dyn.mechanics.sum import Sum
 from pinn_dyn.mechanics.system import MechanicalSystem, Terms
 from pinn_dyn.mechanics.trajectory import State, Trajectory, samples_of, stack
 
@@ -17,6 +18,7 @@ __all__ = [
     "Rosenbrock",
     "Signal",
     "State",
+    "Sum",
     "Terms",
     "Trajectory",
     "double_copy",

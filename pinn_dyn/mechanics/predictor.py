@@ -26,9 +26,11 @@ class Predictor(nn.Module, abc.ABC):
         state: what the state x ``(*batch, 2N)`` is that it starts from and predicts: ``"qv"`` for
             (q, v), ``"qp"`` for (q, p).
         fixed_step: the one step in s that the model predicts in, or None if it takes any.
+        penalized: whether its freedom costs something in a training, see :meth:`penalty`.
     """
 
     fixed_step: float | None = None
+    penalized: bool = False
 
     def __init__(self, num_coordinates: int, num_inputs: int, state: State = "qv"):
         super().__init__()
@@ -47,6 +49,13 @@ class Predictor(nn.Module, abc.ABC):
 
         ``t`` ``(T,)`` are the times of the solution, s; ``input`` is u, of the same batch.
         """
+
+    def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """A scalar that training adds to the error of prediction, where ``penalized``.
+
+        q, v and a ``(B, N)`` and u ``(B, M)`` are states, accelerations and inputs of the data.
+        """
+        return q.new_zeros(())
 
     @final
     def predict(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:

@@ -31,13 +31,14 @@ class MechanicalSystem(ContinuousPredictor):
 
     Lagrangian form, paper eq. (armdynamics)::
 
-        M(q) dv/dt + C(q, v) v + G(q) + D(q) v + F(v) = A(q) u,      G = dV/dq
+        M(q) dv/dt + C(q, v) v + G(q) + D(q) v + F(v) = A(q) u + r,      G = dV/dq
 
     Hamiltonian form, paper eq. (hamiltonian_dyn), with p = M(q) v::
 
-        dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) v - F(v) + A(q) u,  v = dH/dp
+        dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) v - F(v) + A(q) u + r,  v = dH/dp
 
-    F(v) is dry friction, with v^T F(v) >= 0; it is zero, as in the paper, unless a subclass has it.
+    F(v) is dry friction, with v^T F(v) >= 0, and r(q, v, u) a residual force, what is not
+    mechanical; both are zero, as in the paper, unless a subclass has them (``has_residual``).
 
     Symbols: q configuration ``(*batch, N)``, v velocity ``(*batch, N)``, a acceleration
     ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
@@ -52,6 +53,7 @@ class MechanicalSystem(ContinuousPredictor):
     """
 
     input_affine: bool = True
+    has_residual: bool = False
 
     @abc.abstractmethod
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -81,8 +83,13 @@ class MechanicalSystem(ContinuousPredictor):
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         """The a that solves M(q) a + C(q, v) v + G(q) = force."""
+        mass, bias = self._mass_and_bias(q, v)
+        return spd_solve(mass, force - bias)
+
+    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """M(q) and C(q, v) v + G(q)."""
         bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
-        return spd_solve(self.mass_matrix(q), force - bias)
+        return self.mass_matrix(q), bias
 
     def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
         return matvec(self.damping_matrix(q), v)
@@ -96,6 +103,14 @@ class MechanicalSystem(ContinuousPredictor):
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return matvec(self.input_matrix(q), u)
+
+    def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        return torch.zeros_like(v)
+
+    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """A(q) u + r(q, v, u)."""
+        force = self._input_force(q, u)
+        return force + self._residual_force(q, v, u) if self.has_residual else force
 
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """(dH/dq, dH/dp): dH/dp = M^-1 p = v and dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v."""
@@ -158,15 +173,21 @@ class MechanicalSystem(ContinuousPredictor):
         return 0.5 * matvec(symbols, v.unsqueeze(-2))
 
     @final
-    def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """a = M^-1 (A u - C v - G - D v), ``(*batch, N)``; paper eq. (armdynamics)."""
+    def residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """r(q, v, u), ``(*batch, N)``; it may have any power."""
         self._check(q=q, v=v, u=u)
-        force = self._input_force(q, u) - self.dissipative_force(q, v)
+        return self._residual_force(q, v, u)
+
+    @final
+    def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """a = M^-1 (A u + r - C v - G - D v - F), ``(*batch, N)``; paper eq. (armdynamics)."""
+        self._check(q=q, v=v, u=u)
+        force = self._applied_force(q, v, u) - self.dissipative_force(q, v)
         return self._acceleration(q, v, force)
 
     @final
     def inverse_dynamics(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """tau = M a + C v + G + D v + F, ``(*batch, N)``, the force that gives ``a``."""
+        """tau = M a + C v + G + D v + F, ``(*batch, N)``: the A u + r that gives ``a``."""
         self._check(q=q, v=v, a=a)
         conservative = self._inertial_force(q, v, a) + self._potential_force(q)
         return conservative + self.dissipative_force(q, v)
@@ -195,9 +216,9 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """dE/dt = v^T A u - v^T (D v + F), ``(*batch,)``, W: what enters less what is lost."""
+        """dE/dt = v^T (A u + r) - v^T (D v + F), ``(*batch,)``, W: what enters less losses."""
         self._check(q=q, v=v, u=u)
-        supplied = self._input_force(q, u) - self.dissipative_force(q, v)
+        supplied = self._applied_force(q, v, u) - self.dissipative_force(q, v)
         return (v * supplied).sum(-1)
 
     @final
@@ -212,7 +233,7 @@ class MechanicalSystem(ContinuousPredictor):
         q, p = x.chunk(2, dim=-1)
         self._check(q=q, p=p, u=u)
         grad_q, v = self._hamiltonian_gradient(q, p)
-        force = self._input_force(q, u) - self.dissipative_force(q, v)
+        force = self._applied_force(q, v, u) - self.dissipative_force(q, v)
         return torch.cat([v, force - grad_q], dim=-1)
 
     @final

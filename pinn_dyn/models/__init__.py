@@ -16,13 +16,16 @@ from pinn_dyn.models.input_matrix import (
     FixedInput,
     InputMatrix,
     NetworkInput,
+    NoInput,
     NonlinearInput,
 )
 from pinn_dyn.models.known import KnownMechanics
+from pinn_dyn.models.known_and_network import KnownAndNetwork
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
+from pinn_dyn.models.residual import NetworkResidual, NoResidual, Residual
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
@@ -43,6 +46,7 @@ __all__ = [
     "HamiltonianNetwork",
     "InitialVelocity",
     "InputMatrix",
+    "KnownAndNetwork",
     "KnownMechanics",
     "LagrangianNetwork",
     "LearnedVelocity",
@@ -50,11 +54,15 @@ __all__ = [
     "NetworkCholesky",
     "NetworkInput",
     "NetworkPotential",
+    "NetworkResidual",
     "NextStateMLP",
     "NoFriction",
+    "NoInput",
+    "NoResidual",
     "NonlinearInput",
     "Positive",
     "Positivity",
+    "Residual",
     "Scales",
     "Statistics",
     "Stribeck",

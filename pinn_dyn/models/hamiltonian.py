@@ -10,6 +10,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.friction import NoFriction
+from pinn_dyn.models.residual import NoResidual
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
@@ -70,6 +71,7 @@ class HamiltonianNetwork(StructuredNetwork):
             damping,
             friction,
             input,
+            NoResidual,
             angles,
             integrator,
         )

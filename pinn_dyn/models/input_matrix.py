@@ -158,6 +158,26 @@ class ConstantInput(InputMatrix):
         return value.expand(*q.shape[:-1], *value.shape)
 
 
+class NoInput(InputMatrix):
+    """A = 0: the part of a sum that another part drives.
+
+    Args:
+        scales: of the data.
+    """
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Zero, ``(*batch, N, M)``."""
+        return q.new_zeros(*q.shape[:-1], *self.shape)
+
+    def force(self, q: Tensor, u: Tensor) -> Tensor:
+        """Zero, ``(*batch, N)``."""
+        return torch.zeros_like(q)
+
+    def typical_force(self, u_rms: Tensor) -> Tensor:
+        """The inputs themselves, where there is one for each coordinate."""
+        return u_rms if self.shape[0] == self.shape[1] else super().typical_force(u_rms)
+
+
 class FixedInput(InputMatrix):
     """A = a given constant matrix, not learned.
 

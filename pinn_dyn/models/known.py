@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem
-from pinn_dyn.mechanics.arrays import spd_solve
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.known_constants import (
     Constants,
@@ -212,9 +211,9 @@ class KnownMechanics(MechanicalSystem):
             self.structure.rigid_force(q, rest, rest, self.bodies(), gravity=True) - self.offset()
         )
 
-    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
-        return spd_solve(mass + torch.diag(self.armature()), force + self.offset() - bias)
+        return mass + torch.diag(self.armature()), bias - self.offset()
 
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)

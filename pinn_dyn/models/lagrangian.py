@@ -12,6 +12,7 @@ from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import Tape
+from pinn_dyn.models.residual import NoResidual, ResidualHead
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
     CholeskyHead,
@@ -26,10 +27,10 @@ from pinn_dyn.models.triangular import lower_solve, upper_solve
 class LagrangianNetwork(StructuredNetwork):
     """Lagrangian network with dissipation and a learned input matrix.
 
-    Heads give M = L L^T, V, D = L_D L_D^T, A and a friction F; the acceleration follows from paper
-    eq. (armdynamics), which for L(q, v) = v^T M v / 2 - V reads::
+    Heads give M = L L^T, V, D = L_D L_D^T, A, a friction F and a residual force r; the acceleration
+    follows from paper eq. (armdynamics), which for L(q, v) = v^T M v / 2 - V reads::
 
-        M a = A u - D v - F(v) - G - (dM/dt) v + d(v^T M v / 2)/dq
+        M a = A u + r - D v - F(v) - G - (dM/dt) v + d(v^T M v / 2)/dq
 
     One tangent pass (dL/dt) and one reverse pass (the last term, through |L^T v|^2 / 2) through the
     mass head take the place of the Hessian of the Lagrangian, and two triangular solves with the
@@ -37,7 +38,7 @@ class LagrangianNetwork(StructuredNetwork):
 
     Args:
         statistics: scales of the data.
-        mass, potential, damping, input, friction, initial_velocity: builders of the heads.
+        mass, potential, damping, input, friction, residual, initial_velocity: builders of heads.
         angles: which coordinates are angles; the heads see their sine and cosine.
         integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
             damping outweighs inertia.
@@ -54,6 +55,7 @@ class LagrangianNetwork(StructuredNetwork):
         damping: CholeskyHead,
         input: InputHead,
         friction: FrictionHead = NoFriction,
+        residual: ResidualHead = NoResidual,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
         angles: Sequence[int] = (),
         integrator: Integrator | None = None,
@@ -65,6 +67,7 @@ class LagrangianNetwork(StructuredNetwork):
             damping,
             friction,
             input,
+            residual,
             angles,
             integrator,
         )
@@ -91,6 +94,11 @@ class LagrangianNetwork(StructuredNetwork):
         factor, bias = self._factor_and_coriolis_force(q, v)
         root = self._root(factor)
         return matvec(root.transpose(-1, -2), matvec(root, a)) + bias
+
+    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        factor, bias = self._factor_and_coriolis_force(q, v)
+        root = self._root(factor)
+        return root.transpose(-1, -2) @ root, bias + self._potential_force(q)
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         factor, bias = self._factor_and_coriolis_force(q, v)

@@ -36,6 +36,8 @@ class NetworkPotential(Potential):
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         quadratic: whether the K term is there; false is the paper's plain network.
+        initial: factor of the last layer before training; 0 starts from V = 0 where another part
+            of a sum has a potential.
     """
 
     scale: Tensor
@@ -47,10 +49,13 @@ class NetworkPotential(Potential):
         hidden: Sequence[int],
         activation: str = "softplus",
         quadratic: bool = True,
+        initial: float = 1.0,
     ):
         super().__init__()
         size = scales.size
         self.network = scales.network(1, hidden, activation)
+        with torch.no_grad():
+            self.network.linears[-1].weight.mul_(initial)
         self.register_buffer("scale", scales.value.float())
         quadratic = quadratic and len(set(scales.angles)) < size
         self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None

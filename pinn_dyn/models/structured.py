@@ -11,6 +11,7 @@ from pinn_dyn.models.cholesky import CholeskyFactor
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import Potential
+from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
@@ -25,11 +26,11 @@ FrictionHead = Callable[[Scales], Friction]
 
 
 class StructuredNetwork(MechanicalSystem):
-    """A mechanical system with learned V(q), D(q), F(v) and A(q); subclasses add the mass.
+    """A mechanical system with learned V, D, F, A and residual force; subclasses add the mass.
 
     The scales of the heads come from the data, so that every network works on numbers near one:
     with f the root mean square of the input, A ~ f/u, and with f_i the typical force that this
-    gives on coordinate i, D ~ f_i/v_i, F ~ f_i, V ~ f q.
+    gives on coordinate i, D ~ f_i/v_i, F and r ~ f_i, V ~ f q.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class StructuredNetwork(MechanicalSystem):
         damping: CholeskyHead,
         friction: FrictionHead,
         input: InputHead,
+        residual: ResidualHead,
         angles: Sequence[int],
         integrator: Integrator | None,
     ):
@@ -55,6 +57,8 @@ class StructuredNetwork(MechanicalSystem):
         self.potential = potential(self._scales(statistics, energy))
         self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
         self.friction = friction(self._scales(statistics, force))
+        self.residual = residual(self._scales(statistics, force))
+        self.has_residual = self.penalized = self.residual.learned
 
     def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
         return Scales(statistics, value, self.angles)
@@ -82,6 +86,13 @@ class StructuredNetwork(MechanicalSystem):
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)
+
+    def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        return self.residual(q, v, u)
+
+    def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """Of the residual force."""
+        return self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.potential.gradient(q)

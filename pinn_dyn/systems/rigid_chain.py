@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.mechanics.arrays import matvec, spd_solve
+from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, rod
 from pinn_dyn.systems.rigid_chain_urdf import read_tree
 
@@ -244,9 +244,8 @@ class RigidChain(MechanicalSystem):
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         return self.rigid_force(q, v, a, gravity=False)
 
-    def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        mass, bias = self.mass_and_bias(q, v)
-        return spd_solve(mass, force - bias)
+    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return self.mass_and_bias(q, v)
 
     def _in_world(self, at: Kinematics, inertia: Tensor | None) -> Tensor:
         return at.poses @ (self.inertia if inertia is None else inertia) @ at.poses.mT

@@ -5,7 +5,7 @@ from pinn_dyn.training.fit import fit
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.least_squares import Fit, LeastSquares
 from pinn_dyn.training.least_squares_learner import LeastSquaresLearner
-from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, WindowLoss
+from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, Penalized, WindowLoss
 from pinn_dyn.training.schedule import one_cycle
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "LeastSquaresLearner",
     "MidpointLoss",
     "NonFiniteLossError",
+    "Penalized",
     "WholeCheckpoints",
     "WindowLoss",
     "fit",

@@ -24,6 +24,7 @@ from pinn_dyn.models import (
     NextStateMLP,
     NoFriction,
     NonlinearInput,
+    NoResidual,
     Positive,
     Scales,
     Statistics,
@@ -119,6 +120,7 @@ def make_structured(
     input=None,
     friction=None,
     initial_velocity=None,
+    residual=None,
     angles=(),
     statistics=None,
     integrator=None,
@@ -139,7 +141,10 @@ def make_structured(
     statistics = statistics or make_statistics(n, m)
     if kind == "lnn":
         start = initial_velocity or MeasuredVelocity
-        model = LagrangianNetwork(statistics, mass, initial_velocity=start, **heads)
+        residual = residual or NoResidual
+        model = LagrangianNetwork(
+            statistics, mass, initial_velocity=start, residual=residual, **heads
+        )
     else:
         model = HamiltonianNetwork(statistics, mass, state=state or "qp", **heads)
     return perturb(model.to(dtype))

@@ -39,6 +39,7 @@ _HEADERS = {
     "left_data": "left the data",
     "left_data_after": "first after [s]",
     "torque_share": "torque error / spread",
+    "residual_share": "share of the residual force",
     "training_seconds": "training [s]",
 }
 _GROUP_HEADERS = {
@@ -63,6 +64,7 @@ def prediction_report(
     input_labels: Sequence[str],
     comparisons: Mapping[str, TermComparison],
     joints: pd.DataFrame,
+    parts: pd.DataFrame,
     origin: Origin,
 ) -> str:
     """The page as HTML text.
@@ -79,6 +81,7 @@ def prediction_report(
         comparisons: names of the runs that have terms, and these beside the true ones; empty
             where the truth is not known.
         joints: torque errors, one row per run and joint; empty without any.
+        parts: what the parts of sums contribute, one row per run, part and term; empty without any.
         origin: where the numbers come from.
     """
     floors = set(summary["run"][summary["floor"]])
@@ -94,6 +97,8 @@ def prediction_report(
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
     ]
+    if len(parts):
+        sections.insert(3, Section("Parts", _parts(parts)))
     if len(joints):
         sections.insert(3, Section("Torque", _torques(joints)))
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
@@ -188,6 +193,21 @@ def _torques(joints: pd.DataFrame) -> list[Markup]:
         "its torques well and its motion badly, or the other way round."
     )
     return [paragraph(text), table(joints, headers=headers)]
+
+
+def _parts(parts: pd.DataFrame) -> list[Markup]:
+    headers = {
+        "run": "run",
+        "term": "term",
+        "part": "part",
+        "rms": "RMS of its force",
+        "share": "share of all parts",
+    }
+    text = (
+        "What the parts of a sum contribute along the test motions. A network with a large share "
+        "says that the known mechanics leave something out, or that its constants are not found."
+    )
+    return [paragraph(text), table(parts, headers=headers)]
 
 
 def _terms(comparisons: Mapping[str, TermComparison]) -> list[Markup]:

@@ -2,6 +2,7 @@
 
 from pinn_dyn.training.losses.increment import IncrementLoss
 from pinn_dyn.training.losses.midpoint import MidpointLoss
+from pinn_dyn.training.losses.penalized import Penalized
 from pinn_dyn.training.losses.window_loss import WindowLoss
 
-__all__ = ["IncrementLoss", "MidpointLoss", "WindowLoss"]
+__all__ = ["IncrementLoss", "MidpointLoss", "Penalized", "WindowLoss"]

@@ -1,0 +1,111 @@
+"""Heads for a residual force: none, or a network of everything that a log holds."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.scales import Scales
+
+_REACH = 3.0
+"""Standard deviations of v and u beyond which the network sees no more."""
+
+
+class Residual(nn.Module, abc.ABC):
+    """A generalized force r(q, v, u) ``(*batch, N)`` that no mechanical term can say.
+
+    Attributes:
+        learned: whether there is one.
+    """
+
+    learned: bool
+
+    @abc.abstractmethod
+    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """r, ``(*batch, N)``, at q, v ``(*batch, N)`` and u ``(*batch, M)``."""
+
+    @abc.abstractmethod
+    def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """What r costs at states ``(B, N)`` and inputs ``(B, M)`` of the data, a scalar."""
+
+
+ResidualHead = Callable[[Scales], Residual]
+"""Builds a residual head; the value of its scales is a force."""
+
+
+class NoResidual(Residual):
+    """r = 0: the robot is mechanical, as in the paper.
+
+    Args:
+        scales: of the data.
+    """
+
+    learned = False
+
+    def __init__(self, scales: Scales):
+        super().__init__()
+
+    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Zero."""
+        return torch.zeros_like(v)
+
+    def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Zero."""
+        return v.new_zeros(())
+
+
+class NetworkResidual(Residual):
+    """r_i = f_i network_i(q, v, u), zero before training, and penalized::
+
+        penalty = w mean over the batch and i of (r_i / f_i)^2
+
+    f is a typical generalized force. So r grows only where it buys accuracy that no M, V, D, F or A
+    can: hysteresis, forces that depend on the past, losses of a drive. It may do any work, and is
+    not passive. What the network sees saturates outside the data, so that r is bounded.
+
+    Args:
+        scales: of the data; the value is a typical generalized force, ``(N,)``.
+        hidden: widths of the hidden layers.
+        activation: activation of the hidden layers.
+        weight: w; the loss of the prediction is near one before anything is learned.
+
+    Raises:
+        ValueError: on a negative weight.
+    """
+
+    learned = True
+    scale: Tensor
+
+    def __init__(
+        self,
+        scales: Scales,
+        *,
+        hidden: Sequence[int],
+        activation: str = "tanh",
+        weight: float = 0.01,
+    ):
+        super().__init__()
+        if not weight >= 0:
+            raise ValueError(f"residual: weight is {weight}, expected zero or a positive number")
+        self.weight = weight
+        data, size = scales.statistics, scales.size
+        mean, std = data.network_input(repeat_input=1)
+        low, high = mean - _REACH * std, mean + _REACH * std
+        low[:size], high[:size] = data.q_low, data.q_high
+        self.network = MLP(
+            len(mean), size, hidden, activation, mean, std, scales.angles, limits=(low, high)
+        )
+        nn.init.zeros_(self.network.linears[-1].weight)
+        self.register_buffer("scale", scales.value.float())
+
+    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """r(q, v, u)."""
+        return self.scale * self.network.linearize(torch.cat([q, v, u], dim=-1))[0]
+
+    def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """w mean (r_i / f_i)^2."""
+        return self.weight * (self(q, v, u) / self.scale).square().mean()

@@ -1,0 +1,159 @@
+"""Sums of mechanical systems, and known mechanics with a network on top."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from pinn_dyn.evaluation import part_shares
+from pinn_dyn.mechanics import Sum, stack
+from pinn_dyn.models import (
+    CoulombFriction,
+    DriveCoulomb,
+    KnownAndNetwork,
+    KnownMechanics,
+    LagrangianNetwork,
+    NetworkCholesky,
+    NetworkInput,
+    NetworkPotential,
+    NetworkResidual,
+    NoInput,
+    Positive,
+)
+from pinn_dyn.systems import RigidChain
+from tests.contracts.mechanical_system import MechanicalSystemContract
+from tests.models.builders import make_structured, perturb, random_batch
+from tests.support.finite_differences import assert_near
+from tests.support.known import motion, statistics
+from tests.support.rigid_chains import TREE
+
+SMALL = Positive(floor=0.0, initial=0.1)
+
+
+def network(input=NoInput):
+    return partial(
+        LagrangianNetwork,
+        mass=partial(NetworkCholesky, hidden=[6], positivity=SMALL),
+        potential=partial(NetworkPotential, hidden=[6], quadratic=False, initial=0.0),
+        damping=partial(NetworkCholesky, hidden=[6], positivity=SMALL),
+        input=input,
+    )
+
+
+def known(**settings):
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    return partial(KnownMechanics, structure=chain, friction=DriveCoulomb, **settings)
+
+
+def both(**settings):
+    part = known(gain_spread=0.5, drive_gain=2.0)
+    return KnownAndNetwork(statistics(4), part, network(), **settings)
+
+
+def exact(model):
+    """The model is built in single precision, in which rotations are no longer exact."""
+    model.known.structure = RigidChain(TREE, locked_joints=["wrist"])
+    return model
+
+
+class TestSum(MechanicalSystemContract):
+    """Of two networks with all terms."""
+
+    @pytest.fixture
+    def system(self):
+        parts = {
+            "one": make_structured("lnn"),
+            "other": perturb(make_structured("hnn", state="qv", friction=CoulombFriction), seed=5),
+        }
+        return Sum(parts)
+
+
+class TestKnownAndNetwork(MechanicalSystemContract):
+    @pytest.fixture
+    def system(self):
+        return exact(perturb(both().double(), spread=0.2))
+
+
+def test_the_terms_add():
+    one, other = make_structured("lnn"), perturb(make_structured("lnn"), seed=5)
+    total = Sum({"one": one, "other": other})
+    q, v, _, u = random_batch(3, 3)
+    for found, a, b in zip(total.terms(q), one.terms(q), other.terms(q), strict=True):
+        assert_near(found, a + b, 1e-12)
+    coriolis = one.coriolis_matrix(q, v) + other.coriolis_matrix(q, v)
+    assert_near(total.coriolis_matrix(q, v), coriolis, 1e-9)
+    supplied = one.power(q, v, u) + other.power(q, v, u)
+    assert_near(total.power(q, v, u), supplied, 1e-9)
+
+
+def test_the_network_hardly_changes_the_known_mechanics_before_training():
+    model = both().double()
+    q, v, a, _ = random_batch(4, 4)
+    network = model.parts["network"]
+    assert not network.potential_force(q).any()
+    assert not network.input_matrix(q).any()
+    share = network.inverse_dynamics(q, v, a).norm() / model.force.norm()
+    assert 0 < float(share) < 0.1
+
+
+def test_scales_of_the_network_are_those_of_torques():
+    """Twice the drive gain, twice the torques that its terms start from."""
+    q = random_batch(4, 4, dtype=torch.float32)[0]
+    models = []
+    for gain in (2.0, 4.0):
+        torch.manual_seed(0)
+        models.append(KnownAndNetwork(statistics(4), known(drive_gain=gain), network()))
+    one, two = models
+    assert torch.allclose(two.force, 2 * one.force)
+    mass = [model.parts["network"].mass_matrix(q) for model in models]
+    assert torch.allclose(mass[1], 2 * mass[0], rtol=1e-4)
+
+
+def test_what_the_network_contributes_is_penalized():
+    residual = partial(NetworkResidual, hidden=[4], weight=0.7)
+    model = perturb(both(weight=0.3, residual=residual).double())
+    q, v, a, u = random_batch(4, 4)
+    part = model.parts["network"]
+    tau = part.mass_matrix(q) @ a[..., None] + part.coriolis_matrix(q, v) @ v[..., None]
+    tau = tau[..., 0] + part.potential_force(q) + part.dissipative_force(q, v)
+    r = model.residual_force(q, v, u)
+    expected = 0.3 * ((tau / model.force) ** 2).mean() + 0.7 * ((r / model.force) ** 2).mean()
+    assert float(r.abs().max()) > 0
+    assert_near(model.penalty(q, v, a, u), expected, 1e-9)
+
+
+def test_what_each_part_contributes():
+    model = perturb(both().double(), spread=0.2)
+    truth = stack([motion(model, seconds=0.5)])
+    table = part_shares(model, truth).set_index(["part", "term"])
+    q = truth.q[0]
+    sizes = {
+        name: float((part.potential_force(q) ** 2).sum(-1).mean().sqrt().detach())
+        for name, part in model.parts.items()
+    }
+    for name, size in sizes.items():
+        assert table.loc[name, "G"].rms == pytest.approx(size, rel=1e-6)
+        assert table.loc[name, "G"].share == pytest.approx(size / sum(sizes.values()))
+    assert table.groupby("term").share.sum().tolist() == pytest.approx([1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: both(weight=-1.0), "weight is -1.0, expected zero"),
+        (
+            lambda: KnownAndNetwork(
+                statistics(4), known(), network(partial(NetworkInput, hidden=[4]))
+            ),
+            "network.input gives an input matrix, expected none",
+        ),
+        (
+            lambda: Sum({"a": make_structured("lnn", 2, 2), "b": make_structured("lnn", 3, 3)}),
+            r"the parts of a sum have \(N, M\) a: \(2, 2\), b: \(3, 3\)",
+        ),
+        (lambda: Sum({}), "the parts of a sum have .* none"),
+    ],
+)
+def test_a_sum_that_cannot_be_is_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
