@@ -76,8 +76,9 @@ def control(cfg: DictConfig) -> float:
         )
     if not model.input_affine:
         raise ConfigError(
-            f"run: {run.folder} has a force that is not linear in the input (model/input=nonlinear)"
-            ", and the control laws invert A(q): train with model/input=network"
+            f"run: {run.folder} has a force that is not linear in the input (model/input=nonlinear "
+            "or model/friction=load_dependent), and the control laws invert A(q): train with "
+            "model/input=network, or another friction"
         )
     if model.has_residual:
         raise ConfigError(

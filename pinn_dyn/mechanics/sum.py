@@ -79,6 +79,9 @@ class Sum(MechanicalSystem):
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self._total(lambda part: part._input_force(q, u))
 
+    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        return self._total(lambda part: part._applied_force(q, v, u))
+
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return self._total(lambda part: part._residual_force(q, v, u))
 

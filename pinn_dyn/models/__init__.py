@@ -8,7 +8,7 @@ from pinn_dyn.models.cholesky import (
     NetworkCholesky,
 )
 from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
-from pinn_dyn.models.friction_ladder import AsymmetricCoulomb, DriveCoulomb, Stribeck
+from pinn_dyn.models.friction_ladder import AsymmetricCoulomb, DriveCoulomb, LoadDependent, Stribeck
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
 from pinn_dyn.models.initial_velocity import InitialVelocity, LearnedVelocity, MeasuredVelocity
 from pinn_dyn.models.input_matrix import (
@@ -50,6 +50,7 @@ __all__ = [
     "KnownMechanics",
     "LagrangianNetwork",
     "LearnedVelocity",
+    "LoadDependent",
     "MeasuredVelocity",
     "NetworkCholesky",
     "NetworkInput",

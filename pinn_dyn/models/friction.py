@@ -12,11 +12,21 @@ from pinn_dyn.models.scales import Scales
 
 
 class Friction(nn.Module, abc.ABC):
-    """A dissipative force F(v) ``(*batch, N)`` beside D(q) v, with v^T F(v) >= 0."""
+    """A dissipative force F(v) ``(*batch, N)`` beside D(q) v, with v^T F(v) >= 0.
+
+    Attributes:
+        by_load: whether a drive loses more under load, see :meth:`transmitted`.
+    """
+
+    by_load: bool = False
 
     @abc.abstractmethod
     def forward(self, v: Tensor) -> Tensor:
         """F(v), ``(*batch, N)``, at v ``(*batch, N)``."""
+
+    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
+        """What of the force of a drive arrives at the joint, ``(*batch, N)``; here all of it."""
+        return force
 
     @abc.abstractmethod
     def slope(self, v: Tensor) -> Tensor:

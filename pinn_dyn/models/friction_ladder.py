@@ -103,3 +103,28 @@ class Stribeck(AsymmetricCoulomb):
         speed = self.speed()
         rise = self.rise() * torch.exp(-((v / speed) ** 2))
         return level + rise, -2 * v / speed**2 * rise
+
+
+class LoadDependent(Stribeck):
+    """Stribeck friction, and a loss that grows with the force f_i of the drive::
+
+        F_i(v) as below,     transmitted_i = f_i - l_i |f_i| tanh(v_i / w_i)
+
+    Teeth that transmit more press harder on each other: l_i, between 0 and 1, is the part of the
+    force that gets lost while the drive moves; driven backwards the gear takes as much more. Since
+    v_i l_i |f_i| tanh(v_i / w_i) >= 0 it only takes energy. Models M3 to M6 of Duclusaud et al.
+    2025, "Extended friction models for the physics simulation of servo actuators" (BAM). Arguments
+    as of the rungs below.
+    """
+
+    by_load = True
+
+    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
+        super()._add_constants(scales, joints)
+        names = [f"loss by load of joint {k}" for k in joints]
+        self.odds = PositiveConstants(torch.full((scales.size,), 0.05), 1.0, names)
+
+    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
+        """f - l |f| tanh(v / w), with l = odds / (1 + odds)."""
+        odds = self.odds()
+        return force - odds / (1 + odds) * force.abs() * torch.tanh(v / self._width())

@@ -63,12 +63,13 @@ class Named(NamedTuple):
 class KnownMechanics(MechanicalSystem):
     """Rigid bodies with known kinematics, on drives; all constants are learned::
 
-        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = diag(k) u
+        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = T(v, diag(k) u)
 
-    M, C and G of the ``structure`` with bodies of learned pseudo-inertia; r armature (inertia of
-    the rotors, seen at the joint), o constant torque (a potential -o^T q), D = diag(d) viscous and
-    F dry friction, k drive gains from the input to the torque: Nm/A where currents are logged.
-    Every value of the parameters is a physical robot: bodies of positive density, r, d, k > 0.
+    T is the force k u, or what a gear with friction by load transmits of it. M, C and G of the
+    ``structure`` with bodies of learned pseudo-inertia; r armature (inertia of the rotors, seen at
+    the joint), o constant torque (a potential -o^T q), D = diag(d) viscous and F dry friction, k
+    drive gains from the input to the torque: Nm/A where currents are logged. Every value of the
+    parameters is a physical robot: bodies of positive density, r, d, k > 0.
 
     Each parameter is a standard normal variate a priori (:mod:`.known_constants`). The scales of
     the drives come from the data: with f_i the typical torque k_i u_i, d ~ f/v, F and o ~ f and
@@ -132,6 +133,7 @@ class KnownMechanics(MechanicalSystem):
         self.viscous = PositiveConstants(damping, 1.5, [f"viscous friction of {n}" for n in names])
         self.offset = RealConstants(0.3 * force, [f"torque offset of {name}" for name in names])
         self.friction = friction(Scales(statistics, force))
+        self.input_affine = not self.friction.by_load
         self.gain: PositiveConstants | None = None
         if gain_spread > 0:
             self.gain = PositiveConstants(gain, gain_spread, [f"drive gain of {n}" for n in names])
@@ -166,13 +168,13 @@ class KnownMechanics(MechanicalSystem):
         return self.structure.parameters_of(self.bodies())
 
     def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """r a + D v + F(v) - o - k u, ``(*batch, N)``: what is not of the bodies, on one side.
+        """r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``: all but the bodies, on one side.
 
         The equation of motion is Y pi + drive force = 0. The drive of a joint depends on the
         constants of that joint alone.
         """
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
-        return resistance - self.offset() - self.drive_gain() * u
+        return resistance - self.offset() - self.friction.transmitted(v, self.drive_gain() * u)
 
     def _constants(self) -> Iterator[Constants]:
         parts: Iterator[nn.Module] = self.modules()
@@ -200,6 +202,9 @@ class KnownMechanics(MechanicalSystem):
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.drive_gain() * u
+
+    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        return self.friction.transmitted(v, self._input_force(q, u))
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)

@@ -84,5 +84,9 @@ class KnownAndNetwork(Sum):
         share = network.inverse_dynamics(q, v, a) / self.force
         return self.weight * share.square().mean() + self.residual.penalty(q, v, u)
 
+    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        force = super()._applied_force(q, v, u)
+        return force + self.residual(q, v, u) if self.has_residual else force
+
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return self.residual(q, v, u)

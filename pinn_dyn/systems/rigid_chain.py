@@ -198,22 +198,22 @@ class RigidChain(MechanicalSystem):
         """Pseudo-inertias ``(N, 4, 4)`` from the kinematics alone: a rod for each body.
 
         It goes from the body's joint to its farthest next one, or, at the end of the chain and
-        where both coincide, along the joint's axis by the mean length of the others (0.1 m if there
-        are none); its radius is a sixth of its length.
+        where that is nearer than half the mean distance, along the joint's axis by the mean
+        distance (0.1 m if there is none). Its radius is a sixth of that mean: a housing is no
+        lighter where its joints' frames happen to coincide.
         """
         starts = self._placements[0, :, :3, 3].double()
         ends: list[Tensor | None] = []
         for k in range(self.num_coordinates):
             behind = [starts[j] for j, parent in enumerate(self.parents) if parent == k]
             farthest = max(behind, key=lambda p: float(p.norm()), default=None)
-            ends.append(farthest if farthest is not None and farthest.norm() > 0.02 else None)
-        lengths = [float(end.norm()) for end in ends if end is not None]
+            ends.append(farthest)
+        lengths = [float(end.norm()) for end in ends if end is not None and end.norm() > 0.02]
         usual = sum(lengths) / len(lengths) if lengths else 0.1
         bodies = []
         for end, axis in zip(ends, self._axes.double(), strict=True):
-            end = usual * axis if end is None else end
-            radius = float(end.norm()) / 6
-            bodies.append(rod(torch.zeros_like(end), end, radius=radius, density=density))
+            end = usual * axis if end is None or end.norm() < usual / 2 else end
+            bodies.append(rod(torch.zeros_like(end), end, radius=usual / 6, density=density))
         return torch.stack(bodies)
 
     # The contract of a mechanical system.

@@ -212,7 +212,8 @@ def _evaluate(
         vector_to_parameters(torch.from_numpy(z), model.parameters())
         found = residuals(derivative)
     bad = 0.0 if derivative else _BROKEN
-    return np.nan_to_num(found.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
+    values = np.nan_to_num(found.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
+    return values if derivative else values.clip(-_BROKEN, _BROKEN)
 
 
 def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:

@@ -63,7 +63,7 @@ class Sensitivity:
             sensitivity = state[..., 2 * size :].unflatten(-1, (2 * size, count))
             a = model.forward_dynamics(q, v, u)
             by_z = self.force(model.structure.regressor(q, v, a), v, a, u)
-            change = self._by_state(q, v, a) @ sensitivity + by_z
+            change = self._by_state(q, v, a, u) @ sensitivity + by_z
             factor = torch.linalg.cholesky_ex(model.mass_matrix(q))[0]
             rates = [sensitivity[..., size:, :], -torch.cholesky_solve(change, factor)]
             return torch.cat([v, a, torch.cat(rates, dim=-2).flatten(-2)], dim=-1)
@@ -76,12 +76,13 @@ class Sensitivity:
             )
         return path[:, 1:, 2 * size :].unflatten(-1, (2 * size, count))
 
-    def _by_state(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+    def _by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """de/d(q, v), ``(*batch, N, 2N)``: one reverse pass through N copies of the states."""
-        size = q.shape[-1]
+        size, model = q.shape[-1], self.model
         copies = [x.expand(size, *x.shape).clone().requires_grad_() for x in (q, v)]
         with torch.enable_grad():
-            force = self.model.inverse_dynamics(copies[0], copies[1], a.expand(size, *a.shape))
+            needed = model.inverse_dynamics(copies[0], copies[1], a.expand(size, *a.shape))
+            force = needed - model.friction.transmitted(copies[1], model.drive_gain() * u)
             picked = force.diagonal(dim1=0, dim2=-1).sum()
             slopes = torch.autograd.grad(picked, copies)
         return torch.cat(slopes, dim=-1).movedim(0, -2)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pinn_dyn.models import AsymmetricCoulomb, DriveCoulomb, KnownMechanics, Stribeck
+from pinn_dyn.models import AsymmetricCoulomb, DriveCoulomb, KnownMechanics, LoadDependent, Stribeck
 from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters
@@ -11,7 +11,7 @@ from tests.contracts.mechanical_system import MechanicalSystemContract
 from tests.support.known import known_model, statistics, unit_scales
 from tests.support.rigid_chains import TREE
 
-LADDER = [DriveCoulomb, AsymmetricCoulomb, Stribeck]
+LADDER = [DriveCoulomb, AsymmetricCoulomb, Stribeck, LoadDependent]
 
 
 def anywhere(module, std=1.0, seed=0):
@@ -109,6 +109,32 @@ def test_each_rung_has_what_its_name_says():
     stribeck = Stribeck(unit_scales(1), width=0.001).double()
     slow = torch.tensor([[0.05]]).double()
     assert float(stribeck(slow)) > float(stribeck(fast[:1]))
+
+
+def test_a_loaded_gear_transmits_less_forwards_and_takes_more_backwards():
+    friction = LoadDependent(unit_scales(1), width=0.001).double()
+    share = 0.05 / 1.05
+    driven = friction.transmitted(torch.tensor([[5.0], [-5.0], [0.0]]).double(), torch.ones(3, 1))
+    assert driven.flatten().tolist() == pytest.approx([1 - share, 1 + share, 1.0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_load_only_takes_energy(seed):
+    model = anywhere(known_model(friction=LoadDependent, gain_spread=0.5), std=0.7, seed=seed)
+    q, v, u = (5 * torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(seed))).double()
+    entering = (v * model.drive_gain() * u).sum(-1)
+    lost = (v * model.dissipative_force(q, v)).sum(-1)
+    assert (model.power(q, v, u) <= entering - lost).all()
+    assert not model.input_affine
+
+
+def test_the_motion_obeys_the_equation_with_load():
+    model = anywhere(known_model(friction=LoadDependent, gain_spread=0.5), std=0.3)
+    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(1)).double()
+    a = model.forward_dynamics(q, v, u)
+    bodies = model.structure.regressor(q, v, a) @ model.body_parameters().flatten()
+    left = bodies + model.drive_force(v, a, u)
+    assert float(left.abs().max()) < 1e-9 * float(bodies.abs().max())
 
 
 def test_names_and_units_of_all_constants():

@@ -7,13 +7,14 @@ import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.mechanics import RK4
+from pinn_dyn.models import LoadDependent, Stribeck
 from pinn_dyn.training.sensitivity import Sensitivity
 from tests.support.known import known_model, windows_of
 
 
-@pytest.fixture
-def model():
-    model = known_model(gain_spread=0.3)
+@pytest.fixture(params=[Stribeck, LoadDependent])
+def model(request):
+    model = known_model(gain_spread=0.3, friction=request.param)
     generator = torch.Generator().manual_seed(3)
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.3, generator=generator)
@@ -44,7 +45,8 @@ def test_the_force_and_the_gains_by_the_parameters(model):
     regressor = model.structure.regressor(q, v, a)
 
     def force():
-        return model.inverse_dynamics(q, v, a) - model.drive_gain() * u
+        driven = model.friction.transmitted(v, model.drive_gain() * u)
+        return model.inverse_dynamics(q, v, a) - driven
 
     sensitivity = Sensitivity(model)
     assert_close(sensitivity.force(regressor, v, a, u), differences(model, force))
