@@ -50,7 +50,7 @@ from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
-from pinn_dyn.training import Fit, LeastSquaresLearner
+from pinn_dyn.training import COVARIANCE, Fit, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
 
@@ -205,6 +205,9 @@ def train_in(
     if config.get("start_from") and last is None:
         _take_weights(model, Path(config["start_from"]), trust)
     learner = build_learner(config, model, statistics, validator)
+    if isinstance(learner, LeastSquaresLearner) and config.get("start_from"):
+        saved = read_checkpoint(Path(config["start_from"]) / CHECKPOINTS / "best.ckpt")
+        learner.covariance = saved.get(COVARIANCE)
     description = describe(folder, config)
     trainer = build_trainer(config, folder, data.source, validator, description)
     check_processes(trainer, config["data"]["batch_size"])

@@ -24,6 +24,10 @@ log = logging.getLogger(__name__)
 _MOST_PARAMETERS = 500
 _FIRST_NOISE = 0.1
 """Of the normalized residuals, before any are known."""
+_REST = 0.05
+"""Part of a joint's typical speed below which it counts as at rest."""
+_CHANGED = 5.0
+"""Standard deviation of the parameters of a changed body: a payload may outweigh its link."""
 _BROKEN = 1e4
 """Residual of a roll-out that breaks down."""
 
@@ -37,13 +41,20 @@ class Motion(NamedTuple):
     u: Tensor
 
 
+class Prior(NamedTuple):
+    """What is known of the parameters before: their mean ``(P,)``, and a root of P ``(P, P)``."""
+
+    mean: Tensor
+    root: Tensor
+
+
 @dataclass(frozen=True)
 class Fit:
     """What a least-squares fit found.
 
     Attributes:
         covariance: of the standardized parameters z, ``(P, P)``, prior included.
-        information: of z from the data alone, ``(P, P)``: the prior's is the identity.
+        information: of z from the data alone, ``(P, P)``.
         residual: root mean square of the normalized data residuals.
         iterations: of Gauss-Newton.
     """
@@ -57,15 +68,18 @@ class Fit:
 class LeastSquares:
     """Maximum a posteriori fit by Gauss-Newton (a trust region, ``scipy.optimize``)::
 
-        min over z of  |r(z)|^2 / s^2 + |z|^2
+        min over z of  |r(z)|^2 / s^2 + (z - z_0)^T P (z - z_0)
 
-    z are the standardized parameters of the model, so |z|^2 is its prior. Two stages, each started
-    where the one before ended:
+    z are the standardized parameters of the model, so z_0 = 0 and P = 1 is its prior. After an
+    earlier fit z_0 is what that found and P the inverse of its covariance, but for the bodies that
+    have ``changed`` since: a payload is learned from seconds, as all the rest is known. Two stages,
+    each started where the one before ended:
 
     1. inverse dynamics: r = k^-1 (M a + C v + G + D v + F - o) - u, each input in units of its
        spread, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
-       same filter on q, v, a and u leaves a linear law as it is. This is the classical
-       identification, here with bodies that stay physical;
+       same filter on q, v, a and u leaves a linear law as it is. A joint at rest is left out, as
+       dry friction may then have any value up to its level. This is the classical identification,
+       here with bodies that stay physical;
     2. roll-outs: r = predicted less measured increments of the windows, each in units of its
        spread, as of the loss of increments. Derivatives by forward mode through the integrator.
 
@@ -80,6 +94,7 @@ class LeastSquares:
         evaluations: most evaluations of the residuals in a stage.
         chunk: windows whose derivatives are rolled out at once; bounds the memory.
         velocity_weight: weight of the velocity half in the roll-outs, as of the loss.
+        changed: bodies that are others than in the earlier fit, and free again.
 
     Raises:
         ValueError: on a cutoff, samples, evaluations, chunk or weight that is not positive.
@@ -94,6 +109,7 @@ class LeastSquares:
         evaluations: int = 15,
         chunk: int = 500,
         velocity_weight: float = 1.0,
+        changed: Sequence[str] = (),
     ):
         settings = {"cutoff": cutoff, "samples": samples, "evaluations": evaluations}
         settings |= {"chunk": chunk, "velocity_weight": velocity_weight}
@@ -106,9 +122,14 @@ class LeastSquares:
         self.evaluations = evaluations
         self.chunk = chunk
         self.velocity_weight = velocity_weight
+        self.changed = list(changed)
 
     def fit(
-        self, model: KnownMechanics, trajectories: Sequence[Trajectory], windows: Windows
+        self,
+        model: KnownMechanics,
+        trajectories: Sequence[Trajectory],
+        windows: Windows,
+        covariance: Tensor | None = None,
     ) -> Fit:
         """Fit the model in place; it comes back in the precision it had.
 
@@ -116,10 +137,12 @@ class LeastSquares:
             model: what is fitted.
             trajectories: the training trajectories, for the inverse dynamics.
             windows: the training windows, for the roll-outs.
+            covariance: of the z that the model has from an earlier fit, ``(P, P)``, if any.
 
         Raises:
-            ValueError: on a model without parameters or with more than 500, or trajectories that
-                are too short for the filter.
+            ValueError: on a model without parameters or with more than 500, trajectories that are
+                too short for the filter, or changed bodies that the model does not have, or without
+                an earlier fit.
         """
         count = sum(p.numel() for p in model.parameters())
         if not 0 < count <= _MOST_PARAMETERS:
@@ -129,29 +152,60 @@ class LeastSquares:
             )
         precision = next(model.parameters()).dtype
         model.double()
-        found = self._identify(model, filtered_motion(trajectories, self.cutoff, self.samples))
+        prior = self._prior(model, covariance)
+        motion = filtered_motion(trajectories, self.cutoff, self.samples)
+        found = self._identify(model, prior, motion)
         if self.rollouts:
-            found = self._roll_out(model, windows.to(torch.device("cpu"), torch.float64))
+            found = self._roll_out(model, prior, windows.to(torch.device("cpu"), torch.float64))
         model.to(precision)
         return found
 
-    def _identify(self, model: KnownMechanics, motion: Motion) -> Fit:
+    def _prior(self, model: KnownMechanics, covariance: Tensor | None) -> Prior:
+        z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()
+        if covariance is None:
+            if self.changed:
+                raise ValueError(
+                    f"least squares: changed is {self.changed}, but there is no earlier fit that "
+                    "they have changed since: name its run, start_from=<run>"
+                )
+            return Prior(0 * z, torch.eye(len(z)).to(z))
+        bodies = model.structure.body_names
+        if unknown := [body for body in self.changed if body not in bodies]:
+            raise ValueError(
+                f"least squares: changed names {', '.join(unknown)}, expected some of the bodies "
+                f"{', '.join(bodies)}"
+            )
+        if covariance.shape != (len(z), len(z)):
+            raise ValueError(
+                f"the earlier fit has {len(covariance)} constants, this model {len(z)}: take the "
+                "friction and the drive gains of that run"
+            )
+        others = tuple(f" of {body}" for body in self.changed)
+        free = torch.tensor([name.endswith(others) for name in names])
+        held = ~free
+        spread = torch.where(
+            held[:, None] & held, covariance.to(z), torch.diag(_CHANGED**2 * free.to(z))
+        )
+        return Prior(z, torch.linalg.cholesky(torch.linalg.inv(spread)).mT)
+
+    def _identify(self, model: KnownMechanics, prior: Prior, motion: Motion) -> Fit:
         q, v, a, u = motion
         regressor, spread = model.structure.regressor(q, v, a), u.std(0)
+        moves = v.abs() > _REST * v.std(0)
 
         def residuals(derivative: bool) -> Tensor:
             gain = model.drive_gain()
             error = regressor @ model.body_parameters().flatten() + model.drive_force(v, a, u)
-            found = error / gain / spread
             if not derivative:
-                return found
+                return (error / gain / spread)[moves]
             slope = Sensitivity(model)
             by_gain = (error / gain).unsqueeze(-1) * slope.gain()
-            return (slope.force(regressor, v, a, u) - by_gain) / (gain * spread).unsqueeze(-1)
+            found = (slope.force(regressor, v, a, u) - by_gain) / (gain * spread).unsqueeze(-1)
+            return found[moves]
 
-        return self._solve("inverse dynamics", model, residuals, correlated=1)
+        return self._solve("inverse dynamics", model, prior, residuals, correlated=1)
 
-    def _roll_out(self, model: KnownMechanics, windows: Windows) -> Fit:
+    def _roll_out(self, model: KnownMechanics, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
         scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
         x0, measured = windows.start("qv"), windows.increments("qv")
@@ -165,12 +219,13 @@ class LeastSquares:
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
-        return self._solve("roll-outs", model, residuals, correlated=measured.shape[1])
+        return self._solve("roll-outs", model, prior, residuals, correlated=measured.shape[1])
 
     def _solve(
         self,
         stage: str,
         model: KnownMechanics,
+        prior: Prior,
         residuals: Callable[[bool], Tensor],
         *,
         correlated: int,
@@ -181,16 +236,18 @@ class LeastSquares:
         ``(..., R, P)``; ``correlated`` of them count as one.
         """
         z = parameters_to_vector(model.parameters()).detach()
+        mean, root = prior.mean.numpy(), prior.root.numpy()
         noise, steps = _FIRST_NOISE, 0
         for _ in range(2):
             weight = 1 / (noise * correlated**0.5)
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
-                return np.concatenate([weight * _evaluate(model, at, residuals, False), at])
+                data = weight * _evaluate(model, at, residuals, False)
+                return np.concatenate([data, root @ (at - mean)])
 
             def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
-                return np.concatenate([data, np.eye(len(at))])
+                return np.concatenate([data, root])
 
             limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
             found = least_squares(value, z.numpy(), slope, **limit)
@@ -200,7 +257,7 @@ class LeastSquares:
             log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
         slopes = torch.from_numpy(found.jac[: -len(z)])
         information = slopes.T @ slopes
-        covariance = torch.linalg.inv(information + torch.eye(len(z)).to(z))
+        covariance = torch.linalg.inv(information + prior.root.T @ prior.root)
         return Fit(covariance, information, noise, steps)
 
 

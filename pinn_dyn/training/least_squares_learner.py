@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.optim import SGD
 
 from pinn_dyn.data.windows import Windows
@@ -13,6 +14,9 @@ from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.training.learner import DynamicsLearner, Validator
 from pinn_dyn.training.least_squares import Fit, LeastSquares
 from pinn_dyn.training.losses import WindowLoss
+
+COVARIANCE = "covariance"
+"""Under which a checkpoint has that of the constants."""
 
 
 class LeastSquaresLearner(DynamicsLearner):
@@ -24,6 +28,7 @@ class LeastSquaresLearner(DynamicsLearner):
     Args:
         model: what is fitted.
         solver: the fit.
+        covariance: of the constants that the model starts from, if an earlier fit found them.
         loss, validator, config, statistics: as of :class:`DynamicsLearner`.
 
     Attributes:
@@ -40,6 +45,7 @@ class LeastSquaresLearner(DynamicsLearner):
         model: KnownMechanics,
         *,
         solver: LeastSquares,
+        covariance: Tensor | None = None,
         loss: WindowLoss,
         validator: Validator,
         config: dict[str, Any],
@@ -62,15 +68,23 @@ class LeastSquaresLearner(DynamicsLearner):
         )
         self.automatic_optimization = False
         self.solver = solver
+        self.covariance = covariance
 
     def training_step(self, batch: Windows, batch_idx: int) -> None:  # type: ignore[override]
         """The fit, on all training trajectories and windows, in double precision."""
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(self.model, KnownMechanics)
         if self.result is None:
-            self.result = self.solver.fit(self.model, data.splits.train, data.windows)
+            self.result = self.solver.fit(
+                self.model, data.splits.train, data.windows, self.covariance
+            )
         self.log_losses(torch.tensor(self.result.residual**2))
         self.optimizers().step()  # type: ignore[union-attr]  # no gradients: it only counts
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the covariance of the constants, for a fit that starts from this one."""
+        if self.result is not None:
+            checkpoint[COVARIANCE] = self.result.covariance
 
     def configure_optimizers(self) -> Any:
         """One that does nothing, as the trainer counts its steps."""

@@ -1,5 +1,7 @@
 """Least squares finds the constants that made the data, and leaves what no data determine."""
 
+import copy
+
 import pytest
 import torch
 
@@ -60,6 +62,43 @@ def test_the_dynamics_are_found_from_a_generic_start(truth, runs, rollouts):
     assert torch.linalg.eigvalsh(result.information).min() < 0.1
     assert torch.linalg.eigvalsh(result.covariance).max() <= 1.001
     assert torch.linalg.eigvalsh(result.covariance).min() > 0
+
+
+def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs):
+    windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
+    solver = LeastSquares(cutoff=20.0, rollouts=False)
+    before = robot_model("generic")
+    known = solver.fit(before, runs, windows)
+    loaded = copy.deepcopy(truth)
+    with torch.no_grad():
+        loaded.bodies.z[1] += torch.tensor([0.3, 0.2, 0.1, 0.1, 0.0, 0.2, 0.0, 0.3, 0.0, 0.2])
+    short = [motion(loaded, seconds=0.8, rate=100.0, seed=5)]
+    adapted, anew = copy.deepcopy(before), robot_model("generic")
+    changed = LeastSquares(cutoff=20.0, rollouts=False, changed=["tip"])
+    found = changed.fit(adapted, short, windows, known.covariance)
+    solver.fit(anew, short, windows)
+    errors = [held_out_error(model, loaded) for model in (before, adapted, anew)]
+    assert errors[1] < 0.3 * min(errors[0], errors[2])
+    # What is held stays within what was known of it; what is free may go anywhere.
+    moved = (adapted.bodies.z - before.bodies.z).detach().flatten()
+    spread = known.covariance.diagonal()[: len(moved)].sqrt()
+    assert (moved[:10].abs() < 3 * spread[:10]).all()
+    assert (moved[10:].abs() > 3 * spread[10:]).any()
+    assert torch.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_what_has_changed_is_refused_by_name(runs):
+    windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
+    solver = LeastSquares(cutoff=20.0, changed=["hand"])
+    model = robot_model("generic")
+    count = sum(p.numel() for p in model.parameters())
+    with pytest.raises(ValueError, match=r"there is no earlier fit .* start_from="):
+        solver.fit(model, runs, windows)
+    with pytest.raises(ValueError, match=r"changed names hand, expected some .* rod, tip"):
+        solver.fit(model, runs, windows, torch.eye(count))
+    solver.changed = ["tip"]
+    with pytest.raises(ValueError, match=f"the earlier fit has 3 constants, this model {count}"):
+        solver.fit(model, runs, windows, torch.eye(3))
 
 
 def test_the_filter_keeps_the_motion_and_takes_its_derivative(runs):
