@@ -24,9 +24,7 @@ from pathlib import Path
 
 import torch
 from long_rollout import make_model
-from pytorch_optimizer import SOAP
 from torch import Tensor
-from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
@@ -35,12 +33,12 @@ from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.ensembles.data import MemberSampler
 from pinn_dyn.ensembles.gradients import CompiledMembers
-from pinn_dyn.ensembles.learner import clip_by_member
-from pinn_dyn.ensembles.member_soap import MemberSOAP
+from pinn_dyn.ensembles.learner import MemberSOAP
 from pinn_dyn.mechanics import Predictor, Signal
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
-from pinn_dyn.training import IncrementLoss, MidpointLoss
-from pinn_dyn.training.gradients import Compiled, Eager
+from pinn_dyn.training import SOAP, IncrementLoss, MidpointLoss, ParameterVector
+from pinn_dyn.training.gradients import Compiled, Eager, Engine
+from pinn_dyn.training.learner import clipped
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000
@@ -65,12 +63,12 @@ def make_windows() -> Windows:
     )
 
 
-def make_optimizer(name: str, parameters: list[Tensor], members: int) -> Optimizer:
+def make_optimizer(name: str, vector: ParameterVector, members: int) -> Optimizer:
     """As conf/optimizer; the peak rate is small, as there is nothing to learn."""
     if name == "adamw":
-        return AdamW(parameters, lr=1e-4, weight_decay=1e-5, fused=True)
-    soap = SOAP(parameters, lr=1e-4, weight_decay=1e-5, precondition_frequency=10)
-    return soap if members == 1 else MemberSOAP(soap)
+        return AdamW([vector.values], lr=1e-4, weight_decay=1e-5, fused=True)
+    kind = SOAP if members == 1 else MemberSOAP
+    return kind(vector.parameters, lr=1e-4, weight_decay=1e-5)
 
 
 def make_step(
@@ -83,25 +81,25 @@ def make_step(
     samplers = [
         BatchSampler(PAIRS, batch_size=batch, batches=100_000, seed=k) for k in range(members)
     ]
+    engine: Engine
     if members == 1:
         model, loader = models[0], WindowLoader(windows, samplers[0])
-        engine = Compiled(criterion, model, length) if compiled else Eager(criterion, model)
+        vector = ParameterVector(model.parameters())
+        engine = Compiled(criterion, model, vector, length)
     else:
         model = Ensemble(models).stack.train()
         loader = WindowLoader(windows, MemberSampler(samplers))
-        engine = CompiledMembers(criterion, model) if compiled else Eager(criterion, model)
-    parameters = list(model.parameters())
-    optimizer = make_optimizer(optim, parameters, members)
+        vector = ParameterVector(model.parameters(), members)
+        engine = CompiledMembers(criterion, model, vector)
+    if not compiled:
+        engine = Eager(criterion, model, vector)
+    optimizer = make_optimizer(optim, vector, members)
     scheduler = OneCycleLR(optimizer, max_lr=1e-4, total_steps=100_000, cycle_momentum=False)
     batches = iter(loader)
 
     def step() -> None:
-        optimizer.zero_grad()
-        engine(next(batches)).sum().backward()
-        if members == 1:
-            clip_grad_norm_(parameters, 1.0)
-        else:
-            clip_by_member([p.grad for p in parameters if p.grad is not None], 1.0)
+        _, gradient = engine(next(batches))
+        vector.gradient.copy_(clipped(gradient, 1.0))
         optimizer.step()
         scheduler.step()
 

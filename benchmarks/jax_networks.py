@@ -242,6 +242,20 @@ def increment_loss(
     return jnp.mean(residual[:, size:] ** 2)
 
 
+def midpoint_loss(
+    acceleration: Acceleration, p: Parameters, batch: dict[str, Array], step: float, scale: Any
+) -> Array:
+    """Mean squared error of the velocity's increment, by its rate in the middle of the step."""
+    q, v = jnp.split(batch["x0"], 2, -1)
+    dq, dv = jnp.split(batch["measured"], 2, -1)
+    middle = q + 0.5 * dq - step * dv / 8, 1.5 * dq / step - 0.5 * v - 0.25 * dv
+    increment = step * acceleration(p, *middle, batch["u"].mean(1))
+    return jnp.mean(((increment - dv) / scale) ** 2)
+
+
+LOSSES = {"increment": increment_loss, "midpoint": midpoint_loss}
+
+
 def training_step(
     acceleration: Acceleration, step: float, scale: Any
 ) -> Callable[[Parameters, dict[str, Array]], tuple[Array, Parameters]]:

@@ -93,7 +93,6 @@ def ours(config: dict[str, Any], data: DynamicsData, goal: float, clock: Clock) 
         accelerator="cpu",
         devices=1,
         max_epochs=epochs(config)[0],
-        gradient_clip_val=config["trainer"]["gradient_clip_val"],
         limit_val_batches=0,
         inference_mode=False,
         logger=False,

@@ -51,8 +51,8 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
-from pinn_dyn.training import IncrementLoss, MidpointLoss
-from pinn_dyn.training.gradients import Compiled
+from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
+from pinn_dyn.training.gradients import Compiled, Engine
 
 STEP = 2e-3
 RESULTS = Path(__file__).parent / "results"
@@ -114,6 +114,11 @@ def torch_step(model: LagrangianNetwork, loss: Callable[[], Tensor]) -> Step:
         return float(value.detach())
 
     return step
+
+
+def our_step(engine: Engine, windows: Windows) -> Step:
+    """Loss and gradient of an engine."""
+    return lambda: float(engine(windows)[0])
 
 
 def hessian_step(
@@ -250,15 +255,17 @@ def run_cell(size: int, batch: int, cores: int, seconds: float) -> list[dict[str
     eager_model, short_model, mid_model = (make_model(size, torch.float32)[0] for _ in range(3))
     eager_loss, short_loss, loss = (IncrementLoss(scales, model) for _ in range(3))
     mid_loss = MidpointLoss(scales, mid_model)
-    compiled = Compiled(loss, model, STEPS_FOR_PROGRAM)
-    midpoint = Compiled(mid_loss, mid_model, STEPS_FOR_PROGRAM)
-    short = Compiled(short_loss, short_model, 0)
+    compiled = Compiled(loss, model, ParameterVector(model.parameters()), STEPS_FOR_PROGRAM)
+    midpoint = Compiled(
+        mid_loss, mid_model, ParameterVector(mid_model.parameters()), STEPS_FOR_PROGRAM
+    )
+    short = Compiled(short_loss, short_model, ParameterVector(short_model.parameters()), 0)
     names = ["autodiff", "explicit", "hessian"]
     steps = {
-        OURS: torch_step(model, lambda: compiled(windows)),
-        "ours, derivative": torch_step(short_model, lambda: short(windows)),
+        OURS: our_step(compiled, windows),
+        "ours, derivative": our_step(short, windows),
         "ours, eager": torch_step(eager_model, lambda: eager_loss(eager_model, windows)),
-        MIDPOINT: torch_step(mid_model, lambda: midpoint(windows)),
+        MIDPOINT: our_step(midpoint, windows),
         **jax_steps(model, loss, windows, names),
         "torch hessian": hessian_step(eager_model, eager_loss, windows, 1024),
     }

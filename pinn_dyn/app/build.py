@@ -38,6 +38,7 @@ LONGEST_EPOCH = 1000
 """Steps after which the last checkpoint is written anew, at the latest."""
 VALIDATION_ERROR = "val/error_mean"
 """What a training is summed up by, and a sweep minimizes."""
+_CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")  # of the trainer, done by the learner
 BEST_BY = "val/error_windowed"
 """What the best checkpoint is chosen by: a long roll-out may err least before it learns."""
 
@@ -171,6 +172,7 @@ def build_learner(
         config=config,
         statistics=statistics,
         compile=compiles(config),
+        **{key: config["trainer"][key] for key in _CLIPPING if key in config["trainer"]},
     )
 
 
@@ -237,11 +239,11 @@ def build_trainer(
         LearningRateMonitor(),
         ValidationHistory(),
     ]
-    part = {key: x for key, x in config["trainer"].items() if key not in ("steps", "validations")}
+    ours = ("steps", "validations", *_CLIPPING)
+    part = {key: x for key, x in config["trainer"].items() if key not in ours}
     part["enable_progress_bar"] = part.get("enable_progress_bar", True) and sys.stdout.isatty()
-    # Drawing at every step takes a tenth of the time of a small network's step.
     bar = part["enable_progress_bar"]
-    callbacks.append(TQDMProgressBar(refresh_rate=20) if bar else EpochLines(VALIDATION_ERROR))
+    callbacks.append(TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR))
     loggers = [_build_logger(name, x, folder) for name, x in config["logger"].items()]
     count, batches, every = epochs(config)
     return _build(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice, repeat
 from typing import Any
 
 import torch
@@ -14,6 +15,8 @@ from torch.utils.data import Sampler
 from pinn_dyn.mechanics import Signal, State, Trajectory
 from pinn_dyn.mechanics.signal import stacked
 from pinn_dyn.models.statistics import Statistics
+
+_ROWS = ("q", "v", "p", "dq", "dv", "dp")  # have one row for each window, as the input has
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,15 @@ class Windows:
         """The windows at the positions ``index``."""
         return self._map(lambda value: value[index])
 
+    def unbind(self) -> Iterator[Windows]:
+        """Those at each place of the first of several leading dimensions, as views."""
+        rows = zip(*(getattr(self, name).unbind() for name in _ROWS), strict=True)
+        rate = self.input.rate
+        rates = repeat(None) if rate is None else rate.unbind()
+        for values, u, slope in zip(rows, self.u.unbind(), rates, strict=False):
+            picked: dict[str, Any] = dict(zip(_ROWS, values, strict=True))
+            yield replace(self, **picked, input=self.input.with_samples(u, slope))
+
     def split(self, size: int) -> list[Windows]:
         """The windows in parts of at least ``size`` that differ by at most one window."""
         number = len(self) // size
@@ -61,8 +73,7 @@ class Windows:
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Windows:
         """Apply a change to every tensor that has one row per window."""
-        rows = ("q", "v", "p", "dq", "dv", "dp")
-        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in rows}
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _ROWS}
         return replace(self, **changed, input=self.input.mapped(change))
 
     @property
@@ -220,8 +231,14 @@ def _spread_out(q: Tensor, count: int, power: float, generator: torch.Generator)
     return torch.topk(uniform.log() / distance.clamp(min=1e-12) ** power, count).indices
 
 
+PICKED = 16_384
+"""Windows that are picked at once, about."""
+
+
 class WindowLoader:
-    """Windows in the memory of a device; a batch is picked there by a tensor of positions.
+    """Windows in the memory of a device; batches are picked there by tensors of positions.
+
+    Many small batches are picked by one operation, of which each is a view.
 
     Args:
         windows: all windows, on the device that trains.
@@ -237,8 +254,11 @@ class WindowLoader:
 
     def __iter__(self) -> Iterator[Windows]:
         device = self.windows.q.device
-        for index in self.sampler:
-            yield self.windows[index.to(device, non_blocking=True)]
+        indices = iter(self.sampler)
+        for first in indices:
+            others = islice(indices, max(PICKED // first.numel(), 1) - 1)
+            index = torch.stack([first, *others]).to(device, non_blocking=True)
+            yield from self.windows[index].unbind()
 
 
 class BatchSampler(Sampler[Tensor]):

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import torch
-from pytorch_optimizer import SOAP
 from torch import Tensor
-from torch.optim import SGD, Adagrad, Adam, Adamax, NAdam, Optimizer, RAdam, RMSprop
+from torch.optim import Optimizer
 
 from pinn_dyn.ensembles.ensemble import Ensemble
 from pinn_dyn.ensembles.gradients import CompiledMembers
-from pinn_dyn.ensembles.member_soap import MemberSOAP
 from pinn_dyn.ensembles.stack import ContinuousStack
-from pinn_dyn.training import DynamicsLearner
+from pinn_dyn.training import ELEMENTWISE, SOAP, DynamicsLearner, ParameterVector
 from pinn_dyn.training.gradients import Eager, Engine
-
-# Optimizers that treat every number on its own: for them E stacked weights are E trainings.
-_ELEMENTWISE = (Adam, NAdam, RAdam, Adamax, Adagrad, RMSprop, SGD)
 
 
 class EnsembleLearner(DynamicsLearner):
@@ -35,24 +29,28 @@ class EnsembleLearner(DynamicsLearner):
 
     model: Ensemble
 
-    def gradients(self, steps: int) -> Engine:
+    def parameter_vector(self) -> ParameterVector:
+        """One vector for each member."""
+        return ParameterVector(self.model.parameters(), self.model.size)
+
+    def gradients(self, vector: ParameterVector, steps: int) -> Engine:
         """Those of the members, each in its own parameters."""
         stack = self.model.stack
         if self._compile and isinstance(stack, ContinuousStack):
-            return CompiledMembers(self.loss, stack)
-        return Eager(self.loss, stack)
+            return CompiledMembers(self.loss, stack, vector)
+        return Eager(self.loss, stack, vector)
 
     def log_losses(self, losses: Tensor) -> None:
         """Log mean and standard deviation over the members."""
         super().log_losses(losses)
         self.log("train/loss_spread", losses.std(), on_step=False, on_epoch=True, batch_size=1)
 
-    def built_optimizer(self) -> Optimizer:
+    def built_optimizer(self, vector: ParameterVector) -> Optimizer:
         """The optimizer, SOAP with preconditioners of each member's own."""
-        optimizer = super().built_optimizer()
-        if isinstance(optimizer, SOAP):
-            return MemberSOAP(optimizer)
-        if not isinstance(optimizer, _ELEMENTWISE):
+        optimizer = super().built_optimizer(vector)
+        if type(optimizer) is SOAP:
+            return MemberSOAP(vector.parameters, **optimizer.defaults)
+        if type(optimizer) not in ELEMENTWISE:
             raise ValueError(
                 f"optimizer is {type(optimizer).__name__}, which mixes the weights of a tensor, "
                 "here those of different members: take optimizer=adamw or soap, or train the seeds "
@@ -60,32 +58,13 @@ class EnsembleLearner(DynamicsLearner):
             )
         return optimizer
 
-    def configure_gradient_clipping(
-        self,
-        optimizer: Optimizer,
-        gradient_clip_val: int | float | None = None,
-        gradient_clip_algorithm: str | None = None,
-    ) -> None:
-        """Clip each member's gradient by its own norm, as a training of its own would."""
-        if gradient_clip_val is None:
-            return
-        if gradient_clip_algorithm == "value":  # of single numbers: the same for an ensemble
-            super().configure_gradient_clipping(
-                optimizer, gradient_clip_val, gradient_clip_algorithm
-            )
-            return
-        gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
-        clip_by_member(gradients, float(gradient_clip_val))
 
+class MemberSOAP(SOAP):
+    """SOAP on parameters ``(E, ...)``: each of the E members has preconditioners of its own.
 
-def clip_by_member(gradients: list[Tensor], largest: float) -> None:
-    """Scale gradients ``(E, ...)`` in place so that each member's norm is at most ``largest``.
-
-    The norm of a member is that of all its gradients together, as in
-    ``torch.nn.utils.clip_grad_norm_``.
+    Where a gradient leaves directions open, as the first one of a matrix that is not square does,
+    rounding chooses the basis there: a member's training is then another one than that of a single
+    model of its seed, and as good.
     """
-    squares = [gradient.reshape(gradient.shape[0], -1).square().sum(1) for gradient in gradients]
-    norms = torch.stack(squares).sum(0).sqrt()
-    scales = (largest / (norms + 1e-6)).clamp(max=1.0)
-    for gradient in gradients:
-        gradient.mul_(scales.reshape(-1, *[1] * (gradient.ndim - 1)))
+
+    leading = 1

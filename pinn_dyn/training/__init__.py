@@ -6,10 +6,14 @@ from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.least_squares import Fit, LeastSquares
 from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, Penalized, WindowLoss
+from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
 from pinn_dyn.training.schedule import one_cycle
+from pinn_dyn.training.soap import SOAP
 
 __all__ = [
     "COVARIANCE",
+    "ELEMENTWISE",
+    "SOAP",
     "DynamicsLearner",
     "Fit",
     "IncrementLoss",
@@ -17,6 +21,7 @@ __all__ = [
     "LeastSquaresLearner",
     "MidpointLoss",
     "NonFiniteLossError",
+    "ParameterVector",
     "Penalized",
     "WholeCheckpoints",
     "WindowLoss",

@@ -59,6 +59,7 @@ def fit(
         config={},
         statistics=statistics,
         compile=compile,
+        gradient_clip_val=1.0,
     )
     losses = _Losses()
     L.Trainer(
@@ -66,7 +67,6 @@ def fit(
         devices=1,
         max_epochs=epochs,
         limit_val_batches=0,
-        gradient_clip_val=1.0,
         callbacks=[losses],
         logger=False,
         enable_checkpointing=False,

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 
 import lightning as L
@@ -16,6 +20,13 @@ from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.losses import WindowLoss
+from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
+
+# What is said to be wrong by them, such as the counts of batches, is put right below.
+warnings.filterwarnings("ignore", ".*`dataloader_iter` (argument|step flavor)")
+
+MOST_SECONDS = 0.5
+"""Of steps in a row, until the progress is shown."""
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
 """Maps a model and true trajectories ``(K, T, N)`` to named figures of merit."""
@@ -28,6 +39,11 @@ class NonFiniteLossError(RuntimeError):
 class DynamicsLearner(L.LightningModule):
     """Trains a predictor: windows in, loss on them, roll-outs to validate.
 
+    A training step of Lightning is many steps of the optimizer, as its own hundreds of calls take
+    as long as the step of a small network. It ends where something may be due: before and after
+    each ``log_every_n_steps`` steps, at a validation, and after half a second. Of several processes
+    each step is one of its own, as they have to keep together.
+
     Args:
         model: the predictor.
         loss: loss of the model on a batch of windows.
@@ -37,8 +53,11 @@ class DynamicsLearner(L.LightningModule):
         config: the resolved configuration as plain values; saved in the checkpoint.
         statistics: scales of the data; saved in the checkpoint.
         compile: compile the dynamics for training.
+        gradient_clip_val: largest norm of the gradient, or its largest entry; None: any.
+        gradient_clip_algorithm: ``"norm"`` or ``"value"``.
 
     Raises:
+        ValueError: on another algorithm, or, in training, a precision that scales the loss.
         NonFiniteLossError: in training, when the loss is NaN or infinite.
     """
 
@@ -53,8 +72,15 @@ class DynamicsLearner(L.LightningModule):
         config: dict[str, Any],
         statistics: Statistics,
         compile: bool,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
     ):
         super().__init__()
+        if gradient_clip_algorithm not in (None, "norm", "value"):
+            raise ValueError(
+                f"gradient_clip_algorithm is {gradient_clip_algorithm!r}, expected norm or value"
+            )
+        self.automatic_optimization = False
         # For the checkpoint; what the loggers compare is chosen elsewhere.
         hyperparameters = {"config": config, "statistics": statistics.to_dict()}
         self.save_hyperparameters(hyperparameters, logger=False)
@@ -64,39 +90,77 @@ class DynamicsLearner(L.LightningModule):
         self._optimizer = optimizer
         self._scheduler = scheduler
         self._compile = compile
+        self._most, self._by_value = gradient_clip_val, gradient_clip_algorithm == "value"
         self._losses: list[Tensor] = []  # of this epoch
 
-    def setup(self, stage: str) -> None:
-        """Compile here, in the process that trains: compiled code does not reach another one."""
-        if stage == "fit":
-            self._gradients = self.gradients(int(self.trainer.estimated_stepping_batches))
-
-    def gradients(self, steps: int) -> Engine:
-        """How the gradient of the loss is taken, in a training of so many steps."""
+    def gradients(self, vector: ParameterVector, steps: int) -> Engine:
+        """How loss and gradient in the parameters are taken, in a training of so many steps."""
         if self._compile and isinstance(self.model, ContinuousPredictor):
-            return Compiled(self.loss, self.model, steps)
-        return Eager(self.loss, self.model)
+            return Compiled(self.loss, self.model, vector, steps)
+        return Eager(self.loss, self.model, vector)
 
-    def training_step(self, batch: Windows, batch_idx: int) -> Tensor:
-        """Loss of one batch of windows."""
-        if batch_idx == 0:
+    def training_step(self, dataloader_iter: Iterator[tuple[Windows, int, int]]) -> None:
+        """Steps of the optimizer, one for each batch, until something may be due."""
+        loop, trainer = self.trainer.fit_loop.epoch_loop, self.trainer
+        before = loop.batch_progress.current.ready - 1  # in this epoch; Lightning counted one
+        if before == 0:
             self._losses.clear()  # of an epoch that was cut short
-        # Both counts come back with a checkpoint: a resumed training is as far as it was.
-        progress = self.global_step / self.trainer.estimated_stepping_batches
-        losses = self._gradients(self.loss.selected(batch, progress))
-        loss = losses.sum()  # a single number, but for the members of an ensemble
-        if not torch.isfinite(loss):
-            raise NonFiniteLossError(
-                f"the training loss became {float(loss.detach())} at step {self.global_step} "
-                f"(epoch {self.current_epoch}); the checkpoints written before are kept. Lower "
-                "optimizer.lr, shorten the window (data.steps, data.stride) or raise the heads' "
-                "epsilon, then start again"
-            )
-        self._losses.append(losses.detach())
-        if self.trainer.is_last_batch:
+        # Not by way of Lightning, whose hooks around a step take as long as AdamW.
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        schedule = self.lr_schedulers()
+        step, until, done = self.global_step, time.monotonic() + MOST_SECONDS, 0
+        try:
+            for batch, _, _ in islice(dataloader_iter, self._steps_until_due(before)):
+                optimizer.step(self._closure(batch, step + done))  # type: ignore[union-attr, arg-type]
+                schedule.step()  # type: ignore[union-attr]
+                done += 1
+                if time.monotonic() > until:
+                    break
+        finally:
+            loop.manual_optimization.optim_step_progress.increment_by(done)
+            # Lightning itself counts one.
+            loop.batch_progress.increment_by(done - 1)
+            loop._batches_that_stepped += done - 1
+        if before + done >= trainer.num_training_batches:
             self.log_losses(torch.stack(self._losses).mean(0))
             self._losses.clear()
-        return loss
+
+    def _steps_until_due(self, before: int) -> int:
+        """Steps until Lightning may have something to do, after so many in this epoch."""
+        trainer = self.trainer
+        if trainer.world_size > 1:
+            return 1
+        steps = trainer.fit_loop.epoch_loop._batches_that_stepped
+        due = [int(trainer.num_training_batches) - before]
+        if every := trainer.log_every_n_steps:  # type: ignore[attr-defined]
+            due += [every - steps % every, every - (steps + 1) % every]
+        if isinstance(every := trainer.val_check_batch, int):
+            due += [every - steps % every, every - before % every]
+        if trainer.max_steps > 0:
+            due.append(trainer.max_steps - self.global_step)
+        return max(1, min(due))
+
+    def _closure(self, batch: Windows, step: int) -> Callable[[], Tensor]:
+        """What gives the parameters the gradient of a batch, and returns the loss."""
+        # The step comes back with a checkpoint: a resumed training is as far as it was.
+        windows = self.loss.selected(batch, step / self._steps)
+
+        def closure() -> Tensor:
+            losses, gradient = self._gradients(windows)
+            loss = losses.sum()  # a single number, but for the members of an ensemble
+            if not math.isfinite(loss):
+                raise NonFiniteLossError(
+                    f"the training loss became {float(loss)} at step {step} (epoch "
+                    f"{self.current_epoch}); the checkpoints written before are kept. Lower "
+                    "optimizer.lr, shorten the window (data.steps, data.stride) or raise the "
+                    "heads' epsilon, then start again"
+                )
+            gradient = self.trainer.strategy.reduce(gradient)  # mean over processes
+            self._vector.gradient.copy_(clipped(gradient, self._most, self._by_value))
+            self._losses.append(losses)
+            return loss
+
+        return closure
 
     def log_losses(self, losses: Tensor) -> None:
         """Log the mean loss of an epoch.
@@ -122,15 +186,34 @@ class DynamicsLearner(L.LightningModule):
         error = figures["error_mean"]
         self.log("error", error, prog_bar=True, logger=False, batch_size=1, sync_dist=True)
 
-    def built_optimizer(self) -> Optimizer:
-        """The optimizer of the parameters of the model."""
-        return self._optimizer(self.model.parameters())
+    def on_validation_model_zero_grad(self) -> None:
+        """Keep the gradients, which are views of one vector."""
+
+    def parameter_vector(self) -> ParameterVector:
+        """The parameters of the model as one vector."""
+        return ParameterVector(self.model.parameters())
+
+    def built_optimizer(self, vector: ParameterVector) -> Optimizer:
+        """The optimizer, of all numbers at once where it takes each by itself."""
+        optimizer = self._optimizer(vector.parameters)
+        return self._optimizer([vector.values]) if type(optimizer) in ELEMENTWISE else optimizer
 
     def configure_optimizers(self) -> Any:
-        """The optimizer, with its learning rate scheduled per step."""
-        optimizer = self.built_optimizer()
-        steps = int(self.trainer.estimated_stepping_batches)
-        scheduler = self._scheduler(optimizer, total_steps=steps)
+        """The optimizer, with its learning rate scheduled per step.
+
+        The model is on its device now. What is compiled is compiled here, in the process that
+        trains: it does not reach another one.
+        """
+        if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
+            raise ValueError(
+                f"trainer.precision is {self.trainer.precision}, which scales the loss: take "
+                "bf16-mixed or 32"
+            )
+        self._steps = int(self.trainer.estimated_stepping_batches)
+        self._vector = self.parameter_vector()
+        self._gradients = self.gradients(self._vector, self._steps)
+        optimizer = self.built_optimizer(self._vector)
+        scheduler = self._scheduler(optimizer, total_steps=self._steps)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {
@@ -139,3 +222,19 @@ class DynamicsLearner(L.LightningModule):
                 "name": "train/learning_rate",  # in the log
             },
         }
+
+
+def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> Tensor:
+    """A gradient ``(*members, P)`` scaled down to a norm, each member's own, or cut off at a value.
+
+    Args:
+        gradient: of all parameters.
+        largest: norm, or value; None: as it is.
+        by_value: whether it is a value.
+    """
+    if largest is None:
+        return gradient
+    if by_value:
+        return gradient.clamp(-largest, largest)
+    norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+    return gradient * (largest / (norm + 1e-6)).clamp(max=1.0)

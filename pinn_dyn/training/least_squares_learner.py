@@ -23,7 +23,7 @@ class LeastSquaresLearner(DynamicsLearner):
     """Fits a model by least squares where others take many steps of an optimizer.
 
     So a fit has the run folder, checkpoints, validation and logs of every training. The trainer has
-    ``steps: 1``, ``validations: 1`` and ``gradient_clip_val: null``; one batch holds all windows.
+    ``steps: 1`` and ``validations: 1``; one batch holds all windows.
 
     Args:
         model: what is fitted.
@@ -66,7 +66,6 @@ class LeastSquaresLearner(DynamicsLearner):
             statistics=statistics,
             compile=False,
         )
-        self.automatic_optimization = False
         self.solver = solver
         self.covariance = covariance
 

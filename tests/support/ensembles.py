@@ -43,12 +43,11 @@ def learn(cls, model, single, data, optimizer=AdamW, compile=False):
         config={},
         statistics=data.statistics,
         compile=compile,
+        gradient_clip_val=0.3,
     )
 
 
 def train(folder, learner, data, **options):
-    trainer = make_trainer(
-        folder, max_epochs=2, enable_checkpointing=False, gradient_clip_val=0.3, **options
-    )
+    trainer = make_trainer(folder, max_epochs=2, enable_checkpointing=False, **options)
     trainer.fit(learner, data)
     return trainer

@@ -17,26 +17,22 @@ from pinn_dyn.models import (
     LearnedVelocity,
     NetworkPotential,
 )
-from pinn_dyn.training import IncrementLoss, MidpointLoss
+from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
 from tests.models.builders import make_model, make_structured, perturb
 from tests.support.windows import for_members, make_windows, one_step
 
 
-def value_and_gradients(engine, batch, factor=1.0):
-    model = engine.model
-    value = factor * engine(batch)
-    gradients = torch.autograd.grad(value, list(model.parameters()), allow_unused=True)
-    return value.detach(), gradients
+def engine(kind, loss, model, *steps):
+    """The engine, and the vector of the parameters of the model."""
+    return kind(loss, model, ParameterVector(model.parameters()), *steps)
 
 
-def assert_same(found, expected, factor=1.0):
-    torch.testing.assert_close(factor * found[0], expected[0], rtol=1e-12, atol=0)
-    assert sum(gradient is not None for gradient in expected[1]) > 3
-    for one, other in zip(found[1], expected[1], strict=True):
-        assert (one is None) == (other is None)
-        if other is not None:
-            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+def assert_same(found, expected):
+    """Losses and gradients, of which the eager one is that of autograd."""
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-12, atol=0)
+    assert (expected[1] != 0).sum() > 3
+    torch.testing.assert_close(found[1], expected[1], rtol=1e-9, atol=1e-12)
 
 
 # Compiling is what takes the time here: one coordinate, and the two stages of the other method.
@@ -82,7 +78,8 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     untouched = copy.deepcopy(model)
     windows = partial(make_windows, size=model.num_coordinates, interpolation=interpolation)
     loss = kind_of_loss(one_step(), model).double()
-    compiled, eager = Compiled(loss, model, STEPS_FOR_PROGRAM), Eager(loss, untouched)
+    compiled = engine(Compiled, loss, model, STEPS_FOR_PROGRAM)
+    eager = engine(Eager, loss, untouched)
     batches = [windows(8), windows(8, seed=1), windows(24, seed=2)]
     evaluations = compiled.evaluations(batches[0])
     assert evaluations == (1 if kind_of_loss is MidpointLoss else len(model.integrator.nodes))
@@ -90,14 +87,12 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     monkeypatch.setattr("pinn_dyn.training.gradients.compiled.CHUNK", parts)
     for batch, threads in zip([*batches, batches[-1]], [1, 1, 1, 3], strict=True):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
-        found = value_and_gradients(compiled, batch, factor=3.0)
-        assert_same(found, value_and_gradients(eager, batch, factor=3.0))
+        assert_same(compiled(batch), eager(batch))
     assert len(compiled._program._programs) == 1  # and none was compiled for the parts
     with torch.no_grad():
         for parameter in [*model.parameters(), *untouched.parameters()]:
             parameter *= 0.9
-    found = value_and_gradients(compiled, batches[0])
-    assert_same(found, value_and_gradients(eager, batches[0]))
+    assert_same(compiled(batches[0]), eager(batches[0]))
 
 
 @pytest.mark.parametrize(
@@ -113,18 +108,12 @@ def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
     members = [perturb(AccelerationMLP(one_step(), hidden=[6]).double(), seed=k) for k in range(3)]
     stack = Ensemble(members).stack
     loss = IncrementLoss(one_step(), members[0]).double()
-    compiled = CompiledMembers(loss, stack)
+    compiled = CompiledMembers(loss, stack, ParameterVector(stack.parameters(), members=3))
     batches = [make_windows(6, seed=k) for k in range(3)]
-    losses = compiled(for_members(batches))
-    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    gradients = torch.autograd.grad((weights * losses).sum(), list(stack.parameters()))
+    losses, gradients = compiled(for_members(batches))
     assert len(compiled._program._programs) == 1
     for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
-        assert_same(
-            (losses[k], [gradient[k] for gradient in gradients]),
-            value_and_gradients(Eager(loss, member), batch, factor=float(weights[k])),
-            factor=float(weights[k]),
-        )
+        assert_same((losses[k], gradients[k]), engine(Eager, loss, member)(batch))
 
 
 @pytest.mark.parametrize("case", ["short training", "two steps"])
@@ -136,9 +125,8 @@ def test_the_program_is_for_long_trainings_on_short_windows(monkeypatch, case):
     model.integrator = integrator
     loss = IncrementLoss(one_step(size=2), model).double()
     steps = STEPS_FOR_PROGRAM - (case == "short training")
-    compiled, batch = Compiled(loss, model, steps), make_windows(4, size=2)
-    found, expected = (value_and_gradients(one, batch) for one in (compiled, Eager(loss, model)))
-    assert_same(found, expected)
+    compiled, batch = engine(Compiled, loss, model, steps), make_windows(4, size=2)
+    assert_same(compiled(batch), Eager(loss, model, compiled.vector)(batch))
     assert not compiled._program._programs
     assert model.integrator is integrator
 
@@ -149,7 +137,28 @@ def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
     model = make_model("lnn")
     loss = IncrementLoss(one_step(size=2), model).double()
     batch = make_windows(25, size=2)
-    compiled, eager = Compiled(loss, model, steps=100), Eager(loss, model)
-    assert type(compiled(batch).grad_fn) is not type(eager(batch).grad_fn)
-    found, expected = (value_and_gradients(one, batch, 3.0) for one in (compiled, eager))
-    assert_same(found, expected)
+    compiled = engine(Compiled, loss, model, 100)
+    seen = []
+    monkeypatch.setattr(compiled, "_loss", lambda part: seen.append(len(part)) or loss(model, part))
+    assert_same(compiled(batch), Eager(loss, model, compiled.vector)(batch))
+    assert seen == [9, 8, 8]
+
+
+def test_a_vector_holds_the_parameters_and_the_gradient_that_autograd_gives():
+    model = make_model("lnn")
+    values = [p.detach().clone() for p in model.parameters()]
+    loss = IncrementLoss(one_step(size=2), model).double()
+    batch = make_windows(4, size=2)
+    expected = torch.autograd.grad(loss(model, batch), list(model.parameters()), allow_unused=True)
+    eager = engine(Eager, loss, model)
+    _, gradient = eager(batch)
+    eager.vector.gradient.copy_(gradient)
+    for parameter, value, slope in zip(model.parameters(), values, expected, strict=True):
+        assert torch.equal(parameter, value)
+        torch.testing.assert_close(
+            parameter.grad, torch.zeros_like(value) if slope is None else slope
+        )
+    with torch.no_grad():
+        eager.vector.values.mul_(2.0)
+    for parameter, value in zip(model.parameters(), values, strict=True):
+        assert torch.equal(parameter, 2 * value)

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import OneCycleLR
 
@@ -156,3 +156,53 @@ def test_a_loss_that_is_not_a_number_stops_the_training_and_keeps_the_checkpoint
         fresh.load_state_dict(saved["state_dict"])
         assert np.isfinite(loss_of(fresh, data))
         assert all(torch.isfinite(value).all() for value in saved["state_dict"].values())
+
+
+class Ends(Callback):
+    """Notes where each training step of Lightning ends."""
+
+    def __init__(self):
+        self.steps, self.batches = [], []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.steps.append(trainer.global_step)
+        self.batches.append(batch_idx + 1)
+
+
+def trained(tmp_path, data, monkeypatch, seconds, **options):
+    monkeypatch.setattr("pinn_dyn.training.learner.MOST_SECONDS", seconds)
+    torch.manual_seed(0)
+    learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
+    ends = Ends()
+    options = {"log_every_n_steps": 20, "enable_checkpointing": False, **options}
+    trainer = make_trainer(tmp_path, max_epochs=2, callbacks=[ends], **options)
+    trainer.fit(learner, data)
+    return [p.detach().clone() for p in learner.model.parameters()], ends, trainer
+
+
+def test_many_steps_in_one_are_the_same_training(tmp_path, data, monkeypatch):
+    """They end where a log is due or an epoch ends, or each by itself when time is short."""
+    together, ends, trainer = trained(tmp_path, data, monkeypatch, 100.0)
+    assert ends.steps == [19, 20, 30, 39, 40, 59, 60]
+    assert ends.batches == [19, 20, 30, 9, 10, 29, 30]
+    alone, each, other = trained(tmp_path, data, monkeypatch, 0.0)
+    assert each.steps == list(range(1, 61))
+    assert trainer.global_step == other.global_step == 60
+    assert trainer.callback_metrics["train/loss"] == other.callback_metrics["train/loss"]
+    for one, two in zip(together, alone, strict=True):
+        assert torch.equal(one, two)
+
+
+def test_steps_end_where_the_trainer_validates_or_stops(tmp_path, data, monkeypatch):
+    _, ends, _ = trained(tmp_path, data, monkeypatch, 100.0, val_check_interval=7)
+    assert set(ends.batches) >= {7, 14, 21, 28}
+    _, ends, _ = trained(tmp_path, data, monkeypatch, 100.0, max_steps=33)
+    assert ends.steps[-1] == 33
+
+
+def test_a_precision_that_scales_the_loss_is_refused(tmp_path, data):
+    learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
+    trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
+    trainer.precision_plugin.scaler = object()
+    with pytest.raises(ValueError, match="which scales the loss: take bf16-mixed"):
+        trainer.fit(learner, data)

@@ -14,14 +14,14 @@ from pinn_dyn.mechanics.compilation import (
     CompiledDynamics,
     integrated_by,
 )
-from pinn_dyn.training.gradients.known import Gradients, KnownGradients
-from pinn_dyn.training.gradients.program import LossProgram
+from pinn_dyn.training.gradients.program import LossProgram, weighted_sum
 from pinn_dyn.training.gradients.state_windows import StateWindows
 from pinn_dyn.training.losses import WindowLoss
+from pinn_dyn.training.parameter_vector import ParameterVector
 
 
 class Compiled:
-    """The loss of a model with compiled dynamics, or with all of it compiled, gradient included.
+    """Loss and gradient of a model with compiled dynamics, or with all of it compiled.
 
     One program for loss and gradient is fastest, and takes longest to compile: it is made where
     the training is long and a window costs few evaluations of the dynamics, on a CPU. Elsewhere
@@ -30,33 +30,33 @@ class Compiled:
     Args:
         loss: of the model.
         model: what is trained; anything but its training goes on uncompiled.
+        vector: its parameters.
         steps: of the training, about.
     """
 
-    def __init__(self, loss: WindowLoss, model: ContinuousPredictor, steps: int):
+    def __init__(
+        self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector, steps: int
+    ):
         self.loss = loss
         self.model = model
+        self.vector = vector
         self.steps = steps
         self._integrator = CompiledDynamics(model.integrator, model)
-        self._program = LossProgram(loss, model)
+        self._program = LossProgram(loss, model, vector)
         self.evaluations = EvaluationCount(loss, model)
-        # Walking through the modules takes its time.
-        self._parameters = list(model.parameters())
 
-    def __call__(self, windows: Windows) -> Tensor:
-        """The loss; its backward pass may hand out gradients that are known already."""
+    def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
         evaluations = self.evaluations(windows)
         on_cpu = windows.q.device.type == "cpu"
         if on_cpu and worth_a_program(evaluations, self.steps):
             part = CHUNK * MOST_EVALUATIONS // evaluations
-            return KnownGradients.apply(self._program(windows, part), *self._parameters)
+            return self._program(windows, part)
         if not on_cpu or len(windows) < 2 * CHUNK:
-            return self._loss(windows)
-        parts = [
-            (len(part) / len(windows), *self._loss_and_gradients(part))
-            for part in windows.split(CHUNK)
-        ]
-        return KnownGradients.apply(parts, *self._parameters)
+            return self._loss_and_gradient(windows)
+        parts = windows.split(CHUNK)
+        return weighted_sum(
+            [len(part) / len(windows) for part in parts], map(self._loss_and_gradient, parts)
+        )
 
     def _loss(self, windows: Windows) -> Tensor:
         with integrated_by(self.model, self._integrator):
@@ -65,10 +65,9 @@ class Compiled:
             laid_out.x0.requires_grad_()
             return self.loss(self.model, laid_out)
 
-    def _loss_and_gradients(self, windows: Windows) -> tuple[Tensor, Gradients]:
+    def _loss_and_gradient(self, windows: Windows) -> tuple[Tensor, Tensor]:
         loss = self._loss(windows)
-        gradients = torch.autograd.grad(loss, self._parameters, allow_unused=True)
-        return loss.detach(), list(gradients)
+        return loss.detach(), self.vector.gradient_of(loss)
 
 
 def worth_a_program(evaluations: int, steps: int) -> bool:

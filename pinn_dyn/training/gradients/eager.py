@@ -9,18 +9,27 @@ from torch import Tensor
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.training.losses import WindowLoss
+from pinn_dyn.training.parameter_vector import ParameterVector
 
-Engine = Callable[[Windows], Tensor]
-"""Maps windows to the loss, whose backward pass gives the gradient in the model's parameters."""
+Engine = Callable[[Windows], tuple[Tensor, Tensor]]
+"""Maps windows to the loss and its gradient in the parameters, ``()`` and ``(P,)``, or to those of
+the members of an ensemble, ``(E,)`` and ``(E, P)``."""
 
 
 class Eager:
-    """The loss of a model, operation by operation."""
+    """Loss and gradient of a model, operation by operation.
 
-    def __init__(self, loss: WindowLoss, model: Predictor):
+    Args:
+        loss: of the model.
+        model: what is trained.
+        vector: its parameters.
+    """
+
+    def __init__(self, loss: WindowLoss, model: Predictor, vector: ParameterVector):
         self.loss = loss
         self.model = model
+        self.vector = vector
 
-    def __call__(self, windows: Windows) -> Tensor:
-        """The loss; autograd has recorded how it came about."""
-        return self.loss(self.model, windows)
+    def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        losses = self.loss(self.model, windows)
+        return losses.detach(), self.vector.gradient_of(losses.sum())

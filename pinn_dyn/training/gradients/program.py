@@ -15,9 +15,13 @@ from torch.func import functional_call
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor
 from pinn_dyn.mechanics.compilation import Unrolled, compile_graph, integrated_by
-from pinn_dyn.training.gradients.known import Gradients
 from pinn_dyn.training.gradients.state_windows import StateWindows
 from pinn_dyn.training.losses import WindowLoss
+from pinn_dyn.training.parameter_vector import ParameterVector
+
+Program = Callable[..., list[Tensor]]
+_ROWS = {"qv": ("q", "v", "dq", "dv"), "qp": ("q", "p", "dq", "dp")}
+"""What a model of each state sees of windows, beside the input."""
 
 
 class LossProgram:
@@ -30,44 +34,39 @@ class LossProgram:
 
     Args:
         loss: of the model, by operations that can be traced.
-        model: what is trained.
+        model: what is trained, or one whose parameters are stacked over members.
+        vector: its parameters.
     """
 
-    def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
+    def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
         self._loss = _Loss(loss, model)
         self._names = [f"model.{name}" for name, _ in model.named_parameters()]
-        self._parameters = list(model.parameters())  # walking through the modules takes its time
-        self._programs: dict[tuple[Any, ...], Callable[..., list[Any]]] = {}
+        self._vector = vector
+        self._programs: dict[tuple[Any, ...], Program] = {}
 
-    def __call__(self, windows: Windows, part: int) -> list[tuple[float, Tensor, Gradients]]:
-        """Share of the batch, loss and gradients of parts of at least ``part`` windows each."""
+    def __call__(self, windows: Windows, part: int) -> tuple[Tensor, Tensor]:
+        """Loss and gradient, from parts of at least ``part`` windows each."""
         parts = windows.split(part)
-        values = [value.detach() for value in self._parameters]
-        taken = self.side_by_side([values] * len(parts), parts)
-        return [
-            (len(part) / len(windows), loss, gradients)
-            for part, (loss, *gradients) in zip(parts, taken, strict=True)
-        ]
+        taken = self.side_by_side([self._vector.values.detach()] * len(parts), parts)
+        return weighted_sum([len(part) / len(windows) for part in parts], taken)
 
     def side_by_side(
-        self, values: Iterable[Sequence[Tensor]], batches: list[Windows]
-    ) -> Iterable[list[Any]]:
-        """Loss and gradients of each batch at the values of the parameters that go with it."""
-        laid_out = [StateWindows.of(batch, self._loss.model.state) for batch in batches]
+        self, values: Iterable[Tensor], batches: list[Windows]
+    ) -> Iterable[list[Tensor]]:
+        """Loss and gradient of each batch at the values ``(P,)`` that go with it."""
+        names = _ROWS[self._loss.model.state]
         arguments = [
-            (list(some), batch.x0, batch.dx, _samples(batch))
-            for some, batch in zip(values, laid_out, strict=True)
+            (some, [getattr(batch, name) for name in names], _samples(batch))
+            for some, batch in zip(values, batches, strict=True)
         ]
         # A program is compiled here, before the threads call it.
-        programs = list(map(self._program, laid_out, arguments))
+        programs = list(map(self._program, batches, arguments))
         # Even a single batch goes to a thread of the pool: its small products gain by one thread.
         threads = torch.get_num_threads()
         run = map if threads == 1 else _pool(threads).map
         return run(_call, programs, arguments)
 
-    def _program(
-        self, windows: StateWindows, arguments: tuple[Any, ...]
-    ) -> Callable[..., list[Any]]:
+    def _program(self, windows: Windows, arguments: tuple[Any, ...]) -> Program:
         key = (windows.dq.shape, windows.dq.dtype)
         if key not in self._programs:
             with torch.no_grad():
@@ -75,19 +74,34 @@ class LossProgram:
                 self._programs[key](*arguments)
         return self._programs[key]
 
-    def _traced(self, windows: StateWindows) -> Callable[..., list[Any]]:
-        def loss_and_gradients(
-            values: list[Tensor], x0: Tensor, dx: Tensor, samples: list[Tensor]
-        ) -> list[Any]:
-            batch = replace(windows, x0=x0, dx=dx, input=windows.input.with_samples(*samples))
-            with torch.enable_grad():
-                values = [value.detach().requires_grad_() for value in values]
-                given = dict(zip(self._names, values, strict=True))
-                loss = functional_call(self._loss, given, (batch,))
-                gradients = torch.autograd.grad(loss, values, allow_unused=True)
-            return [loss.detach(), *gradients]
+    def _traced(self, windows: Windows) -> Program:
+        state = self._loss.model.state
 
-        return loss_and_gradients
+        def loss_and_gradient(
+            vector: Tensor, rows: list[Tensor], samples: list[Tensor]
+        ) -> list[Tensor]:
+            given = dict(zip(_ROWS[state], rows, strict=True))
+            batch = replace(windows, **given, input=windows.input.with_samples(*samples))
+            batch = StateWindows.of(batch, state)
+            with torch.enable_grad():
+                values = [value.detach().requires_grad_() for value in self._vector.split(vector)]
+                parameters = dict(zip(self._names, values, strict=True))
+                loss = functional_call(self._loss, parameters, (batch,))
+                gradients = torch.autograd.grad(loss, values, allow_unused=True)
+            return [loss.detach(), self._vector.joined(gradients)]
+
+        return loss_and_gradient
+
+
+def weighted_sum(weights: list[float], parts: Iterable[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+    """The sum over parts (loss, gradient), each times its weight."""
+    (loss, gradient), *others = parts
+    if others:
+        loss, gradient = weights[0] * loss, weights[0] * gradient
+    for weight, (more, slope) in zip(weights[1:], others, strict=True):
+        loss.add_(more, alpha=weight)
+        gradient.add_(slope, alpha=weight)
+    return loss, gradient
 
 
 class _Loss(nn.Module):
@@ -108,7 +122,7 @@ def _samples(windows: Windows) -> list[Tensor]:
     return [windows.u] if rate is None else [windows.u, rate]
 
 
-def _call(program: Callable[..., list[Any]], arguments: tuple[Any, ...]) -> list[Any]:
+def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:
     with torch.no_grad():
         return program(*arguments)
 

@@ -1,0 +1,127 @@
+"""SOAP on batches of filled-up matrices moves each as the library's SOAP moves it alone."""
+
+import copy
+
+import pytest
+import torch
+from pytorch_optimizer import SOAP as Library
+
+from pinn_dyn.ensembles.learner import MemberSOAP
+from pinn_dyn.training import SOAP
+
+SHAPES = [(5, 5), (3, 7), (6, 2), (1, 4), (40, 3), (2, 33), (6,), ()]
+SETTINGS = {"lr": 0.01, "weight_decay": 0.1, "precondition_frequency": 4}
+MEMBERS = 3
+
+
+def parameters(leading=()):
+    generator = torch.Generator().manual_seed(0)
+    options = dict(generator=generator, dtype=torch.float64)
+    return [torch.nn.Parameter(torch.randn((*leading, *shape), **options)) for shape in SHAPES]
+
+
+def one_by_one(stacked):
+    """The parameters of each member, in the order of the stacked ones."""
+    return [torch.nn.Parameter(row.detach().clone()) for value in stacked for row in value]
+
+
+def steps(several, alone, optimizers, count, seed):
+    """Each takes so many steps along the same gradients."""
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(count):
+        for parameter in several:
+            parameter.grad = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        rows = [row for parameter in several for row in parameter.grad.view(len(alone) // 8, -1)]
+        for parameter, row in zip(alone, rows, strict=True):
+            parameter.grad = row.view(parameter.shape).clone()
+        for optimizer in optimizers:
+            optimizer.step()
+
+
+def take_bases(ours, several, theirs, alone):
+    """Give the library our first bases: where a gradient leaves one open, rounding chooses it."""
+    state, layout = ours.state[several[0]], ours._layouts[0]
+    of_size = {}
+    for batch, pair in zip(layout.batches, state["bases"], strict=True):
+        for k, (rows, columns) in enumerate(batch.sizes.tolist()):
+            left, right = pair[0][k, :rows, :rows], pair[1][k, :columns, :columns]
+            of_size.setdefault((rows, columns), []).append([left.clone(), right.clone()])
+    for parameter in alone:
+        if parameter.ndim == 2:
+            theirs.state[parameter]["Q"] = of_size[tuple(parameter.shape)].pop(0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "leading"), [(SOAP, ()), (MemberSOAP, (MEMBERS,))], ids=["one model", "members"]
+)
+def test_every_matrix_moves_as_it_does_alone(kind, leading):
+    """The bases are turned three times, each time after gradients along every direction."""
+    several = parameters(leading)
+    alone = one_by_one(several if leading else [p[None] for p in several])
+    settings = {**SETTINGS, "precondition_frequency": 20}
+    ours, theirs = kind(several, **settings), Library(alone, **settings)
+    steps(several, alone, [ours, theirs], 1, seed=1)
+    take_bases(ours, several, theirs, alone)
+    start = [p.detach().clone() for p in several]
+    steps(several, alone, [ours, theirs], 65, seed=2)
+    rows = [row for value in several for row in (value if leading else value[None])]
+    for found, expected in zip(rows, alone, strict=True):
+        # The library decomposes in float32.
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    for before, after in zip(start, several, strict=True):
+        assert (after - before).abs().min() > 1e-4
+
+
+def test_the_zeros_that_fill_a_matrix_up_stay_zeros():
+    several = parameters()
+    optimizer = SOAP(several, **SETTINGS)
+    steps(several, one_by_one([p[None] for p in several]), [optimizer], 13, seed=1)
+    state = optimizer.state[several[0]]
+    filled = 0
+    for batch, bases in zip(optimizer._layouts[0].batches, state["bases"], strict=True):
+        for k, sizes in enumerate(batch.sizes.tolist()):
+            for basis, size in zip(bases, sizes, strict=True):
+                assert (basis[k, :size, size:] == 0).all()
+                assert (basis[k, size:, :size] == 0).all()
+                filled += basis.shape[-1] - size
+    assert filled > 100
+
+
+def test_the_first_bases_diagonalize_the_first_gradient():
+    (several,) = parameters()[1:2]
+    optimizer = SOAP([several], **SETTINGS)
+    several.grad = torch.randn(3, 7, generator=torch.Generator().manual_seed(1)).double()
+    optimizer.step()
+    left, right = optimizer.state[several]["bases"][0]
+    turned = left[0, :3, :3].mT @ several.grad @ right[0, :7, :7]
+    expected = torch.zeros(3, 7, dtype=torch.float64)
+    expected[range(3), range(3)] = torch.linalg.svdvals(several.grad)
+    torch.testing.assert_close(turned.abs(), expected, rtol=0, atol=1e-6)
+
+
+def test_a_training_goes_on_from_its_saved_state():
+    """The same steps in one go, and with the optimizer written and read half way."""
+    whole, halves = parameters(), parameters()
+    alone = one_by_one([p[None] for p in whole])
+    optimizer, first = SOAP(whole, **SETTINGS), SOAP(halves, **SETTINGS)
+    steps(whole, alone, [optimizer], 6, seed=1)
+    steps(whole, alone, [optimizer], 6, seed=2)
+    steps(halves, alone, [first], 6, seed=1)
+    second = SOAP(halves, **SETTINGS)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    steps(halves, alone, [second], 6, seed=2)
+    for one, other in zip(whole, halves, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"lr": -1.0}, "lr is -1.0, expected at least 0"),
+        ({"betas": (0.9, 1.0)}, "a beta is 1.0, expected at least 0 and less than 1"),
+        ({"precondition_frequency": 0}, "precondition_frequency is 0, expected at least 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
+        SOAP(parameters(), **setting)
