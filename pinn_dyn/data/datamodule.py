@@ -31,6 +31,7 @@ class DynamicsData(L.LightningDataModule):
         seed: seed of the windows and their order.
         coverage: how evenly the windows cover the configurations, 0 to 1; see
             :func:`~pinn_dyn.data.windows.draw_windows`.
+        history: time before a window over which the input is kept, for models of a delay, s.
 
     Raises:
         ValueError: on counts below 1, or a batch larger than the number of pairs.
@@ -47,6 +48,7 @@ class DynamicsData(L.LightningDataModule):
         batches_per_epoch: int,
         seed: int,
         coverage: float = 0.0,
+        history: float = 0.0,
     ):
         super().__init__()
         for name, value in (
@@ -67,6 +69,7 @@ class DynamicsData(L.LightningDataModule):
         self.batches_per_epoch = batches_per_epoch
         self.seed = seed
         self.coverage = coverage
+        self.history = history
         self._splits: Splits | None = None
         self._windows: Windows | None = None
 
@@ -93,6 +96,7 @@ class DynamicsData(L.LightningDataModule):
                 stride=self.stride,
                 seed=self.seed,
                 coverage=self.coverage,
+                history=self.history,
             )
         return self._windows
 

@@ -38,6 +38,8 @@ from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
+# Inputs before a piece that are kept for models of a delay, s.
+_PAST = 0.5
 # What the trajectories depend on beside the files.
 _SETTINGS = (
     *("time", "q", "v", "u", "trajectory", "max_age", "steps", "validation", "test"),
@@ -442,7 +444,10 @@ class LogSource(DataSource):
                 f"{step:g} s"
             )
         pieces = [
-            item.rows(slice(first, first + span + 1))
+            replace(
+                item.rows(slice(first, first + span + 1)),
+                past=item.u[max(first - round(_PAST / step), 0) : first],
+            )
             for item in stretches
             for first in _starts(len(item), span)
         ]
@@ -467,7 +472,8 @@ class LogSource(DataSource):
             for values in (recording.q, recording.v, recording.u)
         )
         t = torch.arange(len(recording), dtype=torch.float64) * step
-        return Trajectory(q, v, Signal(t, u, self.interpolation))
+        past = None if recording.past is None else torch.from_numpy(recording.past.copy())
+        return Trajectory(q, v, Signal(t, u, self.interpolation), past=past)
 
 
 def _check_units(name: str, columns: Columns, expected: Sequence[str]) -> None:
