@@ -189,8 +189,8 @@ def draw_windows(
     generator = torch.Generator().manual_seed(seed)
     if coverage > 0:
         flat = _distinct(total, min(max(10 * count, 400_000), total), generator)
-        places = zip(trajectories, starts, strict=True)
-        q = torch.cat([item.q[past : past + n] for item, n in places])[flat]
+        parts = [item.q[past:][:n] for item, n in zip(trajectories, starts, strict=True)]
+        q = torch.cat(parts)[flat]
         flat = flat[_spread_out(q, count, coverage * q.shape[-1], generator)]
     else:
         flat = _distinct(total, count, generator)
@@ -202,8 +202,9 @@ def draw_windows(
     q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(which, offset, strict=True)])
     v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(which, offset, strict=True)])
     inputs = [item.input for item in trajectories]
-    places = zip(which, offset, strict=True)
-    parts = [inputs[i].part(slice(k - past, k + span + 1)) for i, k in places]
+    inputs = [
+        inputs[i].part(slice(k - past, k + span + 1)) for i, k in zip(which, offset, strict=True)
+    ]
     t = torch.arange(-past, span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
     p = q.new_zeros((count, steps + 1, 0)) if momentum is None else momentum(q, v)
@@ -215,7 +216,7 @@ def draw_windows(
         dq=q[:, 1:] - q[:, :1],
         dv=v[:, 1:] - v[:, :1],
         dp=p[:, 1:] - p[:, :1],
-        input=stacked(parts, t),
+        input=stacked(inputs, t),
         past=past,
     )
 

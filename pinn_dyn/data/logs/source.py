@@ -21,6 +21,7 @@ from pinn_dyn.data.logs.checks import (
     check_inputs,
     check_rest,
     check_second_clock,
+    check_stamps,
     check_unseen_inputs,
     check_velocities,
 )
@@ -263,6 +264,7 @@ class LogSource(DataSource):
         if self._loaded is None:
             report = Report(self.name)
             recordings = self._read(report)
+            check_stamps(recordings, list(self.steps.values()), report)
             check_inputs(recordings, self.u, report)
             check_angles(recordings, self.q, report)
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
