@@ -2,9 +2,12 @@
 
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
+from rosbags.highlevel import AnyReader
 
-from pinn_dyn.data.logs import LogError
+from pinn_dyn.data.logs import LogError, messages
+from pinn_dyn.data.logs.bags import read_bag
 from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
 
@@ -46,6 +49,59 @@ def test_bags_map_joints_by_name_whatever_their_order(tmp_path, expected, files,
     assert_same(trajectories(log), expected)
     assert ("lack a joint" in log.report) == ("empty_every" in options)
     assert log.fingerprint()["files"]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_numbers_read_by_layout_are_those_of_the_library(tmp_path, monkeypatch, version):
+    """Two orders of joints and messages without some: read as bytes, and one by one."""
+    path = tmp_path / ("run.bag" if version == 1 else "run")
+    formats.write_bag(path, TABLE, version=version, empty_every=7, late=0.004)
+    columns = [f"/joint_states/{x}/{j}" for x in ("position", "velocity") for j in formats.JOINTS]
+    asked = ["/joint_states/t", *columns, "/commands/data/1", "/commands/t"]
+    called = []
+    deserialize = AnyReader.deserialize
+
+    def counted(self, raw, kind):
+        called.append(kind)
+        return deserialize(self, raw, kind)
+
+    monkeypatch.setattr(AnyReader, "deserialize", counted)
+    by_layout = read_bag(path, asked[0], asked, 0.1)
+    assert len(called) < 10
+    monkeypatch.setattr(messages, "_LAYOUTS", 0)
+    pd.testing.assert_frame_equal(by_layout, read_bag(path, asked[0], asked, 0.1))
+    assert len(called) > 1200
+
+
+def test_layouts_of_nested_messages(tmp_path):
+    """Points of a trajectory: numbers of an element of a sequence, by a joint's name."""
+    types = formats.STORE.types
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    stamp = types["builtin_interfaces/msg/Time"](sec=3, nanosec=5)
+    lasting = types["builtin_interfaces/msg/Duration"](sec=0, nanosec=7)
+    none = np.array([])
+    numbers = [np.array([k + 0.25, k + 0.5]) for k in range(2)]
+    message = types[kind](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="base"),
+        joint_names=["a", "elbow"],
+        points=[point(x, none, none, 10 * x, lasting) for x in numbers],
+    )
+    raw = bytes(formats.STORE.serialize_cdr(message, kind))
+    layout = messages.layout_of(raw, kind, formats.STORE.fielddefs, cdr=True)
+
+    def number(path):
+        place, what = layout.place(path)
+        return np.frombuffer(raw, what, 1, place)[0]
+
+    assert number("points/1/positions/elbow") == 1.5
+    assert number("points/1/effort/0") == 12.5
+    assert number("points/0/time_from_start/nanosec") == 7
+    assert number("header/stamp/sec") == 3
+    for path in ("points/2/positions/elbow", "points/1/positions/wrist", "points/1/positions/2"):
+        assert layout.place(path) is None
+    assert messages.layout_of(raw[:40], kind, formats.STORE.fielddefs, cdr=True) is None
+    assert messages.layout_of(b"\0\0" + raw[2:], kind, formats.STORE.fielddefs, cdr=True) is None
 
 
 def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
