@@ -124,7 +124,7 @@ class Windows:
 def draw_windows(
     trajectories: list[Trajectory],
     *,
-    count: int,
+    count: int | None,
     steps: int,
     stride: int,
     seed: int,
@@ -142,7 +142,7 @@ def draw_windows(
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
-        count: number of windows B.
+        count: number of windows B; None: every start has one.
         steps: steps H of a window.
         stride: samples in a step.
         seed: seed of the starts.
@@ -155,7 +155,7 @@ def draw_windows(
             than there are starts.
     """
     for name, value in (("count", count), ("steps", steps), ("stride", stride)):
-        if value < 1:
+        if value is not None and value < 1:
             raise ValueError(f"{name} is {value}, expected at least 1")
     if not 0 <= coverage <= 1:
         raise ValueError(f"coverage is {coverage}, expected a number from 0 to 1")
@@ -179,6 +179,8 @@ def draw_windows(
     past = math.ceil(history / sample - 1e-6)
     starts = torch.tensor([max(item.t.shape[0] - span - past, 0) for item in trajectories])
     total = int(starts.sum())
+    if count is None:
+        count = max(total, 1)
     if total < count:
         before = f", and of {past} before them for the delay," if past else ""
         raise ValueError(

@@ -209,7 +209,7 @@ class Topic:
                 break
             self._layouts.append(layout)
             left = self._take(layout, raws, received, left, into)
-        for k in left:
+        for k in left.tolist():
             into[:, k] = self._deserialized(raws[k], stamps[k], kind, reader)
 
     def _deserialized(self, raw: bytes, stamp: int, kind: str, reader: Any) -> list[float]:
