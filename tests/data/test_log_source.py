@@ -10,7 +10,7 @@ import scipy.io
 import torch
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps
+from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps, reader
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
@@ -352,3 +352,17 @@ def test_pieces_know_the_input_before_them(folder):
     first, second = source(folder, u=dict(columns=["u1", "u2"], unit="Nm")).load().test
     assert len(first.past) == 0
     assert torch.equal(second.past, first.u[-51:-1])
+
+
+@pytest.mark.parametrize("last", ["7.5", "", "text"])
+def test_files_parsed_in_parts_are_those_parsed_at_once(tmp_path, monkeypatch, last):
+    """Whole numbers, then numbers, text or nothing in a later part; names of runs; blank lines."""
+    rows = [f"{k / 100},{k},a{k // 5},{k // 5}" for k in range(20)]
+    rows += ["", f"0.2,{last},b,4", "", ""]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(["t,x,run,number", *rows]) + "\n")
+    whole = reader.read_table(path, "t", [], 0.1)
+    assert len(whole) == 22
+    monkeypatch.setattr(reader, "_PART", 6)
+    in_parts = reader.read_table(path, "t", [], 0.1)
+    pd.testing.assert_frame_equal(in_parts, whole)

@@ -204,11 +204,11 @@ class Topic:
         for layout in self._layouts:
             left = self._take(layout, raws, received, left, into)
         while len(left) and len(self._layouts) < _LAYOUTS:
-            layout = self._new_layout(raws[left[0]], kind, reader)
-            if layout is None:
+            new = self._new_layout(raws[left[0]], kind, reader)
+            if new is None:
                 break
-            self._layouts.append(layout)
-            left = self._take(layout, raws, received, left, into)
+            self._layouts.append(new)
+            left = self._take(new, raws, received, left, into)
         for k in left.tolist():
             into[:, k] = self._deserialized(raws[k], stamps[k], kind, reader)
 
