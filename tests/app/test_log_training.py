@@ -6,8 +6,10 @@ import shutil
 
 import pandas as pd
 import pytest
+import torch
 from matplotlib.image import imread
 
+from pinn_dyn import fit
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -17,6 +19,8 @@ from tests.app.entry import (
     fails,
     run_script,
 )
+from tests.data import log_formats as formats
+from tests.data.logs_files import motion, source, write
 
 EXAMPLES = ROOT / "examples"
 TINY = ["experiment=example_log/lnn", "compile=false", *TINY_TRAINING, NO_FIGURES]
@@ -169,3 +173,18 @@ def test_presets_of_hardware_have_the_structure_of_the_paper():
     assert len(panda.model.angles) == len(panda.dataset.q.columns) == 7
     for preset in (neck, fit, panda):
         assert preset.model.friction._target_.endswith("CoulombFriction")
+
+
+def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
+    table = motion(6.0)
+    formats.write_bag(tmp_path / "run", table)
+    write(tmp_path, table)
+    small = ["data=multi_step", "data.pairs=64", "data.steps=2", "data.batch_size=32"]
+    small += ["validator.horizon=0.5", "compile=false"]
+    weights = []
+    for log in (source(tmp_path, files="run", **formats.BAG), source(tmp_path)):
+        weights.append(fit(log, model="lnn", steps=3, overrides=small).model.state_dict())
+    for name, value in weights[0].items():
+        torch.testing.assert_close(value, weights[1][name], rtol=1e-5, atol=1e-7)
+    moved = fit(log, model="lnn", steps=3, seed=1, overrides=small).model.state_dict()
+    assert any(not torch.allclose(value, moved[name]) for name, value in weights[0].items())
