@@ -62,8 +62,7 @@ def torque_error(
     chosen = slice(None, None, -(-truth.q.shape[:2].numel() // _SAMPLES))
     learned = double_copy(model)
     with torch.no_grad():
-        input = learned.acting_input(truth.input_since(learned.input_history))
-        u = input.at(truth.t).movedim(0, 1)
+        u = learned.acting_samples(truth)
         q, v, u = (x.double().flatten(0, 1)[chosen] for x in (truth.q, truth.v, u))
         if system is None:
             a = _slope(truth).flatten(0, 1)[chosen]

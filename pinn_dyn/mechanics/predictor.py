@@ -14,7 +14,7 @@ from pinn_dyn.mechanics.arrays import require_last_dim
 from pinn_dyn.mechanics.integrators import RK4, Integrator
 from pinn_dyn.mechanics.rollout import path_between, require_start
 from pinn_dyn.mechanics.signal import Signal
-from pinn_dyn.mechanics.trajectory import State
+from pinn_dyn.mechanics.trajectory import State, Trajectory
 
 
 class Predictor(nn.Module, abc.ABC):
@@ -58,6 +58,18 @@ class Predictor(nn.Module, abc.ABC):
         q, v and a ``(B, N)`` and u ``(B, M)`` are states, accelerations and inputs of the data.
         """
         return q.new_zeros(())
+
+    def acting_input(self, input: Signal) -> Signal:
+        """The input as it acts on the robot; here as it is, in a model of a delay later."""
+        return input
+
+    @final
+    def acting_samples(self, truth: Trajectory) -> Tensor:
+        """The input as it acts at the samples of a trajectory, ``(*batch, T, M)``."""
+        if not self.input_history:
+            return truth.u
+        input = self.acting_input(truth.input_since(self.input_history))
+        return input.at(truth.t).movedim(0, -2)
 
     def learned_figures(self) -> dict[str, float]:
         """Learned numbers to be reported by their names, such as an input delay in s."""
@@ -109,10 +121,6 @@ class ContinuousPredictor(Predictor):
         Here it is x0 itself.
         """
         return x0
-
-    def acting_input(self, input: Signal) -> Signal:
-        """The input as it acts on the robot; here as it is, in a model of a delay later."""
-        return input
 
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor

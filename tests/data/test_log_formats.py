@@ -1,10 +1,15 @@
 """Bags, HDF5, MATLAB 7.3, NPZ and Parquet give the trajectories that the same CSV gives."""
 
+import contextlib
+import sqlite3
+
 import h5py
 import numpy as np
 import pandas as pd
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pinn_dyn.data.logs import LogError, messages
 from pinn_dyn.data.logs.bags import read_bag
@@ -151,6 +156,44 @@ def test_a_bag_cut_short_is_named(tmp_path, version, name):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(LogError, match=f"{path.name}: cannot be read as a bag, it may be cut"):
         source(tmp_path, files=name, **formats.BAG).load()
+
+
+def write_numbers(path, kind, store, *, mcap, compressed=False):
+    """A bag of one topic of messages with a number each."""
+    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compressed:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/number", kind, typestore=store)
+        for k in range(50):
+            message = store.types[kind](float(k))
+            writer.write(connection, 10**7 * k, store.serialize_cdr(message, kind))
+
+
+def test_messages_of_an_unknown_type_are_told(tmp_path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 data", "my_msgs/msg/Own"))
+    write_numbers(tmp_path / "run", "my_msgs/msg/Own", store, mcap=False)
+    asked = "/number/t", ["/number/data"], 0.1
+    assert len(read_bag(tmp_path / "run", *asked)) == 50  # by the definition in the bag
+    (database,) = (tmp_path / "run").glob("*.db3")
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        connection.execute("delete from message_definitions")
+        connection.commit()
+    with pytest.raises(LogError, match=r"topic /number: its type my_msgs/msg/Own is unknown.*MCAP"):
+        read_bag(tmp_path / "run", *asked)
+
+
+def test_chunks_of_a_codec_that_is_missing_are_told(tmp_path):
+    kind = "std_msgs/msg/Float64"
+    write_numbers(tmp_path / "run", kind, formats.STORE, mcap=True, compressed=True)
+    asked = "/number/t", ["/number/data"], 0.1
+    assert len(read_bag(tmp_path / "run", *asked)) == 50
+    (path,) = (tmp_path / "run").glob("*.mcap")
+    path.write_bytes(path.read_bytes().replace(b"zstd", b"rare"))
+    with pytest.raises(LogError, match=r"run: cannot be read.*a codec.*'rare'.*ros2 bag convert"):
+        read_bag(tmp_path / "run", *asked)
 
 
 MATRICES = dict(

@@ -10,8 +10,8 @@ from pinn_dyn.control import Tracking
 from pinn_dyn.data.logs import SavitzkyGolayVelocity
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.evaluation import predict_trajectories, predict_windows
-from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory
+from pinn_dyn.evaluation import predict_trajectories, predict_windows, torque_error
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Sum, Trajectory
 from pinn_dyn.models import (
     AccelerationMLP,
     ConstantCholesky,
@@ -20,6 +20,7 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     LearnedDelay,
     NetworkPotential,
+    NoDelay,
 )
 from pinn_dyn.training.gradients.program import LossProgram
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss
@@ -238,8 +239,29 @@ def make_scales():
     return pendulum_windows(steps=1, history=0.0, count=100).statistics()
 
 
-def test_laws_and_ensembles_refuse_it_by_name():
+def test_terms_are_compared_under_the_input_that_acts():
+    model = set_delay(pendulum_model(make_scales(), LearnedDelay(0.1)), 0.05).double()
+    whole = pendulum_trajectory()
+    late = Trajectory(
+        whole.q[None, 5:],
+        whole.v[None, 5:],
+        whole.input.part(slice(0, -5)).mapped(lambda u: u[None]),
+    )
+    whole = Trajectory(whole.q[None], whole.v[None], whole.input.mapped(lambda u: u[None]))
+    assert_near(model.acting_samples(whole)[:, 5:], late.u, 1e-9)
+    with_delay = torque_error(model, whole, system=None)
+    model.delay = NoDelay()
+    # Five samples of 1200 are the others' start.
+    assert with_delay.share == pytest.approx(torque_error(model, late, system=None).share, rel=0.02)
+    assert with_delay.share != pytest.approx(
+        torque_error(model, whole, system=None).share, rel=0.05
+    )
+
+
+def test_sums_laws_and_ensembles_refuse_it_by_name():
     model = make_model("lnn", LearnedDelay(0.1))
+    with pytest.raises(ValueError, match=r"the part late of a sum learns a delay.*late.delay=none"):
+        Sum({"late": model, "other": make_model("lnn")})
     with pytest.raises(ValueError, match="learned input delay"):
         Tracking(model, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"model/delay=learned.*one by one"):

@@ -71,7 +71,8 @@ def read_bag(path: Path, time: str, columns: Sequence[str], max_age: float) -> p
         raise LogError(
             f"{path}: cannot be read as a bag, it may be cut short, or be compressed by a codec "
             f"that is missing ({type(error).__name__}: {error}): try 'ros2 bag reindex', or "
-            "'rosbag reindex' for ROS 1, or record it again"
+            "'rosbag reindex' for ROS 1, write it without compression ('ros2 bag convert'), or "
+            "record it again"
         ) from error
     return _merged(path, topics, time, max_age)
 
