@@ -134,7 +134,10 @@ def build_predictor(config: dict[str, Any], statistics: Statistics) -> Predictor
     for k in range(ensemble_size(config)):
         L.seed_everything(config["seed"] + k, verbose=False)
         members.append(build_model(config, statistics))
-    return Ensemble(members)
+    try:
+        return Ensemble(members)
+    except ValueError as error:
+        raise ConfigError(f"ensemble: {error}") from error
 
 
 def build_learner(

@@ -69,6 +69,7 @@ _SHOWN = (
     "member_error_mean",
     "member_error_std",
     "spread_over_error",
+    "input_delay_seconds",
 )
 
 # What each split of the data is called in tables and figures.
@@ -138,7 +139,11 @@ def evaluate(cfg: DictConfig) -> float:
         recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
         extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
         row = RunResult(
-            label, run.config["model_name"], run.config["seed"], {}, {**extra, "step": step}
+            label,
+            run.config["model_name"],
+            run.config["seed"],
+            {},
+            {**extra, "step": step, **run.model.learned_figures()},
         )
         try:
             evaluations.append(_evaluate(run.model, row, truth, training.train, stride, config))
@@ -173,9 +178,10 @@ def evaluate(cfg: DictConfig) -> float:
     print(f"{source.name}: {trajectories}, {config['horizon']:g} s open loop")
     headers = {name: name.removesuffix("_error_mean") for name in summary if "window_" in name}
     headers |= {"left_data_after": "after", "torque_share": "torque", "residual_share": "residual"}
+    headers |= {"input_delay_seconds": "delay"}
     print(format_table(summary[[name for name in shown if name in summary]], headers))
     verdict = beaten_by_floors(summary)
-    notes = ["* best; only a model that beats all in brackets; valid_time and after in s"]
+    notes = ["* best; only a model that beats all in brackets; valid_time, after and delay in s"]
     print("\n".join([*notes, *verdict]))
     if len(grouped) < len(summary):
         figures = [c for c in grouped if c.endswith(("_error_mean", "_error_worst"))]

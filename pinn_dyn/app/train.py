@@ -202,6 +202,11 @@ def train_in(
             f"{data.source.name} has none, as they cannot be measured: set "
             "model.state=qv, which learns from (q, v), or use model=lnn"
         )
+    if model.input_history > data.history:
+        raise ConfigError(
+            f"data.history is {data.history} s, but the model may look {model.input_history} s back"
+            " (model.delay.longest): leave data.history out, it follows model.delay.longest"
+        )
     if config.get("start_from") and last is None:
         _take_weights(model, Path(config["start_from"]), trust)
     learner = build_learner(config, model, statistics, validator)
@@ -238,7 +243,7 @@ def train_in(
     write_json(folder / METRICS, record)
     histories = [one for one in trainer.callbacks if isinstance(one, ValidationHistory)]  # type: ignore[attr-defined]
     log.info(
-        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s",
+        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s%s",
         config["name"],
         config["seed"],
         error,
@@ -246,6 +251,7 @@ def train_in(
         seconds,
         folder,
         "".join(f"; {one.summary()}" for one in histories),
+        "".join(f"; {key} {value:.4g}" for key, value in model.learned_figures().items()),
     )
     for one in histories:
         if said := one.warning():

@@ -80,7 +80,8 @@ class ModelBasedLaw(StateFeedback):
 
     Raises:
         TypeError: on a model that is no mechanical system.
-        ValueError: on bad gains, a negative damping, or a condition number below 1.
+        ValueError: on bad gains, a negative damping, a condition number below 1, or a model of a
+            delayed input.
     """
 
     def __init__(
@@ -97,6 +98,13 @@ class ModelBasedLaw(StateFeedback):
                 f"{type(self).__name__}: model is a {type(model).__name__}, expected a mechanical "
                 "system: a black box has no terms M, G and A for a control law; use a run of "
                 "model=lnn or model=hnn"
+            )
+        if model.input_history:
+            raise ValueError(
+                f"{type(self).__name__}: the model has a learned input delay "
+                f"({model.learned_figures()}), and the law acts as if its input acted at once: "
+                "lower the gains until the delay does not matter and set "
+                "model.delay = pinn_dyn.models.NoDelay(), or train with model/delay=none"
             )
         if not (inverse_damping >= 0 and math.isfinite(inverse_damping)):
             raise ValueError(f"inverse_damping is {inverse_damping}, expected 0 or more, finite")

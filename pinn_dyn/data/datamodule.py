@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import lightning as L
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Sampler
 
+from pinn_dyn.data.lengths import Length, seconds_of
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.data.windows import (
     BatchSampler,
@@ -14,7 +17,7 @@ from pinn_dyn.data.windows import (
     Windows,
     draw_windows,
 )
-from pinn_dyn.mechanics import Trajectory, stack
+from pinn_dyn.mechanics import Trajectory, samples_of, stack
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -23,14 +26,15 @@ class DynamicsData(L.LightningDataModule):
 
     Args:
         source: where the trajectories come from.
-        pairs: number of training windows.
+        pairs: number of training windows, or ``"all"`` that the trajectories have.
         steps: steps H of a window; 1 gives the paper's transition pairs.
-        stride: samples of the data in a step.
+        stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
         batch_size: windows in a batch.
         batches_per_epoch: batches in what the trainer counts as an epoch.
         seed: seed of the windows and their order.
         coverage: how evenly the windows cover the configurations, 0 to 1; see
             :func:`~pinn_dyn.data.windows.draw_windows`.
+        history: time before a window over which the input is kept, for models of a delay, s.
 
     Raises:
         ValueError: on counts below 1, or a batch larger than the number of pairs.
@@ -40,13 +44,14 @@ class DynamicsData(L.LightningDataModule):
         self,
         source: DataSource,
         *,
-        pairs: int,
+        pairs: int | Literal["all"],
         steps: int,
-        stride: int,
+        stride: Length,
         batch_size: int,
         batches_per_epoch: int,
         seed: int,
         coverage: float = 0.0,
+        history: float = 0.0,
     ):
         super().__init__()
         for name, value in (
@@ -55,7 +60,7 @@ class DynamicsData(L.LightningDataModule):
         ):
             if value < 1:
                 raise ValueError(f"{name} is {value}, expected at least 1")
-        if batch_size > pairs:
+        if pairs != "all" and batch_size > pairs:
             raise ValueError(
                 f"batch_size is {batch_size}, expected at most the number of pairs, {pairs}"
             )
@@ -67,6 +72,7 @@ class DynamicsData(L.LightningDataModule):
         self.batches_per_epoch = batches_per_epoch
         self.seed = seed
         self.coverage = coverage
+        self.history = history
         self._splits: Splits | None = None
         self._windows: Windows | None = None
 
@@ -85,15 +91,24 @@ class DynamicsData(L.LightningDataModule):
     def windows(self) -> Windows:
         """The training windows."""
         if self._windows is None:
-            splits = self.splits
+            train = self.splits.train
+            stride = self.stride
+            if isinstance(stride, str):
+                stride = samples_of("stride", seconds_of("stride", stride), train[0].t)
             self._windows = draw_windows(
-                splits.train,
-                count=self.pairs,
+                train,
+                count=None if self.pairs == "all" else self.pairs,
                 steps=self.steps,
-                stride=self.stride,
+                stride=stride,
                 seed=self.seed,
                 coverage=self.coverage,
+                history=self.history,
             )
+            if self.batch_size > len(self._windows):
+                raise ValueError(
+                    f"batch_size is {self.batch_size}, expected at most the number of pairs, "
+                    f"{len(self._windows)}"
+                )
         return self._windows
 
     @property

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice, repeat
 from typing import Any
 
@@ -31,7 +32,8 @@ class Windows:
         p: momentum at the start, ``(B, N)``; empty ``(B, 0)`` where there is none.
         dq, dv, dp: increments from the start to each step, ``(B, H, N)``; taken in double
             precision, as they are far smaller than the states.
-        input: u, with samples ``(B, H * stride + 1, M)``.
+        input: u, with samples ``(B, past + H * stride + 1, M)``.
+        past: samples of the input before the start, for models of a delay.
     """
 
     t: Tensor
@@ -42,6 +44,7 @@ class Windows:
     dv: Tensor
     dp: Tensor
     input: Signal
+    past: int = field(default=0, kw_only=True)
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -78,8 +81,8 @@ class Windows:
 
     @property
     def u(self) -> Tensor:
-        """Samples of the input, ``(B, H * stride + 1, M)``."""
-        return self.input.u
+        """Samples of the input from the start on, ``(B, H * stride + 1, M)``."""
+        return self.input.u[..., self.past :, :]
 
     def start(self, state: State) -> Tensor:
         """State at the start, ``(B, 2N)``: (q, v) or (q, p)."""
@@ -93,7 +96,8 @@ class Windows:
         """The windows cut after their first ``steps`` steps."""
         if steps == len(self.t) - 1:
             return self
-        samples = steps * ((len(self.input.t) - 1) // (len(self.t) - 1)) + 1
+        stride = (len(self.input.t) - 1 - self.past) // (len(self.t) - 1)
+        samples = self.past + steps * stride + 1
         return replace(
             self,
             t=self.t[: steps + 1],
@@ -131,11 +135,12 @@ class Windows:
 def draw_windows(
     trajectories: list[Trajectory],
     *,
-    count: int,
+    count: int | None,
     steps: int,
     stride: int,
     seed: int,
     coverage: float = 0.0,
+    history: float = 0.0,
 ) -> Windows:
     """Draw windows at random starts, over all starts of all trajectories.
 
@@ -148,21 +153,25 @@ def draw_windows(
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
-        count: number of windows B.
+        count: number of windows B; None: every start has one.
         steps: steps H of a window.
         stride: samples in a step.
         seed: seed of the starts.
         coverage: c, from 0 to 1.
+        history: time before each start over which the input is kept, s; windows start so late.
 
     Raises:
-        ValueError: on counts below 1, a coverage outside 0 to 1, differing sample times,
-            trajectories shorter than a window, or more windows than there are starts.
+        ValueError: on counts below 1, a coverage outside 0 to 1, a negative history or one of a
+            held input, differing sample times, trajectories shorter than a window, or more windows
+            than there are starts.
     """
     for name, value in (("count", count), ("steps", steps), ("stride", stride)):
-        if value < 1:
+        if value is not None and value < 1:
             raise ValueError(f"{name} is {value}, expected at least 1")
     if not 0 <= coverage <= 1:
         raise ValueError(f"coverage is {coverage}, expected a number from 0 to 1")
+    if not 0 <= history < math.inf:
+        raise ValueError(f"history is {history} s, expected 0 or more")
     span = steps * stride
     sample = float(trajectories[0].t[1] - trajectories[0].t[0])
     for k, item in enumerate(trajectories):
@@ -172,31 +181,44 @@ def draw_windows(
                 f"training trajectory {k} has sample times from {float(spacing.min()):g} to "
                 f"{float(spacing.max()):g} s, expected {sample:g} s throughout: resample it first"
             )
-    starts = torch.tensor([max(item.t.shape[0] - span, 0) for item in trajectories])
-    total = int(starts.sum())
-    if total < count:
+    if history and trajectories[0].input.interpolation == "hold":
         raise ValueError(
-            f"{count} windows of {span} samples ({span * sample:g} s) were asked for, but the "
-            f"{len(trajectories)} training trajectories have only {total} starts for them: ask for "
-            "fewer pairs, a shorter window or more data"
+            f"history is {history} s, for a learned delay, but the input is held between its "
+            "samples, and has no slope to learn by: set dataset.interpolation=linear, or find the "
+            "delay by check.py, shift the input by the step InputDelay and take model/delay=none"
+        )
+    past = math.ceil(history / sample - 1e-6)
+    starts = torch.tensor([max(item.t.shape[0] - span - past, 0) for item in trajectories])
+    total = int(starts.sum())
+    if count is None:
+        count = max(total, 1)
+    if total < count:
+        before = f", and of {past} before them for the delay," if past else ""
+        raise ValueError(
+            f"{count} windows of {span} samples ({span * sample:g} s){before} were asked for, but "
+            f"the {len(trajectories)} training trajectories have only {total} starts for them: ask "
+            "for fewer pairs, a shorter window or more data"
         )
     generator = torch.Generator().manual_seed(seed)
     if coverage > 0:
         flat = _distinct(total, min(max(10 * count, 400_000), total), generator)
-        q = torch.cat([item.q[:n] for item, n in zip(trajectories, starts, strict=True)])[flat]
+        parts = [item.q[past:][:n] for item, n in zip(trajectories, starts, strict=True)]
+        q = torch.cat(parts)[flat]
         flat = flat[_spread_out(q, count, coverage * q.shape[-1], generator)]
     else:
         flat = _distinct(total, count, generator)
     ends = starts.cumsum(0)
     which = torch.searchsorted(ends, flat, right=True)
-    offset = flat - (ends - starts)[which]
+    offset = past + flat - (ends - starts)[which]
 
     knots = torch.arange(steps + 1) * stride
     q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(which, offset, strict=True)])
     v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(which, offset, strict=True)])
     inputs = [item.input for item in trajectories]
-    parts = [inputs[i].part(slice(k, k + span + 1)) for i, k in zip(which, offset, strict=True)]
-    t = torch.arange(span + 1, dtype=torch.float64) * sample
+    inputs = [
+        inputs[i].part(slice(k - past, k + span + 1)) for i, k in zip(which, offset, strict=True)
+    ]
+    t = torch.arange(-past, span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
     p = q.new_zeros((count, steps + 1, 0)) if momentum is None else momentum(q, v)
     return Windows(
@@ -207,7 +229,8 @@ def draw_windows(
         dq=q[:, 1:] - q[:, :1],
         dv=v[:, 1:] - v[:, :1],
         dp=p[:, 1:] - p[:, :1],
-        input=stacked(parts, t),
+        input=stacked(inputs, t),
+        past=past,
     )
 
 

@@ -25,6 +25,7 @@ _NOISE = 0.02
 _CONDITION = 1e3
 _OWN = 0.01
 _FAR = 3.0
+_NEAR = 0.05  # of the spread
 _OUTSIDE = 0.05
 
 
@@ -119,7 +120,9 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
             "least": np.vstack([item.u for item in training]).min(axis=0),
             "most": np.vstack([item.u for item in training]).max(axis=0),
             "delay [ms]": [np.nan if c.delay is None else 1e3 * c.delay for c in delays],
-            "spread [ms]": [1e3 * min(c.spread, 9.999) for c in delays],
+            "spread [ms]": [
+                np.nan if c.delay is None else 1e3 * min(c.spread, 9.999) for c in delays
+            ],
             "how": [c.reason or c.form for c in delays],
         }
     )
@@ -152,7 +155,7 @@ def _run(part: Cleaned) -> dict[str, object]:
         "duration [s]": part.raw.duration,
         "rows": len(part.raw),
         "sample time [ms]": 1e3 * usual,
-        "jitter [%]": 100 * float(np.percentile(np.abs(spacing - usual), 95)) / usual,
+        "jitter [%]": round(100 * float(np.percentile(np.abs(spacing - usual), 95)) / usual, 3),
         "longest gap [ms]": 1e3 * float(spacing.max()),
     }
 
@@ -272,7 +275,8 @@ def _distance(training: list[Recording], test: Sequence[Trajectory]) -> np.ndarr
     """Of the test's (q, v) from the nearest of the training.
 
     The unit is the distance that a tenth of the training keeps from the nine others, so that it
-    does not depend on the number of coordinates.
+    does not depend on the number of coordinates; at least a twentieth of the spread in each of
+    them, which is near also where the training repeats one motion.
     """
     known = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
     asked = np.vstack([np.hstack([item.q.numpy(), item.v.numpy()]) for item in test])
@@ -281,7 +285,7 @@ def _distance(training: list[Recording], test: Sequence[Trajectory]) -> np.ndarr
     asked = asked[:: max(1, len(asked) // _POINTS)] / spread
     tenth = np.arange(len(known)) * 10 // len(known)
     own = [cKDTree(known[tenth != k]).query(known[tenth == k])[0] for k in range(10)]
-    unit = max(float(np.median(np.concatenate(own))), 1e-12)
+    unit = max(float(np.median(np.concatenate(own))), _NEAR * known.shape[1] ** 0.5)
     return cKDTree(known).query(asked)[0] / unit
 
 
@@ -339,9 +343,10 @@ def _warnings(
         )
     late = [c.delay for c in delays if c.delay is not None and c.delay > 0.75 * step]
     if late:
+        shown = list(dict.fromkeys(f"{1e3 * delay:.0f}" for delay in (min(late), max(late))))
         found.append(
-            f"inputs act {1e3 * min(late):.0f} to {1e3 * max(late):.0f} ms after they are logged: "
-            "add the InputDelay step below"
+            f"inputs act {' to '.join(shown)} ms after they are logged: add the InputDelay step "
+            "below, or learn the delay with the model"
         )
     return found
 
@@ -355,6 +360,12 @@ def _suggestion(delays: list[DelayCurve], figures: dict[str, float], step: float
             "steps:",
             f"  delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {shown}}}",
         ]
+        if len(set(shifts)) == 1:
+            longest = max(0.1, 2 * shifts[0])
+            lines.append(
+                "# or, learned with the model, on the command line: model/delay=learned "
+                f"model.delay.initial={shifts[0]:g} model.delay.longest={longest:g}"
+            )
     if figures["share of the training at rest"] > 0.5:
         lines.append("# on the command line: data.coverage=0.5, as the robot often rests")
     return "\n".join(lines)

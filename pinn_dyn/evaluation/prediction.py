@@ -85,8 +85,8 @@ def predict_trajectories(
     paths = _roll_out(
         model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0]),
         truth.states(model.state, slice(1))[:, 0].double(),
-        truth.input.to(truth.q.device, torch.float64),
-        stride,
+        truth.t[::stride],
+        truth.input_since(model.input_history).to(truth.q.device, torch.float64),
     )
     return Prediction(
         truth.t[::stride].double(), paths.mean(0), truth.q[:, ::stride].double(), _members(paths)
@@ -121,15 +121,18 @@ def predict_windows(
         )
     last = windows * samples
     x0 = truth.states(model.state, slice(0, last, samples)).double()
-    # (K windows, samples + 1, M): neighbouring windows share the sample between them.
-    input = truth.input.part(slice(last + 1)).to(truth.q.device, torch.float64)
-    pieces = input.mapped(lambda u: u.unfold(1, samples + 1, samples).movedim(-1, -2).flatten(0, 1))
-    pieces = replace(pieces, t=input.t[: samples + 1])
+    input = truth.input_since(model.input_history)
+    past = input.t.shape[0] - truth.t.shape[0]
+    # (K windows, past + samples + 1, M): neighbours share the sample between them, and their past.
+    input = input.part(slice(past + last + 1)).to(truth.q.device, torch.float64)
+    size = past + samples + 1
+    pieces = input.mapped(lambda u: u.unfold(1, size, samples).movedim(-1, -2).flatten(0, 1))
+    pieces = replace(pieces, t=input.t[:size])
     ends = _roll_out(
         model_for_roll_outs(model, truth.q.device, samples // stride, x0.shape[:2].numel()),
         x0.flatten(0, 1),
+        pieces.t[past::stride],
         pieces,
-        stride,
     )[..., 1:, :]
     q = truth.q[:, : last + 1 : stride].double()
     start = q[:, :1].expand(ends.shape[0], -1, -1, -1)
@@ -155,9 +158,8 @@ def model_for_roll_outs(
 
 
 @torch.no_grad()
-def _roll_out(model: Predictor, x0: Tensor, input: Signal, stride: int) -> Tensor:
-    """Predicted q ``(E, B, T, N)`` at every ``stride``-th sample; E is 1, but for an ensemble."""
-    t = input.t[::stride]
+def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
+    """Predicted q ``(E, B, T, N)`` at the times t; E is 1, but for an ensemble."""
     if isinstance(model, Ensemble):
         states = x0.unsqueeze(-2) + model.member_increments(x0, t, input)
     else:

@@ -50,7 +50,8 @@ def part_shares(model: Sum, truth: Trajectory) -> pd.DataFrame:
 def _samples(model: MechanicalSystem, truth: Trajectory) -> list[Tensor]:
     chosen = slice(None, None, -(-truth.q.shape[:2].numel() // _SAMPLES))
     like = next(model.parameters())
-    return [x.flatten(0, 1)[chosen].to(like) for x in (truth.q, truth.v, truth.u)]
+    u = model.acting_samples(truth).detach()
+    return [x.flatten(0, 1)[chosen].to(like) for x in (truth.q, truth.v, u)]
 
 
 def _rms(force: Tensor) -> float:

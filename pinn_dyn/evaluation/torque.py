@@ -60,9 +60,10 @@ def torque_error(
         ValueError: if a measured trajectory has fewer than 5 samples or its sample time varies.
     """
     chosen = slice(None, None, -(-truth.q.shape[:2].numel() // _SAMPLES))
-    q, v, u = (x.double().flatten(0, 1)[chosen] for x in (truth.q, truth.v, truth.u))
     learned = double_copy(model)
     with torch.no_grad():
+        u = learned.acting_samples(truth)
+        q, v, u = (x.double().flatten(0, 1)[chosen] for x in (truth.q, truth.v, u))
         if system is None:
             a = _slope(truth).flatten(0, 1)[chosen]
         else:

@@ -14,7 +14,7 @@ from pinn_dyn.mechanics.arrays import require_last_dim
 from pinn_dyn.mechanics.integrators import RK4, Integrator
 from pinn_dyn.mechanics.rollout import path_between, require_start
 from pinn_dyn.mechanics.signal import Signal
-from pinn_dyn.mechanics.trajectory import State
+from pinn_dyn.mechanics.trajectory import State, Trajectory
 
 
 class Predictor(nn.Module, abc.ABC):
@@ -27,10 +27,12 @@ class Predictor(nn.Module, abc.ABC):
             (q, v), ``"qp"`` for (q, p).
         fixed_step: the one step in s that the model predicts in, or None if it takes any.
         penalized: whether its freedom costs something in a training, see :meth:`penalty`.
+        input_history: how long before the start the model may look at the input, s.
     """
 
     fixed_step: float | None = None
     penalized: bool = False
+    input_history: float = 0.0
 
     def __init__(self, num_coordinates: int, num_inputs: int, state: State = "qv"):
         super().__init__()
@@ -56,6 +58,22 @@ class Predictor(nn.Module, abc.ABC):
         q, v and a ``(B, N)`` and u ``(B, M)`` are states, accelerations and inputs of the data.
         """
         return q.new_zeros(())
+
+    def acting_input(self, input: Signal) -> Signal:
+        """The input as it acts on the robot; here as it is, in a model of a delay later."""
+        return input
+
+    @final
+    def acting_samples(self, truth: Trajectory) -> Tensor:
+        """The input as it acts at the samples of a trajectory, ``(*batch, T, M)``."""
+        if not self.input_history:
+            return truth.u
+        input = self.acting_input(truth.input_since(self.input_history))
+        return input.at(truth.t).movedim(0, -2)
+
+    def learned_figures(self) -> dict[str, float]:
+        """Learned numbers to be reported by their names, such as an input delay in s."""
+        return {}
 
     @final
     def predict(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
@@ -116,7 +134,11 @@ class ContinuousPredictor(Predictor):
 
         Increments count from the measured ``x0``, wherever the roll-out starts.
         """
-        start = self.initial_state(x0, input.u[..., 0, :])
+        input = self.acting_input(input)
+        first = input.u[..., 0, :]
+        if self.input_history:  # the signal begins before the start
+            (first,) = input.at(t[:1]).to(x0)
+        start = self.initial_state(x0, first)
         increments = path_between(self, self.integrator, start, t, input)
         if start is x0:
             return increments

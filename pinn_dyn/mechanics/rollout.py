@@ -72,7 +72,7 @@ def path_between(
     # Times count from the start, in the recording's own precision, and are cast only then: one
     # dtype throughout, so that the solver's times and the input's times compare exactly.
     input = input.since(t[0])
-    grid = step_grid(t - t[0], input.t, integrator.substeps).to(x0.dtype)
+    grid = step_grid(t - t[0], input.t.detach(), integrator.substeps).to(x0.dtype)
     path = integrator.path(dynamics, x0, grid, input.to(x0.device, x0.dtype))
     return path[:: integrator.substeps].movedim(0, -2)
 

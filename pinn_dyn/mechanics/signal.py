@@ -88,6 +88,20 @@ class Signal:
         """The same signal, its times counted from ``start``, ``()``, s."""
         return self._changed(self.t - start, lambda value: value)
 
+    def delayed(self, delay: Tensor) -> Signal:
+        """u(t - d), for d ``()`` in s; its gradient in d is -du/dt.
+
+        Raises:
+            ValueError: if u is held, and so has no slope between its jumps.
+        """
+        if self.interpolation == "hold":
+            raise ValueError(
+                "interpolation is 'hold', expected 'linear' or 'cubic': a held input has no slope "
+                "by which its delay could be learned; set dataset.interpolation=linear, or find "
+                "the delay before the training (check.py) and shift the input (InputDelay)"
+            )
+        return self._changed(self.t + delay.to(self.t), lambda value: value)
+
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Signal:
         """A change of the batch, such as ``lambda u: u[index]``, in all that has one."""
         return self._changed(self.t, change)
@@ -128,6 +142,10 @@ class Signal:
         weights = torch.tensor(share, dtype=self.u.dtype, device=self.u.device)
         values = self._samples[index : index + 2], span * self._rates[index : index + 2]
         return _combined(_cubic(weights), values[0][0], values[0][1], values[1][0], values[1][1])
+
+    def at(self, times: Tensor) -> Tensor:
+        """u at times ``(T,)``, seen from the right, ``(T, *batch, M)``."""
+        return self._at(times, torch.searchsorted(self.t, times, right=True) - 1)
 
     def stages(self, grid: Tensor, nodes: tuple[float, ...]) -> Tensor:
         """u at the stages of each step, ``(T - 1, stages, *batch, M)``.

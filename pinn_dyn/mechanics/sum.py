@@ -33,6 +33,12 @@ class Sum(MechanicalSystem):
         if len(set(sizes.values())) != 1:
             found = ", ".join(f"{name}: {size}" for name, size in sizes.items()) or "none"
             raise ValueError(f"the parts of a sum have (N, M) {found}; expected the same for all")
+        for name, part in parts.items():
+            if part.input_history:
+                raise ValueError(
+                    f"the part {name} of a sum learns a delay of the input, which all parts share: "
+                    f"take {name}.delay=none, and shift the input by the step InputDelay"
+                )
         super().__init__(*next(iter(sizes.values())))
         self.integrator = integrator or RK4()
         self.parts = nn.ModuleDict(parts)

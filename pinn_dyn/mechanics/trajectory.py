@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -25,6 +26,8 @@ class Trajectory:
         input: u at T times, ``(*batch, T, M)``, and how it moves between them.
         momentum: p = M(q) v where the truth is known, ``(*batch, N), (*batch, N) -> (*batch, N)``
             on the CPU; None for measured data.
+        past: u right before the first sample at the same sample time, ``(*batch, K, M)``, or None
+            where it is not known.
 
     Raises:
         ValueError: on fewer than two samples, or shapes that do not match.
@@ -34,6 +37,7 @@ class Trajectory:
     v: Tensor
     input: Signal
     momentum: Callable[[Tensor, Tensor], Tensor] | None = None
+    past: Tensor | None = None
 
     def __post_init__(self) -> None:
         samples = self.t.shape[0]
@@ -66,6 +70,23 @@ class Trajectory:
         """Time from the first to the last sample in s."""
         return float(self.t[-1] - self.t[0])
 
+    def input_since(self, history: float) -> Signal:
+        """u from ``history`` seconds before the start on; where it is not known, its first value.
+
+        The samples before the start are whole sample times apart.
+        """
+        step = self.t[1] - self.t[0]
+        count = math.ceil(history / float(step) - 1e-6)
+        if count < 1:
+            return self.input
+        past = _extended(self.u[..., :0, :] if self.past is None else self.past, self.u, count)
+        before = self.t[0] - step * torch.arange(count, 0, -1).to(self.t)
+        return Signal(
+            torch.cat([before, self.t]),
+            torch.cat([past, self.u], dim=-2),
+            self.input.interpolation,
+        )
+
     def states(self, state: State, samples: slice = slice(None)) -> Tensor:
         """States ``(*batch, T, 2N)`` at the chosen samples: (q, v) or (q, p).
 
@@ -85,7 +106,8 @@ class Trajectory:
     def to(self, device: torch.device | str) -> Trajectory:
         """The trajectory on another device."""
         moved = {name: getattr(self, name).to(device) for name in ("q", "v", "input")}
-        return replace(self, **moved)
+        past = None if self.past is None else self.past.to(device)
+        return replace(self, **moved, past=past)
 
     def until(self, horizon: float) -> Trajectory:
         """The part of the trajectory up to ``horizon`` seconds after its start.
@@ -138,7 +160,24 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         q=torch.stack([item.q for item in trajectories]),
         v=torch.stack([item.v for item in trajectories]),
         input=stacked([item.input for item in trajectories], first.t - first.t[0]),
+        past=_stacked_past(trajectories),
     )
+
+
+def _stacked_past(trajectories: list[Trajectory]) -> Tensor | None:
+    """The inputs before each start, as far back as that of any is known."""
+    known = [item.u[..., :0, :] if item.past is None else item.past for item in trajectories]
+    count = max(past.shape[-2] for past in known)
+    extended = [_extended(p, item.u, count) for p, item in zip(known, trajectories, strict=True)]
+    return torch.stack(extended) if count else None
+
+
+def _extended(past: Tensor, u: Tensor, count: int) -> Tensor:
+    """The last ``count`` samples before u, the earliest one that is known in place of others."""
+    past = past[..., max(past.shape[-2] - count, 0) :, :]
+    first = torch.cat([past, u], dim=-2)[..., :1, :]
+    missing = count - past.shape[-2]
+    return torch.cat([first.expand(*u.shape[:-2], missing, u.shape[-1]), past], dim=-2)
 
 
 def samples_of(name: str, duration: float, t: Tensor) -> int:

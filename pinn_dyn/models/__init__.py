@@ -7,6 +7,7 @@ from pinn_dyn.models.cholesky import (
     FixedCholesky,
     NetworkCholesky,
 )
+from pinn_dyn.models.delay import Delay, LearnedDelay, NoDelay
 from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
 from pinn_dyn.models.friction_ladder import AsymmetricCoulomb, DriveCoulomb, LoadDependent, Stribeck
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
@@ -39,6 +40,7 @@ __all__ = [
     "ConstantCholesky",
     "ConstantInput",
     "CoulombFriction",
+    "Delay",
     "DriveCoulomb",
     "FixedCholesky",
     "FixedInput",
@@ -49,6 +51,7 @@ __all__ = [
     "KnownAndNetwork",
     "KnownMechanics",
     "LagrangianNetwork",
+    "LearnedDelay",
     "LearnedVelocity",
     "LoadDependent",
     "MeasuredVelocity",
@@ -57,6 +60,7 @@ __all__ = [
     "NetworkPotential",
     "NetworkResidual",
     "NextStateMLP",
+    "NoDelay",
     "NoFriction",
     "NoInput",
     "NoResidual",

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, ContinuousPredictor, Integrator, Predictor, Signal
+from pinn_dyn.models.delay import Delay, NoDelay
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.scales import Scales
@@ -86,6 +87,7 @@ class AccelerationMLP(ContinuousPredictor):
         angles: which coordinates are angles; the network sees their sine and cosine.
         integrator: the method of integration.
         initial_velocity: builder of the head for the velocity at which roll-outs start.
+        delay: of the input; None: there is none.
     """
 
     scale: Tensor
@@ -98,6 +100,7 @@ class AccelerationMLP(ContinuousPredictor):
         angles: Sequence[int] = (),
         integrator: Integrator | None = None,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
+        delay: Delay | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
@@ -109,6 +112,20 @@ class AccelerationMLP(ContinuousPredictor):
             Scales(statistics, statistics.v_std, tuple(angles))
         )
         self.learns_initial_state = self.initial_velocity.learned
+        self.delay = delay or NoDelay()
+
+    @property
+    def input_history(self) -> float:  # type: ignore[override]
+        """The longest delay of its head, s."""
+        return self.delay.longest
+
+    def acting_input(self, input: Signal) -> Signal:
+        """u(t - d), with the d of its head."""
+        return self.delay(input)
+
+    def learned_figures(self) -> dict[str, float]:
+        """The delay of the input, if it is learned."""
+        return self.delay.figures()
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
         """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""

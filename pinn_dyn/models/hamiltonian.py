@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.delay import Delay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.residual import NoResidual
 from pinn_dyn.models.statistics import Statistics
@@ -47,6 +48,7 @@ class HamiltonianNetwork(StructuredNetwork):
         integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
             damping outweighs inertia.
         state: "qp" for (q, p), which needs data with momenta, or "qv" for (q, v).
+        delay: of the input; None: there is none.
 
     Raises:
         ValueError: on another state, or a transposed head.
@@ -63,6 +65,7 @@ class HamiltonianNetwork(StructuredNetwork):
         angles: Sequence[int] = (),
         integrator: Integrator | None = None,
         state: State = "qp",
+        delay: Delay | None = None,
     ):
         super().__init__(
             statistics,
@@ -74,6 +77,7 @@ class HamiltonianNetwork(StructuredNetwork):
             NoResidual,
             angles,
             integrator,
+            delay,
         )
         if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std

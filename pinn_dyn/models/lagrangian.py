@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.delay import Delay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import Tape
@@ -42,6 +43,7 @@ class LagrangianNetwork(StructuredNetwork):
         angles: which coordinates are angles; the heads see their sine and cosine.
         integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
             damping outweighs inertia.
+        delay: of the input; None: there is none.
 
     Raises:
         ValueError: on a mass head for a chain that is not transposed.
@@ -59,6 +61,7 @@ class LagrangianNetwork(StructuredNetwork):
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
         angles: Sequence[int] = (),
         integrator: Integrator | None = None,
+        delay: Delay | None = None,
     ):
         super().__init__(
             statistics,
@@ -70,6 +73,7 @@ class LagrangianNetwork(StructuredNetwork):
             residual,
             angles,
             integrator,
+            delay,
         )
         inertia = self.input.typical_force(statistics.u_rms) / statistics.acceleration
         self.mass = mass(self._scales(statistics, inertia.sqrt()))

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
+from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, Signal, State
 from pinn_dyn.models.cholesky import CholeskyFactor
+from pinn_dyn.models.delay import Delay, NoDelay
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import Potential
@@ -44,10 +45,12 @@ class StructuredNetwork(MechanicalSystem):
         residual: ResidualHead,
         angles: Sequence[int],
         integrator: Integrator | None,
+        delay: Delay | None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs, state)
         self.integrator = integrator or RK4()
+        self.delay = delay or NoDelay()
         self.angles = tuple(angles)
         u_rms = statistics.u_rms
         self.input = input(self._scales(statistics, u_rms.square().mean().sqrt() / u_rms))
@@ -62,6 +65,19 @@ class StructuredNetwork(MechanicalSystem):
 
     def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
         return Scales(statistics, value, self.angles)
+
+    @property
+    def input_history(self) -> float:  # type: ignore[override]
+        """The longest delay of its head, s."""
+        return self.delay.longest
+
+    def acting_input(self, input: Signal) -> Signal:
+        """u(t - d), with the d of its head."""
+        return self.delay(input)
+
+    def learned_figures(self) -> dict[str, float]:
+        """The delay of the input, if it is learned."""
+        return self.delay.figures()
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""

@@ -182,6 +182,7 @@ class DynamicsLearner(L.LightningModule):
         figures = self.validator(self.model, batch)
         # Processes that train together all roll out the same; sync_dist says that this is known.
         named = {f"val/{key}": value for key, value in figures.items()}
+        named |= {f"model/{key}": value for key, value in self.model.learned_figures().items()}
         self.log_dict(named, batch_size=1, sync_dist=True)
         error = figures["error_mean"]
         self.log("error", error, prog_bar=True, logger=False, batch_size=1, sync_dist=True)

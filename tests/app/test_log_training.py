@@ -6,8 +6,10 @@ import shutil
 
 import pandas as pd
 import pytest
+import torch
 from matplotlib.image import imread
 
+from pinn_dyn import fit
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -17,6 +19,8 @@ from tests.app.entry import (
     fails,
     run_script,
 )
+from tests.data import log_formats as formats
+from tests.data.logs_files import motion, source, write
 
 EXAMPLES = ROOT / "examples"
 TINY = ["experiment=example_log/lnn", "compile=false", *TINY_TRAINING, NO_FIGURES]
@@ -82,6 +86,26 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
     assert not (tmp_path / "out" / "terms.txt").exists()
 
 
+def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, capsys):
+    run_script(
+        "train.py",
+        *TINY,
+        "model/delay=learned",
+        "model.delay.initial=0.02",
+        "trainer.steps=4",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())["validation"]
+    seconds = found["model/input_delay_seconds"]
+    assert 0.01 < seconds < 0.03
+    assert seconds != 0.02
+    run_script("evaluate.py", *evaluation_of(tmp_path / "run", tmp_path / "out"))
+    row, *floors = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert row["input_delay_seconds"] == pytest.approx(seconds, abs=1e-3)
+    assert all(one["input_delay_seconds"] is None for one in floors)
+    assert "learned input delay [s]" in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):
     error = fails("evaluate.py", *evaluation_of(run, tmp_path / "out"), "horizon=6")
     assert "horizon is 6" in said(error, capsys)
@@ -111,12 +135,17 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
         ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
         ("dataset.test.piece=7.0", ["test: ", "no stretch is as long as its piece, 7 s"]),
         ("data.pairs=5000", ["5000 windows", "fewer pairs"]),
+        ("data.history=0.1 dataset.interpolation=hold", ["held between its samples", "InputDelay"]),
+        (
+            "model/delay=learned data.history=0.05",
+            ["may look 0.1 s back", "leave data.history out"],
+        ),
     ],
 )
 def test_a_mistake_about_a_log_ends_with_its_name_and_place(
     at_root, tmp_path, capsys, mistake, words
 ):
-    error = fails("train.py", *TINY, mistake, f"hydra.run.dir={tmp_path / 'run'}")
+    error = fails("train.py", *TINY, *mistake.split(), f"hydra.run.dir={tmp_path / 'run'}")
     text = said(error, capsys)
     for word in words:
         assert word in text
@@ -144,3 +173,18 @@ def test_presets_of_hardware_have_the_structure_of_the_paper():
     assert len(panda.model.angles) == len(panda.dataset.q.columns) == 7
     for preset in (neck, fit, panda):
         assert preset.model.friction._target_.endswith("CoulombFriction")
+
+
+def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
+    table = motion(6.0)
+    formats.write_bag(tmp_path / "run", table)
+    write(tmp_path, table)
+    small = ["data=multi_step", "data.pairs=64", "data.steps=2", "data.batch_size=32"]
+    small += ["validator.horizon=0.5", "compile=false"]
+    weights = []
+    for log in (source(tmp_path, files="run", **formats.BAG), source(tmp_path)):
+        weights.append(fit(log, model="lnn", steps=3, overrides=small).model.state_dict())
+    for name, value in weights[0].items():
+        torch.testing.assert_close(value, weights[1][name], rtol=1e-5, atol=1e-7)
+    moved = fit(log, model="lnn", steps=3, seed=1, overrides=small).model.state_dict()
+    assert any(not torch.allclose(value, moved[name]) for name, value in weights[0].items())

@@ -138,6 +138,6 @@ def test_values_fit_annotations(value, hint, expected):
 
 def test_types_come_from_the_constructors():
     found = arguments("pinn_dyn.data.DynamicsData")
-    assert words(found["pairs"]) == "a whole number"
+    assert words(found["pairs"]) == "a whole number or all"
     assert words(found["coverage"]) == "a number"
     assert CONF.is_dir()

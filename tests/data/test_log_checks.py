@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import Deduplicate, LogError, Resample, SplitGaps
+from pinn_dyn.data.logs import Deduplicate, LogError, Resample, RowClock, SplitGaps
 from tests.data.logs_files import motion, source, write
 
 
@@ -155,3 +155,61 @@ def test_a_reversed_torque(tmp_path):
     table["v1"], table["q1"], table["u1"] = v, np.cumsum(v) * 0.01, force
     assert warned(tmp_path, table) == "- none"
     assert "input 'u1' seems to push backwards" in warned(tmp_path, table.assign(u1=-force))
+
+
+def in_bursts(seconds=10.0, rows=8, late=0.002, apart=0.0):
+    """The log of ``motion``, written by a logger that empties its buffer every so many rows."""
+    table = motion(seconds)
+    t = table["t"].to_numpy()
+    number = np.arange(len(t))
+    # A burst is written when its last row is there.
+    written = t[np.minimum(rows * (number // rows) + rows - 1, len(t) - 1)]
+    return table.assign(t=written + late + apart * (number % rows))
+
+
+def test_stamps_in_bursts_are_refused_or_warned_of_by_their_cure(tmp_path):
+    refused(tmp_path, in_bursts(), r"line 3, column 't': the time .* repeats.*bursts.*RowClock")
+    refused(tmp_path, in_bursts(apart=2e-5), r"the time jumps .*RowClock step: its stamps come")
+    steps = {"resample": Resample(rate=100.0, max_gap=0.2)}
+    said = warned(tmp_path, in_bursts(apart=2e-5), steps=steps)
+    assert "run: stamps come in bursts" in said
+    assert "RowClock" in said
+
+
+@pytest.mark.parametrize("apart", [0.0, 2e-5])
+@pytest.mark.parametrize("rate", [None, 100.0])
+def test_a_row_clock_mends_bursts(tmp_path, apart, rate):
+    steps = {"clock": RowClock(longest=0.1, rate=rate)}
+    write(tmp_path, in_bursts(apart=apart))
+    found = source(tmp_path, steps=steps)
+    assert "## Warnings\n\n- none" in found.report
+    write(tmp_path, motion())
+    expected = source(tmp_path).load()
+    for name in ("train", "test"):
+        ours, theirs = getattr(found.load(), name)[0], getattr(expected, name)[0]
+        assert float(ours.t[1]) == pytest.approx(float(theirs.t[1]), rel=1e-3)
+    assert len(found.load().test) == len(expected.test)
+
+
+def test_lost_rows_are_no_bursts(tmp_path):
+    table = in_bursts()
+    write(tmp_path, table.drop(index=range(300, 360)))
+    with pytest.raises(LogError, match=r"RowClock found the stamp .* rows are missing.*SplitGaps"):
+        source(tmp_path, steps={"clock": RowClock(longest=0.1)}).load()
+    steps = {"gaps": SplitGaps(longest=0.3), "clock": RowClock(longest=0.1, rate=100.0)}
+    assert len(source(tmp_path, steps=steps).load().train) == 2
+
+
+def test_a_clock_that_contradicts_the_velocities_is_told_from_jitter(tmp_path):
+    """Stamps that swing about the true times, and samples that were taken at such times."""
+    uniform = motion()["t"].to_numpy()
+    swing = uniform + 0.0115 * np.sin(0.5 * np.arange(len(uniform)))
+    assert (np.diff(swing) > 0).all()
+    steps = {"resample": Resample(rate=100.0, max_gap=0.05)}
+    said = warned(tmp_path, motion().assign(t=swing), steps=steps)
+    assert "coordinate 1: by the stamps v leaves" in said
+    assert "by a uniform clock" in said
+    sampled = (
+        motion().drop(columns="t").apply(lambda x: np.interp(swing, uniform, x)).assign(t=swing)
+    )
+    assert warned(tmp_path, sampled, steps=steps) == "- none"

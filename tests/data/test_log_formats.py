@@ -1,10 +1,18 @@
 """Bags, HDF5, MATLAB 7.3, NPZ and Parquet give the trajectories that the same CSV gives."""
 
+import contextlib
+import sqlite3
+
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pinn_dyn.data.logs import LogError
+from pinn_dyn.data.logs import LogError, messages
+from pinn_dyn.data.logs.bags import read_bag
 from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
 
@@ -46,6 +54,59 @@ def test_bags_map_joints_by_name_whatever_their_order(tmp_path, expected, files,
     assert_same(trajectories(log), expected)
     assert ("lack a joint" in log.report) == ("empty_every" in options)
     assert log.fingerprint()["files"]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_numbers_read_by_layout_are_those_of_the_library(tmp_path, monkeypatch, version):
+    """Two orders of joints and messages without some: read as bytes, and one by one."""
+    path = tmp_path / ("run.bag" if version == 1 else "run")
+    formats.write_bag(path, TABLE, version=version, empty_every=7, late=0.004)
+    columns = [f"/joint_states/{x}/{j}" for x in ("position", "velocity") for j in formats.JOINTS]
+    asked = ["/joint_states/t", *columns, "/commands/data/1", "/commands/t"]
+    called = []
+    deserialize = AnyReader.deserialize
+
+    def counted(self, raw, kind):
+        called.append(kind)
+        return deserialize(self, raw, kind)
+
+    monkeypatch.setattr(AnyReader, "deserialize", counted)
+    by_layout = read_bag(path, asked[0], asked, 0.1)
+    assert len(called) < 10
+    monkeypatch.setattr(messages, "_LAYOUTS", 0)
+    pd.testing.assert_frame_equal(by_layout, read_bag(path, asked[0], asked, 0.1))
+    assert len(called) > 1200
+
+
+def test_layouts_of_nested_messages(tmp_path):
+    """Points of a trajectory: numbers of an element of a sequence, by a joint's name."""
+    types = formats.STORE.types
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    stamp = types["builtin_interfaces/msg/Time"](sec=3, nanosec=5)
+    lasting = types["builtin_interfaces/msg/Duration"](sec=0, nanosec=7)
+    none = np.array([])
+    numbers = [np.array([k + 0.25, k + 0.5]) for k in range(2)]
+    message = types[kind](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="base"),
+        joint_names=["a", "elbow"],
+        points=[point(x, none, none, 10 * x, lasting) for x in numbers],
+    )
+    raw = bytes(formats.STORE.serialize_cdr(message, kind))
+    layout = messages.layout_of(raw, kind, formats.STORE.fielddefs, cdr=True)
+
+    def number(path):
+        place, what = layout.place(path)
+        return np.frombuffer(raw, what, 1, place)[0]
+
+    assert number("points/1/positions/elbow") == 1.5
+    assert number("points/1/effort/0") == 12.5
+    assert number("points/0/time_from_start/nanosec") == 7
+    assert number("header/stamp/sec") == 3
+    for path in ("points/2/positions/elbow", "points/1/positions/wrist", "points/1/positions/2"):
+        assert layout.place(path) is None
+    assert messages.layout_of(raw[:40], kind, formats.STORE.fielddefs, cdr=True) is None
+    assert messages.layout_of(b"\0\0" + raw[2:], kind, formats.STORE.fielddefs, cdr=True) is None
 
 
 def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
@@ -95,6 +156,44 @@ def test_a_bag_cut_short_is_named(tmp_path, version, name):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(LogError, match=f"{path.name}: cannot be read as a bag, it may be cut"):
         source(tmp_path, files=name, **formats.BAG).load()
+
+
+def write_numbers(path, kind, store, *, mcap, compressed=False):
+    """A bag of one topic of messages with a number each."""
+    plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compressed:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/number", kind, typestore=store)
+        for k in range(50):
+            message = store.types[kind](float(k))
+            writer.write(connection, 10**7 * k, store.serialize_cdr(message, kind))
+
+
+def test_messages_of_an_unknown_type_are_told(tmp_path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 data", "my_msgs/msg/Own"))
+    write_numbers(tmp_path / "run", "my_msgs/msg/Own", store, mcap=False)
+    asked = "/number/t", ["/number/data"], 0.1
+    assert len(read_bag(tmp_path / "run", *asked)) == 50  # by the definition in the bag
+    (database,) = (tmp_path / "run").glob("*.db3")
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        connection.execute("delete from message_definitions")
+        connection.commit()
+    with pytest.raises(LogError, match=r"topic /number: its type my_msgs/msg/Own is unknown.*MCAP"):
+        read_bag(tmp_path / "run", *asked)
+
+
+def test_chunks_of_a_codec_that_is_missing_are_told(tmp_path):
+    kind = "std_msgs/msg/Float64"
+    write_numbers(tmp_path / "run", kind, formats.STORE, mcap=True, compressed=True)
+    asked = "/number/t", ["/number/data"], 0.1
+    assert len(read_bag(tmp_path / "run", *asked)) == 50
+    (path,) = (tmp_path / "run").glob("*.mcap")
+    path.write_bytes(path.read_bytes().replace(b"zstd", b"rare"))
+    with pytest.raises(LogError, match=r"run: cannot be read.*a codec.*'rare'.*ros2 bag convert"):
+        read_bag(tmp_path / "run", *asked)
 
 
 MATRICES = dict(

@@ -134,5 +134,5 @@ def test_the_documentation_names_every_unit_and_step():
         and isinstance(getattr(logs, name), type)
         and issubclass(getattr(logs, name), logs.Step)
     ]
-    assert len(steps) == 12
+    assert len(steps) == 13
     assert [name for name in steps if f"| `{name}(" not in text] == []

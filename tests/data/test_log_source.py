@@ -1,5 +1,6 @@
 """Logs as a data source: columns, units, splits without leakage, pieces, report."""
 
+import itertools
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ import scipy.io
 import torch
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps
+from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps, reader
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
@@ -288,3 +289,80 @@ def test_wrong_descriptions_are_refused(tmp_path, changes, message):
 def test_unknown_units_list_the_known_ones():
     with pytest.raises(LogError, match=r"rad, mrad, deg.*Nm, mNm.*psi"):
         Columns("q", unit="furlong")
+
+
+def test_blocks_of_validation_and_test_take_turns_with_guards_between(folder):
+    blocks = dict(seconds=0.5, blocks=2, piece=0.5)
+    mixed = source(folder, validation=blocks, test=blocks, guard=0.2)
+    parts = sorted(mixed.cleaned, key=lambda part: part.raw.t[0])
+    kept = [part.split for part in parts]
+    assert kept.count("train") == 5
+    assert [split for split in kept if split != "train"] in (
+        ["test", "validation"] * 2,
+        ["validation", "test"] * 2,
+    )
+    for one, other in itertools.pairwise(parts):
+        assert other.raw.t[0] - one.raw.t[-1] >= 0.2 - 1e-9
+        assert other.raw.t[0] - one.raw.t[-1] <= 0.2 + 0.025
+    # In the middles of quarters of the run of 10 s.
+    middles = [part.raw.t.mean() for part in parts if part.split != "train"]
+    np.testing.assert_allclose(middles, [1.25, 3.75, 6.25, 8.75], atol=0.02)
+    assert len(mixed.load().test) == len(mixed.load().validation) == 2
+
+
+def test_a_block_from_the_middle_and_the_end_of_a_run(folder):
+    mixed = source(
+        folder,
+        validation=dict(seconds=1.0, blocks=1, piece=0.5),
+        test=dict(seconds=2.0, piece=1.0),
+    )
+    ranges = {part.split: (part.raw.t[0], part.raw.t[-1]) for part in mixed.cleaned}
+    assert ranges["test"] == pytest.approx((8.0, 10.0), abs=0.011)
+    assert np.mean(ranges["validation"]) == pytest.approx((8.0 - 0.5) / 2, abs=0.02)
+    assert [part.split for part in mixed.cleaned].count("train") == 2
+    assert len(mixed.load().validation) == 2
+
+
+def test_blocks_that_do_not_fit_are_refused(folder):
+    blocks = dict(seconds=2.0, blocks=4, piece=1.0)
+    with pytest.raises(LogError, match=r"too short for 4 blocks, of which validation has 2.0 s"):
+        source(folder, validation=blocks, test=dict(seconds=1.0, piece=1.0)).load()
+    with pytest.raises(LogError, match=r"validation: blocks is 2 and seconds is None"):
+        source(folder, validation=dict(runs=1, blocks=2, piece=1.0))
+
+
+def test_whole_runs_of_unequal_length_are_one_roll_out_each(tmp_path):
+    for k, seconds in enumerate((4.0, 3.0, 2.5, 3.5)):
+        write(tmp_path, motion(seconds, phase=0.3 * k), f"run_{k}.csv")
+    log = source(
+        tmp_path,
+        validation=dict(runs=["run_0"], piece=1.0),
+        test=dict(runs=["run_1", "run_2"], piece="whole"),
+    )
+    found = log.load().test
+    assert [item.duration for item in found] == pytest.approx([2.5, 2.5])
+    assert float(found[0].q[0, 0]) == pytest.approx(motion(3.0, phase=0.3)["q1"][0])
+    assert "0.5 s are left over and dropped" in log.report
+    with pytest.raises(LogError, match=r"piece is 'all', expected a time in s, or 'whole'"):
+        source(tmp_path, test=dict(runs=1, piece="all"))
+
+
+def test_pieces_know_the_input_before_them(folder):
+    """What a model of a delay looks back at; the first piece of a stretch has none."""
+    first, second = source(folder, u=dict(columns=["u1", "u2"], unit="Nm")).load().test
+    assert len(first.past) == 0
+    assert torch.equal(second.past, first.u[-51:-1])
+
+
+@pytest.mark.parametrize("last", ["7.5", "", "text"])
+def test_files_parsed_in_parts_are_those_parsed_at_once(tmp_path, monkeypatch, last):
+    """Whole numbers, then numbers, text or nothing in a later part; names of runs; blank lines."""
+    rows = [f"{k / 100},{k},a{k // 5},{k // 5}" for k in range(20)]
+    rows += ["", f"0.2,{last},b,4", "", ""]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(["t,x,run,number", *rows]) + "\n")
+    whole = reader.read_table(path, "t", [], 0.1)
+    assert len(whole) == 22
+    monkeypatch.setattr(reader, "_PART", 6)
+    in_parts = reader.read_table(path, "t", [], 0.1)
+    pd.testing.assert_frame_equal(in_parts, whole)

@@ -16,6 +16,7 @@ from pinn_dyn.data.logs import (
     PolynomialFit,
     RemoveJumps,
     Resample,
+    RowClock,
     SavitzkyGolayVelocity,
     SplitGaps,
     SubtractStart,
@@ -247,6 +248,24 @@ def test_steps_that_count_samples_refuse_a_jittered_clock(step):
 
 
 @pytest.mark.parametrize(
+    ("in_time", "in_samples"),
+    [
+        (MovingAverage(window="50 ms"), MovingAverage(window=5)),
+        (SavitzkyGolayVelocity(window="0.11 s"), SavitzkyGolayVelocity(window=11)),
+        (SavitzkyGolayVelocity(window="0.1s"), SavitzkyGolayVelocity(window=9)),  # odd
+        (SavitzkyGolayVelocity("1 ms", 2, True), SavitzkyGolayVelocity(3, 2, True)),
+        (InputRates(window="70ms"), InputRates(window=7)),
+        (RemoveJumps(0.1, window="0.25 s"), RemoveJumps(0.1, window=25)),
+    ],
+    ids=str,
+)
+def test_windows_in_time_are_those_of_so_many_samples(in_time, in_samples):
+    item = recording(NOISE)
+    one, other = only(in_time, item)[0], only(in_samples, item)[0]
+    np.testing.assert_array_equal(one.values(), other.values())
+
+
+@pytest.mark.parametrize(
     "make",
     [
         lambda: MovingAverage(window=0),
@@ -265,10 +284,16 @@ def test_steps_that_count_samples_refuse_a_jittered_clock(step):
         lambda: Resample(rate=9.0, max_gap=1.0).apply(recording([1, 2], t=[1.0, 1.0])),
         lambda: Deduplicate(longest=0),
         lambda: SplitGaps(longest=0.0),
+        lambda: RowClock(longest=0.0),
+        lambda: RowClock(longest=1.0, rate=-1.0),
+        lambda: RowClock(longest=0.1, rate=50.0).apply(recording(NOISE)),
         lambda: RemoveJumps(threshold=0.1, window=4),
         lambda: RemoveJumps(threshold=[0.1] * 3).apply(recording(NOISE)),
         lambda: InterpolateHeld(longest=0),
         lambda: SubtractStart(samples=0),
+        lambda: MovingAverage(window="5 samples"),
+        lambda: SavitzkyGolayVelocity(window="-5 ms"),
+        lambda: RemoveJumps(0.1, window="five"),
         lambda: InputDelay(delay=-1.0),
         lambda: InputDelay(longest=9.0).fit([recording(NOISE)]),
         lambda: InputDelay(delay=[0.0, 0.1]).apply(recording(NOISE)),

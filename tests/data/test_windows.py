@@ -325,6 +325,22 @@ def test_bad_sizes_are_refused_by_name(changes, message):
         make_data(**changes)
 
 
+def test_all_pairs_are_all_starts_once():
+    data = make_data(pairs="all")
+    assert len(data.windows) == 102
+    assert len(torch.unique(data.windows.q, dim=0)) == 102
+    with pytest.raises(ValueError, match=r"batch_size is 200, expected at most .* 102"):
+        make_data(pairs="all", batch_size=200).windows  # noqa: B018
+
+
+def test_a_stride_in_time_is_the_same_at_any_rate():
+    assert torch.equal(make_data(stride=f"{3e3 * STEP:g} ms").windows.t, make_data().windows.t)
+    with pytest.raises(ValueError, match=r"stride is 0.001 s and the sample time"):
+        make_data(stride="1ms").windows  # noqa: B018
+    with pytest.raises(ValueError, match=r"stride is '3 samples', expected .* such as '20 ms'"):
+        make_data(stride="3 samples").windows  # noqa: B018
+
+
 def test_more_pairs_than_the_data_have_are_refused():
     with pytest.raises(ValueError, match="only 102 starts"):
         make_data(pairs=1000).windows  # noqa: B018

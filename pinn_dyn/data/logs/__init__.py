@@ -1,6 +1,6 @@
 """Logs of robots: columns, units, cleaning steps, checks and the data source."""
 
-from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
+from pinn_dyn.data.logs.clock import Deduplicate, Resample, RowClock, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.delay import DelayCurve, input_delays
 from pinn_dyn.data.logs.errors import LogError
@@ -37,6 +37,7 @@ __all__ = [
     "Recording",
     "RemoveJumps",
     "Resample",
+    "RowClock",
     "SavitzkyGolayVelocity",
     "SplitGaps",
     "Step",

@@ -12,8 +12,7 @@ not later than it, and not older than ``max_age``; rows without one are dropped.
 from __future__ import annotations
 
 import importlib
-from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,9 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.messages import BATCH, Topic
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-# Names of the entries of a message's arrays, in sensor_msgs and trajectory_msgs.
-_NAMES = ("name", "joint_names")
-_NAN = float("nan")
 
 
 def is_bag(path: Path) -> bool:
@@ -67,22 +64,21 @@ def read_bag(path: Path, time: str, columns: Sequence[str], max_age: float) -> p
         # Old bags hold no definitions of their messages: the common ones are known.
         known = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
         with highlevel.AnyReader([path], default_typestore=known) as reader:
-            times, arrays = _read(reader, path, [time, *columns])
+            topics = _read(reader, path, [time, *columns])
     except LogError:
         raise
     except Exception as error:  # rosbags and its codecs raise nearly anything on damaged bytes
         raise LogError(
             f"{path}: cannot be read as a bag, it may be cut short, or be compressed by a codec "
             f"that is missing ({type(error).__name__}: {error}): try 'ros2 bag reindex', or "
-            "'rosbag reindex' for ROS 1, or record it again"
+            "'rosbag reindex' for ROS 1, write it without compression ('ros2 bag convert'), or "
+            "record it again"
         ) from error
-    return _merged(path, times, arrays, time, max_age)
+    return _merged(path, topics, time, max_age)
 
 
-def _read(
-    reader: Any, path: Path, columns: Sequence[str]
-) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]]]:
-    """Times of each topic asked for, and its columns."""
+def _read(reader: Any, path: Path, columns: Sequence[str]) -> dict[str, Topic]:
+    """The topics that columns are asked of."""
     topics = sorted(reader.topics, key=len, reverse=True)
     fields: dict[str, dict[str, str]] = {}
     for column in dict.fromkeys(columns):
@@ -100,118 +96,58 @@ def _read(
                 "the bag has no definition of it: record the bag as MCAP, which keeps definitions"
             )
     wanted = [c for c in reader.connections if c.topic in fields]
-    times = {topic: array("d") for topic in fields}
-    values = {topic: {column: array("d") for column in fields[topic]} for topic in fields}
-    seen: dict[str, set[str]] = {topic: set() for topic in fields}
-    getters: dict[str, list[tuple[array, Callable[[Any], float]]]] = {}
+    taken = {
+        topic: Topic(
+            f"{path}, topic {topic}", asked, sum(c.msgcount for c in wanted if c.topic == topic)
+        )
+        for topic, asked in fields.items()
+    }
+    waiting: dict[tuple[str, str], tuple[list[bytes], list[int]]] = {}
     for connection, stamp, raw in reader.messages(wanted):
-        topic = connection.topic
-        message = reader.deserialize(raw, connection.msgtype)
-        if topic not in getters:
-            getters[topic] = [
-                (values[topic][column], _getter(message, field, f"{path}, topic {topic}"))
-                for column, field in fields[topic].items()
-                if field != "t"
-            ]
-        times[topic].append(_time(message, stamp))
-        for name in _NAMES:
-            seen[topic].update(getattr(message, name, ()))
-        for store, get in getters[topic]:
-            store.append(get(message))
-    arrays: dict[str, dict[str, np.ndarray]] = {}
-    for topic, stores in values.items():
-        if not len(times[topic]):
+        key = connection.topic, connection.msgtype
+        raws, stamps = waiting.setdefault(key, ([], []))
+        raws.append(raw)
+        stamps.append(stamp)
+        if len(raws) == BATCH:
+            taken[connection.topic].add(raws, stamps, connection.msgtype, reader)
+            del waiting[key]
+    for (topic, kind), (raws, stamps) in waiting.items():
+        taken[topic].add(raws, stamps, kind, reader)
+    for topic, found in taken.items():
+        if not found.rows:
             raise LogError(f"{path}, topic {topic}: has no messages")
-        arrays[topic] = {}
-        for column, field in fields[topic].items():
-            x = np.asarray(times[topic] if field == "t" else stores[column], dtype=float)
-            if np.isnan(x).all():
-                names = f"its joints are {', '.join(sorted(seen[topic]))}" if seen[topic] else ""
+        for field, column in zip(fields[topic].values(), found.values, strict=True):
+            if np.isnan(column).all():
+                names = f"its joints are {', '.join(sorted(found.names))}" if found.names else ""
                 raise LogError(
                     f"{path}, topic {topic}: no message has a value of {field!r}: "
                     f"{names or 'the array is empty or shorter in all of them'}"
                 )
-            arrays[topic][column] = x
-    return {topic: np.asarray(t) for topic, t in times.items()}, arrays
-
-
-def _time(message: Any, stamp: int) -> float:
-    header = getattr(message, "header", None)
-    if header is not None and (header.stamp.sec or header.stamp.nanosec):
-        stamp = 10**9 * header.stamp.sec + header.stamp.nanosec  # rounded once, as the other is
-    return 1e-9 * stamp
-
-
-def _getter(message: Any, field: str, place: str) -> Callable[[Any], float]:
-    """What takes the number at a path such as ``position/joint1`` out of a message, or NaN."""
-    *inner, last = field.split("/")
-    names = next((name for name in _NAMES if hasattr(message, name)), None)
-    at = message
-    for step in inner:
-        if step.isdigit():
-            at = at[int(step)] if int(step) < len(at) else None
-        else:
-            at = getattr(at, step, None)
-        if at is None:
-            raise LogError(
-                f"{place}: its messages have no {field!r}: their fields are "
-                f"{', '.join(_fields(message))}"
-            )
-    if not inner and not hasattr(message, last):
-        raise LogError(
-            f"{place}: its messages have no {field!r}: their fields are "
-            f"{', '.join(_fields(message))}"
-        )
-
-    def get(one: Any) -> float:
-        x = one
-        for step in inner:
-            if step.isdigit():
-                if int(step) >= len(x):
-                    return _NAN
-                x = x[int(step)]
-            else:
-                x = getattr(x, step)
-        if hasattr(x, "__len__"):
-            if last.isdigit():
-                k = int(last)
-            else:
-                every = getattr(one, names) if names else ()
-                k = every.index(last) if last in every else len(x)
-            return float(x[k]) if k < len(x) else _NAN
-        x = getattr(x, last)
-        return _NAN if hasattr(x, "__len__") else float(x)
-
-    return get
-
-
-def _fields(message: Any) -> list[str]:
-    return [name for name in message.__dataclass_fields__ if not name.startswith("__")]
+    return taken
 
 
 def _merged(
     path: Path,
-    times: dict[str, np.ndarray],
-    arrays: dict[str, dict[str, np.ndarray]],
+    topics: dict[str, Topic],
     time: str,
     max_age: float,
 ) -> pd.DataFrame:
     """All columns at the times of the topic that has the time."""
-    clock_topic = next(topic for topic, columns in arrays.items() if time in columns)
-    own = pd.DataFrame(arrays[clock_topic])
+    clock_topic = next(topic for topic, found in topics.items() if time in found.fields)
+    own = _table(topics[clock_topic])
     kept = own.notna().all(axis=1).to_numpy()
     notes = []
     if not kept.all():
         notes.append(f"{int((~kept).sum())} messages of {clock_topic} lack a joint asked for")
-    t = arrays[clock_topic][time]
+    t = own[time].to_numpy()
     table = own
-    for topic, columns in arrays.items():
+    for topic, found in topics.items():
         if topic == clock_topic:
             continue
-        other = pd.DataFrame(columns)
+        other = _table(found)
         whole = other.notna().all(axis=1).to_numpy()
-        order = np.argsort(times[topic][whole], kind="stable")
-        s, other = times[topic][whole][order], other[whole].iloc[order]
+        order = np.argsort(found.times[whole], kind="stable")
+        s, other = found.times[whole][order], other[whole].iloc[order]
         if not len(s) or s[-1] < t.min() - max_age or s[0] > t.max():
             raise LogError(
                 f"{path}: the clocks of {clock_topic} and {topic} never overlap: {t.min():.6f} to "
@@ -231,6 +167,14 @@ def _merged(
     if not kept.any():
         raise LogError(f"{path}: no row is left: {'; '.join(notes)}")
     table.index = pd.RangeIndex(1, len(table) + 1)
+    if kept.all():
+        return table
+    whole_table = len(table)
     table = table[kept]
-    table.attrs["notes"] = [f"{len(own) - len(table)} rows are dropped: {x}" for x in notes]
+    table.attrs["notes"] = [f"{whole_table - len(table)} rows are dropped: {x}" for x in notes]
     return table
+
+
+def _table(topic: Topic) -> pd.DataFrame:
+    """Its columns, not copied: logs are large."""
+    return pd.DataFrame(topic.values.T, columns=list(topic.fields), copy=False)

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pinn_dyn.data.logs.clock import GAP_FACTOR, Deduplicate, Resample, SplitGaps
+from pinn_dyn.data.logs.clock import (
+    GAP_FACTOR,
+    Deduplicate,
+    Resample,
+    RowClock,
+    SplitGaps,
+    burst_share,
+)
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording, Report
@@ -20,6 +27,11 @@ _FACTORS = (0.8, 1.25)
 _CLEAR = 0.8
 # Share of the samples in which a robot may rest without a warning.
 _AT_REST = 0.9
+# Share of rows right after the one before from which stamps come in bursts.
+_BURSTS = 0.4
+# What v leaves unexplained of the steps of q: of bad stamps, and of a clock that is right.
+_STAMPS_FAIL = 0.1
+_ROWS_AGREE = 0.25
 # A partial correlation of force and acceleration below this is clear.
 _REVERSED = -0.5
 
@@ -44,16 +56,23 @@ def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: 
             "(run=... of pinn_dyn.fit) or add a SplitGaps step; otherwise repair the file"
         )
     repeated = spacing == 0
-    if repeated.any() and Deduplicate not in kinds:
+    bursts = burst_share(t) > _BURSTS
+    if repeated.any() and not kinds & {Deduplicate, RowClock}:
         k = int(repeated.argmax())
+        cure = "add a Deduplicate step, which keeps the first"
+        if bursts:
+            cure = (
+                "its stamps come in bursts of rows: add a RowClock step, which takes the time "
+                "from the row number, or Deduplicate, which keeps the first row of a burst"
+            )
         raise LogError(
             f"{path}, line {lines[k + 1]}, column {name!r}: the time {t[k]:.9g} s repeats "
-            f"({int(repeated.sum())} rows do): add a Deduplicate step, which keeps the first"
+            f"({int(repeated.sum())} rows do): {cure}"
         )
     forward = spacing[spacing > 0]
     if not len(forward):
         raise LogError(f"{path}, column {name!r}: the time never increases, expected a clock")
-    typical = float(np.median(forward))
+    typical = float(spacing.mean() if RowClock in kinds else np.median(forward))
     low, high = _SAMPLE_TIMES
     if not low <= typical <= high:
         raise LogError(
@@ -61,13 +80,65 @@ def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: 
             f"to {high:g} s: is the unit of the time wrong ({'ms' if typical > high else 's'}?)"
         )
     gaps = spacing > GAP_FACTOR * typical
-    if gaps.any() and not kinds & {SplitGaps, Resample}:
+    if gaps.any() and not kinds & {SplitGaps, Resample, RowClock}:
         k = int(gaps.argmax())
+        cure = "a SplitGaps step to split the run there, or Resample to interpolate over short gaps"
+        if bursts:
+            cure = "a RowClock step: its stamps come in bursts of rows"
         raise LogError(
             f"{path}, line {lines[k + 1]}, column {name!r}: the time jumps from {t[k]:.9g} to "
             f"{t[k + 1]:.9g} s, where {typical:.6g} s is usual ({int(gaps.sum())} such gaps): add "
-            "a SplitGaps step to split the run there, or Resample to interpolate over short gaps"
+            f"{cure}"
         )
+
+
+def check_stamps(recordings: list[Recording], steps: list[Step], report: Report) -> None:
+    """Warns of stamps that come in bursts, or contradict q and v where the row numbers do not.
+
+    By the stamps q moves by v (t_{k+1} - t_k) from row to row, by a uniform clock by v h. The share
+    of the squares of the steps of q that either leaves, by least squares, tells which is right.
+    """
+    if any(isinstance(step, RowClock) for step in steps):
+        return
+    long = [item for item in recordings if len(item) > 20 and item.t[-1] > item.t[0]]
+    bursts = [item.run for item in long if burst_share(item.t) > _BURSTS]
+    if bursts:
+        report.warn(
+            f"{bursts[0]}{' and others' if len(bursts) > 1 else ''}: stamps come in bursts, most "
+            "rows follow the one before within a fifth of the mean sample time: if no row is "
+            "missing, a RowClock step takes the time from the row number"
+        )
+    moved = [item for item in long if item.v is not None]
+    if bursts or not moved:
+        return
+    by_stamps, by_rows = (
+        _unexplained(
+            np.vstack([np.diff(item.q, axis=0) for item in moved]),
+            np.vstack([_mean_speed(item) * spacing(item)[:, None] for item in moved]),
+        )
+        for spacing in (lambda item: np.diff(item.t), _uniform)
+    )
+    for k in np.flatnonzero((by_stamps > _STAMPS_FAIL) & (by_rows < _ROWS_AGREE * by_stamps)):
+        report.warn(
+            f"coordinate {k + 1}: by the stamps v leaves {100 * by_stamps[k]:.0f} % of the steps "
+            f"of q unexplained, by a uniform clock {100 * by_rows[k]:.2g} %: the stamps are not "
+            "the times of the samples; if no row is missing, add a RowClock step"
+        )
+
+
+def _mean_speed(item: Recording) -> np.ndarray:
+    assert item.v is not None
+    return 0.5 * (item.v[1:] + item.v[:-1])
+
+
+def _uniform(item: Recording) -> np.ndarray:
+    return np.full(len(item) - 1, item.duration / (len(item) - 1))
+
+
+def _unexplained(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Share of the squares of each column of y that a multiple of that of x leaves."""
+    squares = ((x**2).sum(axis=0) * (y**2).sum(axis=0)).clip(min=1e-300)
+    return 1 - (x * y).sum(axis=0) ** 2 / squares
 
 
 def check_second_clock(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -125,3 +125,69 @@ class Resample(Step):
             f"{count} samples at {self.rate:g} Hz"
         )
         return [resampled], text
+
+
+@dataclass(frozen=True)
+class RowClock(Step):
+    """Times from the numbers of the rows, where the stamps come in bursts::
+
+        t_k = a + k / rate
+
+    A logger that empties a buffer stamps its rows when it writes them, not when they were sampled:
+    many rows share one stamp, or follow within microseconds, and then nothing comes for a while. a
+    is that of the line through the stamps, by least squares, and the rate where it is not given.
+    Right only where no row is missing.
+
+    Args:
+        longest: longest time between a stamp and the line, s: some bursts. More means lost rows.
+        rate: samples per second, Hz; None: from the stamps of the training runs.
+    """
+
+    longest: float
+    rate: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.longest > 0 or not (self.rate is None or self.rate > 0):
+            raise LogError(
+                f"RowClock: longest is {self.longest} s and rate {self.rate} Hz, expected more "
+                "than 0"
+            )
+
+    @property
+    def learns(self) -> bool:
+        return self.rate is None
+
+    def fit(self, training: list[Recording]) -> Step:
+        if self.rate is not None:
+            return self
+        rows = [np.arange(len(item)) - (len(item) - 1) / 2 for item in training]
+        squares = sum(float(k @ k) for k in rows)
+        slope = sum(float(k @ item.t) for k, item in zip(rows, training, strict=True)) / squares
+        if not slope > 0:
+            raise LogError("RowClock: the time does not increase along the training runs")
+        return replace(self, rate=1 / slope)
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        assert self.rate is not None
+        rows, t, step = np.arange(len(recording)), recording.t - recording.t[0], 1 / self.rate
+        line = step * rows + (t - step * rows).mean()
+        off = np.abs(t - line)
+        k = int(off.argmax())
+        if off[k] > self.longest:
+            raise LogError(
+                f"{recording.place}: RowClock found the stamp {recording.t[k]:.6g} s {off[k]:.4g} s"
+                f" off a clock of {step:.6g} s, more than longest, {self.longest} s: rows are "
+                "missing, or the rate changes: put SplitGaps before it, or raise longest to the "
+                "length of some bursts"
+            )
+        text = f"t from the row number, {step:.6g} s a row; stamps were up to {off[k]:.4g} s off"
+        return [replace(recording, t=recording.t[0] + line)], text
+
+
+def burst_share(t: np.ndarray) -> float:
+    """Share of rows that are stamped within a fifth of the mean sample time after the one before.
+
+    Rows that are sampled when they are stamped keep their distance, a burst of n rows has
+    (n - 1)/n of them.
+    """
+    return float((np.diff(t) < (t[-1] - t[0]) / (len(t) - 1) / 5).mean())

@@ -11,9 +11,18 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import polynomial
 from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
+from pinn_dyn.data.lengths import Length
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.step import SIGNALS, Step, change, check_signals, sample_time
+from pinn_dyn.data.logs.step import (
+    SIGNALS,
+    Step,
+    change,
+    check_signals,
+    check_window,
+    sample_time,
+    window_samples,
+)
 
 
 @dataclass(frozen=True)
@@ -25,29 +34,27 @@ class MovingAverage(Step):
     An even window looks one sample further back than ahead.
 
     Args:
-        window: number of samples w.
+        window: number of samples w, or a time, such as ``"0.1 s"``.
         signals: which of q, v and u.
     """
 
-    window: int = 50
+    window: Length = 50
     signals: Sequence[str] = SIGNALS
 
     def __post_init__(self) -> None:
         check_signals(self.signals)
-        if self.window < 1:
-            raise LogError(f"MovingAverage: window is {self.window}, expected at least 1")
+        check_window("MovingAverage", self.window, 1)
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         step = sample_time(recording, "MovingAverage")
+        window = window_samples(self.window, recording, 1)
         smooth = change(
             recording,
             self.signals,
-            lambda x: (
-                pd.DataFrame(x).rolling(self.window, center=True, min_periods=1).mean().to_numpy()
-            ),
+            lambda x: pd.DataFrame(x).rolling(window, center=True, min_periods=1).mean().to_numpy(),
         )
         names = ", ".join(self.signals)
-        return [smooth], f"mean of {self.window} samples ({self.window * step:.4g} s) of {names}"
+        return [smooth], f"mean of {window} samples ({window * step:.4g} s) of {names}"
 
 
 @dataclass(frozen=True)
@@ -163,27 +170,28 @@ class Butterworth(Step):
 class _SavitzkyGolaySlope(Step):
     """What needs the slope of a polynomial through ``window`` samples around each sample."""
 
-    window: int = 11
+    window: Length = 11
     order: int = 3
 
     def __post_init__(self) -> None:
-        if self.window % 2 == 0 or not 1 <= self.order < self.window:
-            raise LogError(
-                f"{type(self).__name__}: window is {self.window} and order {self.order}, expected "
-                "an odd window and an order from 1 to below the window"
-            )
+        name = type(self).__name__
+        if self.order < 1:
+            raise LogError(f"{name}: order is {self.order}, expected at least 1")
+        check_window(name, self.window, self.order + 1, odd=True)
 
-    def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """The slope of each column of ``values``, and the length of a window in s."""
+    def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, int, float]:
+        """The slope of each column of ``values``, the samples of a window, and the sample time."""
         name = type(self).__name__
         step = sample_time(recording, name)
-        if len(recording) < self.window:
+        # The shortest odd window that has the order.
+        window = window_samples(self.window, recording, self.order + 1 + self.order % 2, odd=True)
+        if len(recording) < window:
             raise LogError(
                 f"{recording.place}: {len(recording)} samples are too few for {name}, expected at "
-                f"least {self.window}"
+                f"least {window}"
             )
-        slope = savgol_filter(values, self.window, self.order, deriv=1, delta=step, axis=0)
-        return slope, self.window * step
+        slope = savgol_filter(values, window, self.order, deriv=1, delta=step, axis=0)
+        return slope, window, step
 
 
 @dataclass(frozen=True)
@@ -199,7 +207,7 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
     It carries more noise, so a shorter window and a lower order suit it.
 
     Args:
-        window: number of samples, odd.
+        window: number of samples, odd, or a time, such as ``"50 ms"``.
         order: order of the polynomial.
         causal: whether only the past counts.
     """
@@ -212,21 +220,19 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
                 f"{recording.run}: the log has a velocity already, expected none: leave out "
                 "SavitzkyGolayVelocity, or v"
             )
-        v, length = self._slope(recording, recording.q)
+        v, window, step = self._slope(recording, recording.q)
         if self.causal:
-            v = self._causal_slope(recording.q, length / self.window)
+            v = self._causal_slope(recording.q, window, step)
         past = ", from the past alone" if self.causal else ""
-        return [replace(recording, v=v)], f"v from q in windows of {length:.3g} s{past}"
+        return [replace(recording, v=v)], f"v from q in windows of {window * step:.3g} s{past}"
 
-    def _causal_slope(self, values: np.ndarray, step: float) -> np.ndarray:
+    def _causal_slope(self, values: np.ndarray, window: int, step: float) -> np.ndarray:
         def weights(position: int) -> np.ndarray:
-            return savgol_coeffs(
-                self.window, self.order, deriv=1, delta=step, pos=position, use="dot"
-            )
+            return savgol_coeffs(window, self.order, deriv=1, delta=step, pos=position, use="dot")
 
-        last = self.window - 1
-        start = [weights(k) @ values[: self.window] for k in range(last)]
-        windows = sliding_window_view(values, self.window, axis=0)
+        last = window - 1
+        start = [weights(k) @ values[:window] for k in range(last)]
+        windows = sliding_window_view(values, window, axis=0)
         return np.vstack([*start, windows @ weights(last)])
 
 
@@ -241,13 +247,13 @@ class InputRates(_SavitzkyGolaySlope):
     :class:`SavitzkyGolayVelocity`, so it looks half a window ahead.
 
     Args:
-        window: number of samples, odd.
+        window: number of samples, odd, or a time, such as ``"50 ms"``.
         order: order of the polynomial.
     """
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        rates, length = self._slope(recording, recording.u)
-        text = f"du/dt, in windows of {length:.3g} s, follows u"
+        rates, window, step = self._slope(recording, recording.u)
+        text = f"du/dt, in windows of {window * step:.3g} s, follows u"
         return [replace(recording, u=np.hstack([recording.u, rates]))], text
 
     def input_labels(self, labels: list[str]) -> list[str]:

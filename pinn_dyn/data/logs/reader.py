@@ -10,6 +10,7 @@ import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,8 @@ from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
 from pinn_dyn.data.logs.bags import is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.parquet import read_parquet
+
+_PART = 200_000  # rows of a CSV file that are parsed together
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
@@ -134,6 +137,49 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
     return values
 
 
+def _parsed(path: Path, separator: str) -> pd.DataFrame:
+    """The table of a CSV file, parsed in parts: at once it takes three times its memory."""
+
+    def parser(rows: int | None) -> Any:
+        return pd.read_csv(
+            path,
+            sep=separator,
+            encoding="utf-8-sig",
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            index_col=False,
+            chunksize=rows,
+        )
+
+    numeric: dict[Any, np.ndarray] = {}
+    texts: dict[Any, list[pd.Series]] = {}
+    names: list[Any] = []
+    with parser(_PART) as reader:
+        for part in reader:
+            first, names = not names, list(part.columns)
+            for name, one in part.items():
+                if one.dtype.kind in "iuf" and (first or name in numeric):
+                    numeric[name] = _longer(numeric.get(name), one.to_numpy())
+                elif first or (name in texts and texts[name][0].dtype == one.dtype):
+                    texts.setdefault(name, []).append(one)
+                else:  # numbers in one part and text in another: what they are takes all rows
+                    return parser(None)
+    joined = {name: pd.concat(each, ignore_index=True) for name, each in texts.items()}
+    columns: dict[Any, Any] = {**numeric, **joined}
+    return pd.DataFrame({name: columns[name] for name in names}, copy=False)
+
+
+def _longer(old: np.ndarray | None, more: np.ndarray) -> np.ndarray:
+    """A column and its next rows; grown in place, which takes no second copy of a large one."""
+    if old is None:
+        return more.copy()
+    whole = old.astype(np.result_type(old, more), copy=False)
+    whole.resize(len(old) + len(more), refcheck=False)
+    whole[-len(more) :] = more
+    return whole
+
+
 def _read_csv(path: Path) -> pd.DataFrame:
     try:
         with (gzip.open if path.suffix == ".gz" else open)(
@@ -144,15 +190,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
         with warnings.catch_warnings():
             # Pandas would cut rows that are longer than the header, and only warn.
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            table = pd.read_csv(
-                path,
-                sep=separator,
-                encoding="utf-8-sig",
-                skipinitialspace=True,
-                skip_blank_lines=False,
-                low_memory=False,
-                index_col=False,
-            )
+            table = _parsed(path, separator)
     except (
         pd.errors.ParserError,
         pd.errors.ParserWarning,
@@ -169,7 +207,9 @@ def _read_csv(path: Path) -> pd.DataFrame:
     table.columns = [str(name).strip() for name in found]
     table.index = pd.RangeIndex(2, len(table) + 2)
     # Blank lines are counted, so that lines keep their numbers, but at the end they do no harm.
-    filled = np.flatnonzero(table.notna().any(axis=1))
-    if not len(filled):
+    filled = len(table)
+    while filled and table.iloc[filled - 1].isna().all():
+        filled -= 1
+    if not filled:
         raise LogError(f"{path}: has no rows, expected a header line and rows of numbers")
-    return table.iloc[: filled[-1] + 1]
+    return table.iloc[:filled]

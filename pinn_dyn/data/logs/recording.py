@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ class Recording:
         q: configuration, ``(T, N)``.
         v: velocity, ``(T, N)``, or None while there is none.
         u: input, ``(T, M)``.
+        past: u of the samples right before, ``(K, M)``, of what was cut out of a longer stretch.
     """
 
     run: str
@@ -28,6 +29,7 @@ class Recording:
     q: np.ndarray
     v: np.ndarray | None
     u: np.ndarray
+    past: np.ndarray | None = None
 
     def __len__(self) -> int:
         return self.t.shape[0]
@@ -45,7 +47,7 @@ class Recording:
     def rows(self, index: Any) -> Recording:
         """The rows that a slice, a mask or positions pick."""
         v = None if self.v is None else self.v[index]
-        return replace(self, t=self.t[index], q=self.q[index], v=v, u=self.u[index])
+        return Recording(self.run, self.t[index], self.q[index], v, self.u[index])
 
     def values(self) -> np.ndarray:
         """All signals side by side, ``(T, 2N + M)`` or ``(T, N + M)``."""

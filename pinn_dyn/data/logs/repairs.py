@@ -8,9 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from pinn_dyn.data.lengths import Length
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.step import Step, change, check_signals
+from pinn_dyn.data.logs.step import (
+    Step,
+    change,
+    check_signals,
+    check_window,
+    window_samples,
+)
 
 # Share of the rows that may be jumps; more are noise or motion.
 _MANY = 0.05
@@ -28,24 +35,23 @@ class RemoveJumps(Step):
     Args:
         threshold: largest distance from the median that is no jump, SI units; one value, or one
             per column.
-        window: number of samples, odd.
+        window: number of samples, odd, or a time, such as ``"0.25 s"``.
         signals: which of q, v and u.
     """
 
     threshold: float | Sequence[float]
-    window: int = 25
+    window: Length = 25
     signals: Sequence[str] = ("q",)
 
     def __post_init__(self) -> None:
         check_signals(self.signals)
-        if self.window < 3 or self.window % 2 == 0 or not np.all(np.asarray(self.threshold) > 0):
-            raise LogError(
-                f"RemoveJumps: threshold is {self.threshold} and window {self.window}, expected a "
-                "threshold above 0 and an odd window of at least 3"
-            )
+        check_window("RemoveJumps", self.window, 3, odd=True)
+        if not np.all(np.asarray(self.threshold) > 0):
+            raise LogError(f"RemoveJumps: threshold is {self.threshold}, expected more than 0")
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         found: list[str] = []
+        window = window_samples(self.window, recording, 3, odd=True)
 
         def repair(x: np.ndarray) -> np.ndarray:
             if np.ndim(self.threshold) and len(np.atleast_1d(self.threshold)) != x.shape[1]:
@@ -54,7 +60,7 @@ class RemoveJumps(Step):
                     f"or one for each of {x.shape[1]} columns"
                 )
             frame = pd.DataFrame(x)
-            median = frame.rolling(self.window, center=True).median()
+            median = frame.rolling(window, center=True).median()
             off = (frame - median).abs()
             bad = off > np.asarray(self.threshold)
             rows = np.flatnonzero(bad.any(axis=1))

@@ -21,6 +21,7 @@ from pinn_dyn.data.logs.checks import (
     check_inputs,
     check_rest,
     check_second_clock,
+    check_stamps,
     check_unseen_inputs,
     check_velocities,
 )
@@ -38,6 +39,8 @@ from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
+# Inputs before a piece that are kept for models of a delay, s.
+_PAST = 0.5
 # What the trajectories depend on beside the files.
 _SETTINGS = (
     *("time", "q", "v", "u", "trajectory", "max_age", "steps", "validation", "test"),
@@ -79,8 +82,9 @@ class LogSource(DataSource):
         max_age: how old a message of another topic of a bag may be at a row, s.
         trajectory: column that tells the runs of a file apart, or None where a file is one run.
         steps: names and steps of the cleaning, in order; None entries are left out.
-        validation, test: whole runs, ``{runs: 2, piece: 5.0}``, or the ends of runs,
-            ``{seconds: 3.0, piece: 3.0}``; pieces in s.
+        validation, test: whole runs, ``{runs: 2, piece: 5.0}``, the ends of runs,
+            ``{seconds: 3.0, piece: 3.0}``, or blocks along them, ``{seconds: 3.0, blocks: 4,
+            piece: 3.0}``; pieces in s, or ``whole``. See :class:`Part`.
         guard: time left out between training, validation and test of one run, s.
         shortest: training stretches shorter than this are dropped, s; at least one window.
         seed: draws the runs where their number is given.
@@ -261,6 +265,7 @@ class LogSource(DataSource):
         if self._loaded is None:
             report = Report(self.name)
             recordings = self._read(report)
+            check_stamps(recordings, list(self.steps.values()), report)
             check_inputs(recordings, self.u, report)
             check_angles(recordings, self.q, report)
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
@@ -386,11 +391,10 @@ class LogSource(DataSource):
 
     def _long_enough(self, name: str, cleaned: list[Cleaned], report: Report) -> list[Cleaned]:
         """Without the stretches that a step left too short to be of use."""
-        least = {
-            "train": ("shortest", self.shortest),
-            "validation": ("its piece", self.validation.piece),
-            "test": ("its piece", self.test.piece),
-        }
+        least = {"train": ("shortest", self.shortest)}
+        for key, split_part in (("validation", self.validation), ("test", self.test)):
+            piece = split_part.piece
+            least[key] = least["train"] if isinstance(piece, str) else ("its piece", piece)
         result = []
         for part in cleaned:
             key, shortest = least[part.split]
@@ -435,16 +439,24 @@ class LogSource(DataSource):
         A stretch of T samples that lasts one sample less than n pieces has n of them all the same.
         """
         stretches = [item for one in cleaned if one.split == name for item in one.clean]
-        span = round(part.piece / step)
-        if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
-            raise LogError(
-                f"{name}.piece is {part.piece} s, expected a multiple of the sample time, "
-                f"{step:g} s"
-            )
+        if isinstance(part.piece, str):
+            span = min(len(item) for item in stretches) - 1
+            starts = [[0] for _ in stretches]
+        else:
+            span = round(part.piece / step)
+            if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
+                raise LogError(
+                    f"{name}.piece is {part.piece} s, expected a multiple of the sample time, "
+                    f"{step:g} s, or 'whole'"
+                )
+            starts = [_starts(len(item), span) for item in stretches]
         pieces = [
-            item.rows(slice(first, first + span + 1))
-            for item in stretches
-            for first in _starts(len(item), span)
+            replace(
+                item.rows(slice(first, first + span + 1)),
+                past=item.u[max(first - round(_PAST / step), 0) : first],
+            )
+            for item, each in zip(stretches, starts, strict=True)
+            for first in each
         ]
         if not pieces:
             longest = max(item.duration for item in stretches)
@@ -467,7 +479,8 @@ class LogSource(DataSource):
             for values in (recording.q, recording.v, recording.u)
         )
         t = torch.arange(len(recording), dtype=torch.float64) * step
-        return Trajectory(q, v, Signal(t, u, self.interpolation))
+        past = None if recording.past is None else torch.from_numpy(recording.past.copy())
+        return Trajectory(q, v, Signal(t, u, self.interpolation), past=past)
 
 
 def _check_units(name: str, columns: Columns, expected: Sequence[str]) -> None:

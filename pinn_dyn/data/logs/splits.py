@@ -1,10 +1,10 @@
-"""Which runs, or which end of a run, are for training, validation and test."""
+"""Which runs, or which parts of a run, are for training, validation and test."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,16 +12,21 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
 
 SPLITS = ("train", "validation", "test")
-_KEYS = ("runs", "seconds", "piece")
+_KEYS = ("runs", "seconds", "blocks", "piece")
+WHOLE: Literal["whole"] = "whole"
+"""As a piece: one roll-out of each stretch, all as long as the shortest stretch."""
 
 
 class Part:
-    """What is kept from training: whole runs, or the last seconds of the others.
+    """What is kept from training: whole runs, or seconds at the end of the others or along them.
 
     Args:
-        piece: length of the roll-outs that it is cut into, s.
+        piece: length of the roll-outs that it is cut into, s; ``"whole"``: each stretch is one,
+            from its start, as long as the shortest of them.
         runs: number of runs, drawn by the seed, or the names of the runs.
         seconds: the last so many seconds of every run that is not named elsewhere.
+        blocks: with ``seconds``, so many blocks of that length spread evenly along every such run,
+            in place of its end.
 
     Raises:
         LogError: unless just one of ``runs`` and ``seconds`` is given, and all are above 0.
@@ -29,10 +34,11 @@ class Part:
 
     def __init__(
         self,
-        piece: float,
+        piece: float | Literal["whole"],
         *,
         runs: int | Sequence[str | int] | None = None,
         seconds: float | None = None,
+        blocks: int | None = None,
     ):
         if (runs is None) == (seconds is None):
             raise LogError(
@@ -41,11 +47,20 @@ class Part:
             )
         self.names = None if runs is None or isinstance(runs, int) else [str(run) for run in runs]
         self.count = runs if isinstance(runs, int) else len(self.names or [])
+        if blocks is not None and (seconds is None or not blocks >= 1):
+            raise LogError(
+                f"blocks is {blocks} and seconds is {seconds}, expected at least one block and "
+                "with it seconds, the length of each"
+            )
         self.seconds = seconds
+        self.blocks = blocks
         self.piece = piece
         if (runs is not None and self.count < 1) or not (seconds is None or seconds > 0):
             raise LogError(f"runs is {runs} and seconds is {seconds}, expected more than 0")
-        if not piece > 0 or (seconds is not None and piece > seconds):
+        if isinstance(piece, str):
+            if piece != WHOLE:
+                raise LogError(f"piece is {piece!r}, expected a time in s, or 'whole'")
+        elif not piece > 0 or (seconds is not None and piece > seconds):
             raise LogError(f"piece is {piece} s, expected more than 0 and at most seconds")
 
     @classmethod
@@ -75,9 +90,11 @@ class Part:
 def split(
     recordings: list[Recording], validation: Part, test: Part, *, guard: float, seed: int
 ) -> dict[str, list[Recording]]:
-    """Assign whole runs, and cut the ends of the others, before any filter sees them.
+    """Assign whole runs, and cut parts out of the others, before any filter sees them.
 
-    Along a run that is cut: training, guard, validation, guard, test.
+    Along a run that is cut at its end: training, guard, validation, guard, test. Blocks lie in the
+    middles of as many equal parts of what is left of the run, those of validation and test taking
+    turns, a guard on both sides of each, and training between them.
 
     Raises:
         LogError: on unknown or doubly used runs, or too few or too short ones.
@@ -120,25 +137,27 @@ def split(
         if recording.run in taken:
             parts[taken[recording.run]].append(recording)
         else:
-            for name, stretch in _cut(recording, validation, test, guard).items():
+            for name, stretch in _cut(recording, validation, test, guard):
                 parts[name].append(stretch)
     return parts
 
 
-def _cut(recording: Recording, validation: Part, test: Part, guard: float) -> dict[str, Recording]:
+def _cut(
+    recording: Recording, validation: Part, test: Part, guard: float
+) -> list[tuple[str, Recording]]:
     """Training, validation and test stretches of one run."""
     if validation.seconds is None and test.seconds is None:
-        return {"train": recording}
+        return [("train", recording)]
     t = recording.t
     if not (np.diff(t) >= 0).all():
         raise LogError(
             f"{recording.run}: the time goes backwards, so its last seconds cannot be cut off: "
             "give a trajectory column, or split by 'runs'"
         )
-    stretches = {}
+    stretches = []
     end, last = t[-1], len(t)
     for name, part in (("test", test), ("validation", validation)):
-        if part.seconds is None:
+        if part.seconds is None or part.blocks:
             continue
         # From the row at or before the border, so that the stretch is not a row too short.
         first = int(np.searchsorted(t, end - part.seconds, side="right")) - 1
@@ -149,8 +168,41 @@ def _cut(recording: Recording, validation: Part, test: Part, guard: float) -> di
                 f"{recording.place}: too short to keep {part.seconds} s for {name} and a guard of "
                 f"{guard} s from training"
             )
-        stretches[name] = recording.rows(slice(first, last))
+        stretches.append((name, recording.rows(slice(first, last))))
         end, last = border, min(left, first)
     # The row after the border only completes a stretch that is measured from its end.
-    stretches["train"] = recording.rows(slice(0, max(last - 1, 1)))
+    rest = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
+    return [*stretches, *_blocks(rest, {"validation": validation, "test": test}, guard)]
+
+
+def _blocks(
+    recording: Recording, parts: Mapping[str, Part], guard: float
+) -> list[tuple[str, Recording]]:
+    """The blocks of one run, in turns, and the training before, between and after them."""
+    order = sorted(
+        ((k + 0.5) / part.blocks, name)
+        for name, part in parts.items()
+        for k in range(part.blocks or 0)
+        if part.blocks
+    )
+    t, stretches, free = recording.t, [], 0
+    for number, (_, name) in enumerate(order):
+        seconds = parts[name].seconds
+        assert seconds is not None
+        if recording.duration / len(order) < seconds + 2 * guard:
+            raise LogError(
+                f"{recording.place}: too short for {len(order)} blocks, of which {name} has "
+                f"{seconds} s each, with a guard of {guard} s on both sides"
+            )
+        middle = t[0] + (number + 0.5) * recording.duration / len(order)
+        first = int(np.searchsorted(t, middle - seconds / 2, side="right")) - 1
+        # To the row at or after the end, so that the block is not a row too short.
+        last = int(np.searchsorted(t, t[first] + seconds - 1e-9)) + 1
+        before = int(np.searchsorted(t, t[first] - guard))
+        stretches.append((name, recording.rows(slice(first, last))))
+        if before > free:
+            stretches.append(("train", recording.rows(slice(free, before))))
+        free = int(np.searchsorted(t, t[min(last, len(t)) - 1] + guard, side="right"))
+    if free < len(t):
+        stretches.append(("train", recording.rows(slice(free, None))))
     return stretches

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pinn_dyn.data.lengths import Length, samples_in, seconds_of
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
 
@@ -87,6 +88,30 @@ def sample_time(recording: Recording, wanted_by: str) -> float:
             f"time is {off[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it"
         )
     return step
+
+
+def check_window(name: str, window: Length, least: int, *, odd: bool = False) -> None:
+    """Refuse a window that is no number of samples, of at least ``least``, and no time.
+
+    Raises:
+        LogError: if it is neither; a time is rounded to an odd number where one is needed.
+    """
+    if isinstance(window, str):
+        try:
+            seconds_of(f"{name}: window", window)
+        except ValueError as error:
+            raise LogError(str(error)) from error
+    elif window < least or (odd and window % 2 == 0):
+        kind = "an odd window" if odd else "a window"
+        raise LogError(
+            f"{name}: window is {window}, expected {kind} of at least {least} samples, or a time, "
+            "such as '0.1 s'"
+        )
+
+
+def window_samples(window: Length, recording: Recording, least: int, *, odd: bool = False) -> int:
+    """A window in samples of the usual sample time of a recording, of at least ``least``."""
+    return max(samples_in("window", window, float(np.median(np.diff(recording.t))), odd=odd), least)
 
 
 def check_signals(signals: Sequence[str]) -> tuple[str, ...]:

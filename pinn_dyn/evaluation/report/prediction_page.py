@@ -40,6 +40,7 @@ _HEADERS = {
     "left_data_after": "first after [s]",
     "torque_share": "torque error / spread",
     "residual_share": "share of the residual force",
+    "input_delay_seconds": "learned input delay [s]",
     "training_seconds": "training [s]",
 }
 _GROUP_HEADERS = {

@@ -35,6 +35,8 @@ class RK4(Integrator):
         return increment + h * (first + 3 * (second + third) + fourth) / 8
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
+        if signal.t.requires_grad:  # a delay is learned: torchdiffeq's stages know no gradient in t
+            return super().path(dynamics, start, grid, signal)
         f = dynamics.state_derivative
 
         def rate(time: Tensor, increment: Tensor) -> Tensor:

@@ -118,8 +118,8 @@ class _Loss(nn.Module):
 
 
 def _samples(windows: Windows) -> list[Tensor]:
-    rate = windows.input.rate
-    return [windows.u] if rate is None else [windows.u, rate]
+    u, rate = windows.input.u, windows.input.rate
+    return [u] if rate is None else [u, rate]
 
 
 def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:

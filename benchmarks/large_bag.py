@@ -1,0 +1,106 @@
+"""Time and memory to read large logs: python -m benchmarks.large_bag [gigabytes] [million rows].
+
+A bag of JointStates of seven joints and a CSV file of 22 columns are written into a temporary
+folder, without randomness, and read in a process each.
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from pinn_dyn.data.logs.reader import read_table
+
+RATE = 1000.0
+JOINTS = [f"panda_joint{k + 1}" for k in range(7)]
+ARRAYS = ("position", "velocity", "effort")
+COLUMNS = [f"/joint_states/{array}/{joint}" for array in ARRAYS for joint in JOINTS]
+BLOCK = 10_000
+
+
+def signals(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps in ns, ``(count,)``, and positions, velocities and efforts, ``(count, 21)``."""
+    number = np.arange(first, first + count)
+    t = number[:, None] / RATE
+    phase = 0.3 * np.arange(1, 8) * t + np.arange(7)
+    stamps = np.int64(1_700_000_000_000_000_000) + np.int64(1e9 / RATE) * number
+    return stamps, np.hstack([np.sin(phase), 0.3 * np.arange(1, 8) * np.cos(phase), phase % 3])
+
+
+def write_bag(folder: Path, size: float) -> None:
+    """A bag in MCAP of at least ``size`` bytes of messages."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/JointState"
+    marks = 1e300 + np.arange(21) * 1e299  # where the numbers are in a message
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=0x01020304, nanosec=0x05060708)
+    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+    message = store.types[kind](header, JOINTS, marks[:7], marks[7:14], marks[14:])
+    raw = bytes(store.serialize_cdr(message, kind))
+    places = [raw.index(mark.tobytes()) for mark in marks]
+    seconds = raw.index((0x01020304).to_bytes(4, "little"))
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joint_states", kind, typestore=store)
+        for first in range(0, round(size / len(raw)), BLOCK):
+            stamps, values = signals(first, BLOCK)
+            rows = np.tile(np.frombuffer(raw, np.uint8), (BLOCK, 1))
+            times = np.stack([stamps // 10**9, stamps % 10**9], axis=1).astype("<i4")
+            rows[:, seconds : seconds + 8] = times.view(np.uint8)
+            for k, place in enumerate(places):
+                rows[:, place : place + 8] = values[:, k : k + 1].copy().view(np.uint8)
+            for at, row in zip(stamps.tolist(), rows, strict=True):
+                writer.write(connection, at, row.tobytes())
+
+
+def write_csv(path: Path, rows: int) -> None:
+    """A CSV file of t and 21 columns."""
+    for first in range(0, rows, BLOCK):
+        stamps, values = signals(first, min(BLOCK, rows - first))
+        frame = pd.DataFrame(values, columns=COLUMNS)
+        frame.insert(0, "/joint_states/t", 1e-9 * (stamps - stamps[0]) + first / RATE)
+        frame.to_csv(path, mode="a", header=not first, index=False, float_format="%.6f")
+
+
+def read(path: Path) -> None:
+    """Read all columns; prints rows, seconds and the most memory that it took."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start, processor = time.perf_counter(), time.process_time()
+    table = read_table(path, "/joint_states/t", ["/joint_states/t", *COLUMNS], 0.1)
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    _, values = signals(len(table) - 1, 1)
+    assert np.allclose(table[COLUMNS].iloc[-1], values, atol=1e-6)
+    print(
+        f"{path.name}: {len(table)} rows in {time.perf_counter() - start:.1f} s "
+        f"({time.process_time() - processor:.1f} s of the processor), at most {most / 1e6:.2f} GB, "
+        f"of which {before / 1e6:.2f} GB are Python's and the packages'",
+        flush=True,
+    )
+
+
+def main(gigabytes: float, million_rows: float) -> None:
+    """Write both and read each in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        if gigabytes:
+            write_bag(place / "bag", 1e9 * gigabytes)
+        if million_rows:
+            write_csv(place / "log.csv", round(1e6 * million_rows))
+        for path in sorted(place.iterdir()):
+            subprocess.run([sys.executable, "-m", "benchmarks.large_bag", str(path)], check=True)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 2 and Path(sys.argv[1]).exists():
+        read(Path(sys.argv[1]))
+    else:
+        given = [float(word) for word in sys.argv[1:]] + [1.0, 5.0][len(sys.argv) - 1 :]
+        main(*given)

@@ -1,0 +1,41 @@
+"""Lengths of steps and windows, in samples or in time: 5, or "20 ms"."""
+
+from __future__ import annotations
+
+import re
+
+Length = int | str
+"""A number of samples; or a time with its unit, which keeps its meaning at another rate."""
+
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+
+
+def seconds_of(name: str, length: str) -> float:
+    """A length such as ``"20 ms"`` in s.
+
+    Raises:
+        ValueError: on any other text, or a time that is not positive.
+    """
+    match = re.fullmatch(r"\s*([0-9.]+(?:e-?\d+)?)\s*([a-z]+)\s*", length)
+    try:
+        assert match is not None
+        seconds = float(match[1]) * _SECONDS[match[2]]
+        assert seconds > 0
+    except (AssertionError, KeyError, ValueError) as error:
+        raise ValueError(
+            f"{name} is {length!r}, expected a number of samples, such as 5, or a time with its "
+            f"unit ({', '.join(_SECONDS)}), such as '20 ms'"
+        ) from error
+    return seconds
+
+
+def samples_in(name: str, length: Length, sample_time: float, *, odd: bool = False) -> int:
+    """A length as a number of samples, at least 1, the closest to a time, odd where asked for.
+
+    Raises:
+        ValueError: as :func:`seconds_of`.
+    """
+    if not isinstance(length, str):
+        return length
+    count = seconds_of(name, length) / sample_time
+    return max(2 * round((count - 1) / 2) + 1 if odd else round(count), 1)

@@ -1,0 +1,285 @@
+"""A learned input delay: what it shifts, its gradient, what it finds, and where it is refused."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from pinn_dyn.control import Tracking
+from pinn_dyn.data.logs import SavitzkyGolayVelocity
+from pinn_dyn.data.windows import draw_windows
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.evaluation import predict_trajectories, predict_windows, torque_error
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Sum, Trajectory
+from pinn_dyn.models import (
+    AccelerationMLP,
+    ConstantCholesky,
+    ConstantInput,
+    HamiltonianNetwork,
+    LagrangianNetwork,
+    LearnedDelay,
+    NetworkPotential,
+    NoDelay,
+)
+from pinn_dyn.training.gradients.program import LossProgram
+from pinn_dyn.training.losses import IncrementLoss, MidpointLoss
+from tests.models.builders import STEP, make_statistics, perturb
+from tests.support.delayed_robots import log
+from tests.support.finite_differences import assert_near
+
+PAST, AHEAD = 8, 6
+CLOCK = STEP * torch.arange(-PAST, AHEAD + 1, dtype=torch.float64)
+T = CLOCK[PAST:]
+
+
+def make_model(kind="lnn", delay=None, integrator=None):
+    torch.manual_seed(3)
+    scales = make_statistics(2, 2)
+    if kind == "acceleration":
+        model = AccelerationMLP(scales, [6], integrator=integrator, delay=delay)
+    else:
+        network = {"lnn": LagrangianNetwork, "hnn": HamiltonianNetwork}[kind]
+        model = network(
+            scales,
+            ConstantCholesky,
+            partial(NetworkPotential, hidden=[6]),
+            ConstantCholesky,
+            ConstantInput,
+            integrator=integrator,
+            delay=delay,
+        )
+    return perturb(model.double())
+
+
+def set_delay(model, seconds):
+    with torch.no_grad():
+        model.delay.share.fill_(seconds / model.delay.longest)
+    return model
+
+
+def start_and_input(interpolation="linear", batch=3):
+    generator = torch.Generator().manual_seed(5)
+    x0 = torch.randn(batch, 4, generator=generator, dtype=torch.float64)
+    u = torch.randn(batch, len(CLOCK), 2, generator=generator, dtype=torch.float64)
+    return x0, Signal(CLOCK, u, interpolation)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn", "acceleration"])
+@pytest.mark.parametrize("samples", [0, 1, 5])
+def test_a_delay_of_whole_samples_is_the_input_of_so_many_samples_before(kind, samples):
+    x0, signal = start_and_input()
+    model = set_delay(make_model(kind, LearnedDelay(0.15)), samples * STEP)
+    earlier = Signal(T, signal.u[:, PAST - samples : PAST - samples + len(T)])
+    expected = set_delay(model, 0.0).increments(x0, T, earlier)
+    actual = set_delay(model, samples * STEP).increments(x0, T, signal)
+    assert_near(actual, expected, 1e-9)
+    if samples:
+        unshifted = set_delay(model, 0.0).increments(x0, T, signal)
+        assert float((actual - unshifted).detach().abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize(
+    "integrator", [RK4(), RK4(3), Rosenbrock(), Rosenbrock(2)], ids=["rk4", "3", "ros", "2"]
+)
+def test_the_gradient_is_that_of_finite_differences(interpolation, integrator):
+    x0, signal = start_and_input(interpolation)
+    model = make_model("lnn", LearnedDelay(0.15), integrator)
+
+    def loss(seconds):
+        return set_delay(model, seconds).increments(x0, T, signal).square().sum()
+
+    at, h = 0.0437, 1e-6  # no stage at a sample, where lines have a corner
+    (gradient,) = torch.autograd.grad(loss(at), model.delay.share)
+    with torch.no_grad():
+        difference = float(loss(at + h) - loss(at - h)) / (2 * h)
+    assert abs(difference) > 1e-3
+    assert float(gradient) / model.delay.longest == pytest.approx(difference, rel=1e-6)
+
+
+def test_the_gradient_of_the_midpoint_loss_is_that_of_finite_differences():
+    windows = pendulum_windows(steps=1, history=0.1, count=50)
+    scales = windows.statistics()
+    model = pendulum_model(scales).double()
+    loss = MidpointLoss(scales, model).double()
+
+    def value(seconds):
+        return loss(set_delay(model, seconds), windows)
+
+    at, h = 0.0337, 1e-6
+    (gradient,) = torch.autograd.grad(value(at), model.delay.share)
+    with torch.no_grad():
+        difference = float(value(at + h) - value(at - h)) / (2 * h)
+    assert float(gradient) / model.delay.longest == pytest.approx(difference, rel=1e-5)
+
+
+def test_it_is_never_negative_nor_beyond_the_longest_and_comes_back():
+    delay = LearnedDelay(0.1, initial=0.02)
+    assert float(delay.seconds().detach()) == pytest.approx(0.02)
+    optimizer = torch.optim.SGD(delay.parameters(), lr=1.0)
+    for push in (10.0, -20.0, 10.0):  # down to 0, up to the longest, back
+        optimizer.zero_grad()
+        (push * delay.seconds()).backward()
+        optimizer.step()
+        assert 0 <= float(delay.seconds().detach()) <= delay.longest + 1e-8
+    assert float(delay.seconds().detach()) == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("longest", "initial"), [(0.0, 0.0), (0.1, 0.2), (0.1, -0.01), (math.nan, 0.0), (math.inf, 0)]
+)
+def test_bad_settings_are_refused(longest, initial):
+    with pytest.raises(ValueError, match=r"delay: longest is .* expected a longest above 0"):
+        LearnedDelay(longest, initial)
+
+
+# On the log of a pendulum.
+
+
+def pendulum_trajectory(delay=0.03, noise=0.0, seed=0, interpolation="linear"):
+    ((recording,), _) = SavitzkyGolayVelocity().apply(log("pendulum", seed, delay, noise=noise))
+    t, q, v, u = (
+        torch.from_numpy(x.copy()) for x in (recording.t, recording.q, recording.v, recording.u)
+    )
+    return Trajectory(q, v, Signal(t, u, interpolation))
+
+
+def pendulum_windows(*, steps, history, count, **options):
+    return draw_windows(
+        [pendulum_trajectory(**options)],
+        count=count,
+        steps=steps,
+        stride=1,
+        seed=0,
+        history=history,
+    )
+
+
+def pendulum_model(scales, delay=None):
+    torch.manual_seed(0)
+    return LagrangianNetwork(
+        scales,
+        ConstantCholesky,
+        partial(NetworkPotential, hidden=[16], activation="tanh"),
+        ConstantCholesky,
+        ConstantInput,
+        angles=[0],
+        delay=delay or LearnedDelay(0.1),
+    )
+
+
+def test_training_finds_the_delay_of_a_pendulum_from_zero():
+    windows = pendulum_windows(steps=3, history=0.1, count=800).to(
+        torch.device("cpu"), torch.float32
+    )
+    scales = windows.statistics()
+    model = pendulum_model(scales).float()
+    loss = IncrementLoss(scales, model)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=0.005)
+    generator = torch.Generator().manual_seed(0)
+    assert model.learned_figures() == {"input_delay_seconds": 0.0}
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss(model, windows[torch.randint(800, (128,), generator=generator)]).backward()
+        optimizer.step()
+        assert model.learned_figures()["input_delay_seconds"] >= 0
+    assert model.learned_figures()["input_delay_seconds"] == pytest.approx(0.03, abs=0.01)
+
+
+def test_windows_keep_the_input_before_their_start():
+    trajectory = pendulum_trajectory()
+    windows = draw_windows([trajectory], count=400, steps=4, stride=2, seed=1, history=0.075)
+    assert windows.past == 8
+    assert windows.input.u.shape == (400, 8 + 8 + 1, 1)
+    assert windows.u.shape == (400, 9, 1)
+    assert_near(windows.input.t, 0.01 * torch.arange(-8, 9, dtype=torch.float64), 1e-12)
+    for k in (0, 7, 399):
+        start = int((trajectory.q == windows.q[k]).all(-1).nonzero()[0])
+        assert start >= 8
+        assert torch.equal(windows.input.u[k], trajectory.u[start - 8 : start + 9])
+    short = windows.first(3)
+    assert torch.equal(short.input.u, windows.input.u[:, :15])
+
+
+def test_windows_of_held_inputs_are_refused_by_name():
+    with pytest.raises(ValueError, match=r"held between its samples.*interpolation=linear"):
+        pendulum_windows(steps=1, history=0.1, count=10, interpolation="hold")
+    with pytest.raises(ValueError, match=r"interpolation is 'hold'.*InputDelay"):
+        pendulum_trajectory(interpolation="hold").input.delayed(torch.tensor(0.01))
+
+
+def test_too_few_starts_say_that_the_delay_needs_some():
+    with pytest.raises(ValueError, match="and of 10 before them for the delay"):
+        pendulum_windows(steps=1, history=0.1, count=1195)
+
+
+def test_roll_outs_see_the_input_before_their_start():
+    whole = pendulum_trajectory()
+    model = set_delay(pendulum_model(make_scales(), LearnedDelay(0.1)), 0.05)
+    cut = {name: getattr(whole, name)[None, 300:421] for name in ("q", "v")}
+    signal = Signal(whole.t[300:421] - whole.t[300], whole.u[None, 300:421])
+    known = Trajectory(**cut, input=signal, past=whole.u[None, 280:300])
+    assert_near(known.input_since(0.1).u, whole.u[None, 290:421], 0)
+    seen = predict_trajectories(model, known).q_hat
+    # The same piece as a window of the whole, and one whose past is not known.
+    again = predict_windows(
+        model,
+        Trajectory(
+            whole.q[None, :1201], whole.v[None, :1201], whole.input.mapped(lambda u: u[None])
+        ),
+        window=1.0,
+    )
+    assert_near(seen[:, 1:101], again.q_hat[:, 301:401], 1e-9)
+    held = predict_trajectories(model, Trajectory(**cut, input=signal)).q_hat
+    assert float((held - seen).abs().max()) > 1e-3
+
+
+def make_scales():
+    return pendulum_windows(steps=1, history=0.0, count=100).statistics()
+
+
+def test_terms_are_compared_under_the_input_that_acts():
+    model = set_delay(pendulum_model(make_scales(), LearnedDelay(0.1)), 0.05).double()
+    whole = pendulum_trajectory()
+    late = Trajectory(
+        whole.q[None, 5:],
+        whole.v[None, 5:],
+        whole.input.part(slice(0, -5)).mapped(lambda u: u[None]),
+    )
+    whole = Trajectory(whole.q[None], whole.v[None], whole.input.mapped(lambda u: u[None]))
+    assert_near(model.acting_samples(whole)[:, 5:], late.u, 1e-9)
+    with_delay = torque_error(model, whole, system=None)
+    model.delay = NoDelay()
+    # Five samples of 1200 are the others' start.
+    assert with_delay.share == pytest.approx(torque_error(model, late, system=None).share, rel=0.02)
+    assert with_delay.share != pytest.approx(
+        torque_error(model, whole, system=None).share, rel=0.05
+    )
+
+
+def test_sums_laws_and_ensembles_refuse_it_by_name():
+    model = make_model("lnn", LearnedDelay(0.1))
+    with pytest.raises(ValueError, match=r"the part late of a sum learns a delay.*late.delay=none"):
+        Sum({"late": model, "other": make_model("lnn")})
+    with pytest.raises(ValueError, match="learned input delay"):
+        Tracking(model, 1.0, 1.0)
+    with pytest.raises(ValueError, match=r"model/delay=learned.*one by one"):
+        Ensemble([model, make_model("lnn", LearnedDelay(0.1))])
+
+
+@pytest.mark.slow
+def test_one_compiled_program_has_the_same_loss_and_gradients():
+    windows = pendulum_windows(steps=1, history=0.1, count=64).to(
+        torch.device("cpu"), torch.float32
+    )
+    scales = windows.statistics()
+    model = set_delay(pendulum_model(scales).float(), 0.0337)
+    loss = IncrementLoss(scales, model)
+    value = loss(model, windows)
+    parameters = list(model.parameters())
+    expected = torch.autograd.grad(value, parameters, allow_unused=True)
+    ((_, compiled, gradients),) = LossProgram(loss, model)(windows, 64)
+    assert float(compiled) == pytest.approx(float(value.detach()), rel=1e-5)
+    place = next(k for k, p in enumerate(parameters) if p is model.delay.share)
+    assert float(gradients[place]) == pytest.approx(float(expected[place]), rel=1e-3)
