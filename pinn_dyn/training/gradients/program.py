@@ -80,7 +80,7 @@ class LossProgram:
         def loss_and_gradient(
             vector: Tensor, rows: list[Tensor], samples: list[Tensor]
         ) -> list[Tensor]:
-            given = dict(zip(_ROWS[state], rows, strict=True))
+            given: dict[str, Any] = dict(zip(_ROWS[state], rows, strict=True))
             batch = replace(windows, **given, input=windows.input.with_samples(*samples))
             batch = StateWindows.of(batch, state)
             with torch.enable_grad():
