@@ -277,9 +277,6 @@ CHANGES = {
     "rise_time": lambda: dict(excitation=excitation(steps={"rise_time": 0.04})),
     "kind": lambda: dict(excitation=MultiSine(**SINE)),
     "q_low": lambda: dict(initial_states=InitialStates(**{**BOX, "q_low": [-1.0, -1.0, 0.2]})),
-    "q_limits": lambda: dict(
-        train_inputs=3, pairing="matched", q_limits=[[-2.0, -2.0, 0.0], [2.0, 2.0, 1.0]]
-    ),
     "v_max": lambda: dict(initial_states=InitialStates(**{**BOX, "v_max": [1.0, 1.0, 0.2]})),
 }
 
@@ -291,6 +288,16 @@ CHANGES = {
 def test_a_change_of_the_data_is_another_entry_of_the_cache(tmp_path, change):
     changed = make_source(tmp_path, **CHANGES[change]())
     assert changed.describe() != make_source(tmp_path).describe()
+
+
+def test_other_limits_are_another_entry(tmp_path):
+    wider = [[-2.0, -2.0, 0.0], [2.0, 2.0, 1.0]]
+    free, limited, wide = (
+        make_source(tmp_path, **SIX, q_limits=limits).describe() for limits in (None, LIMITS, wider)
+    )
+    assert free != limited
+    assert limited != wide
+    assert free != wide
 
 
 @pytest.mark.parametrize(
