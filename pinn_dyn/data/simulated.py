@@ -238,6 +238,15 @@ class SimulatedSource(DataSource):
         q, v, u = (x[:count] for x in self._move([first], rows, t, count))
         if self.limits is not None:
             self._replace(self.limits, (q, v, u), splits, rngs, t)
+        elif isinstance(self.system, HasDomain):
+            for low, high in zip(q.min(1), q.max(1), strict=True):
+                try:
+                    self.system.check_domain(low, high)
+                except ValueError as error:
+                    raise SimulationError(
+                        f"{self.name}: in a motion {error}; set q_limits, within which motions "
+                        "are drawn anew, or reduce the excitation"
+                    ) from error
         ends = np.cumsum([0, *(self._size(split) for split in splits)])
         arrays = {"t": t}
         for index, split in enumerate(splits):

@@ -245,6 +245,19 @@ def test_limits_that_every_motion_leaves_are_refused_with_advice(tmp_path):
     assert not list(tmp_path.glob("*.npz"))
 
 
+class Oscillator(SoftArm):
+    """An arm whose length may pass through zero: constant terms, of a mass on a spring."""
+
+    def _acceleration(self, q, v, force):
+        return 100 * (force - q)
+
+
+def test_a_motion_out_of_the_systems_domain_is_refused_with_advice(tmp_path):
+    source = make_source(tmp_path, system=Oscillator())
+    with pytest.raises(SimulationError, match=r"tiny_arm: in a motion segment 1 .*set q_limits"):
+        source.load()
+
+
 # The cache.
 
 
