@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -39,7 +38,7 @@ def simulate(
     rtol: float = 1e-8,
     atol: float = 1e-9,
     compile: bool = False,
-    q_limits: Sequence[Sequence[float]] | None = None,
+    q_limits: np.ndarray | None = None,
     progress: str | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve the equation of motion for K trajectories in one batch.
@@ -75,10 +74,11 @@ def simulate(
         raise ValueError(f"initial state {k} is {x0[k].tolist()}: expected finite numbers")
     count, size = x0.shape
     half = size // 2
-    low, high = (-np.inf, np.inf) if q_limits is None else np.asarray(q_limits, dtype=float)
+    low, high = (-np.inf, np.inf) if q_limits is None else q_limits
 
     def outside(x: np.ndarray) -> np.ndarray:
-        return ((x[..., :half] < low) | (x[..., :half] > high)).any(-1)
+        q = x[..., :half]
+        return np.asarray(((q < low) | (q > high)).any(-1))
 
     left = outside(x0)
     equation = system.velocity_derivative

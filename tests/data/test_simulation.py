@@ -244,7 +244,7 @@ def test_a_motion_that_leaves_its_limits_is_held_and_the_others_go_on(linear):
     """Against the same motions without limits: equal until one leaves, and NaN from then on."""
     q0, v0 = np.array([[0.5, -0.3], [0.1, 0.0]]), np.array([[2.0, 0.8], [0.0, 0.0]])
     t = np.linspace(0, 4, 401)
-    limits = [[-0.6, -0.6], [0.6, 0.6]]
+    limits = np.array([[-0.6, -0.6], [0.6, 0.6]])
     free_q, free_v = simulate(linear, q0, v0, constant([0.1], 2), t)
     q, v = simulate(linear, q0, v0, constant([0.1], 2), t, q_limits=limits)
     leaves = int(np.argmax((np.abs(free_q[0]) > 0.6).any(-1)))
@@ -265,7 +265,7 @@ def test_a_motion_that_would_lose_its_mass_is_held_before_it_does():
         np.array([[0.0], [-3.0]]),
         constant([1.0], 2),
         np.linspace(0, 1.5, 151),
-        q_limits=[[-10.0], [0.9]],
+        q_limits=np.array([[-10.0], [0.9]]),
     )
     assert np.isnan(q[0, -1]).all()
     assert np.isfinite(q[1]).all()
@@ -278,6 +278,6 @@ def test_a_simulation_that_all_motions_have_left_ends(linear):
         np.zeros((2, 2)),
         constant([0.0], 2),
         np.linspace(0, 1e6, 11),
-        q_limits=[[-0.6, -0.6], [0.6, 0.6]],
+        q_limits=np.array([[-0.6, -0.6], [0.6, 0.6]]),
     )
     assert np.isnan(q[:, 1:]).all()
