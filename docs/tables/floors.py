@@ -31,6 +31,7 @@ _ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.val
 # Of each data set: horizon, step of the roll-outs and windows, all in s, and what makes it small.
 SETS = {
     "soft_arm_1": (5.0, 0.002, (0.1, 1.0), _ONE),
+    "soft_arm_1_wide": (5.0, 0.002, (0.1, 1.0), _ONE),
     "soft_arm_2": (10.0, 0.005, (0.1, 1.0), _ONE),
     "panda": (2.0, 0.01, (0.05, 0.5), ("dataset.train=1", "dataset.validation=1")),
     "double_pendulum": (2.0, 0.01, (0.1, 1.0), ()),

@@ -7,18 +7,27 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
-from docs.tables.text import commands, number, table
+from docs.tables.text import bold, commands, number, table
 from reproduce import ENTRIES, ROOT, Entry, read_entries, recorded, training_seconds
 
+_PREDICTED = ("soft_arm_1_wide", "soft_arm_1", "soft_arm_2", "panda")
+# Columns of the table of generalization: evaluations of the models of the wide range.
+_WIDE = ROOT / "results" / "soft_arm_1_wide"
+_ELSEWHERE = {
+    "in range": "summary.csv",
+    "beyond, 1.3 times": "beyond/summary.csv",
+    "steps of 5 ms": "steps/summary.csv",
+    "trained on 500 pairs": "few_pairs/summary.csv",
+}
 FIGURE = ROOT / "docs" / "figures" / "sample_efficiency.png"
 
 
 def tables() -> dict[str, str]:
     """Every table of the page, by the name of its place."""
     return {
-        **{name: prediction_table(name) for name in ("soft_arm_1", "soft_arm_2", "panda")},
-        **{f"{name}_commands": train_commands(name) for name in ("soft_arm_1", "soft_arm_2")},
-        "panda_commands": train_commands("panda"),
+        **{name: prediction_table(name) for name in _PREDICTED},
+        **{f"{name}_commands": train_commands(name) for name in _PREDICTED},
+        "generalization": generalization_table(),
         "hardware": hardware_table(),
         "control": control_table(),
         "terms": terms_table(),
@@ -38,11 +47,14 @@ def entries_of(group: str) -> dict[str, Entry]:
 
 def prediction_table(group: str) -> str:
     """Prediction errors, a row for each entry: means over the seeds."""
-    head = ["model", "paper", "ours: mean norm ± std", "squared norm, mean ± variance"]
+    entries = {name: (entry, recorded(entry)) for name, entry in entries_of(group).items()}
+    # Older results have no velocities.
+    with_v = all("state_squared_error_mean" in data for _, data in entries.values())
+    square, of = ("state_squared_error", " of (q, v)") if with_v else ("squared_error", "")
+    head = ["model", "paper", "ours: mean norm ± std", f"squared norm{of}, mean ± variance"]
     head += ["each seed", "pairs (paper)", "training, s"]
     rows = []
-    for name, entry in entries_of(group).items():
-        data = recorded(entry)
+    for name, (entry, data) in entries.items():
         mean = data.mean(numeric_only=True)
         took = training_seconds(data)
         pairs = f" ({entry['pairs']:,})" if "pairs" in entry else ""
@@ -51,13 +63,32 @@ def prediction_table(group: str) -> str:
                 name,
                 entry.get("paper", "–"),
                 f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
-                f"{mean['squared_error_mean']:.1e} ± {mean['squared_error_variance']:.1e}",
+                f"{mean[f'{square}_mean']:.1e} ± {mean[f'{square}_variance']:.1e}",
                 " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
                 f"{data['pairs'].iloc[0]:,}{pairs}",
                 f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
             ]
         )
     return table(head, rows)
+
+
+def generalization_table() -> str:
+    """The models of the wide range where they were not trained: means over the seeds."""
+    tables = {head: pd.read_csv(_WIDE / file) for head, file in _ELSEWHERE.items()}
+    rows = []
+    for model in tables["in range"]["model"].unique():
+        cells = []
+        for data in tables.values():
+            runs, trained = data[data["model"] == model], data[~data["floor"]]
+            if runs.empty:
+                cells.append("–")
+                continue
+            error = runs["error_mean"].mean()
+            best = error == trained.groupby("model")["error_mean"].mean().min()
+            cells.append(f"{bold(number(error), best)}{lost(runs)}")
+        floor = bool(tables["in range"].set_index("model").loc[[model], "floor"].iloc[0])
+        rows.append([model if floor else f"`{model}`", *cells])
+    return table(["model", *tables], rows)
 
 
 def lost(data: pd.DataFrame) -> str:

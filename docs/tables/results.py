@@ -20,7 +20,14 @@ NAMES = {
 # Of each row of the README: task, model, entry of ours, of the best black box. An entry is one of
 # reproduction.yaml, or a log and its model.
 SUMMARY = [
-    ("one-segment soft arm, 5 s", "hnn", "soft_arm_1/hnn", "soft_arm_1/acceleration_soap"),
+    ("one-segment soft arm, 5 s", "hnn", "soft_arm_1_wide/hnn", "soft_arm_1_wide/acceleration"),
+    ("", "lnn", "soft_arm_1_wide/lnn", "soft_arm_1_wide/acceleration"),
+    (
+        "the same, narrow: axial force −1.15 ± 0.1 N",
+        "hnn",
+        "soft_arm_1/hnn",
+        "soft_arm_1/acceleration_soap",
+    ),
     ("", "lnn", "soft_arm_1/lnn_midpoint", "soft_arm_1/acceleration_soap"),
     ("two-segment soft arm, 10 s", "lnn", "soft_arm_2/lnn_1000hz_wide", "soft_arm_2/mlp_100hz"),
     ("Panda in PyBullet, 2 s", "lnn", "panda/lnn", "panda/mlp"),

@@ -42,6 +42,7 @@ from pinn_dyn.evaluation import (
     rollout_metrics,
     save,
     spread_figure,
+    state_squared_error,
     summary_table,
     terms_figure,
     torque_error,
@@ -279,7 +280,7 @@ def _evaluate(
     metrics = rollout_metrics(
         prediction.q_hat, prediction.q, prediction.t, thresholds=config["thresholds"]
     ).to_dict()
-    metrics |= left_data(prediction, train)
+    metrics |= state_squared_error(prediction) | left_data(prediction, train)
     if prediction.members is not None:
         metrics |= member_metrics(prediction)
     for window in config["windows"]:

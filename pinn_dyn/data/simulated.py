@@ -13,54 +13,20 @@ from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation
+from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
-from pinn_dyn.data.simulation import simulate
+from pinn_dyn.data.initial_states import InitialStates
+from pinn_dyn.data.limits import HasDomain, Limits
+from pinn_dyn.data.simulation import SimulationError, simulate
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 3
 _SPLITS = ("train", "validation", "test")
-
-
-@dataclass(frozen=True)
-class InitialStates:
-    """A box from which initial states are drawn uniformly.
-
-    Args:
-        q_low, q_high: bounds of the configuration, ``(N,)``.
-        v_max: bound of the speed of each coordinate, ``(N,)``.
-
-    Raises:
-        ValueError: if the lengths differ, a bound is not finite, or a lower one exceeds the upper.
-    """
-
-    q_low: Sequence[float]
-    q_high: Sequence[float]
-    v_max: Sequence[float]
-
-    def __post_init__(self) -> None:
-        if not len(self.q_low) == len(self.q_high) == len(self.v_max):
-            raise ValueError(
-                f"InitialStates: q_low, q_high and v_max have {len(self.q_low)}, "
-                f"{len(self.q_high)} and {len(self.v_max)} entries, expected the same number"
-            )
-        bounds = np.array([self.q_low, self.q_high, self.v_max], dtype=float)
-        if not np.isfinite(bounds).all():
-            raise ValueError(
-                f"InitialStates: bounds are {bounds.tolist()}, expected finite numbers"
-            )
-        if (bounds[0] > bounds[1]).any() or (bounds[2] < 0).any():
-            raise ValueError(
-                f"InitialStates: q_low = {list(self.q_low)}, q_high = {list(self.q_high)}, v_max = "
-                f"{list(self.v_max)}: expected q_low <= q_high and v_max >= 0"
-            )
-
-    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``count`` initial configurations and velocities, both ``(count, N)``."""
-        v_max = np.asarray(self.v_max, dtype=float)
-        shape = (count, len(v_max))
-        return rng.uniform(self.q_low, self.q_high, shape), rng.uniform(-v_max, v_max, shape)
+# Within limits: how often a motion is drawn anew, and how many draws are simulated at once.
+_DRAWS = 40
+_AT_ONCE = 3
 
 
 class SimulatedSource(DataSource):
@@ -68,7 +34,8 @@ class SimulatedSource(DataSource):
 
     Training trajectories combine every initial state with every input, or pair them one to one;
     validation and test trajectories each have an initial state and an input of their own, which
-    no training trajectory has.
+    no training trajectory has. A motion that leaves ``q_limits`` is drawn anew, both its initial
+    state and its input: the k-th motion of a split is the first within them of a sequence of draws.
 
     Args:
         name: short name of the data set.
@@ -83,6 +50,8 @@ class SimulatedSource(DataSource):
         train_inputs: number of inputs for training.
         pairing: ``"product"`` trains on every combination of these, ``"matched"`` gives each
             initial state an input of its own.
+        q_limits: lower and upper limits of the configuration, ``(2, N)``, which no motion leaves;
+            they take ``pairing="matched"``. None: no limits.
         validation: number of validation trajectories.
         test: number of test trajectories.
         seed: seed of all initial states and inputs.
@@ -95,7 +64,8 @@ class SimulatedSource(DataSource):
 
     Raises:
         ValueError: on a step longer than the duration, a count below 1, an unknown pairing or one
-            of unequal counts, or sizes that do not match the system.
+            of unequal counts, sizes that do not match the system, or ranges of q that are empty or
+            go beyond where the system's equation holds.
     """
 
     def __init__(
@@ -112,6 +82,7 @@ class SimulatedSource(DataSource):
         train_initial_states: int,
         train_inputs: int,
         pairing: Literal["product", "matched"] = "product",
+        q_limits: Sequence[Sequence[float]] | None = None,
         validation: int,
         test: int,
         seed: int = 0,
@@ -160,6 +131,25 @@ class SimulatedSource(DataSource):
         ):
             if found != expected:
                 raise ValueError(f"{name}: {key} has {found} entries, the system needs {expected}")
+        ranges = {"initial_states": (initial_states.q_low, initial_states.q_high)}
+        self.limits = None
+        if q_limits is not None:
+            if pairing != "matched":
+                raise ValueError(
+                    f"{name}: q_limits with pairing = {pairing!r}: a motion that leaves them is "
+                    "drawn anew, which would break the combinations; expected 'matched'"
+                )
+            try:
+                self.limits = Limits(q_limits, around=ranges["initial_states"])
+            except ValueError as error:
+                raise ValueError(f"{name}: q_limits {error}") from error
+            ranges["q_limits"] = (q_limits[0], q_limits[1])
+        if isinstance(system, HasDomain):
+            for key, (low, high) in ranges.items():
+                try:
+                    system.check_domain(np.asarray(low), np.asarray(high))
+                except ValueError as error:
+                    raise ValueError(f"{name}: {key}: {error}") from error
         self.name = name
         self.system: MechanicalSystem = system
         self.angles = tuple(getattr(system, "angles", ()))
@@ -203,9 +193,11 @@ class SimulatedSource(DataSource):
         parts = {
             key: describe(getattr(self, key)) for key in ("system", "excitation", "initial_states")
         }
+        limits = {} if self.limits is None else {"q_limits": describe(self.limits.bounds)}
         return {
             "version": _VERSION,
             **parts,
+            **limits,
             "duration": self.duration,
             "test_duration": self.test_duration,
             "step": self.step,
@@ -238,10 +230,39 @@ class SimulatedSource(DataSource):
     def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
         """Trajectories of some splits in one batch, filled up with copies to ``size``."""
         t = np.arange(round(duration / self.step) + 1) * self.step
+        # One generator per split: more test trajectories do not change the training set.
+        rngs = [np.random.default_rng([self.seed, _SPLITS.index(split)]) for split in splits]
+        first = self._draw(splits, rngs)
+        count = len(first.q0)
+        rows = np.arange(max(count, size)) % count
+        q, v, u = (x[:count] for x in self._move([first], rows, t, count))
+        if self.limits is not None:
+            self._replace(self.limits, (q, v, u), splits, rngs, t)
+        elif isinstance(self.system, HasDomain):
+            for low, high in zip(q.min(1), q.max(1), strict=True):
+                try:
+                    self.system.check_domain(low, high)
+                except ValueError as error:
+                    raise SimulationError(
+                        f"{self.name}: in a motion {error}; set q_limits, within which motions "
+                        "are drawn anew, or reduce the excitation"
+                    ) from error
+        ends = np.cumsum([0, *(self._size(split) for split in splits)])
+        arrays = {"t": t}
+        for index, split in enumerate(splits):
+            for key, values in (("q", q), ("v", v), ("u", u)):
+                arrays[f"{split}_{key}"] = values[ends[index] : ends[index + 1]]
+        return arrays
+
+    def _size(self, split: str) -> int:
+        states, inputs = self.counts[split]
+        product = split == "train" and self.pairing == "product"
+        return states * inputs if product else states
+
+    def _draw(self, splits: Sequence[str], rngs: Sequence[np.random.Generator]) -> _Draw:
+        """An initial state and an input for each motion of some splits."""
         starts, signals, pick = [], [], []
-        for split in splits:
-            # One generator per split: more test trajectories do not change the training set.
-            rng = np.random.default_rng([self.seed, _SPLITS.index(split)])
+        for split, rng in zip(splits, rngs, strict=True):
             states, inputs = self.counts[split]
             starts.append(self.initial_states.draw(states, rng))
             signals.append(self.excitation.draw(inputs, self.duration, rng))
@@ -250,33 +271,68 @@ class SimulatedSource(DataSource):
             else:
                 pick.append(np.array([(a, a) for a in range(states)]))
 
-        count = sum(map(len, pick))
-        rows = np.arange(max(count, size)) % count
-
         def signal(time: np.ndarray) -> np.ndarray:
             drawn = [part(time) for part in signals]
-            return np.concatenate([d[p[:, 1]] for d, p in zip(drawn, pick, strict=True)])[rows]
+            return np.concatenate([d[p[:, 1]] for d, p in zip(drawn, pick, strict=True)])
 
-        q0 = np.concatenate([s[0][p[:, 0]] for s, p in zip(starts, pick, strict=True)])[rows]
-        v0 = np.concatenate([s[1][p[:, 0]] for s, p in zip(starts, pick, strict=True)])[rows]
+        q0, v0 = (
+            np.concatenate([s[k][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
+            for k in range(2)
+        )
+        return _Draw(q0, v0, signal)
+
+    def _move(
+        self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray, count: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """q, v and u of some motions: ``rows`` of the draws one after another."""
+
+        def signal(time: np.ndarray) -> np.ndarray:
+            return np.concatenate([draw.signal(time) for draw in draws])[rows]
+
         q, v = simulate(
             self.system,
-            q0,
-            v0,
+            np.concatenate([draw.q0 for draw in draws])[rows],
+            np.concatenate([draw.v0 for draw in draws])[rows],
             signal,
             t,
             rtol=self.rtol,
             atol=self.atol,
             compile=self.compile,
+            q_limits=None if self.limits is None else self.limits.bounds,
             progress=f"simulating {count} trajectories of {self.name}",
         )
-        ends = np.cumsum([0, *(len(p) for p in pick)])
-        arrays = {"t": t}
-        for index, split in enumerate(splits):
-            part = slice(ends[index], ends[index + 1])
-            arrays[f"{split}_q"], arrays[f"{split}_v"] = q[part], v[part]
-            arrays[f"{split}_u"] = signals[index](t)[pick[index][:, 1]]
-        return arrays
+        return q, v, signal(t)
+
+    def _replace(
+        self,
+        limits: Limits,
+        motions: tuple[np.ndarray, np.ndarray, np.ndarray],
+        splits: Sequence[str],
+        rngs: Sequence[np.random.Generator],
+        t: np.ndarray,
+    ) -> None:
+        """Put motions that stay within the limits in the place of those that leave them.
+
+        Raises:
+            SimulationError: if some leave them in every draw.
+        """
+        q, drawn = motions[0], 1
+        while (left := np.flatnonzero(limits.left_by(q))).size:
+            if drawn >= _DRAWS:
+                raise SimulationError(
+                    f"{self.name}: {left.size} of {len(q)} motions leave q_limits in each of "
+                    f"{drawn} draws: {limits.passed(q[left], self.labels)}; reduce the amplitude "
+                    "of the excitation or the initial states, or widen q_limits"
+                )
+            draws = [self._draw(splits, rngs) for _ in range(_AT_ONCE)]
+            drawn += _AT_ONCE
+            rows = np.concatenate([left + k * len(q) for k in range(_AT_ONCE)])
+            new = self._move(draws, rows, t, left.size)
+            stays = ~limits.left_by(new[0]).reshape(_AT_ONCE, left.size)
+            found = stays.any(0)
+            taken = (stays.argmax(0) * left.size + np.arange(left.size))[found]
+            for old, values in zip(motions, new, strict=True):
+                old[left[found]] = values[taken]
 
     def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
         """p = M(q) v, in pieces that fit the processor's cache."""
@@ -284,3 +340,12 @@ class SimulatedSource(DataSource):
         pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
         with torch.no_grad():
             return torch.cat([self.system.momentum(a, b) for a, b in pieces]).reshape(q.shape)
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """Initial states ``(K, N)`` and inputs of K motions."""
+
+    q0: np.ndarray
+    v0: np.ndarray
+    signal: InputSignal

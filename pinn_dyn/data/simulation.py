@@ -38,6 +38,7 @@ def simulate(
     rtol: float = 1e-8,
     atol: float = 1e-9,
     compile: bool = False,
+    q_limits: np.ndarray | None = None,
     progress: str | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve the equation of motion for K trajectories in one batch.
@@ -56,6 +57,8 @@ def simulate(
         atol: absolute tolerance of the solver.
         compile: compile the equation of motion first; takes half a minute, and pays for a long
             simulation of a small batch. Without a C++ compiler it runs uncompiled, and says so.
+        q_limits: lower and upper limits of q, ``(2, N)``; a motion that leaves them is held where
+            it left, so that the others go on, and its later samples are NaN. None: no limits.
         progress: label of a progress bar; no bar if None.
 
     Returns:
@@ -70,6 +73,14 @@ def simulate(
         k = int(np.argwhere(~np.isfinite(x0))[0][0])
         raise ValueError(f"initial state {k} is {x0[k].tolist()}: expected finite numbers")
     count, size = x0.shape
+    half = size // 2
+    low, high = (-np.inf, np.inf) if q_limits is None else q_limits
+
+    def outside(x: np.ndarray) -> np.ndarray:
+        q = x[..., :half]
+        return np.asarray(((q < low) | (q > high)).any(-1))
+
+    left = outside(x0)
     equation = system.velocity_derivative
     if compile and has_cpp_compiler():
         equation = torch.compile(equation)
@@ -80,7 +91,8 @@ def simulate(
         x = torch.from_numpy(np.array(flat.reshape(count, size)))
         u = torch.from_numpy(signal(np.array([time]))[:, 0])
         with torch.inference_mode():
-            return equation(x, u).numpy().ravel()
+            slope = equation(x, u).numpy()
+        return np.where(left[:, None], 0.0, slope).ravel()
 
     def give_up(time: float, reason: str) -> SimulationError:
         return SimulationError(
@@ -92,7 +104,7 @@ def simulate(
         raise give_up(
             t[0], "the acceleration is not finite there (M not positive definite, or a bad input)"
         )
-    states = np.empty((count, len(t), size))
+    states = np.full((count, len(t), size), np.nan)
     solver = DOP853(derivative, t[0], x0.ravel(), t[-1], rtol=rtol, atol=atol)
     states[:, 0] = x0
     filled = 1
@@ -102,7 +114,7 @@ def simulate(
         disable=progress is None or None,  # None: unless on a terminal
         bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
     ) as bar:
-        while solver.status == "running":
+        while solver.status == "running" and not left.all():
             message = solver.step()
             if solver.status == "failed":
                 raise give_up(solver.t, message or "the solver failed")
@@ -114,12 +126,14 @@ def simulate(
                     "matrix is no longer positive definite (an arm of length zero, say)",
                 )
             until = int(np.searchsorted(t, solver.t, side="right"))
+            going = ~left
             if until > filled:
-                dense = solver.dense_output()(t[filled:until])
-                states[:, filled:until] = dense.T.reshape(until - filled, count, size).swapaxes(
-                    0, 1
-                )
+                dense = solver.dense_output()(t[filled:until]).T
+                dense = dense.reshape(until - filled, count, size).swapaxes(0, 1)
+                states[going, filled:until] = dense[going]
+                left |= outside(states[:, filled:until]).any(-1)
                 filled = until
+            left |= outside(solver.y.reshape(count, size))
+            solver.f[np.repeat(left, size)] = 0.0  # the slope that the next step begins with
             bar.update(float(solver.t - solver.t_old))
-    half = size // 2
     return states[..., :half], states[..., half:]

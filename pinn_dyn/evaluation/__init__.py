@@ -28,6 +28,7 @@ from pinn_dyn.evaluation.metrics import (
     left_data,
     member_metrics,
     rollout_metrics,
+    state_squared_error,
 )
 from pinn_dyn.evaluation.png import save
 from pinn_dyn.evaluation.prediction import (
@@ -87,6 +88,7 @@ __all__ = [
     "rollout_metrics",
     "save",
     "spread_figure",
+    "state_squared_error",
     "steady_state_figure",
     "summary_table",
     "terms_figure",

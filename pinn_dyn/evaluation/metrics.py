@@ -161,6 +161,25 @@ def diverged_trajectories(prediction: Prediction) -> Tensor:
     return ~((error <= bound) & torch.isfinite(error)).all(dim=1)
 
 
+def state_squared_error(prediction: Prediction) -> dict[str, float]:
+    """The squared norm of the error of q and v together, as the paper's code prints it::
+
+        e_x(t)^2 = |q_hat(t) - q(t)|^2 + |v_hat(t) - v(t)|^2
+
+    ``state_squared_error_mean`` and ``state_squared_error_variance``, over all times of the K
+    roll-outs that did not diverge; nothing where the prediction has no velocities.
+    """
+    if prediction.v_hat is None or prediction.v is None:
+        return {}
+    kept = ~diverged_trajectories(prediction)
+    of_v = (prediction.v_hat - prediction.v)[kept].square().sum(-1)
+    square = prediction.error()[kept].square() + of_v
+    return {
+        "state_squared_error_mean": _mean(square),
+        "state_squared_error_variance": _variance(square),
+    }
+
+
 def left_data(prediction: Prediction, train: Sequence[Trajectory]) -> dict[str, float]:
     """Where roll-outs leave the data, which no model can know anything about.
 

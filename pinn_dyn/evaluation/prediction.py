@@ -11,6 +11,7 @@ from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
+    MechanicalSystem,
     Predictor,
     Signal,
     Trajectory,
@@ -30,12 +31,16 @@ class Prediction:
         q: true configuration, ``(K, T, N)``.
         members: of an ensemble, what each of its E members predicts, ``(E, K, T, N)``; q_hat is
             their mean.
+        v_hat, v: predicted and true velocity, ``(K, T, N)``; only of whole roll-outs of a single
+            model.
     """
 
     t: Tensor
     q_hat: Tensor
     q: Tensor
     members: Tensor | None = None
+    v_hat: Tensor | None = None
+    v: Tensor | None = None
 
     def error(self) -> Tensor:
         """e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
@@ -43,10 +48,13 @@ class Prediction:
 
     def every(self, samples: int) -> Prediction:
         """The same roll-outs at every ``samples``-th time, to be compared on a coarser grid."""
-        members = None if self.members is None else self.members[..., ::samples, :]
-        return Prediction(
-            self.t[::samples], self.q_hat[:, ::samples], self.q[:, ::samples], members
+        q_hat, q, *others = (
+            None if values is None else values[..., ::samples, :]
+            for values in (self.q_hat, self.q, self.members, self.v_hat, self.v)
         )
+        assert q_hat is not None
+        assert q is not None
+        return Prediction(self.t[::samples], q_hat, q, *others)
 
     def spread(self) -> Tensor:
         """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
@@ -82,14 +90,22 @@ def predict_trajectories(
     """
     _require_stacked(truth)
     stride = 1 if step is None else samples_of("step", step, truth.t)
-    paths = _roll_out(
-        model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0]),
+    copy = model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0])
+    states = _roll_out(
+        copy,
         truth.states(model.state, slice(1))[:, 0].double(),
         truth.t[::stride],
         truth.input_since(model.input_history).to(truth.q.device, torch.float64),
     )
+    paths = states[..., : model.num_coordinates]
+    v_hat = _velocities(copy, states)
     return Prediction(
-        truth.t[::stride].double(), paths.mean(0), truth.q[:, ::stride].double(), _members(paths)
+        truth.t[::stride].double(),
+        paths.mean(0),
+        truth.q[:, ::stride].double(),
+        _members(paths),
+        v_hat,
+        None if v_hat is None else truth.v[:, ::stride].double(),
     )
 
 
@@ -133,7 +149,7 @@ def predict_windows(
         x0.flatten(0, 1),
         pieces.t[past::stride],
         pieces,
-    )[..., 1:, :]
+    )[..., 1:, : model.num_coordinates]
     q = truth.q[:, : last + 1 : stride].double()
     start = q[:, :1].expand(ends.shape[0], -1, -1, -1)
     paths = torch.cat([start, ends.reshape(ends.shape[0], q.shape[0], -1, q.shape[-1])], dim=2)
@@ -159,12 +175,24 @@ def model_for_roll_outs(
 
 @torch.no_grad()
 def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-    """Predicted q ``(E, B, T, N)`` at the times t; E is 1, but for an ensemble."""
+    """States ``(E, B, T, 2N)`` at the times t; E is 1, but for an ensemble."""
     if isinstance(model, Ensemble):
-        states = x0.unsqueeze(-2) + model.member_increments(x0, t, input)
-    else:
-        states = model.predict(x0, t, input).unsqueeze(0)
-    return states[..., : model.num_coordinates]
+        return x0.unsqueeze(-2) + model.member_increments(x0, t, input)
+    return model.predict(x0, t, input).unsqueeze(0)
+
+
+@torch.no_grad()
+def _velocities(model: Predictor, states: Tensor) -> Tensor | None:
+    """v ``(B, T, N)`` of a single model's states ``(1, B, T, 2N)``; None for an ensemble."""
+    if isinstance(model, Ensemble):
+        return None
+    q, rest = states[0].split(model.num_coordinates, dim=-1)
+    if model.state == "qv":
+        return rest
+    if not isinstance(model, MechanicalSystem):
+        return None
+    pieces = zip(q.flatten(0, 1).split(2048), rest.flatten(0, 1).split(2048), strict=True)
+    return torch.cat([model.velocity(*piece) for piece in pieces]).reshape(q.shape)
 
 
 def _require_stacked(truth: Trajectory) -> None:

@@ -112,6 +112,28 @@ class SoftArm(MechanicalSystem):
         self.register_buffer("_s", torch.tensor((points + 1) / 2, dtype=torch.float64))
         self.register_buffer("_weights", torch.tensor(weights / 2, dtype=torch.float64))
 
+    def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
+        """Check that the equation of motion holds for all q from ``q_low`` to ``q_high``, ``(N,)``.
+
+        Raises:
+            ValueError: if a segment has no length there, or bends by a whole turn.
+        """
+        low, high = (np.asarray(q, dtype=float).reshape(-1, 3) for q in (q_low, q_high))
+        for k in range(self.segments):
+            shortest = self.length + low[k, 2]
+            if not shortest > 0:
+                raise ValueError(
+                    f"segment {k + 1} of rest length {self.length:g} m shortens by "
+                    f"{-low[k, 2]:g} m, to {shortest:.3g} m; keep q[{3 * k + 2}] above "
+                    f"{-self.length:g}"
+                )
+            bend = float(np.hypot(*np.maximum(np.abs(low[k, :2]), np.abs(high[k, :2]))))
+            if not bend < 2 * np.pi:
+                raise ValueError(
+                    f"segment {k + 1} bends by up to {bend:.3g} rad, where the equation holds "
+                    f"below 2 pi; lower q[{3 * k}] and q[{3 * k + 1}]"
+                )
+
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q) = sum_i mass_i int J^T J ds, ``(*batch, N, N)``."""
         points, _ = self._chain(q)

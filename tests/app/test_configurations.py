@@ -65,6 +65,7 @@ def of_logs(folder):
 # How to make each data set small, or to write a stand-in for it.
 DATA = {
     "soft_arm_1": of_arm_1,
+    "soft_arm_1_wide": of_arm_1,
     "soft_arm_2": of_arm_2,
     "panda": of_panda,
     "neck": write_neck,

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.data import InitialStates, Mixture, MultiSine, SimulatedSource, Steps
+from pinn_dyn.data import (
+    InitialStates,
+    Mixture,
+    MultiSine,
+    SimulatedSource,
+    SimulationError,
+    Steps,
+    simulate,
+)
 from pinn_dyn.systems import SoftArm
 from tests.support.linear import damped_oscillators
 
@@ -158,6 +166,98 @@ def test_initial_states_fill_their_box():
     assert (np.ptp(v, axis=0) > 0.95 * 2 * v_max).all()
 
 
+# Limits of the configuration.
+
+LIMITS = [[-1.05, -1.05, 0.08], [1.05, 1.05, 0.42]]
+SIX = dict(train_initial_states=6, train_inputs=6, pairing="matched")
+
+
+@pytest.fixture(scope="module")
+def free(cache):
+    return make_source(cache, **SIX).load()
+
+
+@pytest.fixture(scope="module")
+def limited(cache):
+    return make_source(cache, **SIX, q_limits=LIMITS).load()
+
+
+def stays(x):
+    low, high = torch.tensor(LIMITS, dtype=torch.float64)
+    return bool(((x.q >= low) & (x.q <= high)).all())
+
+
+def test_a_motion_that_leaves_the_limits_is_drawn_anew_and_the_others_are_kept(free, limited):
+    replaced = 0
+    for name in ("train", "validation", "test"):
+        for x, y in zip(getattr(free, name), getattr(limited, name), strict=True):
+            assert stays(y)
+            same = torch.equal(x.u, y.u) and torch.equal(x.q[0], y.q[0])
+            assert same == stays(x)
+            replaced += not same
+    assert 0 < replaced < 11
+
+
+def test_motions_within_limits_obey_the_equation_of_motion(limited):
+    """Each of them alone, from its own start under its own input, by another step control."""
+    for x in (*limited.train, *limited.validation, *limited.test):
+        q, v = (
+            torch.from_numpy(part[0])
+            for part in simulate(
+                SoftArm(),
+                x.q[:1].numpy(),
+                x.v[:1].numpy(),
+                lambda t, x=x: np.stack([np.interp(t, x.t, u) for u in x.u.T], -1)[None],
+                x.t.numpy(),
+                rtol=1e-6,
+                atol=1e-6,
+            )
+        )
+        # Linear in place of the smooth input between samples 0.01 s apart.
+        torch.testing.assert_close(x.q, q, rtol=0, atol=0.02)
+        assert v.isfinite().all()
+
+
+def test_limited_motions_are_the_same_again_and_each_differs(cache, tmp_path, limited):
+    again = make_source(tmp_path, **SIX, q_limits=LIMITS).load()
+    for name in ("train", "validation", "test"):
+        for x, y in zip(getattr(limited, name), getattr(again, name), strict=True):
+            assert torch.equal(x.q, y.q)
+            assert torch.equal(x.u, y.u)
+    everything = [*limited.train, *limited.validation, *limited.test]
+    assert len(starts(everything)) == len(inputs(everything)) == 11
+
+
+def test_more_test_trajectories_within_limits_do_not_change_the_others(cache, limited):
+    more = make_source(cache, **SIX, q_limits=LIMITS, test=5).load()
+    for x, y in zip(limited.train, more.train, strict=True):
+        assert torch.equal(x.q[0], y.q[0])
+        assert torch.equal(x.u, y.u)
+
+
+def test_limits_that_every_motion_leaves_are_refused_with_advice(tmp_path):
+    narrow = dict(q_limits=[[-4, -4, 0.2499], [4, 4, 0.2501]])
+    box = InitialStates([-1.0, -1.0, 0.25], [1.0, 1.0, 0.25], [1.0, 1.0, 0.1])
+    source = make_source(tmp_path, **SIX, **narrow, initial_states=box, duration=0.05)
+    with pytest.raises(SimulationError, match=r"motions leave q_limits.* l above 0.2501") as caught:
+        source.load()
+    assert "widen q_limits" in str(caught.value)
+    assert not list(tmp_path.glob("*.npz"))
+
+
+class Oscillator(SoftArm):
+    """An arm whose length may pass through zero: constant terms, of a mass on a spring."""
+
+    def _acceleration(self, q, v, force):
+        return 100 * (force - q)
+
+
+def test_a_motion_out_of_the_systems_domain_is_refused_with_advice(tmp_path):
+    source = make_source(tmp_path, system=Oscillator())
+    with pytest.raises(SimulationError, match=r"tiny_arm: in a motion segment 1 .*set q_limits"):
+        source.load()
+
+
 # The cache.
 
 
@@ -201,6 +301,16 @@ CHANGES = {
 def test_a_change_of_the_data_is_another_entry_of_the_cache(tmp_path, change):
     changed = make_source(tmp_path, **CHANGES[change]())
     assert changed.describe() != make_source(tmp_path).describe()
+
+
+def test_other_limits_are_another_entry(tmp_path):
+    wider = [[-2.0, -2.0, 0.0], [2.0, 2.0, 1.0]]
+    free, limited, wide = (
+        make_source(tmp_path, **SIX, q_limits=limits).describe() for limits in (None, LIMITS, wider)
+    )
+    assert free != limited
+    assert limited != wide
+    assert free != wide
 
 
 @pytest.mark.parametrize(
@@ -260,6 +370,22 @@ def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
         (dict(pairing="paired"), "pairing is 'paired'"),
         (dict(pairing="matched"), "pairing is 'matched' with 3 initial states and 2 inputs"),
         (dict(test=-1), "test is -1"),
+        (dict(**SIX, q_limits=[[-1, -1, 0.1]]), r"q_limits is \[\[-1, -1, 0.1\]\], expected"),
+        (dict(**SIX, q_limits=[[-1, -1], [1, 1]]), "q_limits is .*with 3 finite numbers each"),
+        (dict(**SIX, q_limits=[[-1, -1, 0.2], [1, 1, 0.4]]), "q_limits is .*initial states"),
+        (dict(q_limits=LIMITS), "q_limits with pairing = 'product'"),
+        (
+            dict(**SIX, q_limits=[[-2, -2, -0.3], [2, 2, 1]]),
+            "q_limits: segment 1 of rest length 0.2 m shortens by 0.3 m, to -0.1 m",
+        ),
+        (
+            dict(initial_states=InitialStates([0, 0, -0.2], [1, 1, 0.4], [1, 1, 1])),
+            "initial_states: segment 1 of rest length 0.2 m shortens by 0.2 m, to 0 m",
+        ),
+        (
+            dict(**SIX, q_limits=[[-5, -5, 0], [5, 5, 1]]),
+            "q_limits: segment 1 bends by up to 7.07 rad",
+        ),
         (dict(labels=["x", "y"]), "labels has 2 entries, the system needs 3"),
         (dict(input_labels=["a"]), "input_labels has 1 entries, the system needs 3"),
         (dict(configurations={"odd": [1.0]}), "configurations.odd has 1 entries"),

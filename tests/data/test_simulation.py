@@ -235,3 +235,49 @@ def test_an_input_that_stops_being_a_number_ends_the_simulation(linear):
     with pytest.raises(SimulationError) as caught:
         simulate(linear, np.zeros((1, 2)), np.zeros((1, 2)), signal, np.linspace(0, 1, 11))
     assert time_of(caught.value) == pytest.approx(0.5, abs=1e-3)
+
+
+# Limits of the configuration.
+
+
+def test_a_motion_that_leaves_its_limits_is_held_and_the_others_go_on(linear):
+    """Against the same motions without limits: equal until one leaves, and NaN from then on."""
+    q0, v0 = np.array([[0.5, -0.3], [0.1, 0.0]]), np.array([[2.0, 0.8], [0.0, 0.0]])
+    t = np.linspace(0, 4, 401)
+    limits = np.array([[-0.6, -0.6], [0.6, 0.6]])
+    free_q, free_v = simulate(linear, q0, v0, constant([0.1], 2), t)
+    q, v = simulate(linear, q0, v0, constant([0.1], 2), t, q_limits=limits)
+    leaves = int(np.argmax((np.abs(free_q[0]) > 0.6).any(-1)))
+    assert 0 < leaves < 50
+    assert np.abs(free_q[1]).max() < 0.6
+    np.testing.assert_allclose(q[1], free_q[1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(v[1], free_v[1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(q[0, : leaves + 1], free_q[0, : leaves + 1], rtol=0, atol=1e-6)
+    assert np.isnan(q[0, leaves + 50 :]).all()
+    assert np.isnan(v[0, leaves + 50 :]).all()
+
+
+def test_a_motion_that_would_lose_its_mass_is_held_before_it_does():
+    """Without limits this one ends the simulation of all."""
+    q, _ = simulate(
+        LosesMass(vanishing),
+        np.zeros((2, 1)),
+        np.array([[0.0], [-3.0]]),
+        constant([1.0], 2),
+        np.linspace(0, 1.5, 151),
+        q_limits=np.array([[-10.0], [0.9]]),
+    )
+    assert np.isnan(q[0, -1]).all()
+    assert np.isfinite(q[1]).all()
+
+
+def test_a_simulation_that_all_motions_have_left_ends(linear):
+    q, _ = simulate(
+        linear,
+        np.full((2, 2), 0.7),
+        np.zeros((2, 2)),
+        constant([0.0], 2),
+        np.linspace(0, 1e6, 11),
+        q_limits=np.array([[-0.6, -0.6], [0.6, 0.6]]),
+    )
+    assert np.isnan(q[:, 1:]).all()

@@ -11,6 +11,7 @@ from pinn_dyn.evaluation import (
     predict_trajectories,
     predict_windows,
     rollout_metrics,
+    state_squared_error,
 )
 from pinn_dyn.evaluation.prediction import model_for_roll_outs
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
@@ -126,6 +127,34 @@ def test_leaving_the_data_is_by_more_than_their_width():
     assert found["inside"] == {"left_data": 0, "left_data_after": math.inf}
     assert found["far"] == {"left_data": 1, "left_data_after": 3.0}
     assert found["broken"] == {"left_data": 2, "left_data_after": 2.0}
+
+
+def test_the_squared_error_of_the_state_adds_that_of_the_velocity():
+    """Point masses of the wrong gain: q errs by c t^3 / 6 and v by c t^2 / 2."""
+    truth = ramps()
+    t = truth.t
+    c = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
+    square = (c * t**3 / 6) ** 2 + (c * t**2 / 2) ** 2
+    found = state_squared_error(predict_trajectories(PointMass(gain=2.0), truth).every(2))
+    assert found["state_squared_error_mean"] == pytest.approx(float(square[:, ::2].mean()))
+    variance = float(square[:, ::2].var(correction=0))
+    assert found["state_squared_error_variance"] == pytest.approx(variance)
+    assert state_squared_error(predict_windows(PointMass(), truth, window=1.0)) == {}
+
+
+def test_the_velocity_of_a_model_of_momenta_is_its_momentum_over_its_mass():
+    """A soft arm rolled out in (q, p) against the same in (q, v)."""
+    generator = torch.Generator().manual_seed(0)
+    t = 0.001 * torch.arange(11, dtype=torch.float64)
+    q = (0.5 * torch.rand(2, 1, 3, generator=generator, dtype=torch.float64)).expand(2, 11, 3)
+    v = torch.rand(2, 1, 3, generator=generator, dtype=torch.float64).expand(2, 11, 3)
+    arm, arm_of_momenta = SoftArm(), SoftArm()
+    arm_of_momenta.state = "qp"
+    arm_of_momenta.state_derivative = arm_of_momenta.momentum_derivative
+    truth = Trajectory(q, v, Signal(t, torch.zeros(2, 11, 3).double()), momentum=arm.momentum)
+    by_v, by_p = predict_trajectories(arm, truth), predict_trajectories(arm_of_momenta, truth)
+    assert (by_v.v_hat[:, -1] - by_v.v[:, -1]).abs().max() > 0.01
+    torch.testing.assert_close(by_p.v_hat, by_v.v_hat, rtol=0, atol=1e-6)
 
 
 def test_every_other_time_of_a_prediction():

@@ -287,3 +287,18 @@ def test_a_bad_parameter_is_refused_by_name(name, value):
 def test_one_mass_or_one_for_each_segment():
     with pytest.raises(ValueError, match="mass has 3 entries, expected one number or 2"):
         SoftArm(2, mass=[0.3, 0.3, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ([0, 0, 0, 0, 0, -0.2], [1, 1, 1, 1, 1, 1], r"segment 2 .*to 0 m; keep q\[5\] above -0.2"),
+        ([0, 0, -0.5, 0, 0, 0], [1, 1, 1, 1, 1, 1], r"segment 1 .*by 0.5 m, to -0.3 m"),
+        ([0, 0, 0, -5, -3, 0], [1, 1, 1, 1, 4, 1], r"segment 2 bends by up to 6.4 rad"),
+    ],
+)
+def test_configurations_of_no_length_or_a_whole_turn_are_refused(low, high, message):
+    arm = SoftArm(2)
+    with pytest.raises(ValueError, match=message):
+        arm.check_domain(low, high)
+    arm.check_domain([-4, -4, -0.19, -4, -4, -0.19], [4, 4, 9, 4, 4, 9])

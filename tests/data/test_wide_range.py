@@ -1,0 +1,113 @@
+"""The paper's range of the one-segment arm: what inputs and motions cover, what is beyond."""
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from pinn_dyn.app.build import build_source
+from tests.support.composing import compose
+
+T = np.linspace(0, 5, 501)
+
+
+def build(name, *overrides):
+    cfg = compose("train", f"dataset={name}", *overrides)
+    return build_source({"dataset": OmegaConf.to_container(cfg.dataset, resolve=True)})
+
+
+@pytest.fixture(scope="module")
+def wide():
+    return build("soft_arm_1_wide")
+
+
+@pytest.fixture(scope="module")
+def beyond():
+    return build("soft_arm_1_wide_beyond")
+
+
+def drawn(source, split, count):
+    """Initial configurations and inputs of a split, before any is drawn anew."""
+    index = ("train", "validation", "test").index(split)
+    rng = np.random.default_rng([source.seed, index])
+    q, _ = source.initial_states.draw(count, rng)
+    return q, source.excitation.draw(count, source.duration, rng)(T)
+
+
+def test_inputs_cover_the_papers_range_and_no_more(wide):
+    _, u = drawn(wide, "train", wide.counts["train"][0])
+    low, high = u.min((0, 1)), u.max((0, 1))
+    assert (low >= [-2.0, -2.0, -1.3]).all()
+    assert (high <= [2.0, 2.0, 2.6]).all()
+    assert (low[:2] < -1.8).all()
+    assert low[2] < -1.2
+    assert (high[:2] > 1.8).all()
+    assert high[2] > 2.3
+
+
+def longest_rest(moving):
+    return np.diff(np.flatnonzero(np.concatenate([[True], moving, [True]]))).max() - 1
+
+
+def test_inputs_are_held_for_a_tenth_of_a_second_to_two(wide):
+    """Levels of the fast steps last 0.1 to 0.5 s and of the slow ones up to 2 s, ramps included."""
+    _, u = drawn(wide, "train", 60)
+    rate = 1 / (T[1] - T[0])
+    moving = np.abs(np.diff(u[..., 0], axis=1)) * rate > 1e-9
+    kinds = len(wide.excitation.parts)
+    held = np.array([max(map(longest_rest, moving[k::kinds])) for k in range(kinds)]) / rate
+    assert (held[:2] < 0.02).all()  # sines never stand still
+    assert (held[2:4] > 1.5).all()
+    assert (held[2:4] <= 2.0).all()
+    assert (held[4:] > 0.3).all()
+    assert (held[4:] <= 0.5).all()
+
+
+def test_inputs_beyond_the_range_exceed_it(beyond):
+    _, u = drawn(beyond, "test", 20)
+    assert (np.abs(u[..., :2]).max((0, 1)) > 2.2).all()
+    assert u[..., 2].max() > 2.7
+    assert u[..., 2].min() >= -1.3 - 1e-9
+    assert np.abs(u[..., :2]).max() <= 2.6
+
+
+def test_no_start_or_input_is_shared_between_the_sets(wide, beyond):
+    parts = [drawn(wide, split, 20) for split in ("train", "validation", "test")]
+    parts.append(drawn(beyond, "test", 20))
+    q = np.concatenate([q for q, _ in parts])
+    u = np.concatenate([u for _, u in parts])
+    assert len(np.unique(q[:, 0])) == len(q)
+    assert len({tuple(x.ravel()) for x in u}) == len(u)
+
+
+def test_limits_take_an_arm_of_five_centimetres_to_nearly_four_metres(wide, beyond):
+    low, high = wide.limits.bounds
+    np.testing.assert_allclose(wide.system.length + np.array([low[2], high[2]]), [0.05, 3.9])
+    np.testing.assert_allclose(beyond.limits.bounds[:, :2], 1.3 * wide.limits.bounds[:, :2])
+    assert beyond.limits.bounds[1, 2] == pytest.approx(1.3 * high[2], rel=0.01)
+
+
+@pytest.mark.parametrize("elongation", [-0.2, -0.5])
+def test_a_range_in_which_the_arm_has_no_length_is_refused(elongation):
+    limits = f"dataset.q_limits=[[-2.5,-2.5,{elongation}],[2.5,2.5,3.7]]"
+    with pytest.raises(ValueError, match=r"soft_arm_1_wide: q_limits: .*keep q\[2\] above -0.2"):
+        build("soft_arm_1_wide", limits)
+
+
+@pytest.mark.slow
+def test_motions_cover_the_range_and_stay_within_it(tmp_path):
+    source = build("soft_arm_1_wide", "dataset.step=0.005", f"dataset.cache={tmp_path}")
+    splits = source.load()
+    low, high = torch.from_numpy(source.limits.bounds)
+    for name in ("train", "validation", "test"):
+        for x in getattr(splits, name):
+            assert ((x.q >= low) & (x.q <= high)).all()
+            assert x.v.isfinite().all()
+    q = torch.stack([x.q for x in splits.train])
+    length = source.system.length + q[..., 2]
+    assert float(length.min()) < 0.3
+    assert float(length.max()) > 3.7
+    assert float(torch.linalg.vector_norm(q[..., :2], dim=-1).max()) > 2.3
+    # Not in one corner: a tenth of the time is spent short, and a tenth long.
+    assert float(length.quantile(0.1)) < 0.9
+    assert float(length.quantile(0.9)) > 2.8
