@@ -18,7 +18,7 @@ import pandas as pd
 from scipy.io import loadmat
 
 from pinn_dyn.data.logs.bags import optional
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed
 
 _KINDS = {
     "c": "holds complex numbers",
@@ -67,7 +67,7 @@ def read_hdf5(path: Path, time: str) -> pd.DataFrame:
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Group):
-            unusable[name] = f"is a group that holds {', '.join(item) or 'nothing'}"
+            unusable[name] = f"is a group that holds {listed(item) or 'nothing'}"
         elif item.dtype.names or item.dtype.kind not in "fiub":
             unusable[name] = f"has the type {item.dtype}"
         else:
@@ -137,7 +137,7 @@ def _table(
     if time in unusable:
         raise LogError(f"{path}, variable {time!r} (time): {unusable[time]}, expected real numbers")
     if time not in arrays:
-        names = ", ".join(f"{name} {value.shape}" for name, value in arrays.items())
+        names = listed(f"{name} {value.shape}" for name, value in arrays.items())
         close = difflib.get_close_matches(time, arrays, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise LogError(f"{path}: no variable {time!r} for the time: {hint}the file has {names}")

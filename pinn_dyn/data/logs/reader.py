@@ -17,7 +17,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
 from pinn_dyn.data.logs.bags import is_bag, read_bag
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed, shown
 from pinn_dyn.data.logs.parquet import read_parquet
 
 _PART = 200_000  # rows of a CSV file that are parsed together
@@ -114,18 +114,20 @@ def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise LogError(
             f"{path}: no column {name!r}, which {signal} asks for: {hint}"
-            f"the file has {', '.join(names)}"
+            f"the file has {listed(names)}"
         )
     return table[name]
 
 
 def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarray:
     raw = column(table, path, name, signal)
+    if raw.dtype == object:  # whole numbers of more than 64 bits, which pandas does not convert
+        raw = raw.map(lambda cell: float(str(cell)) if type(cell) is int else cell)
     values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
     bad = ~np.isfinite(values)
     if bad.any():
         k = int(bad.argmax())
-        what = "is empty or NaN" if pd.isna(raw.iloc[k]) else f"is {str(raw.iloc[k])!r}"
+        what = "is empty or NaN" if pd.isna(raw.iloc[k]) else f"is {shown(str(raw.iloc[k]))}"
         if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", str(raw.iloc[k])):
             what += ", with a decimal comma: write points (in a file whose columns are separated by"
             what += " ';', replace every ',' by '.')"
