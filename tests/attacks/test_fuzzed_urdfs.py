@@ -15,8 +15,13 @@ from pinn_dyn.systems.urdf import read_urdf
 from tests.attacks.damage import byte_hits, hit, places
 from tests.support.arm_urdf import ARM
 
-TAGS = "link joint inertial mass inertia origin axis limit parent child".split()
-KEYS = "name type link xyz rpy value ixx ixy izz lower upper effort".split()
+TAGS = [
+    *("link", "joint", "inertial", "mass", "inertia", "origin", "axis", "limit", "parent", "child"),
+]
+KEYS = [
+    *("name", "type", "link", "xyz", "rpy", "value", "ixx", "ixy", "izz"),
+    *("lower", "upper", "effort"),
+]
 VALUES = [
     *("", "base", "upper", "lower", "tool", "0", "-1", "1e300", "1e-300", "nan", "inf", "0 0 0"),
     *("1 0 0", "0 0 1e-7", "1 2", "1,2,3", "fixed", "revolute", "continuous", "prismatic"),
