@@ -304,6 +304,8 @@ def claimed(folder: Path, config: dict[str, Any]) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(folder / _LOCK, timeout=0):
+            for left in folder.rglob("*.partial"):  # of one that was killed while it wrote
+                left.unlink(missing_ok=True)
             # A training that failed before its first checkpoint leaves nothing to be mixed up.
             if (folder / METRICS).is_file() or (folder / CHECKPOINTS / "last.ckpt").is_file():
                 _refuse_another(folder, config)

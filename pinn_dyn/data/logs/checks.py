@@ -32,6 +32,8 @@ _BURSTS = 0.4
 # What v leaves unexplained of the steps of q: of bad stamps, and of a clock that is right.
 _STAMPS_FAIL = 0.1
 _ROWS_AGREE = 0.25
+# A coordinate that moves less, m or rad, does not move.
+_STILL = 1e-12
 # A partial correlation of force and acceleration below this is clear.
 _REVERSED = -0.5
 
@@ -204,7 +206,7 @@ def check_rest(training: list[Recording], q: Columns, report: Report) -> None:
     """
     every = np.vstack([item.q for item in training])
     steps = np.vstack([np.diff(item.q, axis=0) for item in training])
-    still = np.ptp(every, axis=0) == 0
+    still = np.ptp(every, axis=0) <= _STILL
     if still.all():
         raise LogError(
             f"q: no coordinate ({', '.join(q.columns)}) moves in the training runs: there is no "

@@ -8,6 +8,8 @@ class LogError(ValueError):
 
 
 _MOST_LETTERS, _MOST_NAMES = 80, 30
+_SMALL = 100_000_000
+_MOST_EXPANSION = 50  # numbers of a robot compress to a tenth or so
 
 
 def shown(value: object) -> str:
@@ -22,3 +24,8 @@ def listed(names: Iterable[object]) -> str:
     cut = [name if len(name) <= _MOST_LETTERS else f"{name[:_MOST_LETTERS]}..." for name in every]
     more = f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else ""
     return ", ".join(cut[:_MOST_NAMES]) + more
+
+
+def most_bytes(stored: int) -> int:
+    """How many bytes may come out of so many compressed ones: what gives more is no log."""
+    return max(_SMALL, _MOST_EXPANSION * stored)
