@@ -86,7 +86,7 @@ FITS = {
     "a model with a seed": (
         TABLE,
         NAMES | dict(model="lnn seed=3"),
-        "model is 'lnn seed=3', expected the name",
+        "model is 'lnn seed=3', expected",
     ),
     "two models": (TABLE, NAMES | dict(model="lnn,mlp"), "model is 'lnn,mlp'"),
     "a way out": (TABLE, NAMES | dict(model="../../etc/passwd"), "model is .*etc/passwd"),

@@ -134,8 +134,11 @@ def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series
 
 def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarray:
     raw = column(table, path, name, signal)
-    if raw.dtype == object:  # whole numbers of more than 64 bits, which pandas does not convert
-        raw = raw.map(lambda cell: float(str(cell)) if type(cell) is int else cell)
+    if raw.dtype == object:
+        # Whole numbers of more than 64 bits, which pandas does not convert; a true among numbers.
+        raw = raw.map(
+            lambda x: float(str(x)) if type(x) is int else str(x) if type(x) is bool else x
+        )
     values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
     bad = ~np.isfinite(values)
     if bad.any():
