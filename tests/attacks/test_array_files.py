@@ -80,6 +80,13 @@ def test_an_npz_file_that_is_no_log(tmp_path, members, message):
     refused(tmp_path, message, files="*.npz", **columns())
 
 
+def test_an_npz_file_that_starts_as_an_array(tmp_path):
+    archive(tmp_path / "run.npz", {})
+    content = (tmp_path / "run.npz").read_bytes()
+    (tmp_path / "run.npz").write_bytes(content[content.index(b"\x93NUMPY") :])
+    refused(tmp_path, "run.npz: cannot be read as NPZ", files="*.npz", **columns())
+
+
 def test_an_npz_file_that_unpacks_into_far_more(tmp_path):
     content = shaped("(30000000,)") + bytes(240_000_000)
     archive(tmp_path / "run.npz", {"q": content}, zipfile.ZIP_DEFLATED)

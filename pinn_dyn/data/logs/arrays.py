@@ -8,7 +8,6 @@ An array with as many rows as the time is a column; one with several columns is 
 from __future__ import annotations
 
 import difflib
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -52,7 +51,9 @@ def read_mat(path: Path, time: str) -> pd.DataFrame:
 def _read_mat73(path: Path) -> Mapping[str, Any]:
     try:
         return optional("pymatreader", path).read_mat(str(path))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except LogError:
+        raise
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as a MATLAB 7.3 file: {error}") from error
 
 
@@ -86,7 +87,7 @@ def read_hdf5(path: Path, time: str) -> pd.DataFrame:
     try:
         with h5py.File(path, "r") as file:
             deep = file.visititems(visit)
-    except (OSError, RuntimeError, KeyError) as error:
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as HDF5, it may be cut short: {error}") from error
     if deep is not None:
         raise LogError(f"{path}: has groups more than {_DEEPEST} levels deep, expected a log")
@@ -105,7 +106,7 @@ def read_npz(path: Path, time: str) -> pd.DataFrame:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
                 _add_member(file, name, arrays, unusable)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as NPZ, it may be cut short: {error}") from error
     return _table(path, time, arrays, unusable)
 
