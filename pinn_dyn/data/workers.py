@@ -8,7 +8,6 @@ import threading
 import time
 
 _POLL = 1.0  # s
-_GRACE = 10.0  # s to end well, after which the process ends as it is
 
 _watching = False
 
@@ -27,6 +26,5 @@ def end_with_parent() -> None:
 def _watch(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_POLL)
-    os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(_GRACE)
+    # An orderly end waits for the parent too; what is written is whole or absent at any moment.
     os._exit(128 + signal.SIGTERM)
