@@ -234,13 +234,11 @@ def _read_csv(path: Path) -> pd.DataFrame:
     table.columns = [str(name).strip() for name in found]
     table.index = pd.RangeIndex(2, len(table) + 2)
     # Blank lines are counted, so that lines keep their numbers, but at the end they do no harm.
-    filled = len(table)
-    while filled and table.iloc[filled - 1].isna().all():
-        filled -= 1
+    ends = (table.iloc[:, k].last_valid_index() for k in range(table.shape[1]))
+    filled = max((int(end) - 1 for end in ends if end is not None), default=0)
     if not filled:
         raise LogError(f"{path}: has no rows, expected a header line and rows of numbers")
     return table.iloc[:filled]
-    return table.iloc[: filled[-1] + 1]
 
 
 def _opened(path: Path) -> BinaryIO:
