@@ -16,7 +16,7 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.progress import EpochLines
-from pinn_dyn.app.schema import Part, arguments, check_value
+from pinn_dyn.app.schema import MOST_MEMBERS, Part, arguments, check_value
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -55,7 +55,7 @@ def _build(name: str, config: dict[str, Any], /, *given: Any, **extra: Any) -> A
         # Plain lists and dicts reach the constructors: no room below knows a config object.
         built = instantiate(config, _convert_="all")
         return built(*given, **extra) if given or extra else built
-    except (InstantiationException, TypeError, ValueError) as error:
+    except (InstantiationException, TypeError, ValueError, MemoryError) as error:
         # Hydra wraps what a constructor said.
         wrapped = isinstance(error, InstantiationException) and error.__cause__
         said = str(wrapped or error)
@@ -121,8 +121,11 @@ def ensemble_size(config: dict[str, Any]) -> int:
         ConfigError: unless that is a positive integer.
     """
     size = config.get("ensemble", 1)
-    if not isinstance(size, int) or size < 1:
-        raise ConfigError(f"ensemble is {size}, expected a number of members, 1 for a single model")
+    if not isinstance(size, int) or not 1 <= size <= MOST_MEMBERS:
+        raise ConfigError(
+            f"ensemble is {size}, expected a number of members up to {MOST_MEMBERS}, 1 for a "
+            "single model"
+        )
     return size
 
 

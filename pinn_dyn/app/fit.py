@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from pinn_dyn.app.config import ConfigError, composed
 from pinn_dyn.app.frame import Signals, frame_dataset
 from pinn_dyn.app.learned_model import LearnedModel, load
 from pinn_dyn.app.run_folder import CONFIG, claimed
+from pinn_dyn.app.schema import KEYS, Count, check_value
 from pinn_dyn.app.train import train_in
 from pinn_dyn.data import DataSource
 
@@ -69,8 +71,16 @@ def fit(
         if folder is None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="pinn_dyn-"))
         place = Path(folder).expanduser().resolve()
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"folder is {place}, which cannot be written to: {error}") from error
         if (place / CONFIG).exists():
             raise ConfigError(f"folder is {place}, which holds a training: give another one")
+        for name, number in (("seed", seed), ("steps", 1 if steps is None else steps)):
+            check_value(name, number, KEYS["train"]["seed"] if name == "seed" else Count)
+        if not re.fullmatch(r"\w+", str(model)):
+            raise ConfigError(f"model is {model!r}, expected the name of one, as 'lnn'")
         words = [f"model={model}", f"model_name={model}", f"seed={seed}"]
         if isinstance(data, pd.DataFrame):
             if q is None or u is None:
@@ -85,8 +95,13 @@ def fit(
             )
         elif isinstance(data, str):
             words.append(f"dataset={data}")
-        else:
+        elif isinstance(data, DataSource):
             words.append(f"dataset.name={data.name}")
+        else:
+            raise TypeError(
+                f"data is a {type(data).__name__}, expected a data frame, a data source or the "
+                "name of a data set"
+            )
         if steps is not None:
             words += [f"trainer.steps={steps}", f"trainer.validations={_validations(steps)}"]
         config = composed("train", [*words, *overrides])

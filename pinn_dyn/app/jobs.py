@@ -157,7 +157,10 @@ def filter_jobs(jobs: list[Job], conditions: dict[str, Any]) -> list[Job]:
             close = difflib.get_close_matches(key, known, n=3)
             hint = f", did you mean {' or '.join(close)}?" if close else ""
             raise ConfigError(f"filter: the runs have no key '{key}'{hint}")
-        wanted = [flatten({key: v})[key] for v in (value if isinstance(value, list) else [value])]
+        values = value if isinstance(value, list) else [value]
+        if any(isinstance(one, (dict, list)) for one in values):
+            raise ConfigError(f"filter: {key} is {value}, expected a value, or a list of values")
+        wanted = [flatten({key: one})[key] for one in values]
         # What an early failure did not write down is no reason to hide it.
         left = [
             job

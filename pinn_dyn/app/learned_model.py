@@ -238,7 +238,9 @@ class LearnedModel:
             ValueError: on an argument of the wrong size.
         """
         values = [self._coordinates(*item) for item in (("q", q), ("v", v), ("a", a))]
-        return self.system.inverse_dynamics(*torch.broadcast_tensors(*values)).numpy()
+        return self.system.inverse_dynamics(
+            *_together(q=values[0], v=values[1], a=values[2])
+        ).numpy()
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
         """a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``.
@@ -247,8 +249,9 @@ class LearnedModel:
             TypeError: if the model is a black box or an ensemble.
             ValueError: on an argument of the wrong size.
         """
-        x, rate = torch.broadcast_tensors(self._coordinates("q", q), self._coordinates("v", v))
+        x, rate = _together(q=self._coordinates("q", q), v=self._coordinates("v", v))
         force = self._array("u", u, self.model.num_inputs, "M")
+        _together(q=x[..., 0], u=force[..., 0])
         return self.system.forward_dynamics(x, rate, force).numpy()
 
     def _coordinates(self, name: str, value: Values) -> Tensor:
@@ -268,10 +271,32 @@ class LearnedModel:
         return tensor
 
 
-def _tensor(name: str, value: Values) -> Tensor:
-    if isinstance(value, Tensor):
-        return value.detach().to("cpu", torch.float64)
+def _together(**values: Tensor) -> tuple[Tensor, ...]:
+    """Values of one batch.
+
+    Raises:
+        ValueError: if their batches differ.
+    """
     try:
-        return torch.from_numpy(np.array(value, dtype=float))
+        return torch.broadcast_tensors(*values.values())
+    except RuntimeError as error:
+        shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in values.items())
+        raise ValueError(f"the batches differ: {shapes}; expected one for all") from error
+
+
+def _tensor(name: str, value: Values) -> Tensor:
+    """Real numbers in float64.
+
+    Raises:
+        ValueError: if they are none.
+    """
+    try:
+        array = value.detach().cpu() if isinstance(value, Tensor) else np.asarray(value)
+        if np.iscomplexobj(array):
+            raise TypeError("they are complex")
+        if isinstance(array, Tensor):
+            return array.double()
+        return torch.from_numpy(np.array(array, dtype=float))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is {value!r}, expected numbers: {error}") from error
+        shown = " ".join(repr(value).split())[:80]
+        raise ValueError(f"{name} is {shown}, expected real numbers: {error}") from error

@@ -21,6 +21,7 @@ from filelock import FileLock, Timeout
 from pinn_dyn import __version__
 from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.schema import KEYS, check_value
 from pinn_dyn.app.trust import read_foreign
 from pinn_dyn.data import DataSource, fingerprint_changes
 from pinn_dyn.evaluation.sweep_table import flatten
@@ -139,6 +140,7 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
             raise ConfigError(
                 f"{folder / CONFIG}: {key} is {config.get(key)!r}, expected what train.py writes"
             )
+    check_value(f"{folder / CONFIG}: seed", config["seed"], KEYS["train"]["seed"])
     path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
     saved = read_checkpoint(path)
     parameters = saved["hyper_parameters"]
@@ -150,25 +152,48 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
                 f"{path} holds weights of another {_WHAT[part]} than {folder / CONFIG} describes "
                 f"({_differing(here, there)})"
             )
-    statistics = Statistics.from_dict(parameters["statistics"])
-    model = build_predictor(config, statistics)
-    weights = {
-        key.removeprefix("model."): value
-        for key, value in saved["state_dict"].items()
-        if key.startswith("model.")
-    }
-    if broken := [key for key, value in weights.items() if value.isnan().any()]:
-        raise ConfigError(
-            f"{path} holds weights that are NaN ({broken[0]}): its training diverged, take another "
-            "checkpoint or train again with a lower optimizer.lr"
-        )
     try:
-        model.load_state_dict(weights)
-    except RuntimeError as error:
-        raise ConfigError(
-            f"{path} holds weights of another model than {folder / CONFIG} describes: {error}"
-        ) from error
+        statistics = Statistics.from_dict(parameters["statistics"])
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    model = build_predictor(config, statistics)
+    _take_weights(model, path, folder, saved["state_dict"])
     return Run(folder, config, model.eval(), statistics, read_metrics(folder) or {})
+
+
+def _take_weights(
+    model: Predictor, path: Path, folder: Path, state: Mapping[str, torch.Tensor]
+) -> None:
+    """Give a model the weights of a checkpoint.
+
+    Raises:
+        ConfigError: if they are those of another model, or not finite.
+    """
+    weights = {k.removeprefix("model."): x for k, x in state.items() if k.startswith("model.")}
+    for key, own in model.state_dict().items():
+        found = weights.get(key)
+        if found is not None and (found.shape != own.shape or not _alike(found, own)):
+            raise ConfigError(
+                f"{path} holds weights of another model than {folder / CONFIG} describes: {key} is "
+                f"{tuple(found.shape)} of {found.dtype}, expected {tuple(own.shape)} of {own.dtype}"
+            )
+    if other := weights.keys() ^ model.state_dict().keys():
+        raise ConfigError(
+            f"{path} holds weights of another model than {folder / CONFIG} describes: only one of "
+            f"them has {', '.join(sorted(other)[:5])}"
+        )
+    if broken := [key for key, value in weights.items() if not value.isfinite().all()]:
+        raise ConfigError(
+            f"{path} holds weights that are NaN or infinite ({broken[0]}): its training diverged, "
+            "take another checkpoint or train again with a lower optimizer.lr"
+        )
+    model.load_state_dict(weights)
+
+
+def _alike(found: torch.Tensor, own: torch.Tensor) -> bool:
+    """Whether both are plain numbers of one kind, in any precision."""
+    plain = found.layout == torch.strided and found.device.type == "cpu" and not found.is_quantized
+    return plain and found.dtype.is_floating_point == own.dtype.is_floating_point
 
 
 def read_metrics(folder: Path) -> dict[str, Any] | None:
@@ -186,7 +211,7 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
         raise ConfigError(f"{path} cannot be read, it may be cut short: {error}") from error
     if isinstance(record, dict) and isinstance(validation := record.get("validation", {}), dict):
         numbers = [*validation.values(), *(record[key] for key in _NUMBERS if key in record)]
-        if all(isinstance(number, (int, float)) for number in numbers):
+        if all(type(number) in (int, float) for number in numbers):
             return record
     raise ConfigError(f"{path} holds no record that train.py wrote")
 
@@ -214,6 +239,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         )
     try:
         with zipfile.ZipFile(path) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise zipfile.BadZipFile("it is compressed, which no checkpoint is")
             if damaged := archive.testzip():  # torch.load does not compare the checksums
                 raise zipfile.BadZipFile(f"{damaged} has another checksum")
         saved = torch.load(path, map_location="cpu", weights_only=True)
@@ -227,6 +254,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         or not isinstance(parameters.get("statistics"), dict)
         or not isinstance(parameters.get("config"), dict)
         or not all(isinstance(parameters["config"].get(key), dict) for key in _WHAT)
+        or not all(isinstance(key, str) for key in saved["state_dict"])
         or not all(isinstance(value, torch.Tensor) for value in saved["state_dict"].values())
     ):
         raise ConfigError(f"{path} is no checkpoint that train.py wrote")
@@ -304,6 +332,8 @@ def claimed(folder: Path, config: dict[str, Any]) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(folder / _LOCK, timeout=0):
+            for left in folder.rglob("*.partial"):  # of one that was killed while it wrote
+                left.unlink(missing_ok=True)
             # A training that failed before its first checkpoint leaves nothing to be mixed up.
             if (folder / METRICS).is_file() or (folder / CHECKPOINTS / "last.ckpt").is_file():
                 _refuse_another(folder, config)

@@ -46,6 +46,7 @@ class Range(NamedTuple):
 Count = Annotated[int, Range(1)]
 Index = Annotated[int, Range(0)]
 Seconds = Annotated[float, Range(0, above=True)]
+MOST_MEMBERS = 1000
 Threads = Annotated[int, Range(1, 512)]
 Names = str | Sequence[str]
 
@@ -55,7 +56,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "model_name": str,
         "seed": Annotated[int, Range(0, 2**32 - 1)],
         "compile": bool | Literal["auto"],
-        "ensemble": Count,
+        "ensemble": Annotated[int, Range(1, MOST_MEMBERS)],
         "threads": Threads,
         "start_from": str | None,
         "resume": str | None,
@@ -122,9 +123,8 @@ KEYS: dict[str, dict[str, Any]] = {
 
 # Of the numbers that constructors take under these names.
 RANGES = {
-    **dict.fromkeys(
-        ("batch_size", "hidden", "keep_every", "pairs", "steps", "stride", "substeps"), Range(1)
-    ),
+    **dict.fromkeys(("batch_size", "keep_every", "pairs", "steps", "stride", "substeps"), Range(1)),
+    "hidden": Range(1, 20_000),  # two such layers have 1.6 GB
     **dict.fromkeys(("harmonics", "nodes", "segments", "validations"), Range(1)),
     **dict.fromkeys(("duration", "horizon", "lr", "piece", "rate", "window"), Range(0, above=True)),
     **dict.fromkeys(("gradient_clip_val", "weight_decay"), Range(0)),

@@ -37,7 +37,11 @@ class SweepCallback(Callback):
         SweepCallback.unfinished = Path(config.hydra.sweep.dir)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Forget how an earlier try ended."""
+        """Forget how an earlier try ended; in a process of the launcher's, end with its parent."""
+        if config.hydra.mode == RunMode.MULTIRUN and SweepCallback.unfinished is None:
+            from pinn_dyn.data.workers import end_with_parent  # imports PyTorch, as a job does
+
+            end_with_parent()
         (Path(config.hydra.runtime.output_dir) / ERROR).unlink(missing_ok=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:

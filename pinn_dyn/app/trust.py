@@ -82,6 +82,7 @@ _PLACES: dict[str, tuple[Any, ...]] = {
     "tracking_uri": ("sqlite:///runs/mlflow/mlflow.db",),
 }
 
+_LONGEST_NAME = 100
 MOST_BYTES = 1_000_000
 MOST_DEPTH = 30
 MOST_NODES = 50_000
@@ -244,8 +245,9 @@ def _trusted(target: str, trust: tuple[str, ...]) -> bool:
 
 def _check_name(path: Path, where: str, name: Any) -> None:
     """Refuse what would lead out of a folder: files are named by it."""
-    if not isinstance(name, str) or name in ("", ".", "..") or set(name) & set("/\\\0\n"):
+    unusable = not isinstance(name, str) or len(name) > _LONGEST_NAME or set(name) & set("/\\\0\n")
+    if unusable or name in ("", ".", ".."):
         raise ConfigError(
-            f"{path}: {where} is {str(name)[:80]!r}, expected a name without separators, as files "
-            "are named by it"
+            f"{path}: {where} is {str(name)[:80]!r}, expected a name without separators of at most "
+            f"{_LONGEST_NAME} letters, as files are named by it"
         )

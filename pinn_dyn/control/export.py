@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import zipfile
 import zlib
@@ -111,20 +112,23 @@ def export_law(controller: Controller, path: str | Path) -> Path:
                 f"simulator; the cause: {error}"
             ) from error
         path.parent.mkdir(parents=True, exist_ok=True)
-        torch._inductor.aoti_compile_and_package(
-            program,
-            package_path=str(path),
-            inductor_configs={
-                "cpp.threads": 1,
-                "aot_inductor.metadata": {_KEY: json.dumps(_describe(controller, states, u))},
-            },
-        )
-    try:
-        load_law(path)
-    except RuntimeError:
-        path.unlink()
-        raise
-    path.with_name(f"{path.name}.sha256").write_text(f"{_digest(path)}  {path.name}\n")
+        # Beside its place and then moved there: a kill leaves the law of before, or none.
+        partial = path.with_name(f"{path.stem}.partial.pt2")
+        try:
+            torch._inductor.aoti_compile_and_package(
+                program,
+                package_path=str(partial),
+                inductor_configs={
+                    "cpp.threads": 1,
+                    "aot_inductor.metadata": {_KEY: json.dumps(_describe(controller, states, u))},
+                },
+            )
+            load_law(partial)
+            digest = _digest(partial)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+    path.with_name(f"{path.name}.sha256").write_text(f"{digest}  {path.name}\n")
     return path
 
 

@@ -20,6 +20,7 @@ from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
 from pinn_dyn.data.simulation import SimulationError
 from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.data.workers import end_with_parent
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
@@ -183,7 +184,8 @@ class RobotSource(DataSource):
         else:
             # A fresh interpreter each: a fork would copy the threads' locks of this one.
             context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(min(self.workers, len(tasks)), context) as pool:
+            count = min(self.workers, len(tasks))
+            with ProcessPoolExecutor(count, context, end_with_parent) as pool:
                 try:
                     records = list(progress(pool.map(record, tasks)))
                 except BrokenProcessPool as error:

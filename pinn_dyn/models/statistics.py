@@ -10,6 +10,8 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import State
 
+_MOST_NUMBERS = 10_000
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -76,6 +78,37 @@ class Statistics:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Statistics:
-        """The inverse of :meth:`to_dict`."""
-        read = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items() if k != "step"}
-        return cls(**read, step=values["step"])
+        """The inverse of :meth:`to_dict`.
+
+        Raises:
+            ValueError: on numbers that are missing, of the wrong size, not finite, or a spread or
+                step that is not positive; names them.
+        """
+        names = [item.name for item in fields(cls)]
+        if sorted(values) != sorted(names):
+            raise ValueError(f"statistics has {', '.join(values)}, expected {', '.join(names)}")
+        read = {name: _numbers(name, values[name]) for name in names}
+        size, inputs = read["q_mean"].shape, read["u_mean"].shape
+        for name, value in read.items():
+            shape = () if name == "step" else inputs if name.startswith("u_") else size
+            if name.endswith("increment_std") and value.ndim == 2:
+                shape = torch.Size((len(value), 2 * size.numel()))
+            positive = name.endswith("_std") or name == "step"
+            if value.shape != shape or not value.numel() or (positive and not (value > 0).all()):
+                raise ValueError(
+                    f"statistics.{name} has shape {tuple(value.shape)} and starts with "
+                    f"{value.flatten()[:3].tolist()}, expected {tuple(shape)}"
+                    f"{' positive numbers' if positive else ''}"
+                )
+        step = float(read.pop("step"))
+        return cls(**read, step=step)
+
+
+def _numbers(name: str, value: Any) -> Tensor:
+    try:
+        numbers = torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"statistics.{name} holds no numbers: {error}") from error
+    if numbers.numel() > _MOST_NUMBERS or not numbers.isfinite().all():
+        raise ValueError(f"statistics.{name} has {numbers.numel()} numbers, expected finite ones")
+    return numbers

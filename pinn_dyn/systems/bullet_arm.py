@@ -86,7 +86,7 @@ class BulletArm(MechanicalSystem):
             raise ValueError(f"mass_scale is {mass_scale}, expected a positive finite number")
         if not 0 <= payload < np.inf:
             raise ValueError(f"payload is {payload}, expected a finite number of at least 0 in kg")
-        import_bullet()
+        bullet = import_bullet()
         import pybullet_data
 
         source = find_urdf(urdf, Path(pybullet_data.getDataPath()))
@@ -104,7 +104,10 @@ class BulletArm(MechanicalSystem):
         self.inertia: Inertia = inertia
         self.gravity = tuple(float(g) for g in gravity)
         self.mass_scale, self.payload = float(mass_scale), float(payload)
-        self.joint_names = self._world.names
+        try:
+            self.joint_names = self._world.names
+        except bullet.error as error:
+            raise ValueError(f"{source}: Bullet does not load this URDF: {error}") from error
         if inertia == "file":
             for link, found in self._world.moments.items():
                 if abs(found - (moment := description.moments[link])) > 1e-6 * abs(moment):

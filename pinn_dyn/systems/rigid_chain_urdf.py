@@ -110,13 +110,13 @@ def read_tree(
 
 def _parse(urdf: str) -> tuple[Path, ET.Element]:
     if urdf.lstrip().startswith("<"):
-        path, text = Path("URDF text"), urdf
+        path, content = Path("URDF text"), urdf.encode()
     else:
         package = importlib.util.find_spec("pybullet_data")
         shipped = Path(package.origin).parent if package and package.origin else Path()
         path = find_urdf(urdf, shipped)
-        text = path.read_text()
-    return path, parse_urdf(path, text.encode())
+        content = path.read_bytes()
+    return path, parse_urdf(path, content)
 
 
 def _link(joint: ET.Element, end: str) -> str:

@@ -185,10 +185,14 @@ def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Iner
                 "<inertial> with a positive mass, in it or in a link fixed to it"
             )
     for link in links.values():
-        # Bullet takes 1 kg for a link without <inertial>; a mere frame weighs nothing.
-        if link.find("inertial") is None:
+        # Bullet takes 1 kg for a link without <inertial>, and refuses half of one; a mere frame
+        # weighs nothing.
+        inertial = link.find("inertial")
+        if inertial is None:
             inertial = ET.SubElement(link, "inertial")
+        if inertial.find("mass") is None:
             ET.SubElement(inertial, "mass", value="0")
+        if inertial.find("inertia") is None:
             ET.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
 
 

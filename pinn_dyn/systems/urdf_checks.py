@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
@@ -17,8 +18,10 @@ MOST_LETTERS = 200
 """Of a name, for which Bullet has fixed room too."""
 
 _LARGEST = 1000.0  # m or rad, of an origin
+_HEAVIEST = 1e6  # kg, and kg m^2: beyond it Bullet's arithmetic ends
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _TOLERANCE = 1e-6  # of the largest principal moment
+_NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
 
 
 class _Builder(ET.TreeBuilder):
@@ -49,9 +52,9 @@ def parse_urdf(path: Path, content: bytes, *, inertias: bool = True) -> ET.Eleme
     Raises:
         ValueError: on text that is no URDF; a link or joint without a name, or with one that there
             is twice; links that are no tree with one root; an origin or axis that is not three
-            finite numbers, an axis of length zero; a mass that is negative; an inertia that no
-            body has, which is one with a negative principal moment or one larger than the sum of
-            the other two.
+            finite numbers, an axis of length zero; a mass that is negative or a mountain's; an
+            inertia that no body has, which is one with a negative principal moment or one larger
+            than the sum of the other two.
     """
     if len(content) > MOST_BYTES:
         raise ValueError(
@@ -97,15 +100,17 @@ def end_of(path: Path, joint: ET.Element, end: str, links: list[str]) -> str:
 def number(path: Path, owner: str, element: ET.Element, key: str) -> float:
     """A finite number."""
     text = element.get(key, "")
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _float(text)
     if not math.isfinite(value):
         raise ValueError(
-            f"{path}: {owner!r} has <{element.tag} {key}={text!r}>, expected a finite number"
+            f"{path}: {owner!r} has <{element.tag} {key}={text[:80]!r}>, expected a finite number"
         )
     return value
+
+
+def _float(text: str) -> float:
+    """The number that Python and Bullet both read in a text; else NaN, as of 1_0 and of \u0661."""
+    return float(text) if _NUMBER.fullmatch(text) else math.nan
 
 
 def three_numbers(
@@ -115,10 +120,7 @@ def three_numbers(
     text = element.get(key)
     if text is None:
         return None
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.array([])
+    values = np.array([_float(word) for word in text.split()])
     if len(values) != 3 or not (np.abs(values) <= largest).all():
         raise ValueError(
             f"{path}: {owner.tag} {owner.get('name')!r} has <{element.tag} {key}={text[:80]!r}>, "
@@ -195,13 +197,21 @@ def _check_inertial(path: Path, link: ET.Element, counts: bool) -> None:
     if len(link.findall("inertial")) > 1:
         raise ValueError(f"{path}: link {name!r} has several <inertial>, expected at most one")
     mass = link.find("inertial/mass")
-    if mass is not None and (value := number(path, name, mass, "value")) < 0:
-        raise ValueError(f"{path}: link {name!r} has mass {value} kg, expected at least 0")
+    if mass is not None and not 0 <= (value := number(path, name, mass, "value")) <= _HEAVIEST:
+        raise ValueError(
+            f"{path}: link {name!r} has mass {value:g} kg, expected from 0 to {_HEAVIEST:g}"
+        )
     inertia = link.find("inertial/inertia")
     if inertia is None or not counts:
         return
     xx, xy, xz, yy, yz, zz = (number(path, name, inertia, key) for key in _MOMENTS)
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if np.abs(tensor).max() > _HEAVIEST:
+        raise ValueError(
+            f"{path}: link {name!r} has an inertia of {np.abs(tensor).max():g} kg m^2, expected at "
+            f"most {_HEAVIEST:g}"
+        )
+    moments = np.linalg.eigvalsh(tensor)
     slack = _TOLERANCE * np.abs(moments).max()
     if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
         raise ValueError(

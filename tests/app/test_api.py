@@ -126,7 +126,7 @@ START, T = np.zeros(6) + 0.1, np.arange(4) * 0.02
         ((START, np.zeros((5, 3)), T), r"u has shape \(5, 3\) and t \(4,\)"),
         ((START, np.zeros((2, 4, 3)), T[::-1]), "t must increase"),
         ((START * np.nan, np.zeros((4, 3)), T), "start has 6 non-finite entries"),
-        ((["a"] * 6, np.zeros((4, 3)), T), "start is .*expected numbers"),
+        ((["a"] * 6, np.zeros((4, 3)), T), "start is .*expected real numbers"),
         ((np.zeros((3, 6)), np.zeros((2, 4, 3)), T), r"start has the batch \(3,\) and u \(2,\)"),
         (
             (START, pinn_dyn.Signal(torch.tensor(T), torch.zeros(4, 3)), T + 0.02),

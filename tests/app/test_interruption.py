@@ -26,6 +26,18 @@ def test_a_checkpoint_is_replaced_only_by_a_whole_one(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_checkpoint_is_moved_into_place_in_one_step(tmp_path):
+    path = tmp_path / "last.ckpt"
+    WholeCheckpoints().save_checkpoint({"step": 1}, path)
+    before = path.stat().st_ino
+    with path.open("rb") as open_before:
+        WholeCheckpoints().save_checkpoint({"step": 2}, path)
+        # Who has the old one open still reads it whole: the new one is another file.
+        assert torch.load(open_before, weights_only=True) == {"step": 1}
+    assert path.stat().st_ino != before
+    assert torch.load(path, weights_only=True) == {"step": 2}
+
+
 def test_nothing_is_written_to_the_folder_of_temporary_files(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.mkstemp", lambda *_, **__: pytest.fail("a temporary file"))
     WholeCheckpoints().save_checkpoint({"step": 1}, tmp_path / "new" / "last.ckpt")

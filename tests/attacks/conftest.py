@@ -3,8 +3,23 @@
 import sys
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.app.conftest import cache, hnn_run, lnn_run  # noqa: F401
+
+# What hypothesis tries: the same each time, or others for longer.
+settings.register_profile(
+    "short",
+    max_examples=40,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+settings.register_profile(
+    "long", parent=settings.get_profile("short"), max_examples=20_000, derandomize=False
+)
+settings.load_profile("short")
 
 # Events of Python itself (PEP 578), raised by whatever starts a program or calls somebody.
 WATCHED = {

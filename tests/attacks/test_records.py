@@ -23,6 +23,8 @@ RECORDS = {
     "errors in words": '{"validation": {"val/error_mean": "small"}}',
     "pairs in words": '{"pairs": "many", "validation": {}}',
     "time in words": '{"training_seconds": "long", "validation": {}}',
+    "pairs of true": '{"pairs": true, "validation": {}}',
+    "endless digits": '{"pairs": ' + "9" * 5000 + "}",
     "steps of null": '{"steps": null, "validation": {}}',
 }
 

@@ -82,6 +82,22 @@ def test_every_program_says_why(tmp_path, monkeypatch, capsys, lnn_run, command)
         (lambda c: c["dataset"].update(name=".."), "dataset.name"),
         (lambda c: c["dataset"].update(name=7), "dataset.name"),
         (lambda c: c.update(model_name="../out"), "model_name"),
+        (lambda c: c["dataset"].update(name="x" * 5000), "of at most 100 letters"),
+        (lambda c: c.update(seed=2**80), "seed is 1208925819614629174706176, expected"),
+        (lambda c: c.update(seed=-1), "seed is -1, expected"),
+        (lambda c: c.update(seed=True), "seed is True, expected"),
+        (lambda c: c.update(ensemble=10**6), "ensemble is 1000000, expected .* up to 1000"),
+        (lambda c: c.update(ensemble="many"), "ensemble is many"),
+        (lambda c: c["model"]["mass"].update(hidden=[10**9]), "hidden is .*from 1 to 20000"),
+        (lambda c: c["model"]["mass"].update(activation="os.system"), "activation"),
+        (lambda c: c["model"].update(angles=[-1]), "angles"),
+        (lambda c: c.update(model={"_target_": "lightning.Trainer"}), "model"),
+        (
+            lambda c: c.update(
+                model={"_target_": "pinn_dyn.systems.RigidChain", "urdf": "/dev/zero"}
+            ),
+            "model",
+        ),
         (lambda c: c["dataset"]["configurations"].update({"../x": [0, 0, 0]}), "configurations"),
         (lambda c: c["model"].update(cache="/tmp/x"), "where something is written"),
         (

@@ -119,8 +119,12 @@ CHANGES = {
     "a centre of one": ('"0 0 -0.3"', '"-0.3"', "link 'upper' has <origin xyz='-0.3'>"),
     # inertias
     "a negative mass": ('value="1.5"', 'value="-1.5"', "link 'upper' has mass -1.5 kg"),
+    "a mountain": ('value="1.5"', 'value="1e200"', "'upper' has mass 1e\\+200 kg, expected from 0"),
+    "a heavy flywheel": (INERTIA, INERTIA.replace("0.09", "1e9"), "has an inertia of 1e\\+09 kg m"),
     "a mass of NaN": ('value="1.5"', 'value="nan"', "<mass value='nan'>, expected a finite"),
     "an endless mass": ('value="1.5"', 'value="1e400"', "<mass value='1e400'>, expected a finite"),
+    "a mass that Bullet reads as 1": ('value="1.5"', 'value="1_0"', "<mass value='1_0'>"),
+    "an axis that Bullet reads as 0": ('"0 1 0"', '"\u0661 0 0"', "expected three numbers"),
     "a mass in words": ('value="1.5"', 'value="1.5 kg"', "<mass value='1.5 kg'>"),
     "a mass of nothing": ('<mass value="1.5"/>', "<mass/>", "<mass value=''>"),
     "no mass": ('<mass value="0.8"/>', "", "link 'lower' moves with joint 'elbow' and has no mass"),

@@ -1,11 +1,14 @@
 """An ensemble is its members: one by one, in the mean, on every kind of model."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, ContinuousPredictor, Signal, double_copy
-from tests.models.builders import make_model, perturb
+from pinn_dyn.models import LearnedVelocity
+from tests.models.builders import make_model, make_structured, perturb
 
 KINDS = ("lnn", "hnn", "acceleration", "next_state")
 
@@ -34,6 +37,19 @@ def test_an_ensemble_predicts_the_mean_of_what_its_members_predict_alone(kind):
     found = ensemble.predict(x0, t, Signal(t, u, "hold"))
     torch.testing.assert_close(found, expected.mean(0), rtol=0, atol=1e-12)
     assert ensemble.fixed_step == alone[0].fixed_step
+
+
+def test_members_start_at_velocities_of_their_own():
+    head = partial(LearnedVelocity, hidden=[5])
+    alone = [
+        perturb(make_structured("lnn", 2, 2, initial_velocity=head), seed=k, spread=0.3)
+        for k in range(2)
+    ]
+    x0, t, u = motion("lnn")
+    expected = torch.stack([item.increments(x0, t, Signal(t, u)) for item in alone])
+    assert (expected[0, :, 1] - expected[1, :, 1]).abs().max() > 1e-4
+    found = Ensemble(alone).member_increments(x0, t, Signal(t, u))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

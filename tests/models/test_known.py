@@ -1,5 +1,7 @@
 """Known mechanics with learned constants: physical for every parameter, and passive."""
 
+import math
+
 import pytest
 import torch
 
@@ -59,6 +61,34 @@ def test_every_parameter_is_a_body_of_positive_density(seed):
         assert m > 0
         assert principal[0] > 0
         assert principal[2] < principal[0] + principal[1]  # the triangle inequality
+
+
+PLACES = {
+    **{"x extent": (0, 0), "y extent": (1, 1), "z extent": (2, 2)},
+    **{"xy shear": (0, 1), "xz shear": (0, 2), "yz shear": (1, 2)},
+    **{"x centre": (0, 3), "y centre": (1, 3), "z centre": (2, 3)},
+}
+
+
+@pytest.mark.parametrize("part", ["mass", *PLACES])
+def test_each_parameter_of_a_body_is_what_its_name_says(part):
+    """Rucker and Wensing's U has it in one place; the mass, e^2a, is a factor of it all."""
+    start = RigidChain(TREE, locked_joints=["wrist"]).inertia[:1]
+    bodies = PhysicalBodies(start, 0.5, ["it"]).double()
+    size, stretch = 0.8, torch.eye(4, dtype=torch.float64)
+    with torch.no_grad():
+        bodies.z[0, bodies.names.index(f"{part} of it")] = size / 0.5
+    factor = math.exp(2 * size) if part == "mass" else 1.0
+    if part != "mass":
+        row, column = PLACES[part]
+        stretch[row, column] = math.exp(size) if row == column else size
+    mass = start[0, 3, 3]
+    centre = start[0, :3, 3] / mass
+    root = torch.eye(4, dtype=torch.float64)
+    covariance = start[0, :3, :3] / mass - torch.outer(centre, centre)
+    root[:3, :3], root[:3, 3] = torch.linalg.cholesky(covariance), centre
+    changed = factor * mass * root @ stretch @ stretch.T @ root.T
+    torch.testing.assert_close(bodies()[0], changed, rtol=1e-5, atol=1e-7)
 
 
 def test_a_body_that_cannot_be_is_named():

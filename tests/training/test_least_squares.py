@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.models import DriveCoulomb
@@ -99,6 +100,27 @@ def test_what_has_changed_is_refused_by_name(runs):
     solver.changed = ["tip"]
     with pytest.raises(ValueError, match=f"the earlier fit has 3 constants, this model {count}"):
         solver.fit(model, runs, windows, torch.eye(3))
+
+
+def test_the_information_is_that_of_the_inputs_that_are_missed(truth, runs):
+    """Gauss-Newton's matrix, by central differences of r = k^-1 (M a + ... - o) - u."""
+    model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, gain_spread=0.3)
+    found = LeastSquares(cutoff=20.0, rollouts=False, samples=100).fit(model, runs, None)
+    q, v, a, u = filtered_motion(runs, 20.0, 100)
+    moves = v.abs() > 0.05 * v.std(0)  # at rest dry friction may have any value
+
+    def missed(z):
+        vector_to_parameters(z, model.parameters())
+        wanted = model.inverse_dynamics(q, v, a) / model.drive_gain()
+        return ((wanted - u) / u.std(0))[moves]
+
+    with torch.no_grad():
+        z = parameters_to_vector(model.parameters())
+        steps = 1e-5 * torch.eye(len(z), dtype=torch.float64)
+        slopes = torch.stack([(missed(z + s) - missed(z - s)) / 2e-5 for s in steps], dim=-1)
+    expected = slopes.T @ slopes
+    share = found.information.trace() / expected.trace()  # of the noise
+    torch.testing.assert_close(found.information, share * expected, rtol=1e-4, atol=1e-4 * share)
 
 
 def test_the_filter_keeps_the_motion_and_takes_its_derivative(runs):

@@ -8,7 +8,6 @@ An array with as many rows as the time is a column; one with several columns is 
 from __future__ import annotations
 
 import difflib
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,9 @@ import pandas as pd
 from scipy.io import loadmat
 
 from pinn_dyn.data.logs.bags import optional
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed, most_bytes
 
+_DEEPEST = 30
 _KINDS = {
     "c": "holds complex numbers",
     "O": "is a cell array, such as of ragged rows",
@@ -51,7 +51,9 @@ def read_mat(path: Path, time: str) -> pd.DataFrame:
 def _read_mat73(path: Path) -> Mapping[str, Any]:
     try:
         return optional("pymatreader", path).read_mat(str(path))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except LogError:
+        raise
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as a MATLAB 7.3 file: {error}") from error
 
 
@@ -65,19 +67,30 @@ def read_hdf5(path: Path, time: str) -> pd.DataFrame:
     arrays: dict[str, np.ndarray] = {}
     unusable: dict[str, str] = {}
 
-    def visit(name: str, item: Any) -> None:
+    def visit(name: str, item: Any) -> str | None:
+        if name.count("/") > _DEEPEST:
+            return name
         if isinstance(item, h5py.Group):
-            unusable[name] = f"is a group that holds {', '.join(item) or 'nothing'}"
+            unusable[name] = f"is a group that holds {listed(item) or 'nothing'}"
+        elif not isinstance(item, h5py.Dataset):
+            unusable[name] = "is a description of a type"
+        elif item.external:
+            unusable[name] = "lies in another file, which is not opened"
+        elif item.nbytes > most_bytes(item.id.get_storage_size()):
+            unusable[name] = f"claims {item.nbytes} bytes, far more than the file has of it"
         elif item.dtype.names or item.dtype.kind not in "fiub":
             unusable[name] = f"has the type {item.dtype}"
         else:
             _add(name, np.asarray(item[()]), arrays, unusable)
+        return None
 
     try:
         with h5py.File(path, "r") as file:
-            file.visititems(visit)
-    except (OSError, RuntimeError, KeyError) as error:
+            deep = file.visititems(visit)
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as HDF5, it may be cut short: {error}") from error
+    if deep is not None:
+        raise LogError(f"{path}: has groups more than {_DEEPEST} levels deep, expected a log")
     return _table(path, time, arrays, unusable)
 
 
@@ -92,13 +105,31 @@ def read_npz(path: Path, time: str) -> pd.DataFrame:
     try:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
-                try:
-                    _add(name, file[name], arrays, unusable)
-                except ValueError:
-                    unusable[name] = "holds Python objects, which are never unpickled"
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                _add_member(file, name, arrays, unusable)
+    except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as NPZ, it may be cut short: {error}") from error
     return _table(path, time, arrays, unusable)
+
+
+def _add_member(
+    file: Any, name: str, arrays: dict[str, np.ndarray], unusable: dict[str, str]
+) -> None:
+    """An array of an NPZ file, or why it is none."""
+    entry = file.zip.getinfo(name if name in file.zip.namelist() else f"{name}.npy")
+    if entry.file_size > most_bytes(entry.compress_size):
+        unusable[name] = f"has {entry.file_size} bytes in {entry.compress_size} compressed ones"
+        return
+    try:
+        value = file[name]
+    except MemoryError:
+        unusable[name] = "claims to be larger than the memory"
+    except Exception:  # a damaged header raises nearly anything
+        unusable[name] = "is damaged or holds Python objects, which are never unpickled"
+    else:
+        if isinstance(value, np.ndarray):
+            _add(name, value, arrays, unusable)
+        else:
+            unusable[name] = "is no array"
 
 
 def _flatten(
@@ -137,7 +168,7 @@ def _table(
     if time in unusable:
         raise LogError(f"{path}, variable {time!r} (time): {unusable[time]}, expected real numbers")
     if time not in arrays:
-        names = ", ".join(f"{name} {value.shape}" for name, value in arrays.items())
+        names = listed(f"{name} {value.shape}" for name, value in arrays.items())
         close = difflib.get_close_matches(time, arrays, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise LogError(f"{path}: no variable {time!r} for the time: {hint}the file has {names}")
@@ -149,10 +180,14 @@ def _table(
             unusable[name] = f"is {' by '.join(map(str, value.shape))}, and the time has {samples}"
             unusable[name] += " samples"
             continue
-        if rows.shape[1] == 1:
-            columns[name] = rows[:, 0]
-        else:
-            columns |= {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
+        single = rows.shape[1] == 1
+        for k in range(rows.shape[1]):
+            column = name if single else f"{name}_{k + 1}"
+            if column in columns:
+                unusable[column] = "is a column of a matrix and a variable of its own"
+            columns[column] = rows[:, k]
+    for column in unusable.keys() & columns.keys():
+        del columns[column]
     table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
     table.attrs["unusable"] = unusable
     return table

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.messages import BATCH, Topic
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -84,7 +84,7 @@ def _read(reader: Any, path: Path, columns: Sequence[str]) -> dict[str, Topic]:
     for column in dict.fromkeys(columns):
         topic = next((name for name in topics if column.startswith(f"{name}/")), None)
         if topic is None:
-            there = ", ".join(
+            there = listed(
                 f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())
             )
             raise LogError(f"{path}: no topic for the column {column!r}: the bag has {there}")
@@ -118,7 +118,7 @@ def _read(reader: Any, path: Path, columns: Sequence[str]) -> dict[str, Topic]:
             raise LogError(f"{path}, topic {topic}: has no messages")
         for field, column in zip(fields[topic].values(), found.values, strict=True):
             if np.isnan(column).all():
-                names = f"its joints are {', '.join(sorted(found.names))}" if found.names else ""
+                names = f"its joints are {listed(sorted(found.names))}" if found.names else ""
                 raise LogError(
                     f"{path}, topic {topic}: no message has a value of {field!r}: "
                     f"{names or 'the array is empty or shorter in all of them'}"

@@ -50,14 +50,14 @@ class Columns:
         self.file_units = self._each("unit", unit)
         si = [to_si(name) for name in self.file_units]
         self.units = [name for name, _ in si]
-        signs = np.array(self._each("sign", sign), dtype=float)
+        signs = self._numbers("sign", sign)
         if not np.isin(signs, (-1, 1)).all():
             raise LogError(f"sign is {sign}, expected 1 or -1 (a factor belongs in scale)")
-        scales = np.array(self._each("scale", scale), dtype=float)
+        scales = self._numbers("scale", scale)
         if not np.isfinite(scales).all() or (scales == 0).any():
             raise LogError(f"scale is {scale}, expected numbers that are not 0")
         self.factors = signs * scales * np.array([factor for _, factor in si])
-        self.offsets = np.array(self._each("offset", offset), dtype=float)
+        self.offsets = self._numbers("offset", offset)
         if not np.isfinite(self.offsets).all():
             raise LogError(f"offset is {offset}, expected finite numbers")
 
@@ -100,6 +100,12 @@ class Columns:
     def from_si(self, values: np.ndarray) -> np.ndarray:
         """Columns ``(T, K)`` in SI units as the file has them."""
         return values / self.factors + self.offsets
+
+    def _numbers(self, name: str, value: Any) -> np.ndarray:
+        try:
+            return np.array(self._each(name, value), dtype=float)
+        except (TypeError, ValueError) as error:
+            raise LogError(f"{name} is {value!r}, expected a number: {error}") from error
 
     def _each(self, name: str, value: Any) -> list[Any]:
         """One value per column."""

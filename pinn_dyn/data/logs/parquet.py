@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.bags import optional
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, shown
 
 
 def read_parquet(path: Path) -> pd.DataFrame:
@@ -73,11 +73,12 @@ def _entries(path: Path) -> dict[str, Sequence[str]]:
         return {}
     try:
         features = json.loads(info.read_text())["features"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise LogError(f"{info}: is no description of a LeRobot data set: {error!r}") from error
+        given = {name: feature.get("names") for name, feature in features.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        said = shown(error)
+        raise LogError(f"{info}: is no description of a LeRobot data set: {said}") from error
     found: dict[str, Sequence[str]] = {}
-    for name, feature in features.items():
-        names = feature.get("names")
+    for name, names in given.items():
         # Version 2 has them one level deeper, as {"motors": [...]}.
         if isinstance(names, dict) and len(names) == 1:
             names = next(iter(names.values()))

@@ -5,22 +5,25 @@ from __future__ import annotations
 import csv
 import difflib
 import gzip
+import io
 import re
 import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
 from pinn_dyn.data.logs.bags import is_bag, read_bag
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed, most_bytes, shown
 from pinn_dyn.data.logs.parquet import read_parquet
 
 _PART = 200_000  # rows of a CSV file that are parsed together
+_LONGEST_HEADER = 130_000
+_MOST_COLUMNS = 10_000
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
@@ -36,15 +39,22 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
             "as dataset.root=..., or set the variable PINN_DYN_LOGS where the data set uses it"
         )
     found: set[Path] = set()
-    given = [patterns] if isinstance(patterns, str) else list(patterns)
-    if not all(given) or not given:
-        raise LogError(f"files is {patterns!r}, expected names or patterns, as '*.csv'")
+    given = (
+        [patterns] if not isinstance(patterns, Sequence) or isinstance(patterns, str) else patterns
+    )
+    if not given or not all(isinstance(pattern, str) and pattern for pattern in given):
+        raise LogError(f"files is {shown(patterns)}, expected names or patterns, as '*.csv'")
     for pattern in given:
         if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
             raise LogError(f"files has {pattern!r}, expected paths from the folder root")
-        matches = [path for path in folder.glob(pattern) if path.is_file() or is_bag(path)]
+        try:
+            matches = [path for path in folder.glob(pattern) if path.is_file() or is_bag(path)]
+        except OSError:  # as of a name that no file can have
+            matches = []
         if not matches:
-            raise LogError(f"files: nothing matches {pattern!r} in the folder {folder.absolute()}")
+            raise LogError(
+                f"files: nothing matches {shown(pattern)} in the folder {folder.absolute()}"
+            )
         found.update(matches)
     return sorted(found)
 
@@ -103,29 +113,38 @@ def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series
             f"{path}: {len(places)} columns have the name {name!r}, which {signal} asks for: "
             f"numbers {', '.join(map(str, places))}; give each a name of its own in the file"
         )
-    if name in table.attrs.get("unusable", {}):
-        raise LogError(
-            f"{path}, variable {name!r} ({signal}): {table.attrs['unusable'][name]}, expected a "
-            "matrix of real numbers with as many rows as the time"
-        )
+    unusable = table.attrs.get("unusable", {})
+    matrix = re.sub(r"_\d+$", "", name)  # q_1 is the first column of q
+    for variable in (name, matrix) if not places else ():
+        if variable in unusable:
+            raise LogError(
+                f"{path}, variable {variable!r} ({signal}): {unusable[variable]}, expected a "
+                "matrix of real numbers with as many rows as the time"
+            )
     if not places:
         names = [str(known) for known in table.columns]
         close = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise LogError(
             f"{path}: no column {name!r}, which {signal} asks for: {hint}"
-            f"the file has {', '.join(names)}"
+            f"the file has {listed(names)}"
         )
     return table[name]
 
 
 def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarray:
     raw = column(table, path, name, signal)
+    if raw.dtype == object:
+        # Whole numbers of more than 64 bits, which pandas does not convert; a true among numbers.
+        raw = raw.map(
+            lambda x: float(str(x)) if type(x) is int else str(x) if type(x) is bool else x
+        )
     values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
     bad = ~np.isfinite(values)
     if bad.any():
         k = int(bad.argmax())
-        what = "is empty or NaN" if pd.isna(raw.iloc[k]) else f"is {str(raw.iloc[k])!r}"
+        empty = np.ndim(raw.iloc[k]) == 0 and pd.isna(raw.iloc[k])
+        what = "is empty or NaN" if empty else f"is {shown(str(raw.iloc[k]))}"
         if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", str(raw.iloc[k])):
             what += ", with a decimal comma: write points (in a file whose columns are separated by"
             what += " ';', replace every ',' by '.')"
@@ -137,12 +156,13 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
     return values
 
 
-def _parsed(path: Path, separator: str) -> pd.DataFrame:
+def _parsed(file: BinaryIO, separator: str) -> pd.DataFrame:
     """The table of a CSV file, parsed in parts: at once it takes three times its memory."""
 
     def parser(rows: int | None) -> Any:
+        file.seek(0)
         return pd.read_csv(
-            path,
+            file,
             sep=separator,
             encoding="utf-8-sig",
             skipinitialspace=True,
@@ -182,21 +202,28 @@ def _longer(old: np.ndarray | None, more: np.ndarray) -> np.ndarray:
 
 def _read_csv(path: Path) -> pd.DataFrame:
     try:
-        with (gzip.open if path.suffix == ".gz" else open)(
-            path, "rt", encoding="utf-8-sig"
-        ) as file:
-            header = file.readline()
-        separator = max(",;\t", key=header.count)
-        with warnings.catch_warnings():
-            # Pandas would cut rows that are longer than the header, and only warn.
-            warnings.simplefilter("error", pd.errors.ParserWarning)
-            table = _parsed(path, separator)
+        with _opened(path) as file:
+            text = io.TextIOWrapper(file, encoding="utf-8-sig")
+            header = text.readline(_LONGEST_HEADER + 1)
+            text.detach()
+            separator = max(",;\t", key=header.count)
+            columns = header.count(separator) + 1
+            if len(header) > _LONGEST_HEADER or columns > _MOST_COLUMNS:
+                raise LogError(
+                    f"{path}: the first line has {columns} columns in {len(header)} letters or "
+                    f"more, expected a header of at most {_MOST_COLUMNS} names: is the table "
+                    "transposed?"
+                )
+            with warnings.catch_warnings():
+                # Pandas would cut rows that are longer than the header, and only warn.
+                warnings.simplefilter("error", pd.errors.ParserWarning)
+                table = _parsed(file, separator)
     except (
         pd.errors.ParserError,
         pd.errors.ParserWarning,
         pd.errors.EmptyDataError,
         UnicodeDecodeError,
-        gzip.BadGzipFile,
+        OSError,  # also of gzip
         EOFError,
         zlib.error,
     ) as error:
@@ -207,9 +234,27 @@ def _read_csv(path: Path) -> pd.DataFrame:
     table.columns = [str(name).strip() for name in found]
     table.index = pd.RangeIndex(2, len(table) + 2)
     # Blank lines are counted, so that lines keep their numbers, but at the end they do no harm.
-    filled = len(table)
-    while filled and table.iloc[filled - 1].isna().all():
-        filled -= 1
+    ends = (table.iloc[:, k].last_valid_index() for k in range(table.shape[1]))
+    filled = max((int(end) - 1 for end in ends if end is not None), default=0)
     if not filled:
         raise LogError(f"{path}: has no rows, expected a header line and rows of numbers")
     return table.iloc[:filled]
+
+
+def _opened(path: Path) -> BinaryIO:
+    """A file, unpacked if it is compressed.
+
+    Raises:
+        LogError: on one that holds far more than a table of numbers would.
+    """
+    if path.suffix != ".gz":
+        return path.open("rb")
+    most = most_bytes(path.stat().st_size)
+    with gzip.open(path) as packed:
+        content = packed.read(most + 1)
+    if len(content) > most:
+        raise LogError(
+            f"{path}: {path.stat().st_size} compressed bytes hold more than {most}, expected a "
+            "table of numbers, which no file shrinks that far: unpack it and look into it"
+        )
+    return io.BytesIO(content)

@@ -138,6 +138,7 @@ class LogSource(DataSource):
             )
         _check_units("q", self.q, ("rad", "m", "1"))
         _check_units("u", self.u, sorted({unit for unit, _ in UNITS.values()} - {"s"}))
+        self._check_columns()
         self.trajectory = trajectory
         if not max_age > 0:
             raise LogError(f"max_age is {max_age} s, expected more than 0")
@@ -171,6 +172,19 @@ class LogSource(DataSource):
                 )
         self.configurations = dict(configurations or {})
         self._loaded: tuple[Splits, Report, list[Cleaned]] | None = None
+
+    def _check_columns(self) -> None:
+        """Refuse a column that two signals ask for: one of them would explain the other."""
+        taken: dict[str, str] = {}
+        signals = {"time": self.time, "q": self.q, "v": self.v, "u": self.u}
+        for signal, columns in signals.items():
+            for name in [] if columns is None else columns.columns:
+                if name in taken:
+                    raise LogError(
+                        f"column {name!r} is given for {taken[name]} and for {signal}, expected "
+                        "for one of them"
+                    )
+                taken[name] = signal
 
     def load(self) -> Splits:
         """The cleaned trajectories.
@@ -238,7 +252,8 @@ class LogSource(DataSource):
                 "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
             }
             for found in find_files(self.root, self.files)
-            for path in ([found] if found.is_file() else sorted(found.iterdir()))
+            for path in ([found] if found.is_file() else sorted(found.rglob("*")))
+            if path.is_file()
         }
         splits: dict[str, list[str]] = {split: [] for split in SPLITS}
         for part in self.cleaned:
@@ -294,13 +309,19 @@ class LogSource(DataSource):
 
     def _read(self, report: Report) -> list[Recording]:
         paths = find_files(self.root, self.files)
-        recordings = []
+        recordings: list[Recording] = []
+        stems: dict[str, Path] = {}
         signals = [x for x in (self.time, self.q, self.v, self.u) if x is not None]
         asked = [name for signal in signals for name in signal.columns]
         asked += [] if self.trajectory is None else [self.trajectory]
         for path in paths:
             table = read_table(path, self.time.columns[0], asked, self.max_age)
             stem = run_name(path, self.root)
+            if (other := stems.setdefault(stem, path)) is not path:
+                raise LogError(
+                    f"{other} and {path} are both the run {stem!r}: rename one of them, or leave "
+                    "it out of 'files'"
+                )
             for note in table.attrs.get("notes", []):
                 report.warn(f"{path.name}: {note}")
             groups = [(stem, np.full(len(table), True))]

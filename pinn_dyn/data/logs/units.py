@@ -59,7 +59,7 @@ def to_si(unit: str) -> tuple[str, float]:
         LogError: on an unknown unit; lists those that are known.
     """
     if unit not in UNITS:
-        close = difflib.get_close_matches(unit, UNITS, n=1)
+        close = difflib.get_close_matches(str(unit), UNITS, n=1)
         hint = f"did you mean {close[0]!r}? " if close else ""
         raise LogError(f"unit is {unit!r}: {hint}known units are {', '.join(UNITS)}")
     return UNITS[unit]

@@ -1,0 +1,212 @@
+"""Logs that hypothesis damages: refused in a sentence, or read as they are.
+
+Some hundred here, the same ones each time. Others, for longer:
+``pytest tests/attacks --hypothesis-profile=long -k fuzz``.
+"""
+
+import csv
+import functools
+import gzip
+import io
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from pinn_dyn.data.logs import LogError
+from tests.attacks.damage import byte_hits, hit, places
+from tests.data import log_formats as formats
+from tests.data.logs_files import motion, source
+
+COLUMNS = ["t", "q1", "v1", "u1", "q2", "v2", "u2"]
+ODD = [
+    *("", " ", "nan", "inf", "-inf", "1e400", "-0", "1e300", "1e-320", "0x1F", "1_0", "1d3"),
+    *("1,5", "1;5", '"', '""', "'", "#", "\t", "\0", "\ufeff", "\u00bd", "\uff11", "\u22121"),
+    *("1e", "--1", "true", "12:30", "[1]", "1+2j", "None", "NA", "9" * 400, "1" + "0" * 310),
+    *("\u2028", "\x85", "\r"),
+]
+texts = st.sampled_from(ODD) | st.text(max_size=8) | st.floats().map(repr)
+
+
+@functools.cache
+def lines():
+    return tuple(motion(5.0).to_csv(index=False, float_format="%.9g").splitlines())
+
+
+def cell(row, column, text):
+    cells = row.split(",")
+    cells[column % len(cells)] = text
+    return ",".join(cells)
+
+
+def with_cell(rows, where, column, text):
+    k = where % len(rows)
+    return [*rows[:k], cell(rows[k], column, text), *rows[k + 1 :]]
+
+
+def without_line(rows, where):
+    k = where % len(rows)
+    return [*rows[:k], *rows[k + 1 :]]
+
+
+def with_line(rows, where, line):
+    k = where % len(rows)
+    return [*rows[:k], line, *rows[k:]]
+
+
+def with_line_again(rows, where, there):
+    return with_line(rows, there, rows[where % len(rows)])
+
+
+def with_column(rows, column, text):
+    return [rows[0], *(cell(row, column, text) for row in rows[1:])]
+
+
+def with_columns_exchanged(rows, one, other):
+    def exchanged(row):
+        cells = row.split(",")
+        i, k = one % len(cells), other % len(cells)
+        cells[i], cells[k] = cells[k], cells[i]
+        return ",".join(cells)
+
+    return [rows[0], *map(exchanged, rows[1:])]
+
+
+def cut(rows, where):
+    return rows[: 1 + where % len(rows)]
+
+
+def separated(rows, separator):
+    return [row.replace(",", separator) for row in rows]
+
+
+small = st.integers(0, 6)
+changes = st.one_of(
+    st.tuples(st.just(with_cell), places, small, texts),
+    st.tuples(st.just(with_cell), st.just(0), small, texts),
+    st.tuples(st.just(without_line), places),
+    st.tuples(st.just(with_line), places, texts),
+    st.tuples(st.just(with_line_again), places, places),
+    st.tuples(st.just(with_column), small, texts),
+    st.tuples(st.just(with_columns_exchanged), small, small),
+    st.tuples(st.just(cut), places),
+    st.tuples(st.just(separated), st.sampled_from(";\t| ")),
+)
+
+
+def read(source_of):
+    """The stretches of a log as they were read; None where it is refused, in a sentence."""
+    start = time.perf_counter()
+    said, splits = None, None
+    try:
+        splits = source_of.load()
+    except LogError as error:
+        said = str(error)
+    assert time.perf_counter() - start < 10
+    if said is not None:
+        assert 20 < len(said) < 1500
+        return None
+    for one in [*splits.train, *splits.validation, *splits.test]:
+        for name in ("t", "q", "v", "u"):
+            assert getattr(one, name).isfinite().all()
+    return [part.raw for part in source_of.cleaned]
+
+
+def rows_of(content):
+    """The rows of a CSV file by Python's own reader, by their time."""
+    separator = max(",;\t", key=content.split("\n")[0].count)
+    lines = csv.reader(io.StringIO(content), delimiter=separator, skipinitialspace=True)
+    names = [name.strip() for name in next(lines)]
+    found = {}
+    for row in filter(any, lines):
+        values = dict(zip(names, row, strict=False))
+        t, *others = (number(values[name]) for name in COLUMNS)
+        found[t] = others
+    return found
+
+
+def number(text):
+    """Switches are logged as true and false."""
+    switch = {"true": 1.0, "false": 0.0}.get(text.lower())
+    return float(text) if switch is None else switch
+
+
+@given(st.lists(changes, min_size=1, max_size=4))
+def test_a_damaged_table_is_refused_or_read_as_it_is(tmp_path_factory, edits):
+    rows = list(lines())
+    for change, *arguments in edits:
+        rows = change(rows, *arguments)
+        if not rows:
+            return
+    content = "\n".join(rows) + "\n"
+    folder = tmp_path_factory.mktemp("log")
+    (folder / "run.csv").write_text(content, encoding="utf-8", errors="surrogatepass", newline="")
+    raws = read(source(folder))
+    if raws is None:
+        return
+    expected = rows_of(content)
+    for raw in raws:
+        found = np.stack([raw.q, raw.v, raw.u], axis=-1).reshape(len(raw), -1)
+        np.testing.assert_allclose(found, [expected[t] for t in raw.t], rtol=1e-12)
+
+
+MATRICES = {
+    "q": dict(columns=["q_1", "q_2"], unit="rad"),
+    "v": dict(columns=["v_1", "v_2"], unit="rad/s"),
+    "u": dict(columns=["u_1", "u_2"], unit="Nm"),
+}
+IN_LOG = {
+    name: {**part, "columns": [f"log/{x}" for x in part["columns"]]}
+    for name, part in MATRICES.items()
+} | {"time": dict(columns="log/t", unit="s")}
+
+
+def write_mat(path, table, *, packed=False):
+    arrays = {name: table[[f"{name}1", f"{name}2"]].to_numpy() for name in "qvu"}
+    savemat(path, {"t": table[["t"]].to_numpy(), **arrays}, do_compression=packed)
+
+
+def write_gzip(path, table):
+    path.write_bytes(gzip.compress(table.to_csv(index=False).encode()))
+
+
+FORMATS = {
+    "csv.gz": (write_gzip, {}),
+    "npz": (formats.write_npz, MATRICES),
+    "mat": (write_mat, MATRICES),
+    "packed.mat": (functools.partial(write_mat, packed=True), MATRICES),
+    "h5": (formats.write_hdf5, IN_LOG),
+    "parquet": (lambda path, table: table.to_parquet(path), {}),
+    "mcap": (lambda path, table: write_bag(path, table, mcap=True), formats.BAG),
+    "db3": (lambda path, table: write_bag(path, table, mcap=False), formats.BAG),
+    "bag": (functools.partial(formats.write_bag, version=1), formats.BAG),
+}
+
+
+def write_bag(path, table, *, mcap):
+    """The file alone of a bag of ROS 2."""
+    formats.write_bag(path.with_suffix(""), table, mcap=mcap)
+    (file,) = path.with_suffix("").glob(f"*{path.suffix}")
+    file.rename(path)
+
+
+@functools.cache
+def formatted(name):
+    """The bytes of the log in a format."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"run.{name}"
+        FORMATS[name][0](path, motion(5.0))
+        return path.read_bytes()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@given(byte_hits(1, 3))
+def test_a_damaged_file_is_refused_or_numbers(name, tmp_path_factory, hits):
+    folder = tmp_path_factory.mktemp("log")
+    (folder / f"run.{name}").write_bytes(hit(formatted(name), hits))
+    read(source(folder, files=f"run.{name}", **FORMATS[name][1]))
