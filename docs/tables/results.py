@@ -34,11 +34,7 @@ SUMMARY = [
     ("double pendulum, real, 2 s", "lnn", "double_pendulum/lnn", "double_pendulum/acceleration"),
     ("tendon-driven trunk, real, 10 s", "lnn", "trunk/lnn", "trunk/mlp"),
 ]
-LOGS = {
-    **{"double_pendulum": "rad", "panda_gaz": "rad", "ur10e": "rad", "emps": "m"},
-    **{"soft_neck": "rad", "trunk": "m"},
-}
-MODELS = ("lnn", "identification", "known", "known_and_network", "acceleration", "mlp")
+LOGS = {"double_pendulum": "rad", "panda_gaz": "rad", "soft_neck": "rad", "trunk": "m"}
 WINDOWS = ["window_0.1s_error_mean", "window_1s_error_mean", "error_mean"]
 
 
@@ -104,7 +100,7 @@ def logs() -> str:
     for name, unit in LOGS.items():
         data, floor = read_log(name), floors().loc[name]
         means = data.groupby("model")[WINDOWS].mean()
-        present = [model for model in MODELS if model in means.index]
+        present = [m for m in ("lnn", "known", "acceleration", "mlp") if m in means.index]
         for index, model in enumerate(present):
             runs = data[data["model"] == model]
             cells = []

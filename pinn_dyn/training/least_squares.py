@@ -82,6 +82,7 @@ class LeastSquares:
        here with bodies that stay physical;
     2. roll-outs: r = predicted less measured increments of the windows, each in units of its
        spread, as of the loss of increments. Derivatives by forward mode through the integrator.
+       First over a quarter of the windows' steps, then over all.
 
     s, by residual, is the root mean square of what remains, found by repeating each stage. The
     residuals within a window, and of windows that overlap, count as one for each coordinate, as
@@ -156,7 +157,11 @@ class LeastSquares:
         motion = filtered_motion(trajectories, self.cutoff, self.samples)
         found = self._identify(model, prior, motion)
         if self.rollouts:
-            found = self._roll_out(model, prior, windows.to(torch.device("cpu"), torch.float64))
+            windows = windows.to(torch.device("cpu"), torch.float64)
+            steps = len(windows.t) - 1
+            # Short ones first: long ones break down, or end in a poor minimum, from a poor start.
+            for length in sorted({-(-steps // 4), steps}):
+                found = self._roll_out(model, prior, windows.first(length))
         model.to(precision)
         return found
 
@@ -219,7 +224,9 @@ class LeastSquares:
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
-        return self._solve("roll-outs", model, prior, residuals, correlated=measured.shape[1])
+        correlated = measured.shape[1]
+        stage = f"roll-outs of {float(windows.t[-1]):.3g} s"
+        return self._solve(stage, model, prior, residuals, correlated=correlated)
 
     def _solve(
         self,
