@@ -35,6 +35,7 @@ SUMMARY = [
     ("tendon-driven trunk, real, 10 s", "lnn", "trunk/lnn", "trunk/mlp"),
 ]
 LOGS = {"double_pendulum": "rad", "panda_gaz": "rad", "soft_neck": "rad", "trunk": "m"}
+RIGID = {"double_pendulum": "rad", "ur10e": "rad", "panda_gaz": "rad", "emps": "m"}
 WINDOWS = ["window_0.1s_error_mean", "window_1s_error_mean", "error_mean"]
 
 
@@ -45,7 +46,7 @@ def floors() -> pd.DataFrame:
 
 def read_log(name: str) -> pd.DataFrame:
     """The evaluations of one log."""
-    folders = [RESULTS / "logs" / f"{name}{rest}" for rest in ("", "_mlp", "_known")]
+    folders = [RESULTS / "logs" / f"{name}{rest}" for rest in ("", "_mlp")]
     files = [folder / "summary.csv" for folder in folders]
     return pd.concat([pd.read_csv(path) for path in files if path.is_file()])
 
@@ -100,7 +101,7 @@ def logs() -> str:
     for name, unit in LOGS.items():
         data, floor = read_log(name), floors().loc[name]
         means = data.groupby("model")[WINDOWS].mean()
-        present = [m for m in ("lnn", "known", "acceleration", "mlp") if m in means.index]
+        present = [m for m in ("lnn", "acceleration", "mlp") if m in means.index]
         for index, model in enumerate(present):
             runs = data[data["model"] == model]
             cells = []
@@ -112,6 +113,21 @@ def logs() -> str:
             rows.append([f"`{name}`, {unit}" if index == 0 else "", f"`{model}`", *cells])
         rows.append(["", "keeps its velocity", *(_floor(floor[c], means[c]) for c in WINDOWS)])
     return table(["log", "model", "0.1 s windows", "1 s windows", "open loop"], rows)
+
+
+def rigid() -> str:
+    """Known mechanics on the logs of rigid robots, and what they have to beat."""
+    rows = []
+    for name, unit in RIGID.items():
+        data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
+        data = data[(data["diverged"] == 0) & (data["model"] != "stands still")]
+        for index, (_, row) in enumerate(data.iterrows()):
+            label = row["model"] if row["floor"] else f"`{row['model']}`"
+            cells = [bold(_precise(row[c]), row[c] == data[c].min()) for c in WINDOWS]
+            torque = "–" if pd.isna(row["torque_share"]) else number(row["torque_share"])
+            rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells, torque])
+    head = ["log", "model", "0.1 s windows", "1 s windows", "open loop", "torque error / spread"]
+    return table(head, rows)
 
 
 def _precise(value: float) -> str:
@@ -204,6 +220,7 @@ TABLES = {
         "summary": summary(),
         "panda": panda(),
         "logs": logs(),
+        "rigid": rigid(),
         "neck": neck(),
         "long_rollout": long_rollout(),
     },
