@@ -17,7 +17,6 @@ _ELSEWHERE = {
     "in range": "summary.csv",
     "beyond, 1.3 times": "beyond/summary.csv",
     "steps of 5 ms": "steps/summary.csv",
-    "trained on 500 pairs": "few_pairs/summary.csv",
 }
 FIGURE = ROOT / "docs" / "figures" / "sample_efficiency.png"
 
@@ -83,9 +82,12 @@ def generalization_table() -> str:
             if runs.empty:
                 cells.append("–")
                 continue
-            error = runs["error_mean"].mean()
-            best = error == trained.groupby("model")["error_mean"].mean().min()
-            cells.append(f"{bold(number(error), best)}{lost(runs)}")
+            figures = []
+            for column in ("error_mean", "error_median"):
+                error = runs[column].mean()
+                best = error == trained.groupby("model")[column].mean().min()
+                figures.append(bold(number(error), best))
+            cells.append(f"{', '.join(figures)}{lost(runs)}")
         floor = bool(tables["in range"].set_index("model").loc[[model], "floor"].iloc[0])
         rows.append([model if floor else f"`{model}`", *cells])
     return table(["model", *tables], rows)
