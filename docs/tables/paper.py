@@ -17,6 +17,7 @@ _ELSEWHERE = {
     "in range": "summary.csv",
     "beyond, 1.3 times": "beyond/summary.csv",
     "steps of 5 ms": "steps/summary.csv",
+    "trained on 500 pairs": "few_pairs/summary.csv",
 }
 FIGURE = ROOT / "docs" / "figures" / "sample_efficiency.png"
 
