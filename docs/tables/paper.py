@@ -65,7 +65,7 @@ def prediction_table(group: str) -> str:
                 f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
                 f"{mean[f'{square}_mean']:.1e} ± {mean[f'{square}_variance']:.1e}",
                 " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
-                f"{data['pairs'].iloc[0]:,}{pairs}",
+                f"{int(data['pairs'].iloc[0]):,}{pairs}",
                 f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
             ]
         )
@@ -83,9 +83,12 @@ def generalization_table() -> str:
             if runs.empty:
                 cells.append("–")
                 continue
-            error = runs["error_mean"].mean()
-            best = error == trained.groupby("model")["error_mean"].mean().min()
-            cells.append(f"{bold(number(error), best)}{lost(runs)}")
+            figures = []
+            for column in ("error_mean", "error_median"):
+                error = runs[column].mean()
+                best = error == trained.groupby("model")[column].mean().min()
+                figures.append(bold(number(error), best))
+            cells.append(f"{', '.join(figures)}{lost(runs)}")
         floor = bool(tables["in range"].set_index("model").loc[[model], "floor"].iloc[0])
         rows.append([model if floor else f"`{model}`", *cells])
     return table(["model", *tables], rows)

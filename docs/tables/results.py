@@ -20,8 +20,8 @@ NAMES = {
 # Of each row of the README: task, model, entry of ours, of the best black box. An entry is one of
 # reproduction.yaml, or a log and its model.
 SUMMARY = [
-    ("one-segment soft arm, 5 s", "hnn", "soft_arm_1_wide/hnn", "soft_arm_1_wide/acceleration"),
-    ("", "lnn", "soft_arm_1_wide/lnn", "soft_arm_1_wide/acceleration"),
+    ("one-segment soft arm, 5 s", "hnn", "soft_arm_1_wide/hnn", "soft_arm_1_wide/mlp"),
+    ("", "lnn", "soft_arm_1_wide/lnn", "soft_arm_1_wide/mlp"),
     (
         "the same, narrow: axial force −1.15 ± 0.1 N",
         "hnn",

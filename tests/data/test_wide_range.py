@@ -96,7 +96,7 @@ def test_a_range_in_which_the_arm_has_no_length_is_refused(elongation):
 
 @pytest.mark.slow
 def test_motions_cover_the_range_and_stay_within_it(tmp_path):
-    source = build("soft_arm_1_wide", "dataset.step=0.005", f"dataset.cache={tmp_path}")
+    source = build("soft_arm_1_wide", "dataset.step=0.005", f"+dataset.cache={tmp_path}")
     splits = source.load()
     low, high = torch.from_numpy(source.limits.bounds)
     for name in ("train", "validation", "test"):
