@@ -120,10 +120,14 @@ def rigid() -> str:
     rows = []
     for name, unit in RIGID.items():
         data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
-        data = data[(data["diverged"] == 0) & (data["model"] != "stands still")]
+        rivals = ~data["floor"] | data["model"].isin(["keeps its velocity", "ARX"])
+        data = data[rivals]
         for index, (_, row) in enumerate(data.iterrows()):
             label = row["model"] if row["floor"] else f"`{row['model']}`"
-            cells = [bold(_precise(row[c]), row[c] == data[c].min()) for c in WINDOWS]
+            cells = [
+                bold(_precise(row[c]), row[c] == data[c].min()) if row[c] < 100 else "diverged"
+                for c in WINDOWS
+            ]
             torque = "–" if pd.isna(row["torque_share"]) else number(row["torque_share"])
             rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells, torque])
     head = ["log", "model", "0.1 s windows", "1 s windows", "open loop", "torque error / spread"]

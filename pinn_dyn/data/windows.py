@@ -58,7 +58,7 @@ class Windows:
         rows = zip(*(getattr(self, name).unbind() for name in _ROWS), strict=True)
         rate = self.input.rate
         rates = repeat(None) if rate is None else rate.unbind()
-        for values, u, slope in zip(rows, self.u.unbind(), rates, strict=False):
+        for values, u, slope in zip(rows, self.input.u.unbind(), rates, strict=False):
             picked: dict[str, Any] = dict(zip(_ROWS, values, strict=True))
             yield replace(self, **picked, input=self.input.with_samples(u, slope))
 

@@ -58,7 +58,7 @@ class ParameterVector:
         """A vector ``(..., P)`` as views of the shapes of the parameters, ``(..., *shape)``."""
         parts = vector.split(self._sizes, dim=-1)
         return [
-            part.view(*part.shape[:-1], *shape)
+            part.view((*part.shape[:-1], *shape))
             for part, shape in zip(parts, self._shapes, strict=True)
         ]
 

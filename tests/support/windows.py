@@ -45,6 +45,6 @@ def for_members(batches):
     rows = {
         item.name: torch.stack([getattr(batch, item.name) for batch in batches])
         for item in fields(Windows)
-        if item.name not in ("t", "input")
+        if item.name not in ("t", "input", "past")
     }
     return replace(first, **rows, input=stacked([batch.input for batch in batches], first.input.t))
