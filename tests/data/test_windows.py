@@ -268,6 +268,15 @@ def test_training_batches_have_the_asked_shapes_in_single_precision():
         assert {batch.q.dtype, batch.u.dtype, batch.t.dtype} == {torch.float32}
 
 
+def test_batches_picked_together_keep_the_input_before_their_start(trajectories):
+    windows = draw(trajectories, count=6, steps=2, history=3 * STEP)
+    assert windows.past == 3
+    together = windows[torch.arange(6).reshape(2, 3)]
+    for part, apart in zip(together.unbind(), (windows[:3], windows[3:]), strict=True):
+        assert torch.equal(part.input.u, apart.input.u)
+        assert part.input.u.shape[1] == 3 + part.u.shape[1] == len(part.input.t)
+
+
 def test_batches_are_picked_on_the_device_that_trains():
     """The windows are moved once; a batch is where they are."""
     data = make_data()
