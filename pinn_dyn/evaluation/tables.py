@@ -187,7 +187,7 @@ def _column_text(frame: pd.DataFrame, name: str) -> list[str]:
     for index, value in enumerate(frame[name]):
         never = name.endswith("left_data_after") and value == math.inf
         text = "never" if never else number(value)
-        if spread is not None:
+        if spread is not None and text != "-":
             text += f" ± {number(spread.iloc[index])}"
         cells.append(text + ("*" if marks.iloc[index] else " " if ranked else ""))
     return cells
@@ -220,7 +220,7 @@ def beaten_by_floors(frame: pd.DataFrame) -> list[str]:
     """
     sentences = []
     for name in frame:
-        if not name.endswith("error_mean") or name.startswith(("squared_", "member_")):
+        if not name.endswith("error_mean") or name.startswith(("squared_", "state_squared_", "member_")):
             continue
         figures = frame[name].astype(float).where(_competes(frame, name), math.inf)
         floor = frame["floor"].astype(bool)

@@ -104,6 +104,16 @@ def test_a_run_without_a_metric_has_a_gap(tmp_path):
     assert json.loads(records.read_text())[1]["training_pairs"] is None
 
 
+def test_a_figure_that_a_row_does_not_have_is_one_dash():
+    rows = [
+        RunResult("one", "lnn", 0, {"member_error_mean": 0.5, "member_error_std": 0.25}),
+        RunResult("other", "hnn", 0, {}),
+    ]
+    text = format_table(summary_table(rows))
+    assert "0.5 ± 0.25" in row_of(text, "one")
+    assert "±" not in row_of(text, "other")
+
+
 def test_errors_name_the_run():
     with pytest.raises(ValueError, match="results is empty"):
         summary_table([])

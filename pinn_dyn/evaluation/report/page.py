@@ -147,7 +147,7 @@ def table(
         for name in headers:
             value = frame[name].iloc[index]
             text = _cell(value)
-            if spread and spread.get(name) in frame:
+            if spread and spread.get(name) in frame and text != "-":
                 text += f" ± {_cell(frame[spread[name]].iloc[index])}"
             marked = best is not None and name in best and bool(best[name].iloc[index])
             exact = repr(float(value)) if _is_fraction(value) else ""
