@@ -220,7 +220,8 @@ def beaten_by_floors(frame: pd.DataFrame) -> list[str]:
     """
     sentences = []
     for name in frame:
-        if not name.endswith("error_mean") or name.startswith(("squared_", "state_squared_", "member_")):
+        others = ("squared_", "state_squared_", "member_")
+        if not name.endswith("error_mean") or name.startswith(others):
             continue
         figures = frame[name].astype(float).where(_competes(frame, name), math.inf)
         floor = frame["floor"].astype(bool)
