@@ -157,6 +157,8 @@ class DynamicsLearner(L.LightningModule):
                 )
             gradient = self.trainer.strategy.reduce(gradient)  # mean over processes
             self._vector.gradient.copy_(clipped(gradient, self._most, self._by_value))
+            if self._vector.parameters[0].grad is None:  # the trainer clears them once
+                self._vector.show_gradients()
             self._losses.append(losses)
             return loss
 

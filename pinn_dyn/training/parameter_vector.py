@@ -47,9 +47,15 @@ class ParameterVector:
         self.values = nn.Parameter(torch.cat(rows, dim=-1))
         self.gradient = torch.zeros_like(self.values)
         self.values.grad = self.gradient
-        values, gradients = self.split(self.values.detach()), self.split(self.gradient)
-        for parameter, value, gradient in zip(self.parameters, values, gradients, strict=True):
-            parameter.data, parameter.grad = value, gradient
+        for parameter, value in zip(self.parameters, self.split(self.values.detach()), strict=True):
+            parameter.data = value
+        self._gradients = self.split(self.gradient)
+        self.show_gradients()
+
+    def show_gradients(self) -> None:
+        """Give the parameters their part of the gradient, which others may take from them."""
+        for parameter, gradient in zip(self.parameters, self._gradients, strict=True):
+            parameter.grad = gradient
 
     def _pairs(self) -> Iterable[tuple[nn.Parameter, int]]:
         return zip(self.parameters, self._sizes, strict=True)

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import pytorch_optimizer as library
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from torch.optim import AdamW
@@ -11,7 +12,7 @@ from torch.optim.lr_scheduler import OneCycleLR
 
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.models import AccelerationMLP
-from pinn_dyn.training import DynamicsLearner, IncrementLoss, NonFiniteLossError, WindowLoss
+from pinn_dyn.training import SOAP, DynamicsLearner, IncrementLoss, NonFiniteLossError, WindowLoss
 from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
 
@@ -33,11 +34,13 @@ def data(splits):
     )
 
 
-def make_learner(model, data, validator=lambda model, truth: {"error_mean": 1.0}, lr=0.01):
+def make_learner(
+    model, data, validator=lambda model, truth: {"error_mean": 1.0}, lr=0.01, optimizer=AdamW
+):
     return DynamicsLearner(
         model,
         loss=IncrementLoss(data.statistics, model),
-        optimizer=partial(AdamW, lr=lr),
+        optimizer=partial(optimizer, lr=lr),
         scheduler=partial(OneCycleLR, max_lr=lr),
         validator=validator,
         config={"seed": 0},
@@ -52,10 +55,12 @@ def loss_of(learner, data):
         return float(learner.loss(learner.model, windows))
 
 
+@pytest.mark.parametrize("optimizer", [AdamW, SOAP, library.SOAP])
 @pytest.mark.parametrize("kind", MODELS)
-def test_a_short_training_lowers_the_loss(tmp_path, data, kind):
+def test_a_short_training_lowers_the_loss(tmp_path, data, kind, optimizer):
+    """Also by optimizers that take each parameter, not all of them as one vector."""
     torch.manual_seed(0)
-    learner = make_learner(MODELS[kind](data.statistics), data)
+    learner = make_learner(MODELS[kind](data.statistics), data, optimizer=optimizer)
     before = loss_of(learner, data)
     make_trainer(tmp_path, max_epochs=3, enable_checkpointing=False).fit(learner, data)
     assert loss_of(learner, data) < 0.5 * before
