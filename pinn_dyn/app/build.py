@@ -29,7 +29,6 @@ from pinn_dyn.training import (
     DynamicsLearner,
     LeastSquares,
     LeastSquaresLearner,
-    Penalized,
     WholeCheckpoints,
 )
 
@@ -154,8 +153,6 @@ def build_learner(
     ensemble = isinstance(model, Ensemble)
     single = model.member(0) if isinstance(model, Ensemble) else model
     loss = _build("loss", config["loss"], statistics=statistics, model=single)
-    if single.penalized:
-        loss = Penalized(loss)
     optimizer = _build("optimizer", config["optimizer"])
     if isinstance(optimizer, LeastSquares):
         try:

@@ -212,7 +212,12 @@ def train_in(
     learner = build_learner(config, model, statistics, validator)
     if isinstance(learner, LeastSquaresLearner) and config.get("start_from"):
         saved = read_checkpoint(Path(config["start_from"]) / CHECKPOINTS / "best.ckpt")
-        learner.covariance = saved.get(COVARIANCE)
+        if COVARIANCE not in saved:
+            raise ConfigError(
+                f"start_from: {config['start_from']} has no covariance of its constants, which a "
+                "fit by optimizer=least_squares leaves: fit it again, or leave start_from out"
+            )
+        learner.covariance = saved[COVARIANCE]
     description = describe(folder, config)
     trainer = build_trainer(config, folder, data.source, validator, description)
     check_processes(trainer, config["data"]["batch_size"])

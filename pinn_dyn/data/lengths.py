@@ -16,17 +16,14 @@ def seconds_of(name: str, length: str) -> float:
     Raises:
         ValueError: on any other text, or a time that is not positive.
     """
-    match = re.fullmatch(r"\s*([0-9.]+(?:e-?\d+)?)\s*([a-z]+)\s*", length)
-    try:
-        assert match is not None
-        seconds = float(match[1]) * _SECONDS[match[2]]
-        assert seconds > 0
-    except (AssertionError, KeyError, ValueError) as error:
+    units = "|".join(_SECONDS)
+    match = re.fullmatch(rf"\s*(\d+\.?\d*(?:e-?\d+)?|\.\d+)\s*({units})\s*", length)
+    if match is None or not float(match[1]) > 0:
         raise ValueError(
             f"{name} is {length!r}, expected a number of samples, such as 5, or a time with its "
             f"unit ({', '.join(_SECONDS)}), such as '20 ms'"
-        ) from error
-    return seconds
+        )
+    return float(match[1]) * _SECONDS[match[2]]
 
 
 def samples_in(name: str, length: Length, sample_time: float, *, odd: bool = False) -> int:

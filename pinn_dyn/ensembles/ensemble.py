@@ -39,6 +39,7 @@ class Ensemble(Predictor):
         self._check(members)
         continuous = [item for item in members if isinstance(item, ContinuousPredictor)]
         self.stack = ContinuousStack(continuous) if continuous else DiscreteStack(members)
+        self.penalized = first.penalized
 
     @property
     def fixed_step(self) -> float | None:  # type: ignore[override]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, ContinuousPredictor, Integrator, Predictor, Signal
-from pinn_dyn.models.delay import Delay, NoDelay
+from pinn_dyn.mechanics import RK4, Integrator, Predictor, Signal
+from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.scales import Scales
@@ -73,7 +73,7 @@ class NextStateMLP(Predictor):
         return torch.stack(path, dim=-2)
 
 
-class AccelerationMLP(ContinuousPredictor):
+class AccelerationMLP(DelayedPredictor):
     """dv/dt = s * network(q, v, u), integrated by the same RK4 as the structured models.
 
     A fairer rival than :class:`NextStateMLP`: it knows that v is the rate of q, and it is not
@@ -113,19 +113,6 @@ class AccelerationMLP(ContinuousPredictor):
         )
         self.learns_initial_state = self.initial_velocity.learned
         self.delay = delay or NoDelay()
-
-    @property
-    def input_history(self) -> float:  # type: ignore[override]
-        """The longest delay of its head, s."""
-        return self.delay.longest
-
-    def acting_input(self, input: Signal) -> Signal:
-        """u(t - d), with the d of its head."""
-        return self.delay(input)
-
-    def learned_figures(self) -> dict[str, float]:
-        """The delay of the input, if it is learned."""
-        return self.delay.figures()
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
         """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""

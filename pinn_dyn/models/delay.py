@@ -7,7 +7,7 @@ import abc
 import torch
 from torch import Tensor, nn
 
-from pinn_dyn.mechanics import Signal
+from pinn_dyn.mechanics import ContinuousPredictor, Signal
 
 
 class Delay(nn.Module, abc.ABC):
@@ -79,3 +79,26 @@ class LearnedDelay(Delay):
     def figures(self) -> dict[str, float]:
         """d in s."""
         return {"input_delay_seconds": float(self.seconds().detach())}
+
+
+class DelayedPredictor(ContinuousPredictor):
+    """A predictor whose input acts as late as its head says.
+
+    Attributes:
+        delay: the head.
+    """
+
+    delay: Delay
+
+    @property
+    def input_history(self) -> float:  # type: ignore[override]
+        """The longest delay of its head, s."""
+        return self.delay.longest
+
+    def acting_input(self, input: Signal) -> Signal:
+        """u(t - d), with the d of its head."""
+        return self.delay(input)
+
+    def learned_figures(self) -> dict[str, float]:
+        """The delay of the input, if it is learned."""
+        return self.delay.figures()

@@ -38,7 +38,8 @@ class KnownAndNetwork(Sum):
         integrator: the method of integration.
 
     Raises:
-        ValueError: on a negative weight, or a network with an input matrix.
+        ValueError: on a negative weight, or a network with an input matrix, a residual force or a
+            learned start.
     """
 
     def __init__(
@@ -57,10 +58,17 @@ class KnownAndNetwork(Sum):
         gain = first.drive_gain().detach().to(statistics.u_mean)
         forces = replace(statistics, u_mean=gain * statistics.u_mean, u_std=gain * statistics.u_std)
         second = network(statistics=forces)
-        if second.input(statistics.q_mean[None].float()).any():
-            raise ValueError(
-                "network.input gives an input matrix, expected none: the known part has one"
-            )
+        drives = second.input(statistics.q_mean[None].float()).any()
+        for head, there, choice, reason in (
+            ("input", drives, "none", "the known part drives the robot"),
+            ("residual", second.has_residual, "none", "the sum has it (model/residual=network)"),
+            ("initial_velocity", second.learns_initial_state, "measured", "a sum learns no start"),
+        ):
+            if there:
+                raise ValueError(
+                    f"network.{head} is a head that a sum leaves out, as {reason}: take "
+                    f"model/{head}@model.network.{head}={choice}"
+                )
         super().__init__({"known": first, "network": second}, integrator)
         self.weight = weight
         force = forces.u_rms

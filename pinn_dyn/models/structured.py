@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, Signal, State
+from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
 from pinn_dyn.models.cholesky import CholeskyFactor
-from pinn_dyn.models.delay import Delay, NoDelay
+from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.potential import Potential
@@ -26,7 +26,7 @@ FrictionHead = Callable[[Scales], Friction]
 """Builds a friction head; the value of its scales is a force."""
 
 
-class StructuredNetwork(MechanicalSystem):
+class StructuredNetwork(DelayedPredictor, MechanicalSystem):
     """A mechanical system with learned V, D, F, A and residual force; subclasses add the mass.
 
     The scales of the heads come from the data, so that every network works on numbers near one:
@@ -65,19 +65,6 @@ class StructuredNetwork(MechanicalSystem):
 
     def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
         return Scales(statistics, value, self.angles)
-
-    @property
-    def input_history(self) -> float:  # type: ignore[override]
-        """The longest delay of its head, s."""
-        return self.delay.longest
-
-    def acting_input(self, input: Signal) -> Signal:
-        """u(t - d), with the d of its head."""
-        return self.delay(input)
-
-    def learned_figures(self) -> dict[str, float]:
-        """The delay of the input, if it is learned."""
-        return self.delay.figures()
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q), ``(*batch,)``, J."""

@@ -19,7 +19,7 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
-from pinn_dyn.training.losses import WindowLoss
+from pinn_dyn.training.losses import Penalized, WindowLoss
 from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
 
 # What is said to be wrong by them, such as the counts of batches, is put right below.
@@ -85,7 +85,7 @@ class DynamicsLearner(L.LightningModule):
         hyperparameters = {"config": config, "statistics": statistics.to_dict()}
         self.save_hyperparameters(hyperparameters, logger=False)
         self.model = model
-        self.loss = loss
+        self.loss = Penalized(loss) if model.penalized else loss
         self.validator = validator
         self._optimizer = optimizer
         self._scheduler = scheduler

@@ -156,16 +156,6 @@ def test_another_seed_gives_other_trajectories(cache, splits):
     assert not inputs(splits.train) & inputs(other.train)
 
 
-def test_initial_states_fill_their_box():
-    box = InitialStates(**BOX)
-    q, v = box.draw(500, np.random.default_rng(0))
-    low, high, v_max = (np.array(BOX[key]) for key in ("q_low", "q_high", "v_max"))
-    assert ((q >= low) & (q <= high)).all()
-    assert (np.abs(v) <= v_max).all()
-    assert (np.ptp(q, axis=0) > 0.95 * (high - low)).all()
-    assert (np.ptp(v, axis=0) > 0.95 * 2 * v_max).all()
-
-
 # Limits of the configuration.
 
 LIMITS = [[-1.05, -1.05, 0.08], [1.05, 1.05, 0.42]]
@@ -400,17 +390,3 @@ def test_bad_arguments_are_refused_by_name(tmp_path, change, message):
 def test_an_excitation_of_another_size_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"u has shape .* M = 3"):
         make_source(tmp_path, excitation=MultiSine([0.0], [1.0])).load()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(v_max=[1.0]), "v_max have 3, 3 and 1 entries"),
-        (dict(q_high=[1.0, 1.0, np.nan]), "finite"),
-        (dict(q_low=[2.0, -1.0, 0.1]), "q_low <= q_high"),
-        (dict(v_max=[1.0, -1.0, 0.1]), "v_max >= 0"),
-    ],
-)
-def test_a_bad_box_of_initial_states_is_refused(change, message):
-    with pytest.raises(ValueError, match=f"InitialStates: .*{message}"):
-        InitialStates(**{**BOX, **change})

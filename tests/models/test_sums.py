@@ -13,6 +13,7 @@ from pinn_dyn.models import (
     KnownAndNetwork,
     KnownMechanics,
     LagrangianNetwork,
+    LearnedVelocity,
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
@@ -30,13 +31,14 @@ from tests.support.rigid_chains import TREE
 SMALL = Positive(floor=0.0, initial=0.1)
 
 
-def network(input=NoInput):
+def network(input=NoInput, **heads):
     return partial(
         LagrangianNetwork,
         mass=partial(NetworkCholesky, hidden=[6], positivity=SMALL),
         potential=partial(NetworkPotential, hidden=[6], quadratic=False, initial=0.0),
         damping=partial(NetworkCholesky, hidden=[6], positivity=SMALL),
         input=input,
+        **heads,
     )
 
 
@@ -48,6 +50,10 @@ def known(**settings):
 def both(**settings):
     part = known(gain_spread=0.5, drive_gain=2.0)
     return KnownAndNetwork(statistics(4), part, network(), **settings)
+
+
+def with_network(**heads):
+    return KnownAndNetwork(statistics(4), known(), network(**heads))
 
 
 def exact(model):
@@ -142,10 +148,16 @@ def test_what_each_part_contributes():
     [
         (lambda: both(weight=-1.0), "weight is -1.0, expected zero"),
         (
-            lambda: KnownAndNetwork(
-                statistics(4), known(), network(partial(NetworkInput, hidden=[4]))
-            ),
-            "network.input gives an input matrix, expected none",
+            lambda: with_network(input=partial(NetworkInput, hidden=[4])),
+            r"network.input is a head .* take model/input@model.network.input=none",
+        ),
+        (
+            lambda: with_network(residual=partial(NetworkResidual, hidden=[4])),
+            r"network.residual is a head .* take model/residual@model.network.residual=none",
+        ),
+        (
+            lambda: with_network(initial_velocity=partial(LearnedVelocity, hidden=[4])),
+            r"network.initial_velocity is a head .*initial_velocity=measured",
         ),
         (
             lambda: Sum({"a": make_structured("lnn", 2, 2), "b": make_structured("lnn", 3, 3)}),

@@ -12,9 +12,10 @@ from pinn_dyn.data.logs.filters import (
     SavitzkyGolayVelocity,
 )
 from pinn_dyn.data.logs.input_delay import InputDelay
+from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.repairs import InterpolateHeld, RemoveJumps, SubtractStart
-from pinn_dyn.data.logs.source import Cleaned, LogSource
+from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.units import UNITS

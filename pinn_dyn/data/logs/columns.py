@@ -117,3 +117,34 @@ class Columns:
                 )
             return list(value)
         return [value] * len(self.columns)
+
+
+def check_units(name: str, columns: Columns, expected: Sequence[str]) -> None:
+    """Refuse columns whose SI unit is none of those expected.
+
+    Raises:
+        LogError: naming the column.
+    """
+    for label, unit in zip(columns.columns, columns.units, strict=True):
+        if unit not in expected:
+            raise LogError(
+                f"{name} has the column {label!r} in {unit}, expected {', '.join(expected)}: is it "
+                "the right column, and its unit?"
+            )
+
+
+def check_columns(signals: Mapping[str, Columns | None]) -> None:
+    """Refuse a column that two signals ask for: one of them would explain the other.
+
+    Raises:
+        LogError: naming the column and both.
+    """
+    taken: dict[str, str] = {}
+    for signal, columns in signals.items():
+        for name in [] if columns is None else columns.columns:
+            if name in taken:
+                raise LogError(
+                    f"column {name!r} is given for {taken[name]} and for {signal}, expected for "
+                    "one of them"
+                )
+            taken[name] = signal

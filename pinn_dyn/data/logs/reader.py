@@ -258,3 +258,19 @@ def _opened(path: Path) -> BinaryIO:
             "table of numbers, which no file shrinks that far: unpack it and look into it"
         )
     return io.BytesIO(content)
+
+
+def runs_of(table: pd.DataFrame, path: Path, name: str) -> list[tuple[str, np.ndarray]]:
+    """Names of the runs of a table, by a column, in order, and which of its rows are theirs.
+
+    Raises:
+        LogError: on a row without a name.
+    """
+    ids = column(table, path, name, "trajectory")
+    if ids.isna().any():
+        raise LogError(
+            f"{path}, line {table.index[ids.isna()][0]}, column {name!r} (trajectory): is empty, "
+            "expected the name of a run"
+        )
+    ids = ids.astype(str)
+    return [(run, (ids == run).to_numpy()) for run in ids.unique()]

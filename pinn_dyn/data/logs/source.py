@@ -5,13 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.logs.checks import (
@@ -25,42 +24,26 @@ from pinn_dyn.data.logs.checks import (
     check_unseen_inputs,
     check_velocities,
 )
-from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.columns import Columns, check_columns, check_units
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.jumps import Rows, check_rows
-from pinn_dyn.data.logs.reader import column, find_files, numbers, read_table, run_name
+from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
+from pinn_dyn.data.logs.reader import find_files, numbers, read_table, run_name, runs_of
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import SPLITS, Part, split
-from pinn_dyn.data.logs.step import Step, sample_time
+from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
+from pinn_dyn.mechanics import Interpolation
 
-# Inputs before a piece that are kept for models of a delay, s.
-_PAST = 0.5
 # What the trajectories depend on beside the files.
 _SETTINGS = (
     *("time", "q", "v", "u", "trajectory", "max_age", "steps", "validation", "test"),
     *("guard", "shortest", "seed", "interpolation"),
 )
-
-
-@dataclass(frozen=True)
-class Cleaned:
-    """A stretch of a run before and after the cleaning, for a figure.
-
-    Attributes:
-        split: train, validation or test.
-        raw: the stretch as it was read, in SI units.
-        clean: what the steps made of it, on the same clock.
-    """
-
-    split: str
-    raw: Recording
-    clean: list[Recording]
 
 
 class LogSource(DataSource):
@@ -136,9 +119,9 @@ class LogSource(DataSource):
                 f"v has the SI units {', '.join(self.v.units)}, expected those of q, "
                 f"{', '.join(self.q.units)}, per second, in the same order"
             )
-        _check_units("q", self.q, ("rad", "m", "1"))
-        _check_units("u", self.u, sorted({unit for unit, _ in UNITS.values()} - {"s"}))
-        self._check_columns()
+        check_units("q", self.q, ("rad", "m", "1"))
+        check_units("u", self.u, sorted({unit for unit, _ in UNITS.values()} - {"s"}))
+        check_columns({"time": self.time, "q": self.q, "v": self.v, "u": self.u})
         self.trajectory = trajectory
         if not max_age > 0:
             raise LogError(f"max_age is {max_age} s, expected more than 0")
@@ -172,19 +155,6 @@ class LogSource(DataSource):
                 )
         self.configurations = dict(configurations or {})
         self._loaded: tuple[Splits, Report, list[Cleaned]] | None = None
-
-    def _check_columns(self) -> None:
-        """Refuse a column that two signals ask for: one of them would explain the other."""
-        taken: dict[str, str] = {}
-        signals = {"time": self.time, "q": self.q, "v": self.v, "u": self.u}
-        for signal, columns in signals.items():
-            for name in [] if columns is None else columns.columns:
-                if name in taken:
-                    raise LogError(
-                        f"column {name!r} is given for {taken[name]} and for {signal}, expected "
-                        "for one of them"
-                    )
-                taken[name] = signal
 
     def load(self) -> Splits:
         """The cleaned trajectories.
@@ -221,8 +191,8 @@ class LogSource(DataSource):
                 )
         path = Path("the frame")
         groups = [("the frame", np.full(len(frame), True))]
-        if self.trajectory in frame.columns:
-            groups = self._runs(frame, path)
+        if self.trajectory is not None and self.trajectory in frame.columns:
+            groups = runs_of(frame, path, self.trajectory)
         raws = self._recordings(frame, path, groups, Report(self.name))
         return [
             (rows, raw, self._clean_alone(raw)) for (_, rows), raw in zip(groups, raws, strict=True)
@@ -286,21 +256,21 @@ class LogSource(DataSource):
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
             check_copies(parts, report)
             cleaned = self._clean(parts, report)
-            step = self._one_sample_time(cleaned)
+            step = one_sample_time(cleaned)
             training = [item for part in cleaned if part.split == "train" for item in part.clean]
             if self.v is not None:
                 check_velocities(training, self.q, self.v, step, report)
             check_force_signs(training, self.u, step, report)
             check_rest(training, self.q, report)
-            report.add("Splits", "train", _summary(training, step))
+            report.add("Splits", "train", summary(training, step))
             kept = {"train": training}
             for name, part in (("validation", self.validation), ("test", self.test)):
-                kept[name] = self._pieces(name, part, cleaned, step, report)
+                kept[name] = pieces_of(name, part, cleaned, step, report)
             check_unseen_inputs(training, kept["validation"] + kept["test"], self.u, report)
             check_repeats(training, kept["test"], "test", report)
             splits = Splits(
                 **{
-                    name: [self._trajectory(item, step) for item in items]
+                    name: [trajectory(item, step, self.interpolation) for item in items]
                     for name, items in kept.items()
                 }
             )
@@ -327,21 +297,10 @@ class LogSource(DataSource):
             groups = [(stem, np.full(len(table), True))]
             if self.trajectory is not None:
                 prefix = f"{stem}:" if len(paths) > 1 else ""
-                groups = [(f"{prefix}{run}", rows) for run, rows in self._runs(table, path)]
+                runs = runs_of(table, path, self.trajectory)
+                groups = [(f"{prefix}{run}", rows) for run, rows in runs]
             recordings += self._recordings(table, path, groups, report)
         return recordings
-
-    def _runs(self, table: pd.DataFrame, path: Path) -> list[tuple[str, np.ndarray]]:
-        """Names of the runs of a table, in order, and which of its rows are theirs."""
-        assert self.trajectory is not None
-        ids = column(table, path, self.trajectory, "trajectory")
-        if ids.isna().any():
-            raise LogError(
-                f"{path}, line {table.index[ids.isna()][0]}, column {self.trajectory!r} "
-                "(trajectory): is empty, expected the name of a run"
-            )
-        ids = ids.astype(str)
-        return [(run, (ids == run).to_numpy()) for run in ids.unique()]
 
     def _recordings(
         self,
@@ -437,95 +396,3 @@ class LogSource(DataSource):
                     "lower it, or loosen the steps (the warnings name the stretches)"
                 )
         return result
-
-    def _one_sample_time(self, cleaned: list[Cleaned]) -> float:
-        """The sample time that all stretches share."""
-        every = [item for part in cleaned for item in part.clean]
-        times = [sample_time(item, "a data set") for item in every]
-        shared = float(np.median(times))
-        for item, step in zip(every, times, strict=True):
-            # Rounded times leave the sample time of a short stretch uncertain.
-            if abs(step / shared - 1) > max(1e-3, 0.05 / (len(item) - 1)):
-                raise LogError(
-                    f"{item.place}: its sample time is {step:.9g} s, that of the others "
-                    f"{shared:.9g} s: add a Resample step"
-                )
-        return shared
-
-    def _pieces(
-        self, name: str, part: Part, cleaned: list[Cleaned], step: float, report: Report
-    ) -> list[Recording]:
-        """Roll-outs of one length; neighbours share the sample between them, or two.
-
-        A stretch of T samples that lasts one sample less than n pieces has n of them all the same.
-        """
-        stretches = [item for one in cleaned if one.split == name for item in one.clean]
-        if isinstance(part.piece, str):
-            span = min(len(item) for item in stretches) - 1
-            starts = [[0] for _ in stretches]
-        else:
-            span = round(part.piece / step)
-            if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
-                raise LogError(
-                    f"{name}.piece is {part.piece} s, expected a multiple of the sample time, "
-                    f"{step:g} s, or 'whole'"
-                )
-            starts = [_starts(len(item), span) for item in stretches]
-        pieces = [
-            replace(
-                item.rows(slice(first, first + span + 1)),
-                past=item.u[max(first - round(_PAST / step), 0) : first],
-            )
-            for item, each in zip(stretches, starts, strict=True)
-            for first in each
-        ]
-        if not pieces:
-            longest = max(item.duration for item in stretches)
-            raise LogError(
-                f"{name}: no stretch is as long as a piece of {part.piece} s, the longest has "
-                f"{longest:.6g} s: use a shorter piece"
-            )
-        rest = sum(item.duration for item in stretches) - len(pieces) * span * step
-        report.add(
-            "Splits",
-            name,
-            f"{_summary(pieces, step)}, each a roll-out of its own; {max(rest, 0):.4g} s are left "
-            "over and dropped",
-        )
-        return pieces
-
-    def _trajectory(self, recording: Recording, step: float) -> Trajectory:
-        q, v, u = (
-            torch.from_numpy(np.ascontiguousarray(values))
-            for values in (recording.q, recording.v, recording.u)
-        )
-        t = torch.arange(len(recording), dtype=torch.float64) * step
-        past = None if recording.past is None else torch.from_numpy(recording.past.copy())
-        return Trajectory(q, v, Signal(t, u, self.interpolation), past=past)
-
-
-def _check_units(name: str, columns: Columns, expected: Sequence[str]) -> None:
-    for label, unit in zip(columns.columns, columns.units, strict=True):
-        if unit not in expected:
-            raise LogError(
-                f"{name} has the column {label!r} in {unit}, expected {', '.join(expected)}: is it "
-                "the right column, and its unit?"
-            )
-
-
-def _starts(samples: int, span: int) -> list[int]:
-    """First samples of the pieces of ``span`` + 1 samples that a stretch is cut into."""
-    number = samples // span
-    if number * span < samples:
-        return [k * span for k in range(number)]
-    # One sample is missing for as many: two neighbours overlap by it.
-    last = samples - 1 - span
-    return [round(k * last / (number - 1)) for k in range(number)] if number > 1 < span else []
-
-
-def _summary(recordings: list[Recording], step: float) -> str:
-    lengths = [recording.duration for recording in recordings]
-    return (
-        f"{len(recordings)} trajectories of {min(lengths):.6g} to {max(lengths):.6g} s, "
-        f"{sum(lengths):.6g} s in all, sample time {step:.6g} s"
-    )

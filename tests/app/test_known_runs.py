@@ -1,0 +1,71 @@
+"""Runs of known mechanics that others start from: a network on top, or the robot with a load."""
+
+import pytest
+import torch
+
+from tests.app.entry import NO_FIGURES, refused_text, run_script
+from tests.support.recorded_logs import LOGS, needs_logs
+
+pytestmark = needs_logs
+KNOWN = "experiment=logs/double_pendulum/known"
+WINDOWS = ["data.pairs=20", "data.batch_size=20", "data.steps=2", NO_FIGURES]
+SMALL = [*WINDOWS, "optimizer.rollouts=false"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))
+    monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+
+
+@pytest.fixture
+def fitted(tmp_path):
+    folder = tmp_path / "known"
+    run_script("train.py", KNOWN, *SMALL, f"hydra.run.dir={folder}")
+    return folder
+
+
+def constants(folder):
+    saved = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    return {key: value for key, value in saved.items() if key.endswith(".z")}
+
+
+def test_a_network_starts_on_the_constants_of_a_fit(tmp_path, fitted):
+    folder = tmp_path / "both"
+    run_script(
+        "train.py",
+        "experiment=logs/double_pendulum/known_and_network",
+        *WINDOWS,
+        f"start_from={fitted}",
+        "optimizer.lr=1e-9",
+        "trainer.steps=1",
+        "trainer.validations=1",
+        "compile=false",
+        f"hydra.run.dir={folder}",
+    )
+    found = constants(folder)
+    for key, value in constants(fitted).items():
+        assert value.abs().max() > 0.01
+        name = key.replace("model.", "model.parts.known.", 1)
+        assert torch.allclose(found[name], value, atol=1e-6)
+
+
+def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted, capsys):
+    folder = tmp_path / "again"
+    short = ["optimizer.samples=20", f"start_from={fitted}"]
+    run_script("train.py", KNOWN, *SMALL, *short, f"hydra.run.dir={folder}")
+    before, after = constants(fitted), constants(folder)
+    apart = max(float((after[key] - before[key]).abs().max()) for key in before)
+    alone = tmp_path / "alone"
+    run_script("train.py", KNOWN, *SMALL, short[0], f"hydra.run.dir={alone}")
+    else_where = constants(alone)
+    assert apart < 0.5 * max(float((else_where[k] - before[k]).abs().max()) for k in before)
+    # A checkpoint that does not say how certain its constants are is no prior.
+    path = fitted / "checkpoints" / "best.ckpt"
+    saved = torch.load(path, weights_only=True)
+    del saved["covariance"]
+    torch.save(saved, path)
+    start = [f"start_from={fitted}", f"hydra.run.dir={tmp_path / 'no'}"]
+    text = refused_text(capsys, "train.py", KNOWN, *SMALL, *start)
+    assert "has no covariance of its constants" in text
+    assert "fit it again, or leave start_from out" in text
