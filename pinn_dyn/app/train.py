@@ -224,7 +224,12 @@ def train_in(
     batches = EnsembleData(data, model.size) if isinstance(model, Ensemble) else data
 
     start, start_cpu = time.perf_counter(), _cpu_seconds()
-    trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
+    try:
+        trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
+    except ValueError as error:
+        if isinstance(learner, LeastSquaresLearner):  # settings that only the data can refuse
+            raise ConfigError(f"optimizer: {error}") from error
+        raise
     if last is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, batches, verbose=False)
     seconds = time.perf_counter() - start

@@ -170,14 +170,14 @@ class LeastSquares:
         if covariance is None:
             if self.changed:
                 raise ValueError(
-                    f"least squares: changed is {self.changed}, but there is no earlier fit that "
+                    f"changed is {self.changed}, but there is no earlier fit that "
                     "they have changed since: name its run, start_from=<run>"
                 )
             return Prior(0 * z, torch.eye(len(z)).to(z))
         bodies = model.structure.body_names
         if unknown := [body for body in self.changed if body not in bodies]:
             raise ValueError(
-                f"least squares: changed names {', '.join(unknown)}, expected some of the bodies "
+                f"changed names {', '.join(unknown)}, expected some of the bodies "
                 f"{', '.join(bodies)}"
             )
         if covariance.shape != (len(z), len(z)):

@@ -1,5 +1,7 @@
 """Runs of known mechanics that others start from: a network on top, or the robot with a load."""
 
+import re
+
 import pytest
 import torch
 
@@ -69,3 +71,15 @@ def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted, ca
     text = refused_text(capsys, "train.py", KNOWN, *SMALL, *start)
     assert "has no covariance of its constants" in text
     assert "fit it again, or leave start_from out" in text
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("optimizer.changed=[hand]", "optimizer: changed is .'hand'., but there is no earlier fit"),
+        ("optimizer.cutoff=400", "optimizer: .*cutoff is 400.* less than half the sample rate"),
+    ],
+)
+def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, setting, message):
+    place = f"hydra.run.dir={tmp_path / 'no'}"
+    assert re.search(message, refused_text(capsys, "train.py", KNOWN, *SMALL, setting, place))
