@@ -226,9 +226,9 @@ def train_in(
     start, start_cpu = time.perf_counter(), _cpu_seconds()
     try:
         trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
-    except ValueError as error:
+    except ValueError as problem:
         if isinstance(learner, LeastSquaresLearner):  # settings that only the data can refuse
-            raise ConfigError(f"optimizer: {error}") from error
+            raise ConfigError(f"optimizer: {problem}") from problem
         raise
     if last is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, batches, verbose=False)
