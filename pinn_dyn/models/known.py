@@ -51,6 +51,10 @@ class Structure(Protocol):
 
     def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor: ...
 
+    def force_slopes(
+        self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor
+    ) -> tuple[Tensor, Tensor]: ...
+
 
 class Named(NamedTuple):
     """Constants in physical units: n names, their unit and values ``(n,)``."""

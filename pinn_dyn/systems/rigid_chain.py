@@ -190,6 +190,50 @@ class RigidChain(MechanicalSystem):
         per_body = moving.unsqueeze(-4).mT @ per_joint * self._moved[..., None, None]
         return (per_body.flatten(-2) @ self._basis.flatten(1).T).flatten(-2)
 
+    def force_slopes(
+        self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """dtau/dq and dtau/dv of tau = M a + C v + G at fixed a, ``(*batch, N, N)`` each.
+
+        Seen from the bodies behind joint i, a change of q_i turns what lies before it, gravity
+        included, and nothing else. With p the body before joint i, m the later of the joints i and
+        j on one branch (0 for joints on different ones), H_m = sum over k >= m of Xi_k J_k, F_m the
+        force on the bodies from m on, and [A, B] = A B - B A::
+
+            d_i = [Xi_p, xi_i],    E_i = [Xi'_p, xi_i] - [d_i, Xi_p] + xi_i Gamma
+            dtau_j/dq_i = <xi_j, 2 d_i H_m + E_i Jc_m>  (+ <xi_j, xi_i F_i + F_i xi_i^T> if i > j)
+            dtau_j/dv_i = 2 <xi_j, xi_i H_m + d_i Jc_m>
+
+        The same derivatives by spatial vectors: Carpentier and Mansard 2018, "Analytical
+        derivatives of rigid body dynamics algorithms".
+        """
+        at = self.kinematics(q)
+        twists, bodies = at.twists, self._in_world(at, inertia)
+        own = twists * v[..., None, None]
+        velocity = self._tree_sum(self._moved.mT, own)
+        before = velocity - own
+        turned = _bracket(before, twists)
+        own_change = turned * v[..., None, None] + twists * a[..., None, None]
+        change = self._tree_sum(self._moved.mT, own_change)
+        gravity = torch.nn.functional.pad(self._gravity.unsqueeze(-1), (3, 0, 0, 1))
+        shifted = _bracket(change - own_change, twists) - _bracket(turned, before)
+        shifted = shifted + twists @ gravity
+        accelerations = change + velocity @ velocity - gravity
+        momentum, force, composite = (
+            self._tree_sum(self._moved, x)
+            for x in (velocity @ bodies, accelerations @ bodies, bodies)
+        )
+        by_momentum, by_composite = twists @ momentum.mT, twists @ composite
+        turning = 2 * turned @ momentum + shifted @ composite
+        # Row j, column i: of joints i behind j, and of those before it or j itself.
+        to_later = _pairs(twists, turning + twists @ force + force @ twists.mT)
+        to_former = 2 * _pairs(by_momentum, turned) + _pairs(by_composite, shifted)
+        slowing = _pairs(twists, twists @ momentum + turned @ composite)
+        driving = _pairs(by_momentum, twists) + _pairs(by_composite, turned)
+        former, later = self._moved.mT, self._moved.triu(1)
+        by_q = former * to_former + later * to_later
+        return by_q, 2 * (former * driving + later * slowing)
+
     def parameters_of(self, inertia: Tensor | None = None) -> Tensor:
         """Ten inertial parameters of each body, ``(N, 10)``: kg, kg m, kg m^2."""
         return inertial_parameters(self.inertia if inertia is None else inertia)
@@ -273,6 +317,16 @@ class RigidChain(MechanicalSystem):
     def _force(self, at: Kinematics, accelerations: Tensor, bodies: Tensor) -> Tensor:
         forces = self._tree_sum(self._moved, accelerations @ bodies)
         return (at.twists * forces).sum((-2, -1))
+
+
+def _bracket(first: Tensor, second: Tensor) -> Tensor:
+    """[A, B] = A B - B A."""
+    return first @ second - second @ first
+
+
+def _pairs(first: Tensor, second: Tensor) -> Tensor:
+    """<A_j, B_i> of all pairs, ``(*batch, N, N)``, row j, column i."""
+    return first.flatten(-2) @ second.flatten(-2).mT
 
 
 def _screw_basis() -> Tensor:

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 _MOST_PARAMETERS = 500
 _FIRST_NOISE = 0.1
-"""Of the normalized residuals, before any are known."""
+"""Of the normalized residuals at most, before a fit has shown it."""
 _REST = 0.05
 """Part of a joint's typical speed below which it counts as at rest."""
 _CHANGED = 5.0
@@ -107,7 +107,7 @@ class LeastSquares:
         cutoff: float,
         rollouts: bool = True,
         samples: int = 2000,
-        evaluations: int = 15,
+        evaluations: int = 25,
         chunk: int = 500,
         velocity_weight: float = 1.0,
         changed: Sequence[str] = (),
@@ -244,7 +244,11 @@ class LeastSquares:
         """
         z = parameters_to_vector(model.parameters()).detach()
         mean, root = prior.mean.numpy(), prior.root.numpy()
-        noise, steps = _FIRST_NOISE, 0
+
+        def spread(at: np.ndarray) -> float:
+            return float(np.sqrt(np.mean(_evaluate(model, at, residuals, False) ** 2)))
+
+        noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
         for _ in range(2):
             weight = 1 / (noise * correlated**0.5)
 
@@ -259,7 +263,7 @@ class LeastSquares:
             limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
             found = least_squares(value, z.numpy(), slope, **limit)
             z = torch.from_numpy(found.x)
-            noise = float(np.sqrt(np.mean(_evaluate(model, found.x, residuals, False) ** 2)))
+            noise = spread(found.x)
             steps += int(found.njev)
             log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
         slopes = torch.from_numpy(found.jac[: -len(z)])

@@ -77,15 +77,13 @@ class Sensitivity:
         return path[:, 1:, 2 * size :].unflatten(-1, (2 * size, count))
 
     def _by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """de/d(q, v), ``(*batch, N, 2N)``: one reverse pass through N copies of the states."""
-        size, model = q.shape[-1], self.model
-        copies = [x.expand(size, *x.shape).clone().requires_grad_() for x in (q, v)]
+        """de/d(q, v), ``(*batch, N, 2N)``; of the drive of a joint, by its own v alone."""
+        model = self.model
+        by_q, by_v = model.structure.force_slopes(q, v, a, model.bodies())
+        speed = v.clone().requires_grad_()
         with torch.enable_grad():
-            needed = model.inverse_dynamics(copies[0], copies[1], a.expand(size, *a.shape))
-            force = needed - model.friction.transmitted(copies[1], model.drive_gain() * u)
-            picked = force.diagonal(dim1=0, dim2=-1).sum()
-            slopes = torch.autograd.grad(picked, copies)
-        return torch.cat(slopes, dim=-1).movedim(0, -2)
+            (drive,) = torch.autograd.grad(model.drive_force(speed, a, u).sum(), speed)
+        return torch.cat([by_q, by_v + torch.diag_embed(drive)], dim=-1)
 
     def _body_slopes(self) -> Tensor:
         """dpi/dz of the bodies, ``(10 n, 10 n)``: a block for each body."""

@@ -91,6 +91,9 @@ def test_a_chain_equals_pinocchio(name, locked):
     )
     assert_same(chain.regressor(q, v, a), regressor)
     assert_same(chain.regressor(q, v, a) @ chain.parameters_of().flatten(), force)
+    for which, ours in enumerate(chain.force_slopes(q, v, a)):
+        slope = other(lambda *at, k=which: pin.computeRNEADerivatives(*at)[k], *theirs)
+        assert_same(ours, slope[:, order][:, :, order])
 
 
 @pytest.mark.panda
