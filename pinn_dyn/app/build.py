@@ -17,6 +17,7 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.progress import EpochLines
 from pinn_dyn.app.schema import MOST_MEMBERS, Part, arguments, check_value
+from pinn_dyn.app.search import EqualSearch
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -126,6 +127,11 @@ def ensemble_size(config: dict[str, Any]) -> int:
             "single model"
         )
     return size
+
+
+def build_search(config: dict[str, Any]) -> EqualSearch:
+    """The search of ``config["search"]``."""
+    return _build("search", config)
 
 
 def build_predictor(config: dict[str, Any], statistics: Statistics) -> Predictor:

@@ -62,6 +62,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "resume": str | None,
         "resume_from": Literal["last", "best"] | None,
         "trust": Names | None,
+        "search": Part | Mapping[str, Any] | None,  # of a finished run its draw alone
         **dict.fromkeys(
             ("dataset", "data", "model", "loss", "optimizer", "scheduler", "validator", "trainer"),
             Part,

@@ -21,6 +21,7 @@ from pinn_dyn.app.build import (
     build_data,
     build_learner,
     build_predictor,
+    build_search,
     build_trainer,
     build_validator,
     check_processes,
@@ -67,7 +68,7 @@ _ALWAYS = (
     "trainer.steps",
 )
 # Not about what is learned.
-_IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "resume", "search")
+_IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "resume")
 
 
 def train(cfg: DictConfig) -> float:
@@ -85,6 +86,8 @@ def train(cfg: DictConfig) -> float:
     name = cfg.get("resume_from") or "last"
     if cfg.get("resume") is None:
         config = checked("train", cfg)
+        if config.get("search"):
+            config = build_search(config["search"]).applied(config)
         if config.get("resume_from"):
             raise ConfigError("resume_from says from which checkpoint: give resume=<run> with it")
         trust = packages(config.get("trust"))
@@ -347,6 +350,9 @@ def run_settings(config: dict[str, Any], overrides: list[str]) -> dict[str, Cell
     }
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
+        # The draw of a search is a setting; what it may draw is not.
+        if key.startswith("search") and key != "search.draw":
+            continue
         if not key.startswith("~") and key.split(".")[0] not in _IGNORED:
             settings.setdefault(key, flat.get(key, value))
     return settings

@@ -14,6 +14,7 @@ Cell = str | int | float | bool
 
 # Sections that are chosen as a whole have a name of their own.
 _SECTION_NAMES = {"model": "model_name", "dataset": "dataset.name"}
+_DRAW = "search.draw"
 _WITHOUT_SPREAD = ("steps", "pairs", "parameters", "diverged")
 _SHOWN = (
     "val/error_mean",
@@ -70,7 +71,8 @@ def varied_parameters(
 
     Left out are ``seed``, the derived keys, and within a section (a model, one of its heads) what
     the name or the class of the section already says: of runs of two models only ``model_name``
-    is left, not the sizes of networks that the other model does not have.
+    is left, not the sizes of networks that the other model does not have. So it is with the draws
+    of a search (:class:`pinn_dyn.app.search.EqualSearch`), whose number says what was drawn.
 
     Args:
         configs: flattened configurations.
@@ -82,11 +84,15 @@ def varied_parameters(
     varied = [
         key for key in found if not left_out & {key, *_sections(key)} and _varies(key, configs)
     ]
-    return [
+    told = [
         key
         for key in varied
-        if not any(by in varied and _says(by, key, configs) for by in _names_above(key))
+        if not any(by in varied and _says([by], key, configs) for by in _names_above(key))
     ]
+    if _DRAW not in told:
+        return told
+    by = [*names, _DRAW]
+    return [key for key in told if key in by or not _says(by, key, configs)]
 
 
 def runs_table(runs: list[SweepRun], parameters: list[str]) -> pd.DataFrame:
@@ -157,7 +163,7 @@ def told_apart(parameters: list[str], configs: list[dict[str, Cell]]) -> list[st
     return [
         key
         for key in parameters
-        if key in names or not any(_says(name, key, configs) for name in names)
+        if key in names or not any(_says([name], key, configs) for name in names)
     ]
 
 
@@ -191,9 +197,9 @@ def _varies(key: str, configs: list[dict[str, Cell]]) -> bool:
     return len({_value(config, key) for config in configs}) > 1
 
 
-def _says(by: str, key: str, configs: list[dict[str, Cell]]) -> bool:
-    """Whether the value of one key decides the value of another."""
-    pairs = {(_value(config, by), _value(config, key)) for config in configs}
+def _says(by: list[str], key: str, configs: list[dict[str, Cell]]) -> bool:
+    """Whether the values of some keys decide the value of another."""
+    pairs = {(tuple(_value(c, name) for name in by), _value(c, key)) for c in configs}
     return len(pairs) == len({first for first, _ in pairs})
 
 

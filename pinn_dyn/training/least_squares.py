@@ -246,7 +246,8 @@ class LeastSquares:
         mean, root = prior.mean.numpy(), prior.root.numpy()
 
         def spread(at: np.ndarray) -> float:
-            return float(np.sqrt(np.mean(_evaluate(model, at, residuals, False) ** 2)))
+            remains = np.mean(_evaluate(model, at, residuals, False) ** 2)
+            return max(float(np.sqrt(remains)), np.finfo(float).eps)
 
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
         for _ in range(2):
