@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pandas as pd
 import torch
+from torch import Tensor
+from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.known import KnownMechanics
@@ -16,25 +18,51 @@ _SHARE = 0.5
 def constants_table(model: KnownMechanics, fit: Fit) -> pd.DataFrame:
     """All constants in SI units with their 95 % intervals: name, value, low, high, unit, known.
 
-    The interval is value +- 1.96 sigma, with sigma^2 = g^T C g, C the covariance of the
-    standardized parameters and g the slope of the constant in them. ``known`` is the part of the
-    variance a priori that the data took away: near 0 the value is that of the prior.
+    The equation of motion is linear in the constants c (but for widths of friction and drive
+    gains), the parameters z are not. So the interval is value +- 1.96 sigma of the linear
+    problem, with I what the data say of z where the fit ended and P_0 the prior's precision where
+    it began::
+
+        S = (G^-T I G^-1 + G_0^-T P_0 G_0^-1)^-1,    G = dc/dz at the fit, G_0 at the start
+
+    A constant that the data leave open keeps the width of the prior, however small its slope has
+    become on the way. ``known`` is the part of the variance a priori that the data took away:
+    near 0 the value is that of the prior.
     """
     model = double_copy(model)
+    found = model.physical_constants()
+    slope = _constant_slopes(model)
+    vector_to_parameters(fit.prior_mean.double(), model.parameters())
+    first = _constant_slopes(model)
+    precision = torch.linalg.inv(fit.covariance) - fit.information
+    change = torch.linalg.lstsq(slope, first).solution
+    posterior = torch.linalg.inv(change.T @ fit.information @ change + precision)
+    sigma, prior = (
+        (first @ x @ first.T).diagonal().clamp(min=0).sqrt()
+        for x in (posterior, torch.linalg.inv(precision))
+    )
+    value = torch.cat([item.values for item in found]).detach()
+    return pd.DataFrame(
+        {
+            "name": [name for item in found for name in item.names],
+            "value": value,
+            "low": value - 1.96 * sigma,
+            "high": value + 1.96 * sigma,
+            "unit": [item.unit for item in found for _ in item.names],
+            "known": 1 - (sigma / prior) ** 2,
+        }
+    )
+
+
+def _constant_slopes(model: KnownMechanics) -> Tensor:
+    """dc/dz, ``(P, P)``, of all constants by all parameters."""
+    values = torch.cat([item.values for item in model.physical_constants()])
     parameters = list(model.parameters())
     rows = []
-    for item in model.physical_constants():
-        for name, value in zip(item.names, item.values, strict=True):
-            slopes = torch.autograd.grad(
-                value, parameters, retain_graph=True, materialize_grads=True, allow_unused=True
-            )
-            slope = torch.cat([part.flatten() for part in slopes])
-            sigma = float((slope @ fit.covariance @ slope).clamp(min=0).sqrt())
-            prior = float(slope @ slope)
-            known = 1 - sigma**2 / prior if prior > 0 else 0.0
-            size, margin = float(value.detach()), 1.96 * sigma
-            rows.append((name, size, size - margin, size + margin, item.unit, known))
-    return pd.DataFrame(rows, columns=["name", "value", "low", "high", "unit", "known"])
+    for value in values:
+        slopes = torch.autograd.grad(value, parameters, retain_graph=True, materialize_grads=True)
+        rows.append(torch.cat([part.flatten() for part in slopes]))
+    return torch.stack(rows)
 
 
 def undetermined(model: KnownMechanics, fit: Fit, most: int = 10) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -42,7 +43,8 @@ class DynamicsLearner(L.LightningModule):
     A training step of Lightning is many steps of the optimizer, as its own hundreds of calls take
     as long as the step of a small network. It ends where something may be due: before and after
     each ``log_every_n_steps`` steps, at a validation, and after half a second. Of several processes
-    each step is one of its own, as they have to keep together.
+    each step is one of its own, as they have to keep together, and so it is where a callback
+    averages the weights over the steps.
 
     Args:
         model: the predictor.
@@ -128,7 +130,8 @@ class DynamicsLearner(L.LightningModule):
     def _steps_until_due(self, before: int) -> int:
         """Steps until Lightning may have something to do, after so many in this epoch."""
         trainer = self.trainer
-        if trainer.world_size > 1:
+        averaged = any(isinstance(one, WeightAveraging) for one in trainer.callbacks)  # type: ignore[attr-defined]
+        if trainer.world_size > 1 or averaged:
             return 1
         steps = trainer.fit_loop.epoch_loop._batches_that_stepped
         due = [int(trainer.num_training_batches) - before]

@@ -55,12 +55,14 @@ class Fit:
     Attributes:
         covariance: of the standardized parameters z, ``(P, P)``, prior included.
         information: of z from the data alone, ``(P, P)``.
+        prior_mean: z_0, ``(P,)``.
         residual: root mean square of the normalized data residuals.
         iterations: of Gauss-Newton.
     """
 
     covariance: Tensor
     information: Tensor
+    prior_mean: Tensor
     residual: float
     iterations: int
 
@@ -270,7 +272,7 @@ class LeastSquares:
         slopes = torch.from_numpy(found.jac[: -len(z)])
         information = slopes.T @ slopes
         covariance = torch.linalg.inv(information + prior.root.T @ prior.root)
-        return Fit(covariance, information, noise, steps)
+        return Fit(covariance, information, prior.mean, noise, steps)
 
 
 def _evaluate(

@@ -10,7 +10,8 @@ from tests.support.known import known_model
 
 def fit_with(model, variances):
     covariance = torch.diag(torch.as_tensor(variances, dtype=torch.float64))
-    return Fit(covariance, torch.linalg.inv(covariance) - 1, 0.0, 1)
+    information = torch.linalg.inv(covariance) - torch.eye(len(covariance)).double()
+    return Fit(covariance, information, torch.zeros(len(covariance)).double(), 0.0, 1)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pytorch_optimizer as library
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import OneCycleLR
 
@@ -203,6 +203,32 @@ def test_steps_end_where_the_trainer_validates_or_stops(tmp_path, data, monkeypa
     assert set(ends.batches) >= {7, 14, 21, 28}
     _, ends, _ = trained(tmp_path, data, monkeypatch, 100.0, max_steps=33)
     assert ends.steps[-1] == 33
+
+
+def test_weights_are_averaged_over_steps_not_over_their_blocks(tmp_path, data):
+    learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
+    weights = [p.detach().clone() for p in learner.model.parameters()]
+    averaged = [p.clone() for p in weights]
+    average = EMAWeightAveraging(decay=0.9)
+    trainer = make_trainer(
+        tmp_path, max_epochs=1, callbacks=[average, Follows(averaged)], enable_checkpointing=False
+    )
+    trainer.fit(learner, data)
+    assert trainer.global_step == 30
+    for one, two in zip(learner.model.parameters(), averaged, strict=True):
+        torch.testing.assert_close(one.detach(), two)
+
+
+class Follows(Callback):
+    """An average of its own: the first step is taken over, the others count a tenth."""
+
+    def __init__(self, averaged):
+        self.averaged = averaged
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        share = 1.0 if trainer.global_step == 1 else 0.1
+        for mean, now in zip(self.averaged, pl_module.model.parameters(), strict=True):
+            mean.lerp_(now.detach(), share)
 
 
 def test_a_precision_that_scales_the_loss_is_refused(tmp_path, data):
