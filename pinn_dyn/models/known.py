@@ -85,7 +85,8 @@ class KnownMechanics(MechanicalSystem):
         start: ``"generic"`` starts from rods along the links, ``"prior"`` from the bodies of the
             structure's description. For a simulated robot the latter would be the truth.
         spread: how far bodies may be from their start, see :class:`PhysicalBodies`; 0.3 for a data
-            sheet, 1 for generic ones.
+            sheet, 3 for generic ones, whose intervals are too narrow with 1
+            (``benchmarks/random_chains.py``).
         friction: builder of the dry friction.
         drive_gain: k at its start, one number or N; learned if ``gain_spread`` is positive.
         gain_spread: standard deviation of log k a priori; 0 where the input is a torque.
@@ -102,7 +103,7 @@ class KnownMechanics(MechanicalSystem):
         statistics: Statistics,
         structure: Structure,
         start: Start = "generic",
-        spread: float = 1.0,
+        spread: float = 3.0,
         friction: FrictionHead = NoFriction,
         drive_gain: float | Sequence[float] = 1.0,
         gain_spread: float = 0.0,
