@@ -118,7 +118,8 @@ class DynamicsLearner(L.LightningModule):
                     break
         finally:
             loop.manual_optimization.optim_step_progress.increment_by(done)
-            # Lightning itself counts one.
+            # Lightning itself counts one. The last of its counters is private, and no public call
+            # moves it: its loggers and monitors take the step from there.
             loop.batch_progress.increment_by(done - 1)
             loop._batches_that_stepped += done - 1
         if before + done >= trainer.num_training_batches:
@@ -130,7 +131,7 @@ class DynamicsLearner(L.LightningModule):
         trainer = self.trainer
         if trainer.world_size > 1:
             return 1
-        steps = trainer.fit_loop.epoch_loop._batches_that_stepped
+        steps = self.global_step
         due = [int(trainer.num_training_batches) - before]
         if every := trainer.log_every_n_steps:  # type: ignore[attr-defined]
             due += [every - steps % every, every - (steps + 1) % every]
