@@ -46,7 +46,8 @@ test-slurm: $(VENV)/.installed-dev  ## test a sweep on a real SLURM; needs root,
 	$(BIN)/python -m pytest tests/slurm
 
 test-next: $(VENV)/.installed-dev  ## run the tests of the commands on the next Hydra and OmegaConf
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade --pre --target $(VENV)/next 'hydra-core>=1.4.0rc3,<1.5' 2>/dev/null
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade --pre --no-deps --target $(VENV)/next \
+	    'hydra-core>=1.4.0rc3,<1.5' 'omegaconf>=2.4.0rc1,<2.5' 'hydra-optuna-sweeper>=1.4.0rc3,<1.5' 'optuna>=4.9,<5'
 	PYTHONPATH=$(VENV)/next $(BIN)/python -m pytest tests/app --numprocesses auto --dist loadfile -m "not slow"
 
 lint: $(VENV)/.installed-dev  ## check style, types and import order

@@ -37,7 +37,7 @@ SETTINGS = [
     "trainer.validations=1",
     "trainer.enable_progress_bar=false",
     "validator.horizon=0.5",
-    "~callbacks.figures",
+    "callbacks.figures=null",
 ]
 
 

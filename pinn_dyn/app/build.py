@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,8 @@ def _build(name: str, config: dict[str, Any], /, *given: Any, **extra: Any) -> A
     try:
         # Plain lists and dicts reach the constructors: no room below knows a config object.
         built = instantiate(config, _convert_="all")
+        if isinstance(built, partial):  # those of Hydra 1.4 cannot be sent to another process
+            built = partial(built.func, *built.args, **built.keywords)
         return built(*given, **extra) if given or extra else built
     except (InstantiationException, TypeError, ValueError, MemoryError) as error:
         # Hydra wraps what a constructor said.
@@ -236,6 +239,7 @@ def build_trainer(
     callbacks = [
         _build(f"callbacks.{name}", part, **needs.get(name, {}))
         for name, part in config["callbacks"].items()
+        if part is not None
     ]
     # A resumed training finds them by these names.
     saved: dict[str, Any] = {

@@ -201,23 +201,16 @@ def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSo
         )
     train = source.load().train
     fallback = None
-    if config["guard"]["fallback"]:
-        gains = config["gains"]
-        with _errors_of("guard"):
-            fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
     with _errors_of("guard"):
+        if config["guard"]["fallback"]:
+            gains = config["gains"]
+            fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
         region = DataRegion(
             [item.q[:: _stride(item.q)] for item in train],
             [item.v[:: _stride(item.v)] for item in train],
             angles=getattr(law.model, "angles", ()),
         )
-        return Guarded(
-            law,
-            fallback,
-            region,
-            threshold=config["guard"]["threshold"],
-            fallback_active=fallback is not None,
-        )
+        return Guarded(law, fallback, region, threshold=config["guard"]["threshold"])
 
 
 def _stride(samples: Tensor) -> int:

@@ -81,7 +81,6 @@ _SPLITS = {"test": "unseen test trajectories", "validation": "validation traject
 class Evaluation:
     """The roll-outs of one run, or of a floor, and the row of the table."""
 
-    label: str
     model: Predictor
     prediction: Prediction
     result: RunResult
@@ -132,28 +131,18 @@ def evaluate(cfg: DictConfig) -> float:
     log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], _SPLITS[split], source.name)
 
     labels = _labels(runs)
-    floors = build_floors(training.train, training.validation, step=grid)
+    rows = [_row(run, label, step) for run, label, step in zip(runs, labels, steps, strict=True)]
+    models = [run.model for run in runs]
+    for label, floor in build_floors(training.train, training.validation, step=grid).items():
+        rows.append(RunResult(label, label, None, {}, {"step": grid}, floor=True))
+        models.append(floor)
     evaluations = []
-    for run, label, step in zip(
-        tqdm(runs, desc="evaluating runs", disable=None), labels, steps, strict=True
-    ):
-        recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
-        extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
-        row = RunResult(
-            label,
-            run.config["model_name"],
-            run.config["seed"],
-            {},
-            {**extra, "step": step, **run.model.learned_figures()},
-        )
+    for model, row in zip(tqdm(models, desc="evaluating", disable=None), rows, strict=True):
         try:
-            evaluations.append(_evaluate(run.model, row, truth, training.train, stride, config))
+            evaluations.append(_evaluate(model, row, truth, training.train, stride, config))
         except ValueError as error:
-            raise ConfigError(f"{run.folder}: {error}") from error
-    trained = list(evaluations)
-    for label, floor in floors.items():
-        row = RunResult(label, label, None, {}, {"step": grid}, floor=True)
-        evaluations.append(_evaluate(floor, row, truth, training.train, stride, config))
+            raise ConfigError(f"run '{row.run}': {error}") from error
+    trained = evaluations[: len(runs)]
     joints = _torque_errors(trained, truth, source)
     parts = _shares(trained, truth)
     summary = summary_table([item.result for item in evaluations])
@@ -193,7 +182,7 @@ def evaluate(cfg: DictConfig) -> float:
         summary=summary,
         grouped=grouped,
         truth=truth,
-        predictions={item.label: item.prediction for item in evaluations},
+        predictions={item.result.run: item.prediction for item in evaluations},
         trajectory=config["trajectory"],
         labels=source.labels,
         input_labels=source.input_labels,
@@ -265,6 +254,14 @@ def _labels(runs: list[Run]) -> list[str]:
     return [f"{name} {run.folder.name}" for name, run in zip(seeds, runs, strict=True)]
 
 
+def _row(run: Run, label: str, step: float) -> RunResult:
+    """The row of a trained model, without its figures."""
+    recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
+    extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
+    extra |= {"step": step, **run.model.learned_figures()}
+    return RunResult(label, run.config["model_name"], run.config["seed"], {}, extra)
+
+
 def _evaluate(
     model: Predictor,
     row: RunResult,
@@ -288,7 +285,7 @@ def _evaluate(
         figures = rollout_metrics(windowed.q_hat, windowed.q, windowed.t, thresholds={})
         metrics[f"window_{window:g}s_error_mean"] = figures.error_mean
         metrics[f"window_{window:g}s_diverged"] = figures.diverged
-    return Evaluation(row.run, model, prediction, replace(row, metrics=metrics))
+    return Evaluation(model, prediction, replace(row, metrics=metrics))
 
 
 def _torque_errors(
@@ -304,7 +301,7 @@ def _torque_errors(
                 log.warning("no torque error: %s", error)
                 break
             item.result.metrics.update(torque_error=found.mean, torque_share=found.share)
-            tables.append(found.to_frame(source.labels).assign(run=item.label))
+            tables.append(found.to_frame(source.labels).assign(run=item.result.run))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
@@ -315,7 +312,7 @@ def _shares(evaluations: list[Evaluation], truth: Trajectory) -> pd.DataFrame:
         if isinstance(item.model, MechanicalSystem) and item.model.has_residual:
             item.result.metrics["residual_share"] = residual_share(item.model, truth)
         if isinstance(item.model, Sum):
-            tables.append(part_shares(item.model, truth).assign(run=item.label))
+            tables.append(part_shares(item.model, truth).assign(run=item.result.run))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
@@ -326,8 +323,10 @@ def _draw(
     config: dict[str, Any],
     folder: Path,
 ) -> None:
-    floors = {item.label: item.prediction for item in evaluations if item.result.floor}
-    predictions = {item.label: item.prediction for item in evaluations if not item.result.floor}
+    floors, predictions = (
+        {x.result.run: x.prediction for x in evaluations if x.result.floor == floor}
+        for floor in (True, False)
+    )
     split = config["split"]
     title = f"{source.name}, {_SPLITS[split]}, {config['horizon']:g} s open loop"
     figure = trajectory_figure(
@@ -364,14 +363,15 @@ def _compare_with_truth(
         if not isinstance(model, MechanicalSystem):
             continue
         comparison = compare_terms(model, source.system, q, names=names)
-        comparisons[item.label] = comparison
-        stem = item.label.replace(" ", "_")
+        label = item.result.run
+        comparisons[label] = comparison
+        stem = label.replace(" ", "_")
         write_table(comparison.to_frame(), folder, f"terms_{stem}")
         for index, name in enumerate(names):
             figure = terms_figure(
                 comparison,
                 configuration=index,
-                title=f"{item.label}: learned and true terms, {name}",
+                title=f"{label}: learned and true terms, {name}",
                 inverse_mass=model.state == "qp",
             )
             save(figure, folder / f"terms_{stem}_{name}.png")

@@ -18,7 +18,6 @@ from pinn_dyn.app.jobs import Job, derived_keys, filter_jobs, find_jobs
 from pinn_dyn.evaluation import save, write_table
 from pinn_dyn.evaluation.sweep_figures import sweep_figure
 from pinn_dyn.evaluation.sweep_table import (
-    SweepRun,
     runs_table,
     short,
     sweep_table,
@@ -61,15 +60,9 @@ def _report(jobs: list[Job], config: dict[str, Any], folder: Path) -> None:
     parameters = varied_parameters([job.config for job in jobs], derived_keys(jobs))
     tests, source = _test_figures(jobs, config["evaluations"])
     runs = runs_table(
-        [
-            SweepRun(
-                str(job.folder),
-                int(job.config["seed"]),
-                job.config,
-                {**_figures(job), **tests.get(job.folder, {})},
-            )
-            for job in jobs
-        ],
+        [str(job.folder) for job in jobs],
+        [job.config for job in jobs],
+        [{**_figures(job), **tests.get(job.folder, {})} for job in jobs],
         parameters,
     )
     try:

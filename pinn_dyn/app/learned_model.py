@@ -79,6 +79,7 @@ class LearnedModel:
     """
 
     def __init__(self, run: Run):
+        self._run = run
         self.folder = run.folder
         self.config = run.config
         self.metrics = run.metrics
@@ -109,10 +110,7 @@ class LearnedModel:
         if not isinstance(self.model, Ensemble):
             return [self]
         each = [self.model.member(k) for k in range(self.model.size)]
-        return [LearnedModel(replace(self._run(), model=model)) for model in each]
-
-    def _run(self) -> Run:
-        return Run(self.folder, self.config, self.model, self.statistics, self.metrics)
+        return [LearnedModel(replace(self._run, model=model)) for model in each]
 
     # Predictions.
 

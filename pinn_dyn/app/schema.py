@@ -67,7 +67,7 @@ KEYS: dict[str, dict[str, Any]] = {
             ("dataset", "data", "model", "loss", "optimizer", "scheduler", "validator", "trainer"),
             Part,
         ),
-        "callbacks": Mapping[str, Part],
+        "callbacks": Mapping[str, Part | None],  # null leaves one out
         "logger": Mapping[str, Part],
     },
     "evaluate": {

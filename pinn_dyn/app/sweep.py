@@ -47,8 +47,10 @@ class SweepCallback(Callback):
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write down an error; in a sweep turn it, and NaN, into an infinite return value."""
         sweep = config.hydra.mode == RunMode.MULTIRUN
+        error = job_return._return_value  # the public property would raise it
+        if isinstance(error, BaseException) and not isinstance(error, Exception):
+            return  # an end that was asked for, of which Hydra 1.4 tells too
         if job_return.status == JobStatus.FAILED:
-            error = job_return._return_value  # the public property would raise it
             said = f"{type(error).__name__}: {error}"
             details = "".join(traceback.format_exception(error))
             path = Path(config.hydra.runtime.output_dir) / ERROR
@@ -69,6 +71,8 @@ class SweepCallback(Callback):
         Raises:
             SystemExit: if there are any.
         """
+        if sys.exc_info()[0] is not None:
+            return  # interrupted, of which Hydra 1.4 tells too
         SweepCallback.unfinished = None
         folder = Path(config.hydra.sweep.dir)
         failures = sorted(folder.rglob(ERROR))

@@ -9,10 +9,10 @@ from tqdm import tqdm
 
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Delay, Sensor
+from pinn_dyn.control.plants import check_start
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.stiff_loop import StiffLoop, finite_rows, motion_of_copies
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.mechanics.arrays import require_finite
 
 
 def close_loop(
@@ -119,16 +119,12 @@ def close_loop_continuous(
     Args:
         system: what is controlled.
         controller: the law; it must not remember what it was called with.
-        reference: the desired motion.
-        q0: initial configurations, ``(K, N)``, float64.
-        v0: initial velocities, ``(K, N)``, float64.
+        reference, q0, v0, q_bound, progress: as of :func:`close_loop`.
         duration: length of the run in s, an integer multiple of 1 / samples_rate.
         samples_rate: samples of the record per second, 1/s.
         actuator: limits of the input, without a rate; none if None.
         rtol: relative tolerance of the solver.
         atol: absolute tolerance of the solver, in the units of q and v.
-        q_bound: a copy with an entry of |q| beyond it has diverged, in the units of q.
-        progress: label of a progress bar; no bar if None.
 
     Raises:
         ValueError: as :func:`close_loop`, or on an actuator with a rate limit.
@@ -180,7 +176,10 @@ class _Run:
     ):
         n, m = plant.num_coordinates, plant.num_inputs
         _check_sizes(plant, controller, reference)
-        _check_start(q0, v0, n)
+        check_start(q0, v0, n)
+        for name, value in (("q0", q0), ("v0", v0)):
+            if value.dtype != torch.float64:
+                raise ValueError(f"{name} is {value.dtype}, expected float64: {name}.double()")
         self.t = _instants(duration, rate)
         self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
         self._shape_of_u = (len(q0), m)
@@ -275,18 +274,6 @@ def _check_sizes(
             f"the controller has {controller.num_inputs} inputs and the plant "
             f"{plant.num_inputs}: they must be for the same robot"
         )
-
-
-def _check_start(q0: Tensor, v0: Tensor, size: int) -> None:
-    for name, value in (("q0", q0), ("v0", v0)):
-        if value.ndim != 2 or value.shape != (len(q0), size) or not len(q0):
-            raise ValueError(
-                f"{name} has shape {tuple(value.shape)}, expected (K, {size}): K copies, the "
-                "same for q0 and v0"
-            )
-        if value.dtype != torch.float64:
-            raise ValueError(f"{name} is {value.dtype}, expected float64: call {name}.double()")
-        require_finite(name, value)
 
 
 def _instants(duration: float, rate: float) -> Tensor:

@@ -160,7 +160,6 @@ class DisturbanceObserver(Controller):
         return self.law.diagnostics() | {"compensation": self._size}
 
     def faults(self) -> dict[str, Tensor]:
-        """Those of the law."""
         return self.law.faults()
 
     def _forget(self) -> None:

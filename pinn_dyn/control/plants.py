@@ -12,7 +12,7 @@ from torch import Tensor
 from pinn_dyn.control.contracts import Plant
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.mechanics.arrays import require_finite, require_last_dim
+from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.systems import Stepped
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class SystemPlant(Plant):
             log.warning("no C++ compiler (g++ or clang++) on the path: running uncompiled, slower")
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
-        _check_start(self, q0, v0)
+        check_start(q0, v0, self.num_coordinates)
         self._x = torch.cat([q0, v0], dim=-1)
         self._step: float | None = None
 
@@ -136,7 +136,7 @@ class BulletPlant(Plant):
         self._arm, self._step = arm, step
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
-        _check_start(self, q0, v0)
+        check_start(q0, v0, self.num_coordinates)
         self._x = torch.cat([q0, v0], dim=-1)
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
@@ -176,15 +176,19 @@ def _combine(weights: Tensor, stages: list[Tensor]) -> Tensor:
     return torch.tensordot(weights[: len(stages)].to(stages[0]), torch.stack(stages), dims=1)
 
 
-def _check_start(plant: Plant, q0: Tensor, v0: Tensor) -> None:
+def check_start(q0: Tensor, v0: Tensor, size: int) -> None:
+    """Refuse initial states that are not ``(K, N)`` twice, or not finite.
+
+    Raises:
+        ValueError: naming the argument.
+    """
     for name, value in (("q0", q0), ("v0", v0)):
-        require_last_dim(name, value, plant.num_coordinates, "N")
+        if value.ndim != 2 or value.shape != (len(q0), size) or not len(q0):
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, expected (K, {size}): K copies, the "
+                "same for q0 and v0"
+            )
         require_finite(name, value)
-    if q0.ndim != 2 or q0.shape != v0.shape:
-        raise ValueError(
-            f"q0 has shape {tuple(q0.shape)} and v0 {tuple(v0.shape)}, expected "
-            f"(K, {plant.num_coordinates}) twice"
-        )
 
 
 def _check_advance(plant: Plant, x: Tensor, u: Tensor, duration: float) -> None:

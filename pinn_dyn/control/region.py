@@ -134,7 +134,7 @@ def _distance_between_trajectories(states: np.ndarray, owner: np.ndarray) -> flo
 class Guarded(Controller):
     """A law with a guard: it tells when the state is outside the data, and may hand over there::
 
-        u = fallback(t, q, v, reference)  if the fallback is active and distance(q, v) > threshold
+        u = fallback(t, q, v, reference)  if there is one and distance(q, v) > threshold
             law(t, q, v, reference)       otherwise
 
     There is no hysteresis: each instant is judged alone, so a state that follows the edge may
@@ -145,11 +145,9 @@ class Guarded(Controller):
         fallback: the law outside, a PD law say; None for a guard that only warns.
         region: the training data of the law's model.
         threshold: distance from which a state is outside; 1 is the edge of the data.
-        fallback_active: whether to hand over to the fallback outside, or only to warn.
 
     Raises:
-        ValueError: on sizes that do not match, a threshold that is not positive, or an active
-            fallback that is None.
+        ValueError: on sizes that do not match, or a threshold that is not positive.
     """
 
     def __init__(
@@ -159,17 +157,12 @@ class Guarded(Controller):
         region: DataRegion,
         *,
         threshold: float = 2.0,
-        fallback_active: bool,
     ):
         super().__init__(law.num_coordinates, law.num_inputs)
         if region.num_coordinates != self.num_coordinates:
             raise ValueError(
                 f"region has {region.num_coordinates} coordinates, expected those of the law, "
                 f"{self.num_coordinates}"
-            )
-        if fallback_active and fallback is None:
-            raise ValueError(
-                "fallback_active is True, but fallback is None: give a law to hand over to"
             )
         if fallback is not None:
             found = (fallback.num_coordinates, fallback.num_inputs)
@@ -183,7 +176,7 @@ class Guarded(Controller):
         self.law = law
         self.region = region
         self.threshold = threshold
-        self._fallback = fallback if fallback_active else None
+        self._fallback = fallback
         self._distance: Tensor | None = None
         self._warned = False
 

@@ -165,11 +165,7 @@ def prepare(
     model: MechanicalSystem, truth: MechanicalSystem, q: Tensor, name: str
 ) -> tuple[MechanicalSystem, MechanicalSystem, Tensor]:
     """Checked float64 copies of the two systems and of the configurations."""
-    require_system("model", model)
-    require_system("truth", truth)
-    sizes = [(s.num_coordinates, s.num_inputs) for s in (model, truth)]
-    if sizes[0] != sizes[1]:
-        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
+    require_same_robot(model, truth)
     if truth.num_coordinates != truth.num_inputs:
         raise ValueError(
             f"truth has N = {truth.num_coordinates} coordinates and M = {truth.num_inputs} "
@@ -200,6 +196,22 @@ def require_system(name: str, system: object) -> None:
             f"{name} is a {type(system).__name__}, expected a MechanicalSystem: only a "
             "mechanical system has the terms M, D, G, A"
         )
+
+
+def require_same_robot(model: object, truth: object) -> None:
+    """Check that both are mechanical systems of the same sizes.
+
+    Raises:
+        TypeError: if one is no mechanical system.
+        ValueError: if N or M differ.
+    """
+    sizes = []
+    for name, system in (("model", model), ("truth", truth)):
+        require_system(name, system)
+        assert isinstance(system, MechanicalSystem)
+        sizes.append((system.num_coordinates, system.num_inputs))
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
 
 
 def require_samples(name: str, q: Tensor, system: MechanicalSystem) -> Tensor:

@@ -133,8 +133,7 @@ class RobotSource(DataSource):
         self.input_labels = [f"τ{i + 1} [Nm]" for i in range(size)]
 
     def load(self) -> Splits:
-        """The trajectories, from the cache or newly recorded."""
-        arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
+        arrays = load_or_make(self.cache, self.name, self.fingerprint(), self.simulate)
         t = torch.from_numpy(arrays["t"][:-1])
         splits: dict[str, list[Trajectory]] = {}
         for split in _SPLITS:
@@ -146,7 +145,7 @@ class RobotSource(DataSource):
             ]
         return Splits(splits["train"], splits["validation"], splits["test"])
 
-    def describe(self) -> dict[str, object]:
+    def fingerprint(self) -> dict[str, object]:
         """What the trajectories depend on, code included: the key of the cache."""
         return {
             "version": _VERSION,
@@ -157,10 +156,6 @@ class RobotSource(DataSource):
             "counts": self.counts,
             "seed": self.seed,
         }
-
-    def fingerprint(self) -> dict[str, object]:
-        """What the trajectories depend on."""
-        return self.describe()
 
     def simulate(self) -> Arrays:
         """Record all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T + 1, .)``.

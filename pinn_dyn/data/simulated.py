@@ -174,7 +174,6 @@ class SimulatedSource(DataSource):
         self.input_labels = list(input_labels)
 
     def load(self) -> Splits:
-        """The trajectories, from the cache or newly simulated."""
         arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
         t = torch.from_numpy(arrays["t"][:: self.keep_every])
         splits: dict[str, list[Trajectory]] = {}

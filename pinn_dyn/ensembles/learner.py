@@ -30,11 +30,9 @@ class EnsembleLearner(DynamicsLearner):
     model: Ensemble
 
     def parameter_vector(self) -> ParameterVector:
-        """One vector for each member."""
         return ParameterVector(self.model.parameters(), self.model.size)
 
     def gradients(self, vector: ParameterVector, steps: int) -> Engine:
-        """Those of the members, each in its own parameters."""
         stack = self.model.stack
         if self._compile and isinstance(stack, ContinuousStack):
             return CompiledMembers(self.loss, stack, vector)

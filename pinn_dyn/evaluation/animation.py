@@ -18,6 +18,8 @@ from pinn_dyn.evaluation.drawing import COLOURS, TRUTH
 from pinn_dyn.systems import Drawable, Rendered
 
 _TIP = "#CC0000"
+_FRAME = 40  # ms, and of pictures, which take long to render, 50; a GIF counts in 10 ms
+_PICTURE, _SIZE = 50, (480, 360)  # px
 _LAST_FRAME = 1000  # ms
 
 
@@ -29,31 +31,20 @@ def animate(record: ClosedLoopRecord, run: int, robot: object, path: Path) -> No
         animate_lines(record, run, robot, path)
 
 
-def animate_lines(
-    record: ClosedLoopRecord,
-    run: int,
-    robot: Drawable,
-    path: Path,
-    *,
-    fps: float = 25,
-    reference: bool = True,
-) -> None:
+def animate_lines(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> None:
     """Write a GIF of a robot's lines in motion, in real time, with the path of its tip in red.
+
+    The wanted shape is in grey.
 
     Args:
         record: K runs.
         run: which of the K to draw; a stopped one is drawn up to its stop.
         robot: what gives the lines of q.
         path: the GIF; its folder is made if there is none.
-        fps: frames per second, rounded to what a GIF can, a multiple of 10 ms each.
-        reference: draw the wanted shape in grey.
-
-    Raises:
-        ValueError: on fps outside (0, 50].
     """
-    samples, duration = _frames(record, run, fps)
+    samples = _frames(record, run, _FRAME)
     shape, wanted = _shapes(record, run, robot)
-    scene = _scene(record, run, shape, wanted if reference else None)
+    scene = _scene(record, run, shape, wanted)
     figure = Figure(figsize=(4.8, 4.8), dpi=90)
     canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
@@ -62,14 +53,14 @@ def animate_lines(
     for sample in samples:
         for line in list(ax.lines):
             line.remove()
-        _draw_pose(ax, shape, wanted if reference else None, sample)
+        _draw_pose(ax, shape, wanted, sample)
         text = _time_text(record, run, sample, last=sample == samples[-1])
         figure.suptitle(text, x=0.03, y=0.98, ha="left", fontsize="medium", family="monospace")
         if not images:
             _legend(figure, ax)
         canvas.draw()
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
-    _save_gif(images, path, duration)
+    _save_gif(images, path, _FRAME)
 
 
 def pose_strip(
@@ -109,61 +100,44 @@ def pose_strip(
     return figure
 
 
-def animate_pictures(
-    record: ClosedLoopRecord,
-    run: int,
-    robot: Rendered,
-    path: Path,
-    *,
-    fps: float = 20,
-    size: tuple[int, int] = (480, 360),
-    trace: bool = True,
-) -> None:
+def animate_pictures(record: ClosedLoopRecord, run: int, robot: Rendered, path: Path) -> None:
     """Write a GIF of the pictures that a robot's simulator takes of its motion, in real time.
+
+    The path of the tip in red and the wanted one in grey are in front of the robot.
 
     Args:
         record: K runs.
         run: which of the K to draw; a stopped one is drawn up to its stop.
         robot: what takes the pictures.
         path: the GIF; its folder is made if there is none.
-        fps: frames per second, rounded to what a GIF can, a multiple of 10 ms each.
-        size: width and height in pixels.
-        trace: draw the path of the tip in red and the wanted one in grey, in front of the robot.
-
-    Raises:
-        ValueError: on fps outside (0, 50].
     """
-    samples, duration = _frames(record, run, fps)
+    samples = _frames(record, run, _PICTURE)
     q, q_ref = (x[run, samples].double() for x in (record.q, record.reference.q))
     points = torch.cat([robot.tip_position(q), robot.tip_position(q_ref)]).numpy()
-    pictures, places = robot.render(q.numpy(), points, size)
+    pictures, places = robot.render(q.numpy(), points, _SIZE)
     shown, goal = (list(map(tuple, part.tolist())) for part in np.split(places, 2))
     images = []
     for frame, (sample, picture) in enumerate(zip(samples, pictures, strict=True)):
         image = Image.fromarray(picture)
         draw = ImageDraw.Draw(image)
-        if trace:
-            draw.line(goal, fill="#707070", width=1)
-            draw.line(shown[: frame + 1], fill=_TIP, width=2)
-            draw.circle(goal[frame], 3, outline="black")
-            draw.circle(shown[frame], 3, fill=_TIP)
-            key = "path of the tip: red, wanted: grey"
-            draw.text((8, size[1] - 20), key, fill="black", font_size=12)
+        draw.line(goal, fill="#707070", width=1)
+        draw.line(shown[: frame + 1], fill=_TIP, width=2)
+        draw.circle(goal[frame], 3, outline="black")
+        draw.circle(shown[frame], 3, fill=_TIP)
+        key = "path of the tip: red, wanted: grey"
+        draw.text((8, _SIZE[1] - 20), key, fill="black", font_size=12)
         text = _time_text(record, run, sample, last=frame == len(samples) - 1)
         draw.text((8, 6), text, fill="black", font_size=14)
         images.append(image)
-    _save_gif(images, path, duration)
+    _save_gif(images, path, _PICTURE)
 
 
-def _frames(record: ClosedLoopRecord, run: int, fps: float) -> tuple[list[int], int]:
-    """Samples to draw, the last one before a stop included, and the time of a frame in ms."""
-    if not 0 < fps <= 50:
-        raise ValueError(f"fps is {fps}, expected more than 0 and at most 50, as fast as a GIF is")
-    duration = 10 * round(100 / fps)
+def _frames(record: ClosedLoopRecord, run: int, duration: int) -> list[int]:
+    """Samples to draw, a frame each ``duration`` ms, the last one before a stop included."""
     t = record.t[: samples_before_stop(record, run)].double()
     times = torch.arange(float(t[0]), float(t[-1]), 1e-3 * duration, dtype=t.dtype)
     samples = (t - times[:, None]).abs().argmin(dim=1).tolist()
-    return [*dict.fromkeys([*samples, len(t) - 1])], duration
+    return [*dict.fromkeys([*samples, len(t) - 1])]
 
 
 def _time_text(record: ClosedLoopRecord, run: int, sample: int, *, last: bool) -> str:
@@ -191,11 +165,10 @@ def _shapes(record: ClosedLoopRecord, run: int, robot: Drawable) -> tuple[Tensor
     return robot.lines(q.double()), robot.lines(q_ref.double())
 
 
-def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, wanted: Tensor | None) -> Tensor:
+def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, wanted: Tensor) -> Tensor:
     """All points ``(P, 3)`` to be seen; of a stopped run not the last tenth, it may run away."""
     end = len(shape) if record.stopped[run] is None else 1 + int(0.9 * (len(shape) - 1))
-    points = [shape[:end].reshape(-1, 3), shape.new_zeros(1, 3)]
-    return torch.cat(points if wanted is None else [*points, wanted.reshape(-1, 3)])
+    return torch.cat([shape[:end].reshape(-1, 3), shape.new_zeros(1, 3), wanted.reshape(-1, 3)])
 
 
 def _set_space(ax: Axes3D, points: Tensor, z_is_down: bool) -> None:
@@ -219,11 +192,8 @@ def _legend(figure: Figure, ax: Axes3D) -> None:
     figure.legend(handles, names, loc="lower center", ncols=len(names), fontsize="small")
 
 
-def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor | None, sample: int) -> None:
-    if wanted is not None:
-        ax.plot(
-            *wanted[sample].flatten(0, 1).T.numpy(), color=TRUTH, linewidth=7, label="reference"
-        )
+def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor, sample: int) -> None:
+    ax.plot(*wanted[sample].flatten(0, 1).T.numpy(), color=TRUTH, linewidth=7, label="reference")
     for index, segment in enumerate(shape[sample]):
         colour = COLOURS[(0, 5)[index % 2]]
         name = "arm" if index == 0 else None

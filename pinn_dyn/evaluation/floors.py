@@ -18,7 +18,6 @@ class StandsStill(Predictor):
     """q(t) = q(0): what a model is worth that has learned nothing."""
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Zeros."""
         return torch.zeros_like(x0).unsqueeze(-2).expand(*x0.shape[:-1], len(t), x0.shape[-1])
 
 
@@ -26,7 +25,6 @@ class KeepsVelocity(Predictor):
     """q(t) = q(0) + v(0) t: over a short time hard to beat by anything."""
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """v(0) t for q, zeros for v."""
         v = x0[..., None, self.num_coordinates :]
         moved = v * (t - t[0]).to(x0)[:, None]
         return torch.cat([moved, torch.zeros_like(moved)], dim=-1)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.factor import fit_factor
+from pinn_dyn.control.stability import require_same_robot, require_samples
 from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
 
 
@@ -111,22 +112,12 @@ def compare_terms(
         TypeError: if the model has no terms, as a black box has none.
         ValueError: if the systems, ``q`` and ``names`` do not match in size.
     """
-    for argument, system in (("model", model), ("truth", truth)):
-        if not isinstance(system, MechanicalSystem):
-            raise TypeError(
-                f"{argument} is a {type(system).__name__}, expected a MechanicalSystem: only a "
-                "mechanical system has the terms M, D, G, A"
-            )
-    sizes = [(s.num_coordinates, s.num_inputs) for s in (model, truth)]
-    if sizes[0] != sizes[1]:
-        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
-    if q.ndim != 2 or q.shape[0] < 1:
-        raise ValueError(f"q has shape {tuple(q.shape)}, expected (K, N) with at least one row")
+    require_same_robot(model, truth)
+    q = require_samples("q", q, truth)
     if names is None:
         names = [str(index + 1) for index in range(q.shape[0])]
     if len(names) != q.shape[0]:
         raise ValueError(f"names has {len(names)} entries, expected {q.shape[0]}, one per row of q")
-    q = q.double()
     with torch.no_grad():
         true = double_copy(truth, q.device).terms(q)
         learned = double_copy(model, q.device).terms(q)

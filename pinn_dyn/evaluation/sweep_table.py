@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import pandas as pd
 
@@ -26,23 +25,6 @@ _SHOWN = (
     "pairs",
     "parameters",
 )
-
-
-@dataclass(frozen=True)
-class SweepRun:
-    """One finished run.
-
-    Attributes:
-        run: name of the run.
-        seed: seed of the run; runs that differ in nothing else are replicates.
-        config: its flattened configuration.
-        metrics: what it reached, such as ``val/error_mean`` and ``training_seconds``.
-    """
-
-    run: str
-    seed: int
-    config: dict[str, Cell]
-    metrics: dict[str, float]
 
 
 def flatten(config: dict, prefix: str = "") -> dict[str, Cell]:
@@ -95,28 +77,28 @@ def varied_parameters(
     return [key for key in told if key in by or not _says(by, key, configs)]
 
 
-def runs_table(runs: list[SweepRun], parameters: list[str]) -> pd.DataFrame:
+def runs_table(
+    names: list[str],
+    configs: list[dict[str, Cell]],
+    metrics: list[dict[str, float]],
+    parameters: list[str],
+) -> pd.DataFrame:
     """One row per run: run, the parameters (empty where a run has no such key), seed, metrics.
 
     Of runs with the same parameters and seed the last one counts.
 
-    Raises:
-        ValueError: on an empty list.
+    Args:
+        names: of the runs, one at least.
+        configs: their flattened configurations; runs that differ in the seed alone are replicates.
+        metrics: what they reached, such as ``val/error_mean`` and ``training_seconds``.
+        parameters: keys of the configurations.
     """
-    if not runs:
-        raise ValueError("runs is empty: expected at least one finished run")
-    columns = list(dict.fromkeys(name for run in runs for name in run.metrics))
     chosen = {
-        name: pd.Series([r.config.get(name) for r in runs], dtype=object) for name in parameters
+        name: pd.Series([config.get(name) for config in configs], dtype=object)
+        for name in parameters
     }
-    frame = pd.DataFrame(
-        {
-            "run": [r.run for r in runs],
-            **chosen,
-            "seed": [r.seed for r in runs],
-            **{name: [r.metrics.get(name, float("nan")) for r in runs] for name in columns},
-        }
-    )
+    seeds = [config["seed"] for config in configs]
+    frame = pd.DataFrame({"run": names, **chosen, "seed": seeds}).join(pd.DataFrame(metrics))
     return frame.drop_duplicates([*parameters, "seed"], keep="last", ignore_index=True)
 
 

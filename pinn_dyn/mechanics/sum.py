@@ -46,19 +46,15 @@ class Sum(MechanicalSystem):
         self.has_residual = any(part.has_residual for part in parts.values())
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q), ``(*batch, N, N)``."""
         return self._total(lambda part: part.mass_matrix(q))
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
         return self._total(lambda part: part.potential_energy(q))
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D(q), ``(*batch, N, N)``."""
         return self._total(lambda part: part.damping_matrix(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
         return self._total(lambda part: part.input_matrix(q))
 
     def _potential_force(self, q: Tensor) -> Tensor:

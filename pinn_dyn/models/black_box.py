@@ -115,10 +115,8 @@ class AccelerationMLP(DelayedPredictor):
         self.delay = delay or NoDelay()
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""
         return self.initial_velocity.initial_state(x0, u0)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """d(q, v)/dt, ``(*batch, 2N)``."""
         v = x[..., self.num_coordinates :]
         return torch.cat([v, self.scale * self.network(torch.cat([x, u], dim=-1))], dim=-1)

@@ -127,7 +127,6 @@ class NetworkCholesky(CholeskyFactor):
         self.register_buffer("placement", placement)
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
-        """L(q) and its tape."""
         y, tape = self.network.linearize(q)
         values, slopes = self._entries(columns(y))
         return _matrices(self._assemble(values), q), (*tape, slopes)
@@ -140,12 +139,10 @@ class NetworkCholesky(CholeskyFactor):
         return _matrices(self._assemble(values), q), _matrices(rate, q), (*tape, slopes)
 
     def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """dL for dq."""
         dy = columns(self.network.pushforward(tape[:-1], dq))
         return _matrices(self._assemble(tape[-1] * dy), dq)
 
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Gradient of <cotangent, L(q)> in q."""
         dy = self._take(columns(cotangent.flatten(-2))) * tape[-1]
         return self.network.pullback(tape[:-1], rows(dy, cotangent[..., 0]))
 
@@ -189,12 +186,10 @@ class _ConstantFactor(CholeskyFactor):
     constant = True
 
     def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """Zero: L does not depend on q."""
         size = dq.shape[-1]
         return dq.new_zeros((*dq.shape[:-1], size, size))
 
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Zero: L does not depend on q."""
         return torch.zeros_like(cotangent[..., 0])
 
 
@@ -216,7 +211,6 @@ class ConstantCholesky(_ConstantFactor):
         self.register_buffer("scale", scales.value.float())
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
-        """L and an empty tape."""
         diagonal, _ = self.positivity.diagonal(self.raw_diagonal)
         lower, _ = self.positivity.lower(self.lower)
         factor = (torch.diag_embed(diagonal) + lower.tril(-1)) * self.scale.unsqueeze(-1)
@@ -258,5 +252,4 @@ class FixedCholesky(_ConstantFactor):
         self.register_buffer("factor", (sign[:, None] * upper).T.float().contiguous())
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
-        """L and an empty tape."""
         return self.factor.expand(*q.shape[:-1], *self.factor.shape), ()

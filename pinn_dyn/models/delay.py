@@ -34,7 +34,6 @@ class NoDelay(Delay):
     longest = 0.0
 
     def forward(self, input: Signal) -> Signal:
-        """u itself."""
         return input
 
 
@@ -73,11 +72,9 @@ class LearnedDelay(Delay):
         return self.longest * (self.share + (inside - self.share).detach())
 
     def forward(self, input: Signal) -> Signal:
-        """u(t - d)."""
         return input.delayed(self.seconds())
 
     def figures(self) -> dict[str, float]:
-        """d in s."""
         return {"input_delay_seconds": float(self.seconds().detach())}
 
 
@@ -96,7 +93,6 @@ class DelayedPredictor(ContinuousPredictor):
         return self.delay.longest
 
     def acting_input(self, input: Signal) -> Signal:
-        """u(t - d), with the d of its head."""
         return self.delay(input)
 
     def learned_figures(self) -> dict[str, float]:

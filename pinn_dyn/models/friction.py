@@ -44,11 +44,9 @@ class NoFriction(Friction):
         super().__init__()
 
     def forward(self, v: Tensor) -> Tensor:
-        """Zero."""
         return torch.zeros_like(v)
 
     def slope(self, v: Tensor) -> Tensor:
-        """Zero."""
         return torch.zeros_like(v)
 
 
@@ -84,7 +82,6 @@ class CoulombFriction(Friction):
         self.register_buffer("v_std", scales.statistics.v_std.float().clone())
 
     def forward(self, v: Tensor) -> Tensor:
-        """F(v)."""
         force, width = self._constants()
         return force * torch.tanh(v / width)
 

@@ -50,11 +50,9 @@ class DriveCoulomb(Friction):
         """What a law of a higher rung has besides level and width."""
 
     def forward(self, v: Tensor) -> Tensor:
-        """F(v)."""
         return self._level(v)[0] * torch.tanh(v / self._width())
 
     def slope(self, v: Tensor) -> Tensor:
-        """dF_i/dv_i."""
         level, change = self._level(v)
         sign, width = torch.tanh(v / self._width()), self._width()
         return change * sign + level * (1 - sign**2) / width

@@ -48,7 +48,6 @@ class MeasuredVelocity(InitialVelocity):
         super().__init__()
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """v."""
         return v
 
 
@@ -81,5 +80,4 @@ class LearnedVelocity(InitialVelocity):
         self.register_buffer("scale", scales.value.float().clone())
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """v + s_v * network(q, v, u)."""
         return v + self.scale * self.network(torch.cat([q, v, u], dim=-1))

@@ -64,7 +64,6 @@ class NetworkInput(InputMatrix):
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
         return self.scale * self.network.linearize(q)[0].unflatten(-1, self.shape)
 
 
@@ -125,7 +124,6 @@ class NonlinearInput(InputMatrix):
         return self._matrix(q, self.u_mean.expand(*q.shape[:-1], -1))
 
     def force(self, q: Tensor, u: Tensor) -> Tensor:
-        """tau = A(q, u) u, ``(*batch, N)``."""
         return matvec(self._matrix(q, u), u)
 
     def _matrix(self, q: Tensor, u: Tensor) -> Tensor:
@@ -153,7 +151,6 @@ class ConstantInput(InputMatrix):
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
-        """A, ``(*batch, N, M)``."""
         value = self.scale * self.raw
         return value.expand(*q.shape[:-1], *value.shape)
 
@@ -166,11 +163,9 @@ class NoInput(InputMatrix):
     """
 
     def forward(self, q: Tensor) -> Tensor:
-        """Zero, ``(*batch, N, M)``."""
         return q.new_zeros(*q.shape[:-1], *self.shape)
 
     def force(self, q: Tensor, u: Tensor) -> Tensor:
-        """Zero, ``(*batch, N)``."""
         return torch.zeros_like(q)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
@@ -202,7 +197,6 @@ class FixedInput(InputMatrix):
         self.register_buffer("value", matrix)
 
     def forward(self, q: Tensor) -> Tensor:
-        """A, ``(*batch, N, M)``."""
         return self.value.expand(*q.shape[:-1], *self.value.shape)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:

@@ -87,7 +87,6 @@ class LagrangianNetwork(StructuredNetwork):
         self.learns_initial_state = self.initial_velocity.learned
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """(q, v_0) with the v_0 of its head, ``(*batch, 2N)``."""
         return self.initial_velocity.initial_state(x0, u0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:

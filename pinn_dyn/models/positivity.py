@@ -60,11 +60,9 @@ class Positive(Positivity):
         return math.log(math.expm1(self.initial))
 
     def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """softplus(y) + floor."""
         return F.softplus(y) + self.floor, torch.sigmoid(y)
 
     def lower(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """y."""
         return y, torch.ones_like(y)
 
 
@@ -92,12 +90,10 @@ class Bounded(Positivity):
             raise ValueError(f"limit is {self.limit}, expected a positive number")
 
     def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """b sigmoid(y) + floor."""
         share = torch.sigmoid(y)
         return self.limit * share + self.floor, self.limit * share * (1 - share)
 
     def lower(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """b (2 sigmoid(y) - 1)."""
         share = torch.sigmoid(y)
         return self.limit * (2 * share - 1), 2 * self.limit * share * (1 - share)
 

@@ -61,7 +61,6 @@ class NetworkPotential(Potential):
         self.stiffness_root = nn.Parameter(torch.eye(size)) if quadratic else None
 
     def forward(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
         value = self.network(q).squeeze(-1)
         if self.stiffness_root is not None:
             value = value + 0.5 * (self._lengths(q) @ self.stiffness_root).square().sum(-1)
@@ -130,7 +129,6 @@ class ChainPotential(Potential):
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
         w, _ = self._moments(columns(q))
         return self.scale * (self.base * w).sum(0).reshape(q.shape[:-1])
 

@@ -50,11 +50,9 @@ class NoResidual(Residual):
         super().__init__()
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Zero."""
         return torch.zeros_like(v)
 
     def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Zero."""
         return v.new_zeros(())
 
 
@@ -103,9 +101,7 @@ class NetworkResidual(Residual):
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """r(q, v, u)."""
         return self.scale * self.network.linearize(torch.cat([q, v, u], dim=-1))[0]
 
     def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """w mean (r_i / f_i)^2."""
         return self.weight * (self(q, v, u) / self.scale).square().mean()

@@ -67,7 +67,6 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return Scales(statistics, value, self.angles)
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
         return self.potential(q)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
@@ -78,7 +77,6 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return self.damping.product(q, v)
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
         return self.input(q)
 
     def _friction_force(self, v: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ def fit(
         model,
         loss=IncrementLoss(statistics, model) if loss is None else loss,
         optimizer=partial(AdamW, lr=learning_rate, weight_decay=1e-5, fused=True),
-        scheduler=partial(one_cycle, warm_up=0.05),
+        scheduler=one_cycle,
         validator=lambda model, truth: {},
         config={},
         statistics=statistics,

@@ -120,7 +120,8 @@ class DynamicsLearner(L.LightningModule):
                     break
         finally:
             loop.manual_optimization.optim_step_progress.increment_by(done)
-            # Lightning itself counts one.
+            # Lightning itself counts one. The last of its counters is private, and no public call
+            # moves it: its loggers and monitors take the step from there.
             loop.batch_progress.increment_by(done - 1)
             loop._batches_that_stepped += done - 1
         if before + done >= trainer.num_training_batches:
@@ -133,7 +134,7 @@ class DynamicsLearner(L.LightningModule):
         averaged = any(isinstance(one, WeightAveraging) for one in trainer.callbacks)  # type: ignore[attr-defined]
         if trainer.world_size > 1 or averaged:
             return 1
-        steps = trainer.fit_loop.epoch_loop._batches_that_stepped
+        steps = self.global_step
         due = [int(trainer.num_training_batches) - before]
         if every := trainer.log_every_n_steps:  # type: ignore[attr-defined]
             due += [every - steps % every, every - (steps + 1) % every]

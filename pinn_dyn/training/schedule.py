@@ -6,7 +6,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
 
-def one_cycle(optimizer: Optimizer, *, total_steps: int, warm_up: float) -> OneCycleLR:
+def one_cycle(optimizer: Optimizer, *, total_steps: int, warm_up: float = 0.05) -> OneCycleLR:
     """Half a cosine up to the optimizer's learning rate, then one down to next to nothing.
 
     Smith and Topin 2019, "Super-convergence". The rate starts at a 25th of the peak and ends at a

@@ -55,7 +55,7 @@ TINY_TRAINING = [
 ]
 TINY = [*TINY_DATA, STRIDE, *TINY_TRAINING]
 # Drawing takes longer than the training itself.
-NO_FIGURES = "~callbacks.figures"
+NO_FIGURES = "callbacks.figures=null"
 
 
 @contextlib.contextmanager

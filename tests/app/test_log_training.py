@@ -10,6 +10,7 @@ import torch
 from matplotlib.image import imread
 
 from pinn_dyn import fit
+from pinn_dyn.models import Bounded
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -168,7 +169,9 @@ def test_presets_of_hardware_have_the_structure_of_the_paper():
     assert fit.dataset.steps.fit.degree == 7
     assert len(neck.dataset.u.columns) == 4
     assert neck.model.input._target_.endswith("NetworkInput")
-    assert panda.model.mass.positivity.limit == 3.5
+    # The class's own limit is the paper's.
+    assert panda.model.mass.positivity._target_.endswith("Bounded")
+    assert Bounded().limit == 3.5
     assert panda.model.input._target_.endswith("FixedInput")
     assert len(panda.model.angles) == len(panda.dataset.q.columns) == 7
     for preset in (neck, fit, panda):

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from scipy.integrate import simpson
 from torch import Tensor
 
-from pinn_dyn.mechanics import MechanicalSystem, Signal, rollout
+from pinn_dyn.mechanics import MechanicalSystem, Signal
+from tests.contracts.mechanical_motion import MotionContract, product
 from tests.support.finite_differences import assert_near, partial_derivatives, slope
 
 
@@ -24,10 +24,6 @@ class Configurations(NamedTuple):
     v: Tensor  # (8, N)
     a: Tensor  # (8, N)
     u: Tensor  # (8, M)
-
-
-def product(matrix, vector):
-    return torch.einsum("...ij,...j->...i", matrix, vector)
 
 
 def quantities(system, at):
@@ -58,22 +54,13 @@ def quantities(system, at):
     }
 
 
-class MechanicalSystemContract:
+class MechanicalSystemContract(MotionContract):
     """The suite. Tolerances are relative to the largest entry of what is compared."""
 
     exact_tolerance = 1e-9
     """Between two float64 computations of the same quantity."""
-    difference_tolerance = 1e-7
-    """Between a derivative and the five-point stencil with ``difference_step``."""
-    difference_step = 1e-3
     float32_tolerance = 1e-3
     """Between float32 and float64; the accelerations lose the condition number of M."""
-    steps = 10
-    """Even number of integrator steps in a roll-out."""
-    step_times_rate = 0.02
-    """Step of a roll-out times the largest eigenvalue of the dynamics at its start."""
-    rollout_tolerance = 1e-5
-    """Between roll-outs: fourth order in the step, measured at most 5e-6 for the energies."""
 
     @pytest.fixture
     def system(self) -> MechanicalSystem:
@@ -315,99 +302,3 @@ class MechanicalSystemContract:
             for actual, expected in pairs:
                 scale = max(1e-12, float(expected.abs().max()))
                 assert_near(actual, expected, self.exact_tolerance, scale)
-
-    # Energy.
-
-    def test_power_is_the_rate_of_the_total_energy(self, system, configurations):
-        q, v, _, u = configurations
-        a = system.forward_dynamics(q, v, u)
-        # A time step in which the velocity does not change by more than about one unit.
-        step = self.difference_step / max(1.0, float(a.abs().max()))
-        expected = slope(
-            lambda e: system.total_energy(q + e * v + 0.5 * e * e * a, v + e * a), step
-        )
-        assert_near(system.power(q, v, u), expected, self.difference_tolerance)
-
-    def test_rollout_keeps_the_balance_of_energy(self, system, configurations):
-        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F).
-
-        The input is one straight line over the whole roll-out, so the power is smooth, and both
-        the integrator and Simpson's rule are of fourth order in the step.
-        """
-        t, x = self._rollout(system, configurations, system.velocity_derivative)
-        q, v = x.chunk(2, -1)
-        u = self._input(configurations, t)
-        supplied = (product(system.input_matrix(q), u) * v).sum(-1)
-        lost = (system.dissipative_force(q, v) * v).sum(-1)
-        work = torch.from_numpy(simpson((supplied - lost).numpy(), x=t.numpy(), axis=-1))
-        energy = system.total_energy(q, v)
-        turnover = simpson((supplied.abs() + lost.abs()).numpy(), x=t.numpy(), axis=-1).max()
-        change = energy[..., -1] - energy[..., 0]
-        assert_near(change, work, self.rollout_tolerance, scale=turnover)
-
-    def test_rollouts_in_velocity_and_momentum_give_the_same_motion(self, system, configurations):
-        _, lagrangian = self._rollout(system, configurations, system.velocity_derivative)
-        _, hamiltonian = self._rollout(system, configurations, system.momentum_derivative)
-        q, v = lagrangian.chunk(2, -1)
-        q_hamiltonian, p = hamiltonian.chunk(2, -1)
-        moved = (q - q[..., :1, :]).abs().max()
-        assert_near(q_hamiltonian, q, self.rollout_tolerance, scale=moved)
-        assert_near(system.velocity(q_hamiltonian, p), v, self.rollout_tolerance)
-
-    def _step(self, system, configurations):
-        """A step that resolves the fastest motion of the linearized dynamics."""
-        q, v, _, u = configurations
-        x = torch.cat([q, v], -1)
-        jacobian = partial_derivatives(
-            lambda x: system.velocity_derivative(x, u), x, self.difference_step
-        )
-        return self.step_times_rate / float(torch.linalg.eigvals(jacobian).abs().max())
-
-    def _input(self, configurations, t):
-        """From u to -u on a straight line, ``(8, T, M)``."""
-        return (1 - 2 * t / t[-1])[:, None] * configurations.u[:, None, :]
-
-    def _rollout(self, system, configurations, derivative):
-        q, v, _, _ = configurations
-        end = self.steps * self._step(system, configurations)
-        t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
-        second = v if derivative == system.velocity_derivative else system.momentum(q, v)
-        u = self._input(configurations, t[[0, -1]])
-        return t, rollout(derivative, torch.cat([q, second], -1), t, Signal(t[[0, -1]], u))
-
-    # Gradients.
-
-    def test_gradients_through_an_rk4_step_match_finite_differences(self, system, configurations):
-        """Of a scalar of the increments, by the initial state, the input and each parameter."""
-        q, v, a, u = configurations
-        second = v if system.state == "qv" else system.momentum(q, v)
-        x0, u = torch.cat([q, second], -1), torch.stack([u, -u], -2)
-        t = torch.tensor([0.0, self._step(system, configurations)], dtype=torch.float64)
-        weights = torch.cat([a, v], -1) / t[-1]
-
-        def loss():
-            return (weights * system.increments(x0, t, Signal(t, u))[..., -1, :]).sum()
-
-        leaves = {"x0": x0, "u": u, **dict(system.named_parameters())}
-        with torch.enable_grad():
-            for leaf in leaves.values():
-                leaf.requires_grad_(True)
-            gradients = torch.autograd.grad(loss(), list(leaves.values()), allow_unused=True)
-        generator = torch.Generator().manual_seed(1)
-        for (name, leaf), gradient in zip(leaves.items(), gradients, strict=True):
-            direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
-            direction /= direction.norm()
-            start = leaf.detach().clone()
-
-            def shifted(e, leaf=leaf, start=start, direction=direction):
-                leaf.copy_(start + e * direction)
-                value = loss()
-                leaf.copy_(start)
-                return value
-
-            expected = slope(shifted, self.difference_step)
-            gradient = torch.zeros_like(leaf) if gradient is None else gradient
-            actual = (gradient * direction).sum()
-            error = float((actual - expected).abs())
-            scale = float(gradient.norm()) + float(loss().abs())
-            assert error <= self.difference_tolerance * scale, (name, actual, expected)

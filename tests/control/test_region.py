@@ -153,10 +153,9 @@ def spring():
     return LinearSystem([[1.0]], [[2.0]], [[0.1]], [[4.0]])
 
 
-def guard(active, threshold=2.0, fallback=True):
-    pd = ProportionalDerivative(unit_masses(1), 1.0, 1.0) if fallback else None
-    law = Regulation(spring(), 3.0, 1.0)
-    return Guarded(law, pd, DataRegion(*comb()), threshold=threshold, fallback_active=active)
+def guard(active, threshold=2.0):
+    pd = ProportionalDerivative(unit_masses(1), 1.0, 1.0) if active else None
+    return Guarded(Regulation(spring(), 3.0, 1.0), pd, DataRegion(*comb()), threshold=threshold)
 
 
 MIXED = tensor([[10.0], [103.5], [100.5], [-9.0]])  # distances 0, 4.5, 1.5 and 9
@@ -181,12 +180,12 @@ def test_the_fallback_takes_the_states_outside_and_no_others():
     assert found["input_condition"].tolist() == [1, 1, 1, 1]
 
 
-def test_without_an_active_fallback_the_law_goes_on():
-    for guarded in (guard(active=False), guard(active=False, fallback=False)):
-        u = guarded(0.5, MIXED, 0 * MIXED, REST)
-        assert u == pytest.approx(law_and_pd(MIXED)[0], rel=1e-12)
-        assert guarded.diagnostics()["outside"].tolist() == [0, 1, 0, 1]
-        assert guarded.diagnostics()["fallback"].tolist() == [0, 0, 0, 0]
+def test_without_a_fallback_the_law_goes_on():
+    guarded = guard(active=False)
+    u = guarded(0.5, MIXED, 0 * MIXED, REST)
+    assert u == pytest.approx(law_and_pd(MIXED)[0], rel=1e-12)
+    assert guarded.diagnostics()["outside"].tolist() == [0, 1, 0, 1]
+    assert guarded.diagnostics()["fallback"].tolist() == [0, 0, 0, 0]
 
 
 def test_a_state_that_comes_back_is_given_back_to_the_law():
@@ -244,7 +243,7 @@ def test_faults_are_those_of_who_is_in_charge():
         (False, {"law": [1, 1, 1, 1], "both": [1, 1, 1, 1]}),
         (True, {"law": [1, 0, 1, 0], "both": [1, 1, 1, 1], "fallback": [0, 1, 0, 1]}),
     ):
-        guarded = Guarded(law, fallback, DataRegion(*comb()), fallback_active=active)
+        guarded = Guarded(law, fallback if active else None, DataRegion(*comb()))
         guarded(0.0, MIXED, 0 * MIXED, REST)
         found = {reason: mask.int().tolist() for reason, mask in guarded.faults().items()}
         assert found == expected
@@ -253,14 +252,12 @@ def test_faults_are_those_of_who_is_in_charge():
 def test_bad_guards_are_named():
     law, region = Regulation(spring(), 1.0, 1.0), DataRegion(*comb())
     pd = ProportionalDerivative(unit_masses(1), 1.0, 1.0)
-    with pytest.raises(ValueError, match="fallback_active is True, but fallback is None"):
-        Guarded(law, None, region, fallback_active=True)
     with pytest.raises(ValueError, match=r"threshold is 0.0, expected a positive"):
-        Guarded(law, pd, region, threshold=0.0, fallback_active=True)
+        Guarded(law, pd, region, threshold=0.0)
     with pytest.raises(ValueError, match=r"fallback has N, M = \(2, 2\), expected .* \(1, 1\)"):
-        Guarded(law, ProportionalDerivative(unit_masses(2), 1.0, 1.0), region, fallback_active=True)
+        Guarded(law, ProportionalDerivative(unit_masses(2), 1.0, 1.0), region)
     with pytest.raises(ValueError, match=r"region has 1 coordinates, expected .* the law, 2"):
-        Guarded(Regulation(CartPole(), 1.0, 1.0), None, region, fallback_active=False)
+        Guarded(Regulation(CartPole(), 1.0, 1.0), None, region)
 
 
 @pytest.mark.parametrize("threshold", [0.01, 1.0, 1e3], ids=["outside", "both", "inside"])
@@ -272,4 +269,4 @@ class TestGuarded(ControllerContract):
         law, pd = Regulation(system, 2.0, 1.0), ProportionalDerivative(unit_masses(2), 1.0, 1.0)
         q, v, _ = states(2, batch=60, seed=1)
         region = DataRegion(0.5 * q.unflatten(0, (6, 10)), 0.5 * v.unflatten(0, (6, 10)))
-        return Guarded(law, pd, region, threshold=threshold, fallback_active=active)
+        return Guarded(law, pd if active else None, region, threshold=threshold)

@@ -50,39 +50,27 @@ def count_red(pixels):
     return int((np.abs(pixels - RED).sum(-1) < 60).sum())
 
 
-@pytest.mark.parametrize(("fps", "duration", "count"), [(25, 40, 14), (12, 80, 8)])
-def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(
-    bending, fps, duration, count, tmp_path
-):
+def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(bending, tmp_path):
     path = tmp_path / "new" / "arm.gif"
-    animate_lines(bending, 0, SoftArm(2), path, fps=fps)
+    animate_lines(bending, 0, SoftArm(2), path)
     found, times = frames(path)
     # From 0 s up to 0.48 s, and the last sample at 0.5 s.
-    assert times == [duration] * (count - 1) + [1000]
+    assert times == [40] * 13 + [1000]
     assert path.stat().st_size < 200_000
     # The path of the tip grows.
-    assert count_red(found[-1]) > count_red(found[count // 2]) > count_red(found[0])
-
-
-def test_the_reference_is_drawn_in_grey(bending, tmp_path):
-    pictures = []
-    for shown in (True, False):
-        animate_lines(bending, 0, SoftArm(2), tmp_path / "a.gif", fps=2, reference=shown)
-        first = frames(tmp_path / "a.gif")[0][0]
-        grey = np.abs(first - 0.7 * 255).max(-1) < 8
-        pictures.append(int(grey[40:-40].sum()))  # the legend is below
-    assert pictures[0] > 300 + pictures[1]
+    assert count_red(found[-1]) > count_red(found[7]) > count_red(found[0])
+    # The wanted shape is grey, and covered once the arm has come there; the legend is below.
+    grey = [(np.abs(x[40:-40] - 0.7 * 255).max(-1) < 8).sum() for x in (found[0], found[-1])]
+    assert grey[0] > 300 + grey[1]
 
 
 def test_a_stopped_run_is_drawn_up_to_its_stop(bending, tmp_path):
     stop(bending, 21)
-    animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=25)
+    animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif")
     assert frames(tmp_path / "arm.gif")[1] == [40] * 5 + [1000]  # 0 to 0.16 s, 0.2 s
 
 
-def test_bad_frame_rates_and_runs_that_never_started_are_refused(bending, tmp_path):
-    with pytest.raises(ValueError, match="fps is 60"):
-        animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif", fps=60)
+def test_a_run_that_never_started_is_refused(bending, tmp_path):
     stop(bending, 0)
     with pytest.raises(ValueError, match="run 0 has no finite q at its start"):
         animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif")
@@ -133,12 +121,13 @@ def test_panda_moves_in_view_of_the_camera(tmp_path):
     record = make_record(q_ref - 0.05, q_ref, t)
     arm = BulletArm(PANDA, locked_joints=FINGERS)
     path = tmp_path / "panda.gif"
-    animate_pictures(record, 0, arm, path, fps=10, size=(240, 180))
+    animate_pictures(record, 0, arm, path)
     found, times = frames(path)
-    assert times == [100] * 5 + [1000]
+    assert times == [50] * 10 + [1000]
     assert count_red(found[-1]) > count_red(found[0]) + 30
-    animate_pictures(record, 0, arm, path, fps=10, size=(240, 180), trace=False)
-    plain = frames(path)[0]
+    q = record.q[0, ::10]
+    plain, _ = arm.render(q.numpy(), arm.tip_position(q).numpy(), (240, 180))
+    plain = np.asarray(plain).astype(int)
     for picture in plain:
         arm_pixels = (picture < 220).all(-1)
         assert arm_pixels.mean() > 0.05

@@ -22,7 +22,7 @@ from pinn_dyn.evaluation.control_figures import (
 )
 from pinn_dyn.evaluation.control_metrics import stopped_runs
 from pinn_dyn.evaluation.drawing import units, with_unit
-from pinn_dyn.evaluation.report.error_curves import error_figure
+from pinn_dyn.evaluation.report.error_curves import error_section
 from pinn_dyn.evaluation.report.motion import motion_figure, shown_motions
 from pinn_dyn.evaluation.report.page import (
     Origin,
@@ -99,7 +99,9 @@ def control_report(
     runs = len(record.stopped)
     sections = [
         Section("Summary", _summary(summary, coordinates, inputs, records, labels)),
-        Section("Error over time", _errors(records, labels)),
+        error_section(
+            control_error_panel(records, with_unit(ERROR, labels)), one="run", lost="stopped"
+        ),
         *_motions(records, run, held, labels, input_labels),
     ]
     if animation is not None:
@@ -173,13 +175,6 @@ def _is_step_error(name: str) -> bool:
 def _step_header(name: str) -> str:
     seconds, kind = name.removeprefix("step_error_after_").split("_s_")
     return f"error after {seconds} s, {kind.removesuffix('_percent')} [% of step]"
-
-
-def _errors(records: Mapping[str, ClosedLoopRecord], labels: Sequence[str]) -> list[Markup]:
-    panel = control_error_panel(records, with_unit(ERROR, labels))
-    drawn = error_figure(panel, one="run", lost="stopped")
-    text = "A click on a name of the legend hides or shows it, a double click leaves it alone."
-    return [figure(drawn, "figure-error"), paragraph(text)]
 
 
 def _motions(

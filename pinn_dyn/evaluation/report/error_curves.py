@@ -11,6 +11,7 @@ import plotly.graph_objects as go
 from torch import Tensor
 
 from pinn_dyn.evaluation.drawing import Panel
+from pinn_dyn.evaluation.report.page import Section, figure, paragraph
 from pinn_dyn.evaluation.report.style import CURVE, POINTS, calm, simplify
 
 _HEIGHT, _ABOVE, _BELOW = 500, 80, 90  # of the figure and its margins, px
@@ -92,6 +93,13 @@ def error_figure(panel: Panel, *, one: str, lost: str) -> go.Figure:
     drawn.update_xaxes(title="time [s]")
     drawn.update_yaxes(type="log", range=ends, title=html.escape(panel.label))
     return drawn
+
+
+def error_section(panel: Panel, *, one: str, lost: str) -> Section:
+    """The section of a page with :func:`error_figure`."""
+    text = "A click on a name of the legend hides or shows it, a double click leaves it alone."
+    drawn = figure(error_figure(panel, one=one, lost=lost), "figure-error")
+    return Section("Error over time", [drawn, paragraph(text)])
 
 
 def _buttons(above: float, method: str, entries: Sequence[tuple[str, Any]]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pinn_dyn.evaluation.figures import ERROR, prediction_errors, terms_figure, 
 from pinn_dyn.evaluation.learned_terms import TermComparison
 from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.prediction import Prediction
-from pinn_dyn.evaluation.report.error_curves import error_figure
+from pinn_dyn.evaluation.report.error_curves import error_section
 from pinn_dyn.evaluation.report.motion import motion_figure, shown_motions
 from pinn_dyn.evaluation.report.page import (
     Origin,
@@ -86,11 +86,18 @@ def prediction_report(
         origin: where the numbers come from.
     """
     floors = set(summary["run"][summary["floor"]])
-    models = {name: item for name, item in predictions.items() if name not in floors}
+    models, below = (
+        {name: item for name, item in predictions.items() if (name in floors) == floor}
+        for floor in (False, True)
+    )
     trained = summary[~summary["floor"]]
     sections = [
         Section("Summary", _summary(summary, grouped, labels)),
-        Section("Error over time", _errors(predictions, floors, labels)),
+        error_section(
+            prediction_errors(models, below, with_unit(ERROR, labels)),
+            one="trajectory",
+            lost="diverged",
+        ),
         Section(
             "Trajectories",
             _trajectories(trained, truth, models, trajectory, labels, input_labels),
@@ -133,17 +140,6 @@ def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]
         parts.append(table(bracketed(grouped), headers=shown, best=marks))
     parts.append(details("All figures of every run (summary.csv)", table(turned(summary, "run"))))
     return parts
-
-
-def _errors(
-    predictions: Mapping[str, Prediction], floors: set[str], labels: Sequence[str]
-) -> list[Markup]:
-    models = {name: item for name, item in predictions.items() if name not in floors}
-    below = {name: item for name, item in predictions.items() if name in floors}
-    panel = prediction_errors(models, below, with_unit(ERROR, labels))
-    drawn = error_figure(panel, one="trajectory", lost="diverged")
-    text = "A click on a name of the legend hides or shows it, a double click leaves it alone."
-    return [figure(drawn, "figure-error"), paragraph(text)]
 
 
 def _trajectories(

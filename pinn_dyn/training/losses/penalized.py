@@ -23,7 +23,6 @@ class Penalized(WindowLoss):
         self.loss = loss
 
     def selected(self, windows: Windows, progress: float) -> Windows:
-        """As the loss selects."""
         return self.loss.selected(windows, progress)
 
     def forward(self, model: Predictor, windows: Windows) -> Tensor:

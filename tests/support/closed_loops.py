@@ -1,0 +1,64 @@
+"""Three copies of two coupled springs under PD control, for tests of closed loops."""
+
+import numpy as np
+import torch
+
+from pinn_dyn.control import Controller, Motion, Reference
+from pinn_dyn.control.closed_loop import close_loop
+from pinn_dyn.control.plants import SystemPlant
+from tests.support.linear import LinearSystem
+
+K_P, K_D = 30.0, 4.0
+
+
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+Q0, V0 = double([[0.5, -0.2], [1.0, 0.4], [-0.3, 0.0]]), double([[0.0, 1.0], [-1.0, 0.3], [2, 0]])
+
+
+class Wave(Reference):
+    def __init__(self, amplitude):
+        self.amplitude = amplitude
+        self.num_coordinates = amplitude.shape[-1]
+
+    def __call__(self, t):
+        a = self.amplitude
+        return Motion(a * np.sin(2 * t), 2 * a * np.cos(2 * t), -4 * a * np.sin(2 * t))
+
+
+class PD(Controller):
+    """PD with the time of each call as a diagnostic; copies for whom ``bad(t, q)`` are faulty."""
+
+    def __init__(self, size=2, k_p=K_P, k_d=K_D, bad=None):
+        super().__init__(size, size)
+        self.k_p, self.k_d, self.bad = k_p, k_d, bad
+
+    def __call__(self, t, q, v, reference):
+        assert q.isfinite().all()
+        assert v.isfinite().all()
+        self.q, self.time = q, t
+        return self.k_p * (reference.q - q) + self.k_d * (reference.v - v)
+
+    def diagnostics(self):
+        return {"time": torch.full(self.q.shape[:-1], self.time)}
+
+    def faults(self):
+        return {} if self.bad is None else {"too far": self.bad(self.time, self.q)}
+
+
+def spring(inputs=((1.0, 0.0), (0.3, 0.8))):
+    return LinearSystem(
+        mass=[[1.0, 0.2], [0.2, 0.7]],
+        stiffness=[[9.0, -2.0], [-2.0, 5.0]],
+        damping=[[0.4, 0.1], [0.1, 0.3]],
+        inputs=inputs,
+    )
+
+
+def sampled(plant=None, controller=None, reference=None, q0=Q0, v0=V0, **changes):
+    plant = plant or SystemPlant(spring(), rtol=1e-9, atol=1e-11)
+    reference = reference or Wave(double([0.5, -1.0]))
+    settings = {"duration": 0.4, "rate": 50.0} | changes
+    return close_loop(plant, controller or PD(), reference, q0, v0, **settings)
