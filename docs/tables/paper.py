@@ -65,7 +65,7 @@ def prediction_table(group: str) -> str:
                 f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
                 f"{mean[f'{square}_mean']:.1e} ± {mean[f'{square}_variance']:.1e}",
                 " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
-                f"{int(data['pairs'].iloc[0]):,}{pairs}",
+                f"{int(data['pairs'].iloc[0]) * entry.get('steps', 1):,}{pairs}",
                 f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
             ]
         )

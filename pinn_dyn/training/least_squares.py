@@ -86,9 +86,9 @@ class LeastSquares:
        spread, as of the loss of increments. Derivatives by forward mode through the integrator.
        First over a quarter of the windows' steps, then over all.
 
-    s, by residual, is the root mean square of what remains, found by repeating each stage. The
-    residuals within a window, and of windows that overlap, count as one for each coordinate, as
-    they are far from independent.
+    s, by residual, is the root mean square of what remains, found by repeating each stage. What is
+    correlated counts as one: successive samples of the motion by :func:`correlation_length`, the
+    residuals within a window, and of windows that overlap, for each coordinate.
 
     Args:
         cutoff: of the filter before the inverse dynamics, Hz: above the motion, below the noise.
@@ -200,17 +200,25 @@ class LeastSquares:
         regressor, spread = model.structure.regressor(q, v, a), u.std(0)
         moves = v.abs() > _REST * v.std(0)
 
+        def errors() -> Tensor:
+            force = regressor @ model.body_parameters().flatten() + model.drive_force(v, a, u)
+            return force / model.drive_gain() / spread
+
         def residuals(derivative: bool) -> Tensor:
-            gain = model.drive_gain()
-            error = regressor @ model.body_parameters().flatten() + model.drive_force(v, a, u)
+            error = errors()
             if not derivative:
-                return (error / gain / spread)[moves]
+                return error[moves]
+            gain = model.drive_gain()
             slope = Sensitivity(model)
-            by_gain = (error / gain).unsqueeze(-1) * slope.gain()
+            by_gain = (error * spread).unsqueeze(-1) * slope.gain()
             found = (slope.force(regressor, v, a, u) - by_gain) / (gain * spread).unsqueeze(-1)
             return found[moves]
 
-        return self._solve("inverse dynamics", model, prior, residuals, correlated=1)
+        self._solve("inverse dynamics", model, prior, residuals, correlated=1.0)
+        with torch.no_grad():
+            correlated = correlation_length((errors() * moves).numpy())
+        stage = f"inverse dynamics, {correlated:.3g} samples as one"
+        return self._solve(stage, model, prior, residuals, correlated=correlated)
 
     def _roll_out(self, model: KnownMechanics, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
@@ -226,7 +234,7 @@ class LeastSquares:
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
-        correlated = measured.shape[1]
+        correlated = float(measured.shape[1])
         stage = f"roll-outs of {float(windows.t[-1]):.3g} s"
         return self._solve(stage, model, prior, residuals, correlated=correlated)
 
@@ -237,7 +245,7 @@ class LeastSquares:
         prior: Prior,
         residuals: Callable[[bool], Tensor],
         *,
-        correlated: int,
+        correlated: float,
     ) -> Fit:
         """Two fits, the second with the noise that the first left; the model is set in place.
 
@@ -285,6 +293,23 @@ def _evaluate(
     bad = 0.0 if derivative else _BROKEN
     values = np.nan_to_num(found.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
     return values if derivative else values.clip(-_BROKEN, _BROKEN)
+
+
+def correlation_length(errors: np.ndarray) -> float:
+    """How many successive errors ``(K, N)`` say as much as one that is independent, at least 1.
+
+    1 + 2 sum over k of rho_k, the autocorrelation up to its first sign change; the mean over the N
+    columns, each weighted by its square. Source: Sokal 1997, "Monte Carlo methods in statistical
+    mechanics", the integrated autocorrelation time.
+    """
+    count = len(errors)
+    spectrum = np.fft.rfft(errors, 2 * count, axis=0)
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[:count].sum(-1)
+    if not correlation[0] > 0:
+        return 1.0
+    share = correlation / correlation[0]
+    until = int(np.argmax(share <= 0)) or count
+    return float(1 + 2 * share[1:until].sum())
 
 
 def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
