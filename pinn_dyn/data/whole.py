@@ -25,7 +25,8 @@ def whole(path: Path) -> Iterator[Path]:
     try:
         yield partial
         os.replace(partial, path)
-    except OSError as error:  # that of a write names no file
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    except OSError as error:
+        error.filename = str(path)  # that of a write names none
+        raise
     finally:
         partial.unlink(missing_ok=True)
