@@ -26,7 +26,8 @@ def whole(path: Path) -> Iterator[Path]:
         yield partial
         os.replace(partial, path)
     except OSError as error:
-        error.filename = str(path)  # that of a write names none
+        if error.errno is not None:  # what the system says of a write names no file
+            error.filename = str(path)
         raise
     finally:
         partial.unlink(missing_ok=True)
