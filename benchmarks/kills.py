@@ -53,12 +53,12 @@ MANY = [  # a simulation that lasts some seconds
     *("dataset.step=0.002", "dataset.duration=2", "dataset.train_initial_states=15"),
     *("dataset.train_inputs=15", "trainer.steps=2", "trainer.validations=1"),
 ]
-BLOCKS = [  # hundreds of the optimizer's steps between two checkpoints
-    *("trainer.steps=3000", "trainer.validations=5", "compile=false"),
+BLOCKS = [  # many steps of the optimizer between two checkpoints
+    *("trainer.steps=600", "trainer.validations=3", "compile=false"),
 ]
 LOG = [  # pieces of a log, a learned delay and a residual torque
     *("dataset=example_log", f"dataset.root={ROOT / 'examples'}", "model/delay=learned"),
-    *("model/residual=network", "data=multi_step", "data.pairs=64", "data.batch_size=32"),
+    *("model/residual=network", "data.pairs=64", "data.batch_size=32", "validator.horizon=0.5"),
     *("~callbacks.figures", "compile=false"),
 ]
 FIT = [  # one step of the trainer that is a whole fit
