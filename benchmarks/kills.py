@@ -4,7 +4,10 @@ Of each kill it is asked whether the same command then ends well and gives the s
 a process lives on, and whether a file of the dead one is left.
 
     python benchmarks/kills.py                        # 50 kills, half of them with TMPDIR elsewhere
-    python benchmarks/kills.py --kills 6 --only train
+    python benchmarks/kills.py --kills 6 --only train fit
+
+Each kill adds a row to benchmarks/results/kills.csv. The fit needs the double pendulum's log, in
+the folder that PINN_DYN_LOGS names.
 """
 
 from __future__ import annotations
@@ -49,6 +52,18 @@ MANY = [  # a simulation that lasts some seconds
     *(word for word in TINY if not word.startswith(("dataset.step", "dataset.duration"))),
     *("dataset.step=0.002", "dataset.duration=2", "dataset.train_initial_states=15"),
     *("dataset.train_inputs=15", "trainer.steps=2", "trainer.validations=1"),
+]
+BLOCKS = [  # many steps of the optimizer between two checkpoints
+    *("trainer.steps=600", "trainer.validations=3", "compile=false"),
+]
+LOG = [  # pieces of a log, a learned delay and a residual torque
+    *("dataset=example_log", f"dataset.root={ROOT / 'examples'}", "model/delay=learned"),
+    *("model/residual=network", "data.pairs=64", "data.batch_size=32", "validator.horizon=0.5"),
+    *("~callbacks.figures", "compile=false"),
+]
+FIT = [  # one step of the trainer that is a whole fit
+    *("experiment=logs/double_pendulum/known", "data.pairs=20", "data.batch_size=20"),
+    *("data.steps=2", "~callbacks.figures"),
 ]
 ONCE = ["reference.q=[0.05,0.05,0.2]", "duration=0.02", "settled_after=0.01", "animate=false"]
 
@@ -121,6 +136,18 @@ PROGRAMS = {
         "out/*/.hydra/config.yaml",
         weights,
     ),
+    "blocks": Program(
+        ["train.py", *TINY, *BLOCKS, ARM, "hydra.run.dir=out"], "out/checkpoints/last.ckpt", weights
+    ),
+    "start_from": Program(
+        ["train.py", *TINY, *LENGTH, ARM, "start_from=run", "hydra.run.dir=out"],
+        "out/.hydra/config.yaml",
+        weights,
+    ),
+    "log": Program(
+        ["train.py", *LOG, *LENGTH, ARM, "hydra.run.dir=out"], "out/.hydra/config.yaml", weights
+    ),
+    "fit": Program(["train.py", *FIT, "hydra.run.dir=out"], "out/.hydra/config.yaml", weights),
     "simulate": Program(
         ["train.py", *MANY, ARM, "hydra.run.dir=out"], "out/.hydra/config.yaml", trajectories
     ),
@@ -140,7 +167,7 @@ PROGRAMS = {
         law,
     ),
 }
-SHARES = [5, 3, 3, 4, 3, 2, 2]  # of the kills, in this order
+SHARES = [3, 2, 2, 4, 2, 2, 3, 2, 2, 2, 1]  # of the kills, in this order
 
 
 def start(words: list[str], folder: Path, temporary: Path) -> subprocess.Popen[bytes]:
@@ -215,27 +242,29 @@ def kill(program: Program, folder: Path, temporary: Path, after: float, expected
     return "; ".join(wrong) or ("" if killed else "it had ended")
 
 
-def write(rows: list[dict[str, object]]) -> None:
-    """The table in benchmarks/results."""
-    record = provenance()
-    with (Path(__file__).parent / "results" / "kills.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*rows[0], *record], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({**row, **record} for row in rows)
+def write(row: dict[str, object]) -> None:
+    """Add a row to the table in benchmarks/results."""
+    path = Path(__file__).parent / "results" / "kills.csv"
+    full = {**row, **provenance()}
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(full), lineterminator="\n")
+        if new:
+            writer.writeheader()
+        writer.writerow(full)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--only", choices=list(PROGRAMS), help="one program instead of all")
+    parser.add_argument("--only", nargs="+", choices=list(PROGRAMS), help="not all programs")
     parser.add_argument("--seed", type=int, default=0, help="of the programs and the moments")
     arguments = parser.parse_args()
     draw = random.Random(arguments.seed)
-    chosen = [arguments.only] * arguments.kills
-    if arguments.only is None:
-        every = [name for name, n in zip(PROGRAMS, SHARES, strict=True) for _ in range(n)]
-        chosen = [every[k % len(every)] for k in range(arguments.kills)]
-        draw.shuffle(chosen)
+    shares = zip(PROGRAMS, SHARES, strict=True)
+    every = arguments.only or [name for name, n in shares for _ in range(n)]
+    chosen = [every[k % len(every)] for k in range(arguments.kills)]
+    draw.shuffle(chosen)
 
     place = Path(tempfile.mkdtemp(prefix="kills-"))
     near, far = place / "tmp", Path(tempfile.mkdtemp(prefix="kills-", dir=OTHER_DISK))
@@ -269,8 +298,7 @@ def main() -> None:
         print(rows[-1], flush=True)
         if not wrong:
             shutil.rmtree(folder)
-        if arguments.only is None:  # as it goes: an hour is long
-            write(rows)
+        write(rows[-1])  # as it goes: an hour is long
     shutil.rmtree(far)
     survived = sum(row["wrong"] in ("", "it had ended") for row in rows)
     print(f"{survived} of {len(rows)} kills left nothing wrong; the others are in {place}")

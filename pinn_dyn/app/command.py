@@ -6,6 +6,7 @@ configuration is ``conf/<name>.yaml``.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import logging
 import sys
@@ -19,6 +20,9 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import ConfigError, completed, config_folder
 from pinn_dyn.app.sweep import how_to_go_on
+
+# Of a disk that is full, also by a quota or a limit on one file, or that may only be read.
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def main(command: str) -> None:
@@ -45,6 +49,14 @@ def main(command: str) -> None:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # SweepCallback then goes on with the other jobs
             raise SystemExit(f"Error: {error}") from error
+        except OSError as error:
+            if error.errno not in _DISK or HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            place = error.filename or f"a file in {HydraConfig.get().runtime.output_dir}"
+            raise SystemExit(
+                f"Error: {place} cannot be written: {error.strerror}. What was written before is "
+                "whole: free space, or choose another folder, and give the same command again"
+            ) from error
 
     hush()
     try:

@@ -46,6 +46,7 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
+from pinn_dyn.data.whole import whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
@@ -150,7 +151,8 @@ def _report_without_truth(
     print(text)
     title = f"{source.name}: learned model of measured data"
     page = measured_model_report(title=title, report=text, origin=origin)
-    (folder / "report.html").write_text(page, encoding="utf-8")
+    with whole(folder / "report.html") as partial:
+        partial.write_text(page, encoding="utf-8")
     log.info(
         "%s is measured data, there is no robot to close the loop with: what can be said of the "
         "model alone is in %s",

@@ -24,6 +24,7 @@ from pinn_dyn.control import (
     stability_report,
 )
 from pinn_dyn.data import DataSource
+from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation import (
     animate,
     closed_loop_figure,
@@ -127,7 +128,8 @@ def write_results(
         stability=stability,
         origin=origin,
     )
-    (folder / "report.html").write_text(report, encoding="utf-8")
+    with whole(folder / "report.html") as partial:
+        partial.write_text(report, encoding="utf-8")
     print(
         f"\ntables, figures and recorded motions are in {folder}; open report.html there in a "
         "browser"

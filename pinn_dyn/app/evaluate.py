@@ -20,6 +20,7 @@ from pinn_dyn.app.provenance import build_origin, command_line, data_hash, prove
 from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource
+from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation import (
     Prediction,
     RunResult,
@@ -191,7 +192,8 @@ def evaluate(cfg: DictConfig) -> float:
         parts=parts,
         origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
     )
-    (folder / "report.html").write_text(report, encoding="utf-8")
+    with whole(folder / "report.html") as partial:
+        partial.write_text(report, encoding="utf-8")
     print(f"\nfigures and tables are in {folder}; open report.html there in a browser")
     if damaged:
         raise ConfigError(

@@ -215,7 +215,7 @@ def train_in(
     learner = build_learner(config, model, statistics, validator)
     if isinstance(learner, LeastSquaresLearner) and config.get("start_from"):
         saved = read_checkpoint(Path(config["start_from"]) / CHECKPOINTS / "best.ckpt")
-        if COVARIANCE not in saved:
+        if not isinstance(saved.get(COVARIANCE), torch.Tensor):
             raise ConfigError(
                 f"start_from: {config['start_from']} has no covariance of its constants, which a "
                 "fit by optimizer=least_squares leaves: fit it again, or leave start_from out"

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock
 
+from pinn_dyn.data.whole import whole
+
 log = logging.getLogger(__name__)
 
 Arrays = Mapping[str, np.ndarray]
@@ -79,16 +81,11 @@ def _read(path: Path, description: object) -> Arrays:
 
 
 def _write(path: Path, arrays: Arrays, description: object) -> None:
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            # The names tell a reader what must be there, should the archive's directory be damaged.
-            members = {
-                "description": np.array(json.dumps(description)),
-                "names": np.array(list(arrays)),
-                **arrays,
-            }
-            np.savez(file, allow_pickle=False, **members)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole(path) as partial, partial.open("wb") as file:
+        # The names tell a reader what must be there, should the archive's directory be damaged.
+        members = {
+            "description": np.array(json.dumps(description)),
+            "names": np.array(list(arrays)),
+            **arrays,
+        }
+        np.savez(file, allow_pickle=False, **members)

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation.drawing import Line, Panel
 
 DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
@@ -93,7 +94,8 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG at 150 dpi, and its folder if there is none."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png", dpi=150)
+    with whole(path) as partial:
+        figure.savefig(partial, format="png", dpi=150)
 
 
 def _style(line: Line) -> dict[str, Any]:

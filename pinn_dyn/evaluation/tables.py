@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from pinn_dyn.data.whole import whole
+
 # A column is recognized by how its name ends, so that prefixes (windowed_, mean_) may be added.
 _LOWER_IS_BETTER = (
     "squared_error_mean",
@@ -152,12 +154,14 @@ def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> tuple[Path, Pat
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     csv, records = folder / f"{stem}.csv", folder / f"{stem}.json"
-    frame.to_csv(csv, index=False)
+    with whole(csv) as partial:
+        frame.to_csv(partial, index=False)
     rows = [
         {name: _json_value(value) for name, value in row.items()}
         for row in frame.astype(object).to_dict(orient="records")
     ]
-    records.write_text(json.dumps(rows, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with whole(records) as partial:
+        partial.write_text(json.dumps(rows, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return csv, records
 
 

@@ -100,7 +100,8 @@ class LeastSquares:
         changed: bodies that are others than in the earlier fit, and free again.
 
     Raises:
-        ValueError: on a cutoff, samples, evaluations, chunk or weight that is not positive.
+        ValueError: on a cutoff, chunk or weight that is not positive, or fewer than two samples or
+            evaluations.
     """
 
     def __init__(
@@ -119,6 +120,9 @@ class LeastSquares:
         for name, value in settings.items():
             if not value > 0:
                 raise ValueError(f"least squares: {name} is {value}, expected a positive number")
+        for name, value in (("samples", samples), ("evaluations", evaluations)):
+            if value < 2:  # one sample has no spread, and one evaluation is that of the start
+                raise ValueError(f"least squares: {name} is {value}, expected at least 2")
         self.cutoff = cutoff
         self.rollouts = rollouts
         self.samples = samples
@@ -144,8 +148,8 @@ class LeastSquares:
 
         Raises:
             ValueError: on a model without parameters or with more than 500, trajectories that are
-                too short for the filter, or changed bodies that the model does not have, or without
-                an earlier fit.
+                too short for the filter, a covariance that is none or of another model, or changed
+                bodies that the model does not have, or without an earlier fit.
         """
         count = sum(p.numel() for p in model.parameters())
         if not 0 < count <= _MOST_PARAMETERS:
@@ -193,6 +197,11 @@ class LeastSquares:
         spread = torch.where(
             held[:, None] & held, covariance.to(z), torch.diag(_CHANGED**2 * free.to(z))
         )
+        if torch.linalg.cholesky_ex(spread).info:
+            raise ValueError(
+                "the covariance of the earlier fit is no positive definite matrix of finite "
+                "numbers: its checkpoint is damaged, fit it again"
+            )
         return Prior(z, torch.linalg.cholesky(torch.linalg.inv(spread)).mT)
 
     def _identify(self, model: KnownMechanics, prior: Prior, motion: Motion) -> Fit:

@@ -52,7 +52,7 @@ def test_a_network_starts_on_the_constants_of_a_fit(tmp_path, fitted):
         assert torch.allclose(found[name], value, atol=1e-6)
 
 
-def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted, capsys):
+def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted):
     folder = tmp_path / "again"
     short = ["optimizer.samples=20", f"start_from={fitted}"]
     run_script("train.py", KNOWN, *SMALL, *short, f"hydra.run.dir={folder}")
@@ -62,21 +62,34 @@ def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted, ca
     run_script("train.py", KNOWN, *SMALL, short[0], f"hydra.run.dir={alone}")
     else_where = constants(alone)
     assert apart < 0.5 * max(float((else_where[k] - before[k]).abs().max()) for k in before)
-    # A checkpoint that does not say how certain its constants are is no prior.
+
+
+FORGED = {
+    "none": (lambda c: None, "has no covariance of its constants.*or leave start_from out"),
+    "in words": (lambda c: "certain", "has no covariance of its constants"),
+    "NaN": (lambda c: c * torch.nan, "is no positive definite matrix of finite numbers"),
+    "below zero": (lambda c: -c, "is no positive definite matrix of finite numbers"),
+    "flat": (lambda c: c.flatten(), "the earlier fit has .* constants, this model"),
+    "of another": (lambda c: c[:3, :3], "the earlier fit has 3 constants, this model"),
+}
+
+
+def test_a_covariance_that_is_none_is_no_prior(tmp_path, fitted, capsys):
     path = fitted / "checkpoints" / "best.ckpt"
-    saved = torch.load(path, weights_only=True)
-    del saved["covariance"]
-    torch.save(saved, path)
-    start = [f"start_from={fitted}", f"hydra.run.dir={tmp_path / 'no'}"]
-    text = refused_text(capsys, "train.py", KNOWN, *SMALL, *start)
-    assert "has no covariance of its constants" in text
-    assert "fit it again, or leave start_from out" in text
+    whole = torch.load(path, weights_only=True)
+    for change, message in FORGED.values():
+        torch.save({**whole, "covariance": change(whole["covariance"])}, path)
+        start = [f"start_from={fitted}", f"hydra.run.dir={tmp_path / 'no'}"]
+        text = refused_text(capsys, "train.py", KNOWN, *SMALL, *start)
+        assert re.search(message, text, re.DOTALL)
 
 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
         ("optimizer.changed=[hand]", "optimizer: changed is .'hand'., but there is no earlier fit"),
+        ("optimizer.samples=1", "optimizer: .*samples is 1, expected at least 2"),
+        ("optimizer.evaluations=1", "optimizer: .*evaluations is 1, expected at least 2"),
         ("optimizer.cutoff=400", "optimizer: .*cutoff is 400.* less than half the sample rate"),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from pinn_dyn.data.logs import LogError
+from tests.attacks.test_fuzzed_logs import MATRICES, formatted
 from tests.data.logs_files import motion, source
 
 ROW = 300
@@ -216,3 +217,14 @@ def test_a_matlab_file_without_the_signals(tmp_path, content, message):
 def test_a_file_that_is_no_matlab_file(tmp_path, content):
     (tmp_path / "run.mat").write_bytes(content)
     refused(tmp_path, "cannot be read as a MATLAB file|MATLAB 7.3", files="*.mat")
+
+
+@pytest.mark.parametrize("kind", [0, 8, 14, 15, 19, 255])
+def test_an_element_of_a_matlab_file_of_no_type(tmp_path, kind):
+    """SciPy itself ends the process on it, without a word."""
+    content = bytearray(formatted("mat"))
+    place = content.index(b"\x09\0\0\0")  # the first array's numbers
+    content[place : place + 4] = kind.to_bytes(4, "little")
+    (tmp_path / "run.mat").write_bytes(content)
+    with pytest.raises(LogError, match=f"run.mat: cannot be read .* element of type {kind} "):
+        source(tmp_path, files="run.mat", **MATRICES).load()

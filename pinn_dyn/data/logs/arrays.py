@@ -18,6 +18,7 @@ from scipy.io import loadmat
 
 from pinn_dyn.data.logs.bags import optional
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes
+from pinn_dyn.data.logs.mat_elements import check_elements
 
 _DEEPEST = 30
 _KINDS = {
@@ -37,6 +38,7 @@ def read_mat(path: Path, time: str) -> pd.DataFrame:
     arrays: dict[str, np.ndarray] = {}
     unusable: dict[str, str] = {}
     try:
+        check_elements(path)
         content = loadmat(path, squeeze_me=False, struct_as_record=True)
     except NotImplementedError:  # version 7.3 is HDF5
         content = _read_mat73(path)
