@@ -9,7 +9,7 @@ from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.known import KnownMechanics
-from pinn_dyn.training.least_squares import Fit
+from pinn_dyn.training.least_squares import Fit, posterior_covariance
 
 _SHARE = 0.5
 """Variance of a direction, as a part of that of the prior, from which the data leave it open."""
@@ -32,14 +32,13 @@ def constants_table(model: KnownMechanics, fit: Fit) -> pd.DataFrame:
     model = double_copy(model)
     found = model.physical_constants()
     slope = _constant_slopes(model)
-    vector_to_parameters(fit.prior_mean.double(), model.parameters())
+    vector_to_parameters(fit.prior.mean.double(), model.parameters())
     first = _constant_slopes(model)
-    precision = torch.linalg.inv(fit.covariance) - fit.information
     change = torch.linalg.lstsq(slope, first).solution
-    posterior = torch.linalg.inv(change.T @ fit.information @ change + precision)
+    information = change.T @ fit.information @ change
     sigma, prior = (
-        (first @ x @ first.T).diagonal().clamp(min=0).sqrt()
-        for x in (posterior, torch.linalg.inv(precision))
+        (first @ posterior_covariance(known, fit.prior.root) @ first.T).diagonal().sqrt()
+        for known in (information, torch.zeros_like(information))
     )
     value = torch.cat([item.values for item in found]).detach()
     return pd.DataFrame(

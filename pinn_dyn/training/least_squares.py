@@ -55,14 +55,14 @@ class Fit:
     Attributes:
         covariance: of the standardized parameters z, ``(P, P)``, prior included.
         information: of z from the data alone, ``(P, P)``.
-        prior_mean: z_0, ``(P,)``.
+        prior: what was known of z before.
         residual: root mean square of the normalized data residuals.
         iterations: of Gauss-Newton.
     """
 
     covariance: Tensor
     information: Tensor
-    prior_mean: Tensor
+    prior: Prior
     residual: float
     iterations: int
 
@@ -288,8 +288,8 @@ class LeastSquares:
             log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
         slopes = torch.from_numpy(found.jac[: -len(z)])
         information = slopes.T @ slopes
-        covariance = torch.linalg.inv(information + prior.root.T @ prior.root)
-        return Fit(covariance, information, prior.mean, noise, steps)
+        covariance = posterior_covariance(information, prior.root)
+        return Fit(covariance, information, prior, noise, steps)
 
 
 def _evaluate(
@@ -302,6 +302,17 @@ def _evaluate(
     bad = 0.0 if derivative else _BROKEN
     values = np.nan_to_num(found.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
     return values if derivative else values.clip(-_BROKEN, _BROKEN)
+
+
+def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
+    """(I + R^T R)^-1, ``(P, P)``, from information I and the root R of the prior's precision.
+
+    By the eigenvalues of R^-T I R^-1: of data without noise I + R^T R cannot be inverted as it is.
+    """
+    back = torch.linalg.inv(root)
+    values, vectors = torch.linalg.eigh(back.T @ information @ back)
+    half = back @ vectors / (1 + values.clamp(min=0)).sqrt()
+    return half @ half.T
 
 
 def correlation_length(errors: np.ndarray) -> float:

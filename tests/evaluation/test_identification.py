@@ -5,13 +5,15 @@ import torch
 
 from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.training import Fit
+from pinn_dyn.training.least_squares import Prior
 from tests.support.known import known_model
 
 
 def fit_with(model, variances):
     covariance = torch.diag(torch.as_tensor(variances, dtype=torch.float64))
     information = torch.linalg.inv(covariance) - torch.eye(len(covariance)).double()
-    return Fit(covariance, information, torch.zeros(len(covariance)).double(), 0.0, 1)
+    prior = Prior(torch.zeros(len(covariance)).double(), torch.eye(len(covariance)).double())
+    return Fit(covariance, information, prior, 0.0, 1)
 
 
 @pytest.fixture
@@ -28,9 +30,9 @@ def test_intervals_follow_from_the_covariance(model):
     assert gain.value == pytest.approx(2.0)
     assert gain.high - gain.value == pytest.approx(1.96 * 0.1)
     assert gain.known == pytest.approx(0.99)
-    # m ~ exp(2 a): of the ten parameters of a body the mass depends on one.
+    # m ~ exp(2 a), a = 3 z: of the ten parameters of a body the mass depends on one.
     mass = table.loc["mass of slider"]
-    assert mass.high - mass.value == pytest.approx(1.96 * 0.5 * 2 * mass.value)
+    assert mass.high - mass.value == pytest.approx(1.96 * 0.5 * 6 * mass.value)
     assert mass.unit == "kg"
 
 
@@ -40,3 +42,17 @@ def test_open_directions_are_named(model):
     words = undetermined(model, fit_with(model, [open_ones.get(name, 0.01) for name in names]))
     assert [text.split(":")[0] for text in words] == list(open_ones)
     assert "95%" in words[0]
+
+
+def test_what_no_data_determine_keeps_the_width_of_the_prior(model):
+    """Though its slope has become small on the way from the start."""
+    names = model.parameter_names()
+    fit = fit_with(model, [1.0] * len(names))
+    before = constants_table(model, fit).set_index("name")
+    with torch.no_grad():
+        model.bodies.z[1, 0] -= 2  # the slider's mass, to a fiftieth
+    after = constants_table(model, fit).set_index("name")
+    width = after.high - after.low
+    assert width["mass of slider"] == pytest.approx((before.high - before.low)["mass of slider"])
+    assert after.known["mass of slider"] == pytest.approx(0, abs=1e-9)
+    assert after.value["mass of slider"] < 0.1 * before.value["mass of slider"]

@@ -2,14 +2,16 @@
 
 import copy
 
+import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.models import DriveCoulomb
 from pinn_dyn.training import LeastSquares
-from pinn_dyn.training.least_squares import filtered_motion
+from pinn_dyn.training.least_squares import correlation_length, filtered_motion
 from tests.support.known import known_model, motion
 from tests.support.rigid_chains import joint, link, robot
 
@@ -121,6 +123,28 @@ def test_the_information_is_that_of_the_inputs_that_are_missed(truth, runs):
     expected = slopes.T @ slopes
     share = found.information.trace() / expected.trace()  # of the noise
     torch.testing.assert_close(found.information, share * expected, rtol=1e-4, atol=1e-4 * share)
+
+
+def test_errors_of_an_autoregression_count_for_fewer():
+    """x_k = a x_(k-1) + white noise has rho_k = a^k, so the length (1 + a) / (1 - a)."""
+    white = np.random.default_rng(0).normal(size=(20_000, 3))
+    assert correlation_length(white) == pytest.approx(1, abs=0.1)
+    coloured = lfilter([1], [1, -0.8], white, axis=0)
+    assert correlation_length(coloured) == pytest.approx(9, rel=0.1)
+    assert correlation_length(np.zeros((10, 2))) == 1
+
+
+def test_correlated_errors_widen_the_intervals(truth, runs):
+    """Four times the samples of the same filtered motion say hardly more."""
+    model, windows = robot_model("prior"), draw_windows(runs, count=4, steps=1, stride=1, seed=0)
+    found = [
+        LeastSquares(cutoff=2.0, rollouts=False, samples=samples).fit(
+            copy.deepcopy(model), runs, windows
+        )
+        for samples in (120, 480)
+    ]
+    few, many = (fit.information.trace() for fit in found)
+    assert many < 2 * few
 
 
 def test_the_filter_keeps_the_motion_and_takes_its_derivative(runs):
