@@ -136,6 +136,46 @@ def rigid() -> str:
     return table(head, rows)
 
 
+_MECHANICAL = ("identification", "known", "known_and_network", "lnn", "lnn_residual")
+
+
+def verdict() -> str:
+    """For each log the best mechanical model beside the best of all rivals and floors."""
+    rows, ahead = [], dict.fromkeys(WINDOWS[:2], 0)
+    for name, unit in {**RIGID, **LOGS}.items():
+        data = _of_log(name)
+        cells = []
+        for column in WINDOWS[:2]:
+            means = data.groupby("model")[column].mean().dropna()
+            ours = means[means.index.isin(_MECHANICAL)]
+            others = means.drop(ours.index)
+            # Within the spread over seeds of either it is a tie.
+            runs = data[data["model"].isin([ours.idxmin(), others.idxmin()])]
+            spread = runs.groupby("model")[column].agg(lambda x: x.max() - x.min()).max()
+            holds = ours.min() <= others.min() + spread
+            ahead[column] += holds
+            cells += [
+                f"{bold(_precise(ours.min()), holds)} (`{ours.idxmin()}`)",
+                f"{bold(_precise(others.min()), not holds)} ({others.idxmin()})",
+            ]
+        rows.append([f"`{name}`, {unit}", *cells])
+    head = ["log", "mechanical, 0.1 s", "best rival or floor", "mechanical, 1 s"]
+    counts = (
+        f"{n} of {len(rows)} after {when}"
+        for n, when in zip(ahead.values(), ("0.1 s", "1 s"), strict=True)
+    )
+    found = table([*head, "best rival or floor"], rows)
+    return f"{found}\nAt or below every rival and floor: {', '.join(counts)}.\n"
+
+
+def _of_log(name: str) -> pd.DataFrame:
+    """The evaluations of a log with its floors."""
+    if name in RIGID:
+        return pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
+    floor = floors().loc[[name], WINDOWS].assign(model="keeps its velocity")
+    return pd.concat([read_log(name), floor])
+
+
 def _precise(value: float) -> str:
     """Three digits, as the models of a log are close to each other."""
     return f"{value:#.3g}"
@@ -209,13 +249,16 @@ def tracking() -> str:
     """Sines and a helix of the Panda in PyBullet: RMS and largest errors, in mrad."""
     runs = ["tracking", "helix", "tracking_heavier", "helix_heavier"]
     runs += ["tracking_payload", "tracking_other_inertia"]
-    data = [_controlled("panda", run) for run in runs]
+    found = [(name, "panda", controller) for controller, name in NAMES.items()]
+    found[2:2] = [
+        ("the paper's law on known mechanics", "panda_known", "learned"),
+        ("the same with the observer", "panda_known", "learned_observer"),
+    ]
     rows = []
-    for controller, name in NAMES.items():
-        errors = [run.loc[controller, ["rms_error", "max_error"]] for run in data]
-        rows.append(
-            [name, *(f"{number(1000 * rms)}, {number(1000 * most)}" for rms, most in errors)]
-        )
+    for name, robot, controller in found:
+        errors = [_controlled(robot, run).loc[controller] for run in runs]
+        cells = (f"{number(1000 * e.rms_error)}, {number(1000 * e.max_error)}" for e in errors)
+        rows.append([name, *cells])
     head = ["law", "sines", "helix", "sines, 20 % heavier", "helix, 20 % heavier"]
     return table([*head, "sines, 1 kg in the hand", "sines, other inertias"], rows)
 
@@ -227,6 +270,7 @@ TABLES = {
         "panda": panda(),
         "logs": logs(),
         "rigid": rigid(),
+        "verdict": verdict(),
         "neck": neck(),
         "long_rollout": long_rollout(),
     },
