@@ -223,7 +223,9 @@ _WHAT = {"model": "model", "dataset": "data set"}
 def _differing(here: dict[str, Any], there: dict[str, Any]) -> str:
     """The first value in which two configurations differ."""
     one, other = flatten(here), flatten(there)
-    key = next(key for key in [*one, *other] if one.get(key) != other.get(key))
+    key = next((key for key in [*one, *other] if one.get(key) != other.get(key)), None)
+    if key is None:  # flatten keeps neither the modules of classes nor empty sections
+        return "in the module of a class, in an empty section, or in a value that is not a number"
     return f"{key} is {one.get(key, 'absent')}, the checkpoint has {other.get(key, 'absent')}"
 
 
