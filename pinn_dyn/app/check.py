@@ -13,7 +13,7 @@ from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.provenance import command_line
 from pinn_dyn.app.run_folder import write_config
 from pinn_dyn.data.logs import LogError, LogSource
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.log_check import check_log
 from pinn_dyn.evaluation.report import check_report
 
@@ -38,12 +38,8 @@ def check(cfg: DictConfig) -> None:
     except LogError as error:
         raise ConfigError(f"{source.name}: {error}") from error
     write_config(folder, config)
-    for name, text in (
-        ("check.html", check_report(found, source, command=command_line())),
-        ("log_report.md", source.report),
-    ):
-        with whole(folder / name) as partial:
-            partial.write_text(text)
+    write_whole(folder / "check.html", check_report(found, source, command=command_line()))
+    write_whole(folder / "log_report.md", source.report)
     print(f"\n{found}\n\nthe page is {folder / 'check.html'}")
     if found.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(found.problems)}")

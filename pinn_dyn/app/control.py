@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,7 +27,7 @@ from pinn_dyn.app.build import (
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.control_results import write_results, write_stability
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
-from pinn_dyn.app.run_folder import load_run, write_config
+from pinn_dyn.app.run_folder import load_run, write_config, write_json
 from pinn_dyn.app.trust import packages
 from pinn_dyn.control import (
     ClosedLoopRecord,
@@ -46,7 +45,7 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
@@ -89,9 +88,7 @@ def control(cfg: DictConfig) -> float:
     learned = double_copy(model)
     source = build_source(run.config)
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    (folder / "provenance.json").write_text(
-        json.dumps({"config": config, "run": run.config, **record}, indent=2)
-    )
+    write_json(folder / "provenance.json", {"config": config, "run": run.config, **record})
     origin = build_origin({run.config["name"]: run}, source, record, config)
     if source.system is None:
         return _report_without_truth(learned, source, folder, origin)
@@ -147,12 +144,11 @@ def _report_without_truth(
     with _errors_of("run"):
         check = check_without_truth(learned, q, region=f"the training data of {source.name}")
     text = model_report(check)
-    (folder / "stability.md").write_text(text)
+    write_whole(folder / "stability.md", text)
     print(text)
     title = f"{source.name}: learned model of measured data"
     page = measured_model_report(title=title, report=text, origin=origin)
-    with whole(folder / "report.html") as partial:
-        partial.write_text(page, encoding="utf-8")
+    write_whole(folder / "report.html", page)
     log.info(
         "%s is measured data, there is no robot to close the loop with: what can be said of the "
         "model alone is in %s",
@@ -272,7 +268,8 @@ def _write_record(record: ClosedLoopRecord, path: Path) -> None:
         **{name: value.numpy() for name, value in record.diagnostics.items()},
         "stopped": np.array([reason or "" for reason in record.stopped]),
     }
-    np.savez_compressed(path, **arrays)
+    with whole(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 @contextlib.contextmanager

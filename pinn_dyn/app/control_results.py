@@ -24,7 +24,7 @@ from pinn_dyn.control import (
     stability_report,
 )
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import (
     animate,
     closed_loop_figure,
@@ -99,7 +99,8 @@ def write_results(
         # A row per figure of merit, to be read without scrolling.
         text = table.set_index("controller").T.to_string(float_format="{:.4g}".format)
         writer.add_text("closed_loop/summary", f"<pre>{text}</pre>")
-        writer.add_text("run/configuration", f"```yaml\n{(folder / CONFIG).read_text()}\n```")
+        configuration = (folder / CONFIG).read_text(encoding="utf-8")
+        writer.add_text("run/configuration", f"```yaml\n{configuration}\n```")
         for name in figures:
             # The saved picture: to draw a figure of seven joints again takes seconds.
             picture = imread(folder / f"{name}.png")
@@ -128,8 +129,7 @@ def write_results(
         stability=stability,
         origin=origin,
     )
-    with whole(folder / "report.html") as partial:
-        partial.write_text(report, encoding="utf-8")
+    write_whole(folder / "report.html", report)
     print(
         f"\ntables, figures and recorded motions are in {folder}; open report.html there in a "
         "browser"
@@ -171,7 +171,7 @@ def write_stability(
     write_table(table, folder, "stability_set_points")
     wanted = {error: required_gain(learned, robot, q_ref, error=error) for error in _WANTED_ERRORS}
     text = stability_report(certificate, [predicted], [measured], wanted)
-    (folder / "stability.md").write_text(text)
+    write_whole(folder / "stability.md", text)
     figure = steady_state_figure(
         torch.where(predicted.holds, predicted.bound, torch.inf),
         measured,

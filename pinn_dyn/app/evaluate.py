@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,10 +16,10 @@ from tqdm import tqdm
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
-from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run
+from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run, write_json
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import (
     Prediction,
     RunResult,
@@ -155,9 +154,8 @@ def evaluate(cfg: DictConfig) -> float:
     if len(parts):
         write_table(parts, folder, "parts")
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    (folder / "provenance.json").write_text(
-        json.dumps({"config": config, "dataset": runs[0].config["dataset"], **record}, indent=2)
-    )
+    made = {"config": config, "dataset": runs[0].config["dataset"], **record}
+    write_json(folder / "provenance.json", made)
     _draw(evaluations, truth, source, config, folder)
     comparisons = _compare_with_truth(trained, source, folder)
 
@@ -192,8 +190,7 @@ def evaluate(cfg: DictConfig) -> float:
         parts=parts,
         origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
     )
-    with whole(folder / "report.html") as partial:
-        partial.write_text(report, encoding="utf-8")
+    write_whole(folder / "report.html", report)
     print(f"\nfigures and tables are in {folder}; open report.html there in a browser")
     if damaged:
         raise ConfigError(
@@ -377,7 +374,7 @@ def _compare_with_truth(
                 inverse_mass=model.state == "qp",
             )
             save(figure, folder / f"terms_{stem}_{name}.png")
-    (folder / "terms.txt").write_text(_terms_text(comparisons) + "\n")
+    write_whole(folder / "terms.txt", _terms_text(comparisons) + "\n")
     return comparisons
 
 

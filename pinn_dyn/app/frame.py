@@ -12,6 +12,7 @@ import yaml
 
 from pinn_dyn.data.logs import Columns, LogError
 from pinn_dyn.data.logs.reader import column, numbers
+from pinn_dyn.data.whole import whole, write_whole
 
 Signals = str | Sequence[str] | Mapping[str, Any]
 
@@ -51,7 +52,8 @@ def frame_dataset(
     runs = {str(key): x.to_numpy() for key, x in pd.Series(t).groupby(np.asarray(ids), sort=False)}
 
     folder.mkdir(parents=True, exist_ok=True)
-    frame.to_csv(folder / FRAME, index=False)
+    with whole(folder / FRAME) as partial:
+        frame.to_csv(partial, index=False)
     split, settings = _split(runs, seed)
     dataset = {
         "defaults": ["csv_log", "_self_"],
@@ -64,8 +66,9 @@ def frame_dataset(
     }
     group = folder / "dataset"
     group.mkdir(exist_ok=True)
-    (group / "frame.yaml").write_text(
-        yaml.safe_dump(dataset, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    write_whole(
+        group / "frame.yaml",
+        yaml.safe_dump(dataset, sort_keys=False, allow_unicode=True, default_flow_style=None),
     )
     place = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     return [

@@ -24,7 +24,7 @@ from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.schema import KEYS, check_value
 from pinn_dyn.app.trust import read_foreign
 from pinn_dyn.data import DataSource, fingerprint_changes
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.sweep_table import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
@@ -58,8 +58,7 @@ class Run:
 def write_config(folder: Path, config: dict[str, Any]) -> None:
     """Write the resolved configuration of a run."""
     folder.mkdir(parents=True, exist_ok=True)
-    with whole(folder / CONFIG) as partial:
-        partial.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+    write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
 
 
 def read_config(folder: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -224,7 +223,9 @@ _WHAT = {"model": "model", "dataset": "data set"}
 def _differing(here: dict[str, Any], there: dict[str, Any]) -> str:
     """The first value in which two configurations differ."""
     one, other = flatten(here), flatten(there)
-    key = next(key for key in [*one, *other] if one.get(key) != other.get(key))
+    key = next((key for key in [*one, *other] if one.get(key) != other.get(key)), None)
+    if key is None:  # flatten keeps neither the modules of classes nor empty sections
+        return "in the module of a class, in an empty section, or in a value that is not a number"
     return f"{key} is {one.get(key, 'absent')}, the checkpoint has {other.get(key, 'absent')}"
 
 
@@ -265,8 +266,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write a record that is whole or absent."""
-    with whole(path) as partial:
-        partial.write_text(json.dumps(values, indent=2))
+    write_whole(path, json.dumps(values, indent=2))
 
 
 def check_data(folder: Path, source: DataSource) -> None:

@@ -45,6 +45,7 @@ from pinn_dyn.app.run_folder import (
 from pinn_dyn.app.schema import KEYS, check_value
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource, LogSource
+from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
 from pinn_dyn.evaluation.identification import constants_table, undetermined
@@ -304,15 +305,16 @@ def _cpu_seconds() -> float:
 def _write_constants(model: Predictor, result: Fit, folder: Path) -> None:
     """Write the constants with their 95 % intervals, and what the data leave to the prior."""
     assert isinstance(model, KnownMechanics)
-    constants_table(model, result).to_csv(folder / "constants.csv", index=False)
+    with whole(folder / "constants.csv") as partial:
+        constants_table(model, result).to_csv(partial, index=False)
     left = undetermined(model, result) or ["nothing: the data determine every parameter"]
-    (folder / "undetermined.md").write_text("".join(f"- {line}\n" for line in left))
+    write_whole(folder / "undetermined.md", "".join(f"- {line}\n" for line in left))
     log.info("constants and their intervals are in %s", folder / "constants.csv")
 
 
 def _write_report(source: LogSource, folder: Path) -> None:
     """Write what the cleaning of a log did, and a picture of it."""
-    (folder / "log_report.md").write_text(source.report)
+    write_whole(folder / "log_report.md", source.report)
     figure = cleaning_figure(
         source.cleaned[0],
         title=f"{source.name}, raw and cleaned",
@@ -329,7 +331,7 @@ def describe(folder: Path, config: dict[str, Any]) -> RunDescription:
     overrides = yaml.safe_load(path.read_text()) if path.is_file() else []
     return RunDescription(
         settings=run_settings(config, overrides),
-        configuration=(folder / CONFIG).read_text(),
+        configuration=(folder / CONFIG).read_text(encoding="utf-8"),
         provenance=provenance(),
     )
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from pinn_dyn.control.contracts import Controller
 from pinn_dyn.control.laws import ModelBasedLaw, StateFeedback
 from pinn_dyn.data.simulation import has_cpp_compiler
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.mechanics.arrays import require_finite
 
 INPUTS = ("q", "v", "q_ref", "v_ref", "a_ref")
@@ -128,7 +129,7 @@ def export_law(controller: Controller, path: str | Path) -> Path:
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)
-    path.with_name(f"{path.name}.sha256").write_text(f"{digest}  {path.name}\n")
+    write_whole(path.with_name(f"{path.name}.sha256"), f"{digest}  {path.name}\n")
     return path
 
 

@@ -31,3 +31,9 @@ def whole(path: Path) -> Iterator[Path]:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text, in UTF-8, by ``whole``."""
+    with whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.whole import whole, write_whole
 
 # A column is recognized by how its name ends, so that prefixes (windowed_, mean_) may be added.
 _LOWER_IS_BETTER = (
@@ -160,8 +160,7 @@ def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> tuple[Path, Pat
         {name: _json_value(value) for name, value in row.items()}
         for row in frame.astype(object).to_dict(orient="records")
     ]
-    with whole(records) as partial:
-        partial.write_text(json.dumps(rows, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(records, json.dumps(rows, indent=2, allow_nan=False) + "\n")
     return csv, records
 
 

@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -79,12 +81,17 @@ def test_tensorboard_has_losses_errors_figures_and_hyperparameters(hnn_run):
     assert "data.pairs" in hparams
 
 
-def test_a_training_starts_from_the_weights_of_another_run(tmp_path, hnn_run):
+def test_a_training_starts_from_the_best_weights_of_another_run(tmp_path, hnn_run):
     """With a learning rate of next to nothing it also ends there; its windows may be longer."""
+    earlier = Path(shutil.copytree(hnn_run, tmp_path / "earlier"))
+    last = load(earlier, "last")
+    for value in last["state_dict"].values():
+        value.zero_()
+    torch.save(last, earlier / "checkpoints" / "last.ckpt")
     run = train(
         tmp_path / "run",
         "model=hnn",
-        f"start_from={hnn_run}",
+        f"start_from={earlier}",
         "data.steps=2",
         "optimizer.lr=1e-9",
         NO_FIGURES,

@@ -49,6 +49,13 @@ def of_another_model(path):
     torch.save(saved, path)
 
 
+def of_another_module(path):
+    saved = torch.load(path, weights_only=True)
+    model = saved["hyper_parameters"]["config"]["model"]
+    model["_target_"] = f"elsewhere.{model['_target_'].rpartition('.')[2]}"
+    torch.save(saved, path)
+
+
 def stored(change):
     """A change of what a checkpoint holds."""
 
@@ -142,6 +149,7 @@ class Path:
         (with_nan, "holds weights that are NaN or infinite"),
         (of_another_data_set, "another data set .*segments is 1, the checkpoint has 2"),
         (of_another_model, "another model .*mass.hidden is"),
+        (of_another_module, "another model .*in the module of a class"),
         (without_parts, "is no checkpoint that train.py wrote"),
         (a_pickle, "cannot be read"),
         (lambda path: path.write_bytes(b""), "cannot be read"),

@@ -10,6 +10,7 @@ import torch
 
 from pinn_dyn.app.run_folder import write_config, write_json
 from pinn_dyn.data.cache import load_or_make
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import write_table
 from pinn_dyn.training import WholeCheckpoints
 from tests.app.entry import (
@@ -43,6 +44,7 @@ def cached(folder, size):
 WRITERS = {
     "config.yaml": lambda folder, size: write_config(folder, {"q": [0] * size}),
     "metrics.json": lambda folder, size: write_json(folder / "metrics.json", {"q": [0] * size}),
+    "stability.md": lambda folder, size: write_whole(folder / "stability.md", "q" * size),
     "summary.csv": lambda folder, size: write_table(
         pd.DataFrame({"q": np.zeros(size)}), folder, "summary"
     ),

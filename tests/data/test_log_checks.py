@@ -85,6 +85,16 @@ def test_two_clocks(tmp_path):
     refused(tmp_path, table, r"line 10\d.*clocks 't' and 't_robot' disagree", time=both)
 
 
+@pytest.mark.parametrize("rate", [50, 200])
+def test_a_run_of_another_sample_time_is_named(tmp_path, rate):
+    write(tmp_path, motion(), "a.csv")
+    write(tmp_path, motion(phase=1.0), "b.csv")
+    message = rf"c .*its sample time is {1 / rate:g} s, that of the others 0.01 s: add a Resample"
+    write(tmp_path, motion(phase=2.0, rate=rate), "c.csv")
+    with pytest.raises(LogError, match=message):
+        source(tmp_path).load()
+
+
 def test_an_empty_pattern_names_itself_and_the_folder(tmp_path):
     with pytest.raises(LogError, match=rf"nothing matches '\*.txt' in the folder {tmp_path}"):
         source(tmp_path, files="*.txt").load()

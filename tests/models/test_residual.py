@@ -66,6 +66,15 @@ def test_it_is_bounded_far_outside_the_data():
     assert largest[1] < 2 * largest[0]
 
 
+def test_it_sees_q_as_far_as_the_data_and_v_and_u_three_deviations():
+    data = make_statistics(3, 3)
+    head = RESIDUAL(make_structured("lnn")._scales(data, torch.ones(3).double()))
+    far = 3 * data.u_std
+    low, high = head.network.limits.double()
+    assert_near(low, torch.cat([data.q_low, -3 * data.v_std, data.u_mean - far]), 1e-6)
+    assert_near(high, torch.cat([data.q_high, 3 * data.v_std, data.u_mean + far]), 1e-6)
+
+
 @pytest.mark.parametrize("weight", [0.5, 2.0])
 def test_the_loss_of_training_adds_its_penalty(weight):
     model = structured(residual=partial(RESIDUAL, weight=weight))

@@ -19,6 +19,7 @@ from pinn_dyn.models import (
     NetworkPotential,
     NetworkResidual,
     NoInput,
+    NonlinearInput,
     Positive,
 )
 from pinn_dyn.systems import RigidChain
@@ -90,6 +91,13 @@ def test_the_terms_add():
     assert_near(total.coriolis_matrix(q, v), coriolis, 1e-9)
     supplied = one.power(q, v, u) + other.power(q, v, u)
     assert_near(total.power(q, v, u), supplied, 1e-9)
+
+
+def test_one_part_that_is_not_affine_in_the_input_is_enough():
+    affine = make_structured("lnn")
+    curved = make_structured("lnn", input=partial(NonlinearInput, hidden=[4]))
+    assert Sum({"one": affine, "other": affine}).input_affine
+    assert not Sum({"one": affine, "other": curved}).input_affine
 
 
 def test_the_network_hardly_changes_the_known_mechanics_before_training():

@@ -66,10 +66,17 @@ def test_a_short_training_lowers_the_loss(tmp_path, data, kind, optimizer):
     assert loss_of(learner, data) < 0.5 * before
 
 
-def test_the_logged_loss_is_that_of_the_batches(tmp_path, data):
-    """With the learning rate at zero it is the mean over batches of a fixed model's loss."""
+@pytest.mark.parametrize("cut", [False, True])
+def test_the_logged_loss_is_that_of_the_batches(tmp_path, data, cut):
+    """With the learning rate at zero it is the mean over batches of a fixed model's loss.
+
+    Those of an epoch that was cut short before do not count.
+    """
     torch.manual_seed(0)
     learner = make_learner(AccelerationMLP(data.statistics, [8]), data, lr=0.0)
+    if cut:
+        options = {"max_epochs": 1, "max_steps": 5, "enable_checkpointing": False}
+        make_trainer(tmp_path, **options).fit(learner, data)
     trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
     trainer.fit(learner, data)
     loader = data.train_dataloader()
@@ -200,7 +207,10 @@ def test_many_steps_in_one_are_the_same_training(tmp_path, data, monkeypatch):
 
 def test_steps_end_where_the_trainer_validates_or_stops(tmp_path, data, monkeypatch):
     _, ends, _ = trained(tmp_path, data, monkeypatch, 100.0, val_check_interval=7)
-    assert set(ends.batches) >= {7, 14, 21, 28}
+    assert [k for k in ends.batches if k % 7 == 0] == 2 * [7, 14, 21, 28]  # in each epoch
+    over_epochs = {"val_check_interval": 7, "check_val_every_n_epoch": None}
+    _, ends, _ = trained(tmp_path, data, monkeypatch, 100.0, **over_epochs)
+    assert [k for k in ends.steps if k % 7 == 0] == list(range(7, 60, 7))
     _, ends, _ = trained(tmp_path, data, monkeypatch, 100.0, max_steps=33)
     assert ends.steps[-1] == 33
 
