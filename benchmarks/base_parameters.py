@@ -44,7 +44,7 @@ def main(folder: Path) -> None:
     torque = np.abs(expected) * np.linalg.norm(columns[:, order[:rank]], axis=0)
     carries = torque > CARRIES * torque.max()
     error = np.abs(learned / expected - 1)[carries]
-    print(f"{rank} combinations, {carries.sum()} carry at least {CARRIES:.1%} of the largest torque")
+    print(f"{rank} combinations, {carries.sum()} with {CARRIES:.1%} of the largest torque or more")
     print(f"of these within 1 %: {(error < 0.01).sum()}; the worst is {error.max():.2%} off")
 
 
