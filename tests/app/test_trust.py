@@ -68,7 +68,8 @@ def test_everything_that_conf_names_may_be_built():
         for _, part in trust._mappings(_plain(yaml.safe_load(path.read_text())), ""):
             if "_target_" in part:
                 found.add(part["_target_"])
-    found.discard("pinn_dyn.app.sweep.SweepCallback")  # of Hydra, in no run's configuration
+    # In no run's configuration: one of Hydra, and a search, of which a run keeps the draw alone.
+    found -= {"pinn_dyn.app.sweep.SweepCallback", "pinn_dyn.app.search.EqualSearch"}
     assert len(found) > 50
     assert not [name for name in sorted(found) if not trust.may_build(name, ())]
 
