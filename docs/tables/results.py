@@ -122,10 +122,10 @@ def rigid() -> str:
     rows = []
     for name, unit in RIGID.items():
         data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
-        data = data.set_index("model", drop=False)
+        data = data.groupby("model")[["floor", *WINDOWS, "torque_share"]].mean()
         data = data.loc[[model for model in _RIGID_ROWS if model in data.index]]
-        for index, (_, row) in enumerate(data.iterrows()):
-            label = row["model"] if row["floor"] else f"`{row['model']}`"
+        for index, (model, row) in enumerate(data.iterrows()):
+            label = model if row["floor"] else f"`{model}`"
             cells = [
                 bold(_precise(row[c]), row[c] == data[c].min()) if row[c] < 100 else "diverged"
                 for c in WINDOWS
