@@ -29,8 +29,6 @@ SUMMARY = [
 ]
 LOGS = {"double_pendulum": "rad", "panda_gaz": "rad", "soft_neck": "rad", "trunk": "m"}
 RIGID = {"double_pendulum": "rad", "ur10e": "rad", "panda_gaz": "rad", "emps": "m"}
-KNOWN_STEPS = 20
-"""Pairs in a window of experiment=panda/known."""
 WINDOWS = ["window_0.1s_error_mean", "window_1s_error_mean", "error_mean"]
 
 
@@ -84,7 +82,7 @@ def panda() -> str:
     for _, row in data.iterrows():
         cells = [bold(number(row[c]), row[c] == data[c].min()) for c in columns]
         diverged = f"{row['diverged']} of {row['trajectories']}"
-        pairs = row["pairs"] * (KNOWN_STEPS if row["model"] == "known" else 1)
+        pairs = row["pairs"] * read_entries()[f"panda/{row['model']}"].get("steps", 1)
         rows.append([f"`{row['model']}`", f"{pairs:,}", *cells, diverged])
     rows.append(["keeps its velocity", "–", *(number(floor[c]) for c in columns), "0 of 20"])
     head = ["model", "pairs", "0.05 s windows", "0.5 s windows", "2 s", "2 s, median", "diverged"]

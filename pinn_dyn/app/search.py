@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from pinn_dyn.app.schema import ConfigError, Count, Index, Range
 
-Positive = Annotated[float, Range(0, above=True)]
+PositiveNumber = Annotated[float, Range(0, above=True)]
 T = TypeVar("T")
 Activation = Literal["softplus", "silu", "tanh"]
 
@@ -36,14 +36,14 @@ class EqualSearch:
         ConfigError: on a range that is none, or no choices.
     """
 
-    draw: Index = 0
-    lr: Sequence[Positive] = (5e-4, 1e-2)
-    weight_decay: Sequence[Positive] = (1e-4, 0.3)
-    width: Sequence[Count] = (16, 32, 64, 128)
-    depth: Sequence[Count] = (1, 2, 3, 4)
-    activation: Sequence[Activation] = ("softplus", "silu", "tanh")
-    length: Sequence[Positive] = (0.5, 1.0, 2.0)
-    substeps: Sequence[Count] = (1, 2, 4)
+    draw: Index
+    lr: Sequence[PositiveNumber]
+    weight_decay: Sequence[PositiveNumber]
+    width: Sequence[Count]
+    depth: Sequence[Count]
+    activation: Sequence[Activation]
+    length: Sequence[PositiveNumber]
+    substeps: Sequence[Count]
 
     def __post_init__(self) -> None:
         for name in ("lr", "weight_decay"):

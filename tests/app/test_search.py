@@ -10,6 +10,16 @@ from pinn_dyn.app.schema import ConfigError
 from pinn_dyn.app.search import EqualSearch
 from tests.app.entry import NO_FIGURES, TINY, run_script
 
+RANGES = {
+    "draw": 1,
+    "lr": [1e-3, 1e-2],
+    "weight_decay": [1e-3, 1e-1],
+    "width": [8],
+    "depth": [1],
+    "activation": ["tanh"],
+    "length": [1.0],
+    "substeps": [1],
+}
 MODELS = ["lnn", "hnn", "mlp", "acceleration"]
 
 
@@ -92,7 +102,7 @@ def test_runs_of_a_search_are_ordinary_ones_told_apart_by_their_draw(tmp_path, m
 )
 def test_ranges_that_are_none(settings, said):
     with pytest.raises(ConfigError, match=said):
-        EqualSearch(**settings)
+        EqualSearch(**{**RANGES, **settings})
 
 
 def test_a_fit_without_a_learning_rate_has_nothing_to_draw():
