@@ -89,22 +89,28 @@ def panda() -> str:
     return table(head, rows)
 
 
+_LINEAR = ("ARX", "EDMDc degree 2")
+"""Rivals by least squares, without a seed."""
+
+
 def logs() -> str:
     """The logs of real robots: means over the seeds, with the smallest and the largest."""
     rows = []
     for name, unit in LOGS.items():
         data, floor = read_log(name), floors().loc[name]
         means = data.groupby("model")[WINDOWS].mean()
-        present = [m for m in ("lnn", "acceleration", "mlp") if m in means.index]
+        rows_of_log = ("lnn", "acceleration", "mlp", *_LINEAR)
+        present = [model for model in rows_of_log if model in means.index]
         for index, model in enumerate(present):
             runs = data[data["model"] == model]
             cells = []
             for column in WINDOWS:
                 mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
                 best = mean == means[column].min() and mean < floor[column]
-                spread = f"{_precise(low)}–{_precise(high)}" if len(runs) > 1 else "one seed"
-                cells.append(f"{bold(_precise(mean), best)} ({spread})")
-            rows.append([f"`{name}`, {unit}" if index == 0 else "", f"`{model}`", *cells])
+                spread = f" ({_precise(low)}–{_precise(high)})" if len(runs) > 1 else ""
+                cells.append(f"{bold(_precise(mean), best)}{spread}")
+            label = model if model in _LINEAR else f"`{model}`"
+            rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells])
         rows.append(["", "keeps its velocity", *(_floor(floor[c], means[c]) for c in WINDOWS)])
     return table(["log", "model", "0.1 s windows", "1 s windows", "open loop"], rows)
 
