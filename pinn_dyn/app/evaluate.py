@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,19 @@ from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
 from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run, write_json
 from pinn_dyn.app.trust import packages
-from pinn_dyn.data import DataSource
+from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
+    Calibration,
     Prediction,
     RunResult,
     TermComparison,
     beaten_by_floors,
     build_floors,
+    calibration,
+    calibration_figure,
+    calibration_table,
     common_stride,
     compare_terms,
     default_horizon,
@@ -33,6 +39,7 @@ from pinn_dyn.evaluation import (
     error_figure,
     format_table,
     grouped_table,
+    interval_lines,
     left_data,
     member_metrics,
     part_shares,
@@ -79,11 +86,15 @@ _SPLITS = {"test": "unseen test trajectories", "validation": "validation traject
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The roll-outs of one run, or of a floor, and the row of the table."""
+    """The roll-outs of one run, or of a floor, and the row of the table.
+
+    ``intervals`` are those of its windowed predictions, by window in s; none of a single network.
+    """
 
     model: Predictor
     prediction: Prediction
     result: RunResult
+    intervals: dict[float, Calibration]
 
 
 def evaluate(cfg: DictConfig) -> float:
@@ -133,13 +144,16 @@ def evaluate(cfg: DictConfig) -> float:
     labels = _labels(runs)
     rows = [_row(run, label, step) for run, label, step in zip(runs, labels, steps, strict=True)]
     models = [run.model for run in runs]
+    members = [run.members() for run in runs]
     for label, floor in build_floors(training.train, training.validation, step=grid).items():
         rows.append(RunResult(label, label, None, {}, {"step": grid}, floor=True))
         models.append(floor)
+        members.append(None)
     evaluations = []
-    for model, row in zip(tqdm(models, desc="evaluating", disable=None), rows, strict=True):
+    progress = tqdm(models, desc="evaluating", disable=None)
+    for model, drawn, row in zip(progress, members, rows, strict=True):
         try:
-            evaluations.append(_evaluate(model, row, truth, training.train, stride, config))
+            evaluations.append(_evaluate(model, drawn, row, truth, training, stride, config))
         except ValueError as error:
             raise ConfigError(f"run '{row.run}': {error}") from error
     trained = evaluations[: len(runs)]
@@ -157,10 +171,16 @@ def evaluate(cfg: DictConfig) -> float:
     made = {"config": config, "dataset": runs[0].config["dataset"], **record}
     write_json(folder / "provenance.json", made)
     _draw(evaluations, truth, source, config, folder)
+    intervals = {x.result.run: x.intervals for x in trained if x.intervals}
+    if intervals:
+        write_table(calibration_table(intervals), folder, "calibration")
+        title = f"{source.name}: intervals of predictions on {_SPLITS[split]}"
+        save(calibration_figure(intervals, title=title), folder / "calibration.png")
     comparisons = _compare_with_truth(trained, source, folder)
 
     shown = ["run", "seed", "floor", "pairs", *_SHOWN]
-    shown += [name for name in summary if name.startswith(("window_", "valid_time_"))]
+    shown += [name for name in summary if name.startswith("valid_time_")]
+    shown += [name for name in summary if name.endswith(("s_error_mean", "s_diverged"))]
     text = _terms_text(comparisons)
     print(f"\n{text}" if text else "")
     trajectories = f"{truth.q.shape[0]} {_SPLITS[split]}"
@@ -171,7 +191,7 @@ def evaluate(cfg: DictConfig) -> float:
     print(format_table(summary[[name for name in shown if name in summary]], headers))
     verdict = beaten_by_floors(summary)
     notes = ["* best; only a model that beats all in brackets; valid_time, after and delay in s"]
-    print("\n".join([*notes, *verdict]))
+    print("\n".join([*notes, *verdict, *interval_lines(intervals)]))
     if len(grouped) < len(summary):
         figures = [c for c in grouped if c.endswith(("_error_mean", "_error_worst"))]
         print(f"\nover seeds:\n{format_table(grouped[['model', 'seeds', 'floor', *figures]])}")
@@ -188,6 +208,7 @@ def evaluate(cfg: DictConfig) -> float:
         comparisons=comparisons,
         joints=joints,
         parts=parts,
+        intervals=intervals,
         origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
     )
     write_whole(folder / "report.html", report)
@@ -263,28 +284,44 @@ def _row(run: Run, label: str, step: float) -> RunResult:
 
 def _evaluate(
     model: Predictor,
+    members: Ensemble | None,
     row: RunResult,
     truth: Trajectory,
-    train: list[Trajectory],
+    training: Splits,
     stride: int,
     config: dict[str, Any],
 ) -> Evaluation:
     """Roll out over the horizon and window by window; compared at every ``stride``-th sample."""
     step = row.extra["step"]
     every = stride // samples_of("step", step, truth.t)
-    prediction = predict_trajectories(model, truth, step=step).every(every)
+
+    def predicted(roll_out: Callable[..., Prediction], **given: Any) -> Prediction:
+        found = roll_out(model, step=step, **given).every(every)
+        if members in (None, model):
+            return found
+        return replace(found, members=roll_out(members, step=step, **given).every(every).members)
+
+    prediction = predicted(predict_trajectories, truth=truth)
     metrics = rollout_metrics(
         prediction.q_hat, prediction.q, prediction.t, thresholds=config["thresholds"]
     ).to_dict()
-    metrics |= state_squared_error(prediction) | left_data(prediction, train)
+    metrics |= state_squared_error(prediction) | left_data(prediction, training.train)
     if prediction.members is not None:
         metrics |= member_metrics(prediction)
+    # The model was chosen by these motions, but not fitted to them.
+    seen = stack(training.validation) if config["split"] == "test" else None
+    intervals = {}
     for window in config["windows"]:
-        windowed = predict_windows(model, truth, window=window, step=step).every(every)
+        windowed = predicted(predict_windows, truth=truth, window=window)
         figures = rollout_metrics(windowed.q_hat, windowed.q, windowed.t, thresholds={})
         metrics[f"window_{window:g}s_error_mean"] = figures.error_mean
         metrics[f"window_{window:g}s_diverged"] = figures.diverged
-    return Evaluation(model, prediction, replace(row, metrics=metrics))
+        if members is not None:
+            fits = seen is not None and seen.duration >= window
+            known = predicted(predict_windows, truth=seen, window=window) if fits else None
+            intervals[window] = calibration(windowed, known)
+            metrics |= intervals[window].figures(f"window_{window:g}s")
+    return Evaluation(model, prediction, replace(row, metrics=metrics), intervals)
 
 
 def _torque_errors(

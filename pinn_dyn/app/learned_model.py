@@ -20,6 +20,7 @@ from pinn_dyn.app.run_folder import Run, load_run, require_finished
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import LogSource
 from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.evaluation import half_widths
 from pinn_dyn.mechanics import MechanicalSystem, Signal, double_copy
 from pinn_dyn.mechanics.arrays import require_finite
 
@@ -159,6 +160,60 @@ class LearnedModel:
             return predict_frame(self.model, self.source, start)
         if u is None:
             raise TypeError("predict(start) lacks the input: expected predict(start, u, t)")
+        x0, times, signal = self._motion(start, u, t)
+        return self.model.predict(x0, times, signal).numpy()
+
+    def predict_interval(
+        self,
+        start: Values,
+        u: Values | Signal,
+        t: Values | None = None,
+        level: float = 0.95,
+        factor: float = 1.0,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Between which states the motion lies with the probability ``level``::
+
+            x(t) +- factor c sqrt(1 + 1/E) s(t)
+
+        s is the spread of E predictions: those of the members of an ensemble, or of draws of the
+        constants that least squares fitted; c the quantile of Student's t with E - 1 degrees of
+        freedom. Neither knows of measurement noise, nor of what no member can say; evaluate.py
+        finds the ``factor`` that validation motions needed (``calibration.csv``).
+
+        Args:
+            start, u, t: as of :meth:`predict`.
+            level: above 0 and below 1.
+            factor: on the width.
+
+        Returns:
+            The lower and the upper ends, ``(*batch, T, 2N)`` each.
+
+        Raises:
+            TypeError: if the model is a single network, which has no spread.
+            ValueError: as :meth:`predict`; on a level or a factor that is none.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level is {level}, expected a probability between 0 and 1")
+        if not factor > 0:
+            raise ValueError(f"factor is {factor}, expected a positive number")
+        members = self._run.members()
+        if members is None:
+            raise TypeError(
+                f"model={self.config['model_name']} is a single network, whose prediction has no "
+                "spread: train an ensemble (train.py ensemble=5), or model=known by least squares"
+            )
+        x0, times, signal = self._motion(start, u, t)
+        with torch.no_grad():
+            each = double_copy(members).member_increments(x0, times, signal)
+            middle = self.model.predict(x0, times, signal)
+        width = float(half_widths(len(each), level)) * (1 + 1 / len(each)) ** 0.5
+        reach = factor * width * each.std(dim=0)
+        return (middle - reach).numpy(), (middle + reach).numpy()
+
+    def _motion(
+        self, start: Values, u: Values | Signal, t: Values | None
+    ) -> tuple[Tensor, Tensor, Signal]:
+        """Start, times and input of a prediction, in one batch."""
         x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
         signal, times = self._input(u, t)
         try:
@@ -168,9 +223,8 @@ class LearnedModel:
                 f"start has the batch {tuple(x0.shape[:-1])} and u {tuple(signal.batch)}: expected "
                 "the same, or one of them without"
             ) from error
-        x0 = x0.expand(*batch, -1)
         signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
-        return self.model.predict(x0, times, signal).numpy()
+        return x0.expand(*batch, -1), times, signal
 
     def _input(self, u: Values | Signal, t: Values | None) -> tuple[Signal, Tensor]:
         """The input, and the times of the prediction."""

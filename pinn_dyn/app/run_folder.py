@@ -25,9 +25,11 @@ from pinn_dyn.app.schema import KEYS, check_value
 from pinn_dyn.app.trust import read_foreign
 from pinn_dyn.data import DataSource, fingerprint_changes
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.sweep_table import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
+from pinn_dyn.training import COVARIANCE
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"
@@ -46,13 +48,32 @@ _MOST_CHANGES = 10  # that are shown
 
 @dataclass(frozen=True)
 class Run:
-    """A trained model with its resolved configuration, scales and recorded metrics."""
+    """A trained model with its resolved configuration, scales and recorded metrics.
+
+    ``covariance`` is that of the constants that least squares fitted, ``(P, P)``; else None.
+    """
 
     folder: Path
     config: dict[str, Any]
     model: Predictor
     statistics: Statistics
     metrics: dict[str, Any]
+    covariance: torch.Tensor | None = None
+
+    def members(self) -> Ensemble | None:
+        """What intervals of predictions come from; None for a single network.
+
+        These are the members of an ensemble, or draws of the constants that least squares fitted.
+
+        Raises:
+            ConfigError: if the covariance is none of the model.
+        """
+        if self.covariance is None or isinstance(self.model, Ensemble):
+            return self.model if isinstance(self.model, Ensemble) else None
+        try:
+            return posterior_draws(self.model, self.covariance)
+        except ValueError as error:
+            raise ConfigError(f"{self.folder}: {error}") from error
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
@@ -159,7 +180,9 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
         raise ConfigError(f"{path}: {error}") from error
     model = build_predictor(config, statistics)
     _take_weights(model, path, folder, saved["state_dict"])
-    return Run(folder, config, model.eval(), statistics, read_metrics(folder) or {})
+    found = saved.get(COVARIANCE)
+    covariance = found if isinstance(found, torch.Tensor) and found.ndim == 2 else None
+    return Run(folder, config, model.eval(), statistics, read_metrics(folder) or {}, covariance)
 
 
 def _take_weights(

@@ -1,6 +1,14 @@
 """How good a model is: roll-out errors, learned terms against true ones, tables and figures."""
 
 from pinn_dyn.evaluation.animation import animate, pose_strip
+from pinn_dyn.evaluation.calibration import (
+    Calibration,
+    calibration,
+    calibration_figure,
+    calibration_table,
+    half_widths,
+    interval_lines,
+)
 from pinn_dyn.evaluation.control_figures import (
     closed_loop_figure,
     controller_comparison_figure,
@@ -50,6 +58,7 @@ from pinn_dyn.evaluation.torque import TorqueError, torque_error
 from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator, ValidationHistory
 
 __all__ = [
+    "Calibration",
     "ClosedLoopMetrics",
     "KeepsVelocity",
     "Prediction",
@@ -65,6 +74,9 @@ __all__ = [
     "animate",
     "beaten_by_floors",
     "build_floors",
+    "calibration",
+    "calibration_figure",
+    "calibration_table",
     "cleaning_figure",
     "closed_loop_figure",
     "closed_loop_metrics",
@@ -78,6 +90,8 @@ __all__ = [
     "error_figure",
     "format_table",
     "grouped_table",
+    "half_widths",
+    "interval_lines",
     "left_data",
     "member_metrics",
     "part_shares",

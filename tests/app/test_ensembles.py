@@ -9,6 +9,7 @@ import torch
 from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import pinn_dyn
 from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.models import LagrangianNetwork
@@ -71,6 +72,36 @@ def test_an_ensemble_is_evaluated_beside_a_single_model(tmp_path, ensemble_run, 
     assert np.isnan(single["members"])
     (picture,) = tmp_path.glob("spread_*.png")
     assert imread(picture).std() > 0
+    # 0.02 s is shorter than the validation motions, so widths are corrected too.
+    assert 0 <= both["window_0.02s_within"] <= 1
+    assert both["window_0.02s_factor"] > 0
+    assert np.isnan(single["window_0.02s_within"])
+    levels = pd.read_csv(tmp_path / "calibration.csv")
+    assert set(levels.run) == {both["run"]}
+    assert levels.share.is_monotonic_increasing
+    assert "Intervals" in (tmp_path / "report.html").read_text()
+
+
+def test_an_interval_holds_the_predictions_of_the_members(ensemble_run, lnn_run):
+    model = pinn_dyn.load(ensemble_run)
+    t = np.linspace(0, 0.05, 6)
+    start, u = np.zeros(6), np.ones((6, 3))
+    each = np.stack([member.predict(start, u, t) for member in model.members])
+    low, high = model.predict_interval(start, u, t)
+    # Student's t with two degrees of freedom at 97.5 %.
+    reach = 4.30265 * (4 / 3) ** 0.5 * each.std(axis=0, ddof=1)
+    np.testing.assert_allclose(0.5 * (low + high), each.mean(axis=0), atol=1e-12)
+    np.testing.assert_allclose(0.5 * (high - low), reach, rtol=1e-4, atol=1e-9)
+    assert reach[-1].max() > 0
+    twice = model.predict_interval(start, u, t, factor=2)
+    np.testing.assert_allclose(twice[1] - twice[0], 2 * (high - low))
+    narrow = model.predict_interval(start, u, t, level=0.5)
+    assert (narrow[1] - narrow[0] <= high - low).all()
+    with pytest.raises(TypeError, match="is a single network, whose prediction has no spread"):
+        pinn_dyn.load(lnn_run).predict_interval(start, u, t)
+    for wrong in ({"level": 1.0}, {"factor": 0.0}):
+        with pytest.raises(ValueError, match=r"(level|factor) is [01]\.0, expected"):
+            model.predict_interval(start, u, t, **wrong)
 
 
 def test_a_controller_takes_one_member(tmp_path, capsys, monkeypatch, ensemble_run, lnn_run):

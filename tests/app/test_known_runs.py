@@ -2,9 +2,12 @@
 
 import re
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
+import pinn_dyn
 from tests.app.entry import NO_FIGURES, refused_text, run_script
 from tests.support.recorded_logs import LOGS, needs_logs
 
@@ -62,6 +65,28 @@ def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted):
     run_script("train.py", KNOWN, *SMALL, short[0], f"hydra.run.dir={alone}")
     else_where = constants(alone)
     assert apart < 0.5 * max(float((else_where[k] - before[k]).abs().max()) for k in before)
+
+
+def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
+    run_script(
+        "evaluate.py",
+        f"runs=[{fitted}]",
+        "windows=[0.1]",
+        "horizon=0.5",
+        f"hydra.run.dir={tmp_path}",
+    )
+    table = pd.read_csv(tmp_path / "summary.csv")
+    (row,) = table[~table.floor].to_dict("records")
+    assert row["members"] == 20
+    assert 0.5 < row["window_0.1s_within"] <= 1
+    assert row["window_0.1s_factor"] > 0
+    model = pinn_dyn.load(fitted)
+    t = np.linspace(0, 0.2, 11)
+    start, u = np.array([0.5, -0.5, 1.0, -1.0]), np.zeros((11, 2))
+    low, high = model.predict_interval(start, u, t)
+    middle = model.predict(start, u, t)
+    assert (low[1:] < middle[1:]).all()
+    assert (middle[1:] < high[1:]).all()
 
 
 FORGED = {

@@ -141,6 +141,7 @@ def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
         "comparisons": comparisons_of(names[:1]),
         "joints": pd.DataFrame(),
         "parts": pd.DataFrame(),
+        "intervals": {},
         "origin": origin(names),
     }
     return prediction_report(**arguments | changes), summary

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 from markupsafe import Markup
 
+from pinn_dyn.evaluation.calibration import Calibration, calibration_figure
 from pinn_dyn.evaluation.drawing import units, with_unit
 from pinn_dyn.evaluation.figures import ERROR, prediction_errors, terms_figure, trajectory_panels
 from pinn_dyn.evaluation.learned_terms import TermComparison
@@ -66,6 +67,7 @@ def prediction_report(
     comparisons: Mapping[str, TermComparison],
     joints: pd.DataFrame,
     parts: pd.DataFrame,
+    intervals: Mapping[str, Mapping[float, Calibration]],
     origin: Origin,
 ) -> str:
     """The page as HTML text.
@@ -83,6 +85,7 @@ def prediction_report(
             where the truth is not known.
         joints: torque errors, one row per run and joint; empty without any.
         parts: what the parts of sums contribute, one row per run, part and term; empty without any.
+        intervals: names of the runs that have members, and the calibration for each window in s.
         origin: where the numbers come from.
     """
     floors = set(summary["run"][summary["floor"]])
@@ -105,6 +108,8 @@ def prediction_report(
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
     ]
+    if intervals:
+        sections.insert(3, Section("Intervals", _intervals(intervals)))
     if len(parts):
         sections.insert(3, Section("Parts", _parts(parts)))
     if len(joints):
@@ -205,6 +210,17 @@ def _parts(parts: pd.DataFrame) -> list[Markup]:
         "says that the known mechanics leave something out, or that its constants are not found."
     )
     return [paragraph(text), table(parts, headers=headers)]
+
+
+def _intervals(intervals: Mapping[str, Mapping[float, Calibration]]) -> list[Markup]:
+    text = (
+        "How many of the errors lie in intervals that promise to hold some share of them. Widths "
+        "are those of the members: of an ensemble, or draws of constants that least squares "
+        "fitted. These know nothing of measurement noise, nor of what no member can say. Dashed: "
+        "widths that the validation motions needed."
+    )
+    drawn = calibration_figure(intervals, title="")
+    return [paragraph(text), drawing(drawn, "levels of intervals and what they hold")]
 
 
 def _terms(comparisons: Mapping[str, TermComparison]) -> list[Markup]:

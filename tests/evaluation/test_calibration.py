@@ -1,0 +1,99 @@
+"""Intervals of predictions on errors of which their share is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.evaluation import (
+    Prediction,
+    calibration,
+    calibration_figure,
+    calibration_table,
+    half_widths,
+    interval_lines,
+)
+from pinn_dyn.evaluation.calibration import standardized_errors
+
+
+def prediction(seed, narrower=1.0, members=6, shape=(40, 60, 2)):
+    """The truth is one more draw of what the members are drawn from, or of a wider one."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randn(members, *shape, generator=generator).double() / narrower
+    q = torch.randn(*shape, generator=generator).double()
+    for value in (drawn, q):
+        value[..., 0, :] = 0  # all start where the robot does
+    return Prediction(torch.arange(float(shape[1])), drawn.mean(0), q, drawn)
+
+
+def test_members_of_one_kind_with_the_truth_hold_what_they_promise():
+    found = calibration(prediction(0), None)
+    assert found.share == pytest.approx(found.level, abs=0.02)
+    assert found.corrected is None
+    assert found.factor is None
+
+
+def test_members_that_are_too_sure_are_corrected_on_validation():
+    found = calibration(prediction(0, narrower=3), prediction(1, narrower=3))
+    assert (found.share[:-1] < 0.75 * found.level[:-1]).all()
+    assert found.corrected == pytest.approx(found.level, abs=0.02)
+    assert found.factor == pytest.approx(3, rel=0.1)
+    figures = found.figures("window_1s")
+    assert figures["window_1s_within"] == found.share[list(found.level).index(0.95)]
+    assert figures["window_1s_within_corrected"] == pytest.approx(0.95, abs=0.02)
+    assert figures["window_1s_factor"] == found.factor
+
+
+def test_two_members_have_the_quantiles_of_cauchy():
+    assert half_widths(2, 0.5) == pytest.approx(1.0)
+    assert half_widths(2, 0.9) == pytest.approx(math.tan(0.45 * math.pi))
+
+
+def test_a_roll_out_that_broke_down_lies_in_no_interval():
+    item = prediction(0)
+    item.q_hat[:10, 30:] = math.nan
+    errors = standardized_errors(item)
+    assert errors[:10].isinf().all()
+    assert errors[10:].isfinite().all()
+    found = calibration(item, None)
+    assert found.share[-1] == pytest.approx(0.75 * 0.99, abs=0.01)
+
+
+def test_members_that_agree_on_something_else_lie_in_no_interval():
+    item = prediction(0)
+    item.members[:, :20] = item.q_hat[:20]
+    errors = standardized_errors(item)
+    assert errors[:20].isinf().all()
+    # Nor do they say a width where validation needs one.
+    found = calibration(prediction(1), item)
+    assert found.factor == math.inf
+    assert found.corrected[-1] == 1.0
+
+
+def test_a_single_model_has_no_intervals():
+    item = prediction(0)
+    with pytest.raises(ValueError, match="a single model has no spread"):
+        standardized_errors(Prediction(item.t, item.q_hat, item.q))
+
+
+def test_the_table_the_lines_and_the_figure_say_the_same():
+    wide, corrected = calibration(prediction(0), None), calibration(prediction(0), prediction(1))
+    found = {"lnn": {0.1: corrected, 1.0: wide}, "known": {1.0: corrected}}
+    table = calibration_table(found)
+    row = table.query("run == 'lnn' and window == 0.1 and level == 0.95").iloc[0]
+    assert row.share == corrected.figures("")["_within"]
+    assert row.factor == corrected.factor
+    assert np.isnan(table.query("run == 'lnn' and window == 1").factor).all()
+    first, second = interval_lines(found)
+    share = f"{100 * row.share:.0f} %"
+    assert first.startswith(f"lnn: its 95 % intervals hold {share} after 0.1 s (")
+    assert first.endswith(f", {share} after 1 s of the errors")
+    assert second.startswith("known: ")
+    figure = calibration_figure(found, title="an arm")
+    left, right = figure.axes
+    drawn = {line.get_label(): line.get_ydata() for line in left.get_lines()}
+    assert drawn["lnn"] == pytest.approx(100 * corrected.share)
+    assert drawn["lnn, width from validation"] == pytest.approx(100 * corrected.corrected)
+    assert "known" in [line.get_label() for line in right.get_lines()]
+    assert figure.get_suptitle() == "an arm"
