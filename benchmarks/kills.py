@@ -35,7 +35,7 @@ from pinn_dyn.control import load_law
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHER_DISK = Path("/dev/shm")  # a file system of its own
-PATIENCE = 30.0  # s that a child may take to notice that its parent is gone
+PATIENCE = 10.0  # s that a child may take to notice that its parent is gone
 
 DATA = [
     *("dataset.duration=0.2", "dataset.step=0.002", "dataset.train_initial_states=2"),

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import errno
 import importlib
+import io
 import logging
+import os
 import sys
+import traceback
 import warnings
 from functools import partial
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.config import ConfigError, completed, config_folder
 from pinn_dyn.app.sweep import how_to_go_on
@@ -43,30 +48,69 @@ def main(command: str) -> None:
         from pinn_dyn.training import NonFiniteLossError
 
         task = getattr(importlib.import_module(f"pinn_dyn.app.{command}"), command)
+        for handler in logging.getLogger().handlers:
+            if isinstance(handler, logging.FileHandler):
+                handler.handleError = partial(_raise, handler)  # type: ignore[method-assign]
         try:
             return task(cfg)
-        except (ConfigError, NonFiniteLossError, SimulationError) as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
+        except Exception as error:
+            known = isinstance(error, (ConfigError, NonFiniteLossError, SimulationError))
+            said = str(error) if known else _in_a_line(error)
+            if said is None or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # SweepCallback then goes on with the other jobs
-            raise SystemExit(f"Error: {error}") from error
-        except OSError as error:
-            if error.errno not in _DISK or HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise
-            place = error.filename or f"a file in {HydraConfig.get().runtime.output_dir}"
-            raise SystemExit(
-                f"Error: {place} cannot be written: {error.strerror}. What was written before is "
-                "whole: free space, or choose another folder, and give the same command again"
-            ) from error
+            raise SystemExit(f"Error: {said}") from error
 
     hush()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print a traceback of
     try:
         folder = str(config_folder(command))
         hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
+    except Exception as error:
+        if (said := _in_a_line(error)) is None:
+            raise
+        raise SystemExit(f"Error: {said}") from error
     finally:
         if hint := how_to_go_on():
             print(hint, file=sys.stderr)
+
+
+def _in_a_line(error: BaseException) -> str | None:
+    """What Hydra or the system says that a user can mend; None of what looks like a bug."""
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        cause = error.__cause__
+        return f"{error}\n{cause}" if isinstance(cause, OmegaConfBaseException) else str(error)
+    if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
+        error = error.__cause__  # logging says so of a file that it cannot open
+    if isinstance(error, OSError) and error.errno in _DISK:
+        return (
+            f"{error.filename or _place(error)} cannot be written: {error.strerror}. What was "
+            "written before is whole: free space, or choose another folder, and give the same "
+            "command again"
+        )
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return None
+
+
+def _place(error: OSError) -> str:
+    """What could not be written: the system names no file of a write, but somebody has it open."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    for value in (value for frame in reversed(frames) for value in frame.f_locals.values()):
+        if isinstance(value, io.IOBase) and isinstance(name := getattr(value, "name", 0), str):
+            return name
+    folder = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else "the run folder"
+    return f"a file in {folder}"
+
+
+def _raise(handler: logging.FileHandler, record: logging.LogRecord) -> None:
+    """Let an error of the disk through, of which logging prints a traceback for each message."""
+    error = sys.exc_info()[1]
+    if not isinstance(error, OSError):
+        return logging.Handler.handleError(handler, record)
+    error.filename = handler.baseFilename
+    raise error
 
 
 def hush() -> None:

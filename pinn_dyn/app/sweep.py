@@ -7,6 +7,7 @@ import math
 import shlex
 import sys
 import traceback
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,6 +15,8 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
+
+from pinn_dyn.workers import end_with_parent
 
 log = logging.getLogger(__name__)
 
@@ -33,15 +36,17 @@ class SweepCallback(Callback):
     """Folder of the sweep under way in this process."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Remember that a sweep is under way."""
+        """Remember that a sweep is under way, whose processes end with this one."""
         SweepCallback.unfinished = Path(config.hydra.sweep.dir)
+        if "joblib" in config.hydra.launcher._target_:
+            from joblib.parallel import BACKENDS, register_parallel_backend
+
+            # The launcher has no setting for the first act of a process.
+            loky = partial(BACKENDS["loky"], initializer=end_with_parent)
+            register_parallel_backend("loky", loky)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Forget how an earlier try ended; in a process of the launcher's, end with its parent."""
-        if config.hydra.mode == RunMode.MULTIRUN and SweepCallback.unfinished is None:
-            from pinn_dyn.data.workers import end_with_parent  # imports PyTorch, as a job does
-
-            end_with_parent()
+        """Forget how an earlier try ended."""
         (Path(config.hydra.runtime.output_dir) / ERROR).unlink(missing_ok=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:

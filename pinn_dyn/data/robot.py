@@ -20,8 +20,8 @@ from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
 from pinn_dyn.data.simulation import SimulationError
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.data.workers import end_with_parent
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
+from pinn_dyn.workers import end_with_parent
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 4

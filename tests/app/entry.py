@@ -68,7 +68,8 @@ def own_logging():
     finally:
         for handler in root.handlers:
             if handler not in handlers:
-                handler.close()
+                with contextlib.suppress(OSError):  # of a full disk, as logging itself does at exit
+                    handler.close()
         root.handlers[:] = handlers
         root.setLevel(level)
 

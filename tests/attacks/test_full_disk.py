@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -111,3 +112,44 @@ def test_a_check_says_so(tmp_path, capsys):
     words = ["check.py", "dataset=example_log", root, f"hydra.run.dir={tmp_path}"]
     ends_in_a_line(capsys, 20_000, "check.html", *words)
     assert not (tmp_path / "check.html").exists()
+
+
+def commands(run):
+    """Each of them, as it is called on a run."""
+    data = ["dataset=example_log", f"dataset.root={ROOT / 'examples'}"]
+    return {
+        "train.py": [*TINY, NO_FIGURES, "model=lnn"],
+        "evaluate.py": [f"runs=[{run}]"],
+        "control.py": [f"run={run}", *SET_POINTS],
+        "gather.py": [f"runs=[{run}]"],
+        "check.py": data,
+    }
+
+
+@pytest.mark.parametrize("script", commands(""))
+def test_files_of_hydra_end_in_a_line_too(tmp_path, capsys, lnn_run, script):
+    folder = tmp_path / "out"
+    words = [script, *commands(lnn_run)[script], f"hydra.run.dir={folder}"]
+    ends_in_a_line(capsys, 100, folder / ".hydra" / "config.yaml", *words)
+
+
+@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+def test_a_log_that_takes_no_line_ends_in_one(tmp_path, capsys, lnn_run, script):
+    """Logging itself would print a traceback for each; the other commands say nothing by it."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    name = f"{Path(script).stem}.log"
+    (folder / name).write_text(" " * 20_000)
+    words = [script, *commands(lnn_run)[script], f"hydra.run.dir={folder}"]
+    ends_in_a_line(capsys, 20_000, name, *words)
+
+
+def test_a_log_that_cannot_be_opened_is_named(tmp_path, capsys):
+    (tmp_path / "train.log").mkdir()
+    text = refused_text(capsys, "train.py", *TINY, "model=lnn", f"hydra.run.dir={tmp_path}")
+    assert f"{tmp_path / 'train.log'}: Is a directory" in text
+
+
+def test_a_sweep_says_so_of_hydras_files(tmp_path, capsys):
+    words = ["train.py", "-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1"]
+    ends_in_a_line(capsys, 100, tmp_path / "multirun.yaml", *words, f"hydra.sweep.dir={tmp_path}")

@@ -1,0 +1,93 @@
+"""Workers end with the process that they work for."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.app.entry import NO_FIGURES, TINY, start_process
+
+pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are seen in /proc")
+
+SCRIPT = """
+import multiprocessing, os, sys, time
+from concurrent.futures import ProcessPoolExecutor
+from pinn_dyn.workers import end_with_parent
+
+def begin(parent, late):
+    if late:
+        print(os.getpid(), flush=True)
+        while os.getppid() == parent:
+            time.sleep(0.01)
+        end_with_parent()
+    else:
+        end_with_parent()
+        print(os.getpid(), flush=True)
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    given = (os.getpid(), sys.argv[1] == "late")
+    with ProcessPoolExecutor(1, context, begin, given) as pool:
+        pool.submit(time.sleep, 600).result()
+"""
+
+
+def gone(alive, seconds):
+    """Whether nothing is alive any more, after so many seconds at most."""
+    until = time.monotonic() + seconds
+    while alive() and time.monotonic() < until:
+        time.sleep(0.1)
+    return not alive()
+
+
+@pytest.mark.parametrize("moment", ["before", "late"])
+def test_a_worker_whose_parent_is_killed_ends(tmp_path, moment):
+    """Whether it watched before, or begins to when its parent is dead already."""
+    script = tmp_path / "parent.py"
+    script.write_text(SCRIPT)
+    command = [sys.executable, str(script), moment]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    assert gone(Path(f"/proc/{worker}").exists, seconds=60)
+
+
+def session(leader):
+    """The processes of a session that have not ended."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, _, own = path.read_text().rsplit(")", 1)[1].split()[:4]
+        except OSError:  # it has ended
+            continue
+        if int(own) == leader and state != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after", [0, 0.5, 3])
+def test_a_killed_sweep_leaves_no_process(tmp_path, after):
+    """Killed so many seconds after its workers were started, before their first job or in it."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ["-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"]
+    words += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "trainer.steps=400"]
+    with (tmp_path / "log.txt").open("w") as output:
+        process = start_process(
+            "train.py", *words, folder=tmp_path, output=output, start_new_session=True
+        )
+        while len(session(process.pid)) < 4 and process.poll() is None:
+            time.sleep(0.02)
+        time.sleep(after)
+        assert len(session(process.pid)) >= 4  # two workers, and who tracks what they share
+        process.kill()
+        process.wait()
+    try:
+        assert gone(lambda: session(process.pid), seconds=10)
+    finally:
+        for pid in session(process.pid):
+            os.kill(pid, signal.SIGKILL)
