@@ -51,7 +51,7 @@ from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figu
 from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models import KnownAndNetwork, KnownMechanics
+from pinn_dyn.models import KnownAndNetwork, KnownMechanics, LearnedConstants
 from pinn_dyn.training import COVARIANCE, Fit, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
@@ -304,7 +304,7 @@ def _cpu_seconds() -> float:
 
 def _write_constants(model: Predictor, result: Fit, folder: Path) -> None:
     """Write the constants with their 95 % intervals, and what the data leave to the prior."""
-    assert isinstance(model, KnownMechanics)
+    assert isinstance(model, LearnedConstants)
     with whole(folder / "constants.csv") as partial:
         constants_table(model, result).to_csv(partial, index=False)
     left = undetermined(model, result) or ["nothing: the data determine every parameter"]

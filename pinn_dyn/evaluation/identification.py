@@ -1,4 +1,4 @@
-"""How well the data determine the constants of a known mechanism."""
+"""How well the data determine the constants of a known system."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from torch import Tensor
 from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.mechanics import double_copy
-from pinn_dyn.models.known import KnownMechanics
+from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.training.least_squares import Fit, posterior_covariance
 
 _SHARE = 0.5
 """Variance of a direction, as a part of that of the prior, from which the data leave it open."""
 
 
-def constants_table(model: KnownMechanics, fit: Fit) -> pd.DataFrame:
+def constants_table(model: LearnedConstants, fit: Fit) -> pd.DataFrame:
     """All constants in SI units with their 95 % intervals: name, value, low, high, unit, known.
 
     The equation of motion is linear in the constants c (but for widths of friction and drive
@@ -47,13 +47,13 @@ def constants_table(model: KnownMechanics, fit: Fit) -> pd.DataFrame:
             "value": value,
             "low": value - 1.96 * sigma,
             "high": value + 1.96 * sigma,
-            "unit": [item.unit for item in found for _ in item.names],
+            "unit": [unit for item in found for unit in item.units],
             "known": 1 - (sigma / prior) ** 2,
         }
     )
 
 
-def _constant_slopes(model: KnownMechanics) -> Tensor:
+def _constant_slopes(model: LearnedConstants) -> Tensor:
     """dc/dz, ``(P, P)``, of all constants by all parameters."""
     values = torch.cat([item.values for item in model.physical_constants()])
     parameters = list(model.parameters())
@@ -64,7 +64,7 @@ def _constant_slopes(model: KnownMechanics) -> Tensor:
     return torch.stack(rows)
 
 
-def undetermined(model: KnownMechanics, fit: Fit, most: int = 10) -> list[str]:
+def undetermined(model: LearnedConstants, fit: Fit, most: int = 10) -> list[str]:
     """In words, directions of the parameters that the prior decides and not the data.
 
     They are eigenvectors of the covariance whose variance is more than half of the prior's, the

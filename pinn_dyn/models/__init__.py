@@ -22,7 +22,9 @@ from pinn_dyn.models.input_matrix import (
 )
 from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.known_and_network import KnownAndNetwork
+from pinn_dyn.models.known_system import HasConstants, KnownSystem
 from pinn_dyn.models.lagrangian import LagrangianNetwork
+from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
@@ -46,11 +48,14 @@ __all__ = [
     "FixedInput",
     "Friction",
     "HamiltonianNetwork",
+    "HasConstants",
     "InitialVelocity",
     "InputMatrix",
     "KnownAndNetwork",
     "KnownMechanics",
+    "KnownSystem",
     "LagrangianNetwork",
+    "LearnedConstants",
     "LearnedDelay",
     "LearnedVelocity",
     "LoadDependent",

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Literal, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem
+from pinn_dyn.mechanics import RK4, Integrator
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.known_constants import (
-    Constants,
-    PhysicalBodies,
-    PositiveConstants,
-    RealConstants,
-)
+from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
+from pinn_dyn.models.known_slopes import KnownSlopes
+from pinn_dyn.models.learned_constants import LearnedConstants, Named
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import FrictionHead
@@ -24,6 +21,7 @@ Start = Literal["generic", "prior"]
 """Where the bodies start: plausible rods along the links, or those of the description."""
 
 
+@runtime_checkable
 class Structure(Protocol):
     """Rigid bodies with known kinematics: what :class:`KnownMechanics` needs of an analytic system.
 
@@ -56,15 +54,7 @@ class Structure(Protocol):
     ) -> tuple[Tensor, Tensor]: ...
 
 
-class Named(NamedTuple):
-    """Constants in physical units: n names, their unit and values ``(n,)``."""
-
-    names: list[str]
-    unit: str
-    values: Tensor
-
-
-class KnownMechanics(MechanicalSystem):
+class KnownMechanics(LearnedConstants):
     """Rigid bodies with known kinematics, on drives; all constants are learned::
 
         (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = T(v, diag(k) u)
@@ -94,8 +84,8 @@ class KnownMechanics(MechanicalSystem):
             friction outweighs inertia.
 
     Raises:
-        ValueError: if the data have other coordinates than the structure, on bodies that are not
-            physical, or on gains that are not positive.
+        ValueError: if the structure has no rigid bodies, the data have other coordinates than it,
+            on bodies that are not physical, or on gains that are not positive.
     """
 
     def __init__(
@@ -109,6 +99,11 @@ class KnownMechanics(MechanicalSystem):
         gain_spread: float = 0.0,
         integrator: Integrator | None = None,
     ):
+        if not isinstance(structure, Structure):
+            raise ValueError(
+                f"structure is a {type(structure).__name__}, expected rigid bodies such as a "
+                "RigidChain: constants of other systems are learned by model=known_system"
+            )
         size = structure.num_coordinates
         if (statistics.num_coordinates, statistics.num_inputs) != (size, size):
             raise ValueError(
@@ -152,10 +147,6 @@ class KnownMechanics(MechanicalSystem):
         """k, ``(N,)``."""
         return self.fixed_gain if self.gain is None else self.gain()
 
-    def parameter_names(self) -> list[str]:
-        """What each standardized parameter means, in the order of ``parameters()``."""
-        return [name for part in self._constants() for name in part.names]
-
     def physical_constants(self) -> list[Named]:
         """All constants in SI units: masses, m c, moments of inertia, armature, friction, gains."""
         table = self.body_parameters()
@@ -164,9 +155,9 @@ class KnownMechanics(MechanicalSystem):
         for column, label in enumerate(labels):
             unit = "kg" if column == 0 else "kg m" if column < 4 else "kg m^2"
             names = [f"{label} of {body}" for body in self.structure.body_names]
-            found.append(Named(names, unit, table[:, column]))
+            found.append(Named(names, [unit] * len(names), table[:, column]))
         others = [part for part in self._constants() if part is not self.bodies]
-        return found + [Named(part.names, "SI", part()) for part in others]
+        return found + [Named(part.names, part.units, part()) for part in others]
 
     def body_parameters(self) -> Tensor:
         """pi ``(n, 10)``: the inertial parameters, with M a + C v + G = Y(q, v, a) pi."""
@@ -181,9 +172,9 @@ class KnownMechanics(MechanicalSystem):
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
         return resistance - self.offset() - self.friction.transmitted(v, self.drive_gain() * u)
 
-    def _constants(self) -> Iterator[Constants]:
-        parts: Iterator[nn.Module] = self.modules()
-        return (part for part in parts if isinstance(part, Constants))
+    def slopes(self) -> KnownSlopes:
+        """The derivatives of the missing force, by closed formulas."""
+        return KnownSlopes(self)
 
     # The contract of a mechanical system.
 

@@ -1,4 +1,4 @@
-"""Learned constants of known mechanics; every parameter is a standard normal variate a priori.
+"""Learned physical constants; every parameter is a standard normal variate a priori.
 
 So the prior is the same for all of them, ``|z|^2 / 2``: a least-squares fit adds z to its
 residuals, and a parameter that no data determine stays where it started.
@@ -19,12 +19,16 @@ class Constants(nn.Module, abc.ABC):
     Attributes:
         z: the parameters, zero at the start.
         names: of the entries of z, flattened: what a direction in them means.
+        units: of what these names stand for.
     """
 
-    def __init__(self, shape: Sequence[int], names: Sequence[str]):
+    def __init__(
+        self, shape: Sequence[int], names: Sequence[str], units: Sequence[str] | None = None
+    ):
         super().__init__()
-        self.z = nn.Parameter(torch.zeros(*shape))
+        self.z = nn.Parameter(torch.zeros(tuple(shape)))
         self.names = list(names)
+        self.units = ["SI"] * len(self.names) if units is None else list(units)
 
     @abc.abstractmethod
     def forward(self) -> Tensor:
@@ -38,6 +42,7 @@ class PositiveConstants(Constants):
         start: the median a priori, ``(n,)``.
         spread: standard deviation of the logarithm; 0.7 is a factor of two.
         names: n names.
+        units: n units; SI by default.
 
     Raises:
         ValueError: unless start and spread are positive.
@@ -45,12 +50,18 @@ class PositiveConstants(Constants):
 
     start: Tensor
 
-    def __init__(self, start: Tensor, spread: float, names: Sequence[str]):
+    def __init__(
+        self,
+        start: Tensor,
+        spread: float,
+        names: Sequence[str],
+        units: Sequence[str] | None = None,
+    ):
         if not bool((start > 0).all()) or not spread > 0:
             raise ValueError(
                 f"{names[0]} ...: start is {start.tolist()} and spread {spread}, expected positive"
             )
-        super().__init__(start.shape, names)
+        super().__init__(start.shape, names, units)
         self.register_buffer("start", start.float().clone())
         self.spread = spread
 

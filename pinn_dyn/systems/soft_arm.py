@@ -44,8 +44,8 @@ class SoftArm(MechanicalSystem):
     and the tip frame is turned by theta about the axis (-dy, dx, 0). Then::
 
         M = sum_i mass_i int J^T J ds          (point masses, no rotational inertia)
-        V = sum_i stiffness |q_i|^2 / 2 - mass_i gravity int z ds      (the arm hangs along +z)
-        D = damping I
+        V = stiffness^T q^2 / 2 - sum_i mass_i gravity int z ds        (the arm hangs along +z)
+        D = diag(damping)
         A = [A_1 ... A_n],  A_i = transposed Jacobian of (-omega_x, -omega_y, v_z) of tip i, in
                             its own frame: two bending torques in Nm and an axial force in N
 
@@ -55,24 +55,30 @@ class SoftArm(MechanicalSystem):
     Source: paper, section Simulation Results, in the parametrization of Della Santina, Bicchi and
     Rus 2020 (IEEE RA-L 5(2)); the constants reproduce the paper's tables.
 
+    Mass ``(n,)``, stiffness ``(N,)`` and damping ``(N,)`` are buffers, which a model may learn
+    (:class:`~pinn_dyn.models.KnownSystem`).
+
     Args:
         segments: n, number of segments; N = M = 3 n.
         mass: mass of each segment, kg; one for all, or n of them. A segment without mass leaves
             M singular in its coordinates.
         length: rest length of each segment, m.
         gravity: gravitational acceleration along +z, m/s^2.
-        stiffness: elastic stiffness of each coordinate, Nm/rad for bending, N/m for elongation.
-        damping: viscous damping of each coordinate, Nms/rad and Ns/m.
+        stiffness: elastic stiffness, Nm/rad for bending, N/m for elongation; one for all
+            coordinates, or N of them.
+        damping: viscous damping likewise, Nms/rad and Ns/m.
         nodes: Gauss-Legendre nodes per segment; 10 are exact to 1e-12 for theta <= 3.
 
     Raises:
-        ValueError: on segments < 1, nodes < 1, length not positive, masses that are negative, all
-            zero or not n, or negative gravity, stiffness or damping.
+        ValueError: on segments < 1, nodes < 1, length not positive, masses that are all zero,
+            negative gravity, or constants that are negative or neither one nor as many as expected.
     """
 
     z_is_down = True
+    mass: Tensor
+    stiffness: Tensor
+    damping: Tensor
     _s: Tensor
-    _masses: Tensor
     _weights: Tensor
 
     def __init__(
@@ -82,35 +88,34 @@ class SoftArm(MechanicalSystem):
         mass: float | Sequence[float] = 0.3,
         length: float = 0.2,
         gravity: float = 9.81,
-        stiffness: float = 1.0,
-        damping: float = 0.1,
+        stiffness: float | Sequence[float] = 1.0,
+        damping: float | Sequence[float] = 0.1,
         nodes: int = 10,
     ):
         for name, count in (("segments", segments), ("nodes", nodes)):
             if count < 1:
                 raise ValueError(f"SoftArm: {name} is {count}, expected at least 1")
-        masses = [float(mass)] * segments if isinstance(mass, (int, float)) else list(mass)
-        if len(masses) != segments:
-            raise ValueError(
-                f"SoftArm: mass has {len(masses)} entries, expected one number or {segments}"
-            )
-        if not all(m >= 0 for m in masses) or not sum(masses) > 0:
-            raise ValueError(f"SoftArm: mass is {mass}, expected a positive number")
         if not length > 0:
             raise ValueError(f"SoftArm: length is {length}, expected a positive number")
-        for name, value in (("gravity", gravity), ("stiffness", stiffness), ("damping", damping)):
-            if not value >= 0:
-                raise ValueError(f"SoftArm: {name} is {value}, expected zero or a positive number")
+        if not gravity >= 0:
+            raise ValueError(f"SoftArm: gravity is {gravity}, expected zero or a positive number")
         super().__init__(num_coordinates=3 * segments, num_inputs=3 * segments)
         self.segments = segments
         self.length = length
         self.gravity = gravity
-        self.stiffness = stiffness
-        self.damping = damping
-        self.register_buffer("_masses", torch.tensor(masses, dtype=torch.float64))
+        self.constants = {
+            "mass": ["kg"] * segments,
+            "stiffness": ["Nm/rad", "Nm/rad", "N/m"] * segments,
+            "damping": ["Nms/rad", "Nms/rad", "Ns/m"] * segments,
+        }
+        for name, given in (("mass", mass), ("stiffness", stiffness), ("damping", damping)):
+            self.register_buffer(name, _entries(name, given, len(self.constants[name])))
+        if not self.mass.any():
+            raise ValueError(f"SoftArm: mass is {mass}, expected a positive number")
         points, weights = np.polynomial.legendre.leggauss(nodes)
-        self.register_buffer("_s", torch.tensor((points + 1) / 2, dtype=torch.float64))
-        self.register_buffer("_weights", torch.tensor(weights / 2, dtype=torch.float64))
+        # Not persistent: a checkpoint in single precision would round them.
+        for name, value in (("_s", (points + 1) / 2), ("_weights", weights / 2)):
+            self.register_buffer(name, torch.from_numpy(value), persistent=False)
 
     def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
         """Check that the equation of motion holds for all q from ``q_low`` to ``q_high``, ``(N,)``.
@@ -140,15 +145,14 @@ class SoftArm(MechanicalSystem):
         return self._gram(points.jacobian)
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q) = stiffness |q|^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
+        """V(q) = stiffness^T q^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
         depths = self.backbone(q, self._s)[..., 2] @ self._weights.to(q)
-        elastic = 0.5 * self.stiffness * (q * q).sum(-1)
-        return elastic - self.gravity * (depths @ self._masses.to(q))
+        elastic = 0.5 * (self.stiffness.to(q) * q * q).sum(-1)
+        return elastic - self.gravity * (depths @ self.mass.to(q))
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D = damping I, ``(*batch, N, N)``."""
-        eye = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
-        return (self.damping * eye).expand(*q.shape[:-1], -1, -1)
+        """D = diag(damping), ``(*batch, N, N)``."""
+        return torch.diag_embed(self.damping.to(q).expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """A(q) = [A_1 ... A_n], ``(*batch, N, 3 n)``."""
@@ -204,7 +208,7 @@ class SoftArm(MechanicalSystem):
         return spd_solve(self._gram(points.jacobian), force - bias)
 
     def _point_masses(self, like: Tensor) -> Tensor:
-        return torch.outer(self._masses, self._weights).flatten().to(like)
+        return torch.outer(self.mass.to(like), self._weights.to(like)).flatten()
 
     def _gram(self, jacobian: Tensor) -> Tensor:
         weighted = jacobian * self._point_masses(jacobian)[:, None, None]
@@ -218,7 +222,7 @@ class SoftArm(MechanicalSystem):
 
     def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
         lift = (jacobian[..., 2, :] * self._point_masses(q)[:, None]).sum(-2)
-        return self.stiffness * q - self.gravity * lift
+        return self.stiffness.to(q) * q - self.gravity * lift
 
     # Kinematics of the chain.
 
@@ -317,6 +321,17 @@ class SoftArm(MechanicalSystem):
         square = (block[..., :2] ** 2).sum(-1, keepdim=True)
         turn, _ = _turn(block, stumpff(square))
         return position + matvec(rotation, end), rotation @ turn
+
+
+def _entries(name: str, value: float | Sequence[float], count: int) -> Tensor:
+    values = [float(value)] * count if isinstance(value, (int, float)) else list(value)
+    if len(values) != count:
+        raise ValueError(
+            f"SoftArm: {name} has {len(values)} entries, expected one number or {count}"
+        )
+    if not all(x >= 0 for x in values):
+        raise ValueError(f"SoftArm: {name} is {value}, expected zero or positive numbers")
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _turn(q: Tensor, c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:

@@ -16,8 +16,8 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Trajectory
-from pinn_dyn.models.known import KnownMechanics
-from pinn_dyn.training.sensitivity import Sensitivity
+from pinn_dyn.models.learned_constants import LearnedConstants
+from pinn_dyn.training.sensitivity import rollout_slopes
 
 log = logging.getLogger(__name__)
 
@@ -77,11 +77,11 @@ class LeastSquares:
     have ``changed`` since: a payload is learned from seconds, as all the rest is known. Two stages,
     each started where the one before ended:
 
-    1. inverse dynamics: r = k^-1 (M a + C v + G + D v + F - o) - u, each input in units of its
+    1. inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), each force in units of its
        spread, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
        same filter on q, v, a and u leaves a linear law as it is. A joint at rest is left out, as
        dry friction may then have any value up to its level. This is the classical identification,
-       here with bodies that stay physical;
+       here with constants that stay physical;
     2. roll-outs: r = predicted less measured increments of the windows, each in units of its
        spread, as of the loss of increments. Derivatives by forward mode through the integrator.
        First over a quarter of the windows' steps, then over all.
@@ -97,7 +97,8 @@ class LeastSquares:
         evaluations: most evaluations of the residuals in a stage.
         chunk: windows whose derivatives are rolled out at once; bounds the memory.
         velocity_weight: weight of the velocity half in the roll-outs, as of the loss.
-        changed: bodies that are others than in the earlier fit, and free again.
+        changed: bodies and other owners of constants, such as the ``tip`` in ``mass of tip``,
+            that are others than in the earlier fit, and free again.
 
     Raises:
         ValueError: on a cutoff, chunk or weight that is not positive, or fewer than two samples or
@@ -133,7 +134,7 @@ class LeastSquares:
 
     def fit(
         self,
-        model: KnownMechanics,
+        model: LearnedConstants,
         trajectories: Sequence[Trajectory],
         windows: Windows,
         covariance: Tensor | None = None,
@@ -171,7 +172,7 @@ class LeastSquares:
         model.to(precision)
         return found
 
-    def _prior(self, model: KnownMechanics, covariance: Tensor | None) -> Prior:
+    def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
         z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()
         if covariance is None:
             if self.changed:
@@ -180,19 +181,18 @@ class LeastSquares:
                     "they have changed since: name its run, start_from=<run>"
                 )
             return Prior(0 * z, torch.eye(len(z)).to(z))
-        bodies = model.structure.body_names
-        if unknown := [body for body in self.changed if body not in bodies]:
+        owners = [name.split(" of ", 1)[-1] for name in names]
+        if unknown := [one for one in self.changed if one not in owners]:
             raise ValueError(
-                f"changed names {', '.join(unknown)}, expected some of the bodies "
-                f"{', '.join(bodies)}"
+                f"changed names {', '.join(unknown)}, expected some of "
+                f"{', '.join(dict.fromkeys(owners))}"
             )
         if covariance.shape != (len(z), len(z)):
             raise ValueError(
                 f"the earlier fit has {len(covariance)} constants, this model {len(z)}: take the "
                 "friction and the drive gains of that run"
             )
-        others = tuple(f" of {body}" for body in self.changed)
-        free = torch.tensor([name.endswith(others) for name in names])
+        free = torch.tensor([owner in self.changed for owner in owners])
         held = ~free
         spread = torch.where(
             held[:, None] & held, covariance.to(z), torch.diag(_CHANGED**2 * free.to(z))
@@ -204,24 +204,28 @@ class LeastSquares:
             )
         return Prior(z, torch.linalg.cholesky(torch.linalg.inv(spread)).mT)
 
-    def _identify(self, model: KnownMechanics, prior: Prior, motion: Motion) -> Fit:
+    def _identify(self, model: LearnedConstants, prior: Prior, motion: Motion) -> Fit:
         q, v, a, u = motion
-        regressor, spread = model.structure.regressor(q, v, a), u.std(0)
+        with torch.no_grad():
+            spread = model.force_scale(q, v, a, u)
         moves = v.abs() > _REST * v.std(0)
+        if not moves.any():
+            raise ValueError(
+                "least squares: nothing moves in the training trajectories, expected motions that "
+                "show the constants: excite the robot"
+            )
 
         def errors() -> Tensor:
-            force = regressor @ model.body_parameters().flatten() + model.drive_force(v, a, u)
-            return force / model.drive_gain() / spread
+            return model.missing_force(q, v, a, u) / model.drive_gain() / spread
 
         def residuals(derivative: bool) -> Tensor:
             error = errors()
             if not derivative:
                 return error[moves]
-            gain = model.drive_gain()
-            slope = Sensitivity(model)
-            by_gain = (error * spread).unsqueeze(-1) * slope.gain()
-            found = (slope.force(regressor, v, a, u) - by_gain) / (gain * spread).unsqueeze(-1)
-            return found[moves]
+            slopes = model.slopes()
+            by_gain = (error * spread).unsqueeze(-1) * slopes.gain()
+            by_z = slopes.by_parameters(q, v, a, u) - by_gain
+            return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
 
         self._solve("inverse dynamics", model, prior, residuals, correlated=1.0)
         with torch.no_grad():
@@ -229,7 +233,7 @@ class LeastSquares:
         stage = f"inverse dynamics, {correlated:.3g} samples as one"
         return self._solve(stage, model, prior, residuals, correlated=correlated)
 
-    def _roll_out(self, model: KnownMechanics, prior: Prior, windows: Windows) -> Fit:
+    def _roll_out(self, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
         scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
         x0, measured = windows.start("qv"), windows.increments("qv")
@@ -238,7 +242,7 @@ class LeastSquares:
 
         def residuals(derivative: bool) -> Tensor:
             if derivative:
-                parts = [Sensitivity(model).rollout(part) for part in windows.split(self.chunk)]
+                parts = [rollout_slopes(model, part) for part in windows.split(self.chunk)]
                 return (torch.cat(parts) / scale.unsqueeze(-1))[:, :, first:]
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
@@ -250,7 +254,7 @@ class LeastSquares:
     def _solve(
         self,
         stage: str,
-        model: KnownMechanics,
+        model: LearnedConstants,
         prior: Prior,
         residuals: Callable[[bool], Tensor],
         *,
@@ -293,7 +297,7 @@ class LeastSquares:
 
 
 def _evaluate(
-    model: KnownMechanics, z: np.ndarray, residuals: Callable[[bool], Tensor], derivative: bool
+    model: LearnedConstants, z: np.ndarray, residuals: Callable[[bool], Tensor], derivative: bool
 ) -> np.ndarray:
     """Residuals at z, flattened; a roll-out that breaks down is a bad step, not an error."""
     with torch.no_grad():

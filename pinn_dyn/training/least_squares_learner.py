@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import SGD
 
 from pinn_dyn.data.windows import Windows
-from pinn_dyn.models.known import KnownMechanics
+from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.training.learner import DynamicsLearner, Validator
 from pinn_dyn.training.least_squares import Fit, LeastSquares
@@ -35,14 +35,14 @@ class LeastSquaresLearner(DynamicsLearner):
         result: of the fit, once it is done.
 
     Raises:
-        TypeError: unless the model is one of known mechanics.
+        TypeError: unless the parameters of the model are physical constants.
     """
 
     result: Fit | None = None
 
     def __init__(
         self,
-        model: KnownMechanics,
+        model: LearnedConstants,
         *,
         solver: LeastSquares,
         covariance: Tensor | None = None,
@@ -51,10 +51,10 @@ class LeastSquaresLearner(DynamicsLearner):
         config: dict[str, Any],
         statistics: Statistics,
     ):
-        if not isinstance(model, KnownMechanics):
+        if not isinstance(model, LearnedConstants):
             raise TypeError(
-                f"least squares fits known mechanics (model=known), not {type(model).__name__}: "
-                "take optimizer=adamw"
+                "least squares fits physical constants (model=known or known_system), not "
+                f"{type(model).__name__}: take optimizer=adamw"
             )
         super().__init__(
             model,
@@ -72,7 +72,7 @@ class LeastSquaresLearner(DynamicsLearner):
     def training_step(self, batch: Windows, batch_idx: int) -> None:  # type: ignore[override]
         """The fit, on all training trajectories and windows, in double precision."""
         data = self.trainer.datamodule  # type: ignore[attr-defined]
-        assert isinstance(self.model, KnownMechanics)
+        assert isinstance(self.model, LearnedConstants)
         if self.result is None:
             self.result = self.solver.fit(
                 self.model, data.splits.train, data.windows, self.covariance

@@ -1,13 +1,15 @@
-"""Known mechanics of the small tree, and motions of it."""
+"""Known mechanics of the small tree, soft arms with learned constants, and motions of them."""
 
+from dataclasses import replace
 from functools import partial
 
 import torch
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.models import KnownMechanics, Scales, Statistics, Stribeck
-from pinn_dyn.systems import RigidChain
+from pinn_dyn.models import KnownMechanics, KnownSystem, Scales, Statistics, Stribeck
+from pinn_dyn.systems import RigidChain, SoftArm
+from tests.support.cart_pole import CartPole
 from tests.support.rigid_chains import TREE
 
 
@@ -45,16 +47,46 @@ def known_model(urdf=TREE, locked_joints=("wrist",), friction=Stribeck, **settin
     return model
 
 
+def known_arm(segments=1, *, mass=0.5, stiffness=20.0, damping=2.0):
+    """A soft arm with learned constants, in float64; so long and stiff that no motion breaks it."""
+    structure = SoftArm(segments, length=2.0, mass=mass, stiffness=stiffness, damping=damping)
+    return KnownSystem(statistics(3 * segments), structure).double()
+
+
+class KnownCartPole(CartPole):
+    """The cart-pole with its constants as buffers; the rod's length is not linear in the force."""
+
+    def __init__(self):
+        super().__init__()
+        self.constants = {
+            "cart": ["kg"],
+            "bob": ["kg"],
+            "rod": ["m"],
+            "friction": ["Ns/m", "Nms/rad"],
+        }
+        for name in self.constants:
+            value = getattr(self, name).detach()
+            delattr(self, name)
+            self.register_buffer(name, value)
+
+
+def known_cart_pole():
+    """A cart-pole with learned constants, in float64."""
+    one = torch.ones(1, dtype=torch.float64)
+    scales = replace(statistics(2), u_mean=0 * one, u_std=5 * one)
+    return KnownSystem(scales, KnownCartPole()).double()
+
+
 def motion(model, *, seconds=2.0, rate=200.0, seed=0):
     """A motion of the model under a random smooth input, ``(T, N)``."""
     generator = torch.Generator().manual_seed(seed)
-    n = model.num_coordinates
+    n = model.num_inputs
     t = torch.arange(int(seconds * rate) + 1, dtype=torch.float64) / rate
     u = torch.zeros(len(t), n, dtype=torch.float64)
     for k in range(1, 6):
         weight, phase = torch.rand(2, n, generator=generator).double()
         u += 4 * (weight - 0.5) * torch.sin(2 * torch.pi * 0.5 * k * t[:, None] + 6 * phase)
-    start = torch.rand(2 * n, generator=generator).double() - 0.5
+    start = torch.rand(2 * model.num_coordinates, generator=generator).double() - 0.5
     with torch.no_grad():
         q, v = model.predict(start, t, Signal(t, u)).chunk(2, dim=-1)
     return Trajectory(q, v, Signal(t, u))

@@ -1,4 +1,4 @@
-"""Derivatives of known mechanics by its parameters against finite differences."""
+"""Derivatives of models of physical constants by these against finite differences."""
 
 from functools import partial
 
@@ -8,13 +8,21 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.mechanics import RK4
 from pinn_dyn.models import LoadDependent, Stribeck
-from pinn_dyn.training.sensitivity import Sensitivity
-from tests.support.known import known_model, windows_of
+from pinn_dyn.models.learned_constants import Slopes
+from pinn_dyn.training.sensitivity import rollout_slopes
+from tests.support.known import known_arm, known_model, windows_of
+
+MODELS = {
+    "Stribeck": lambda: known_model(gain_spread=0.3, friction=Stribeck),
+    "load": lambda: known_model(gain_spread=0.3, friction=LoadDependent),
+    "soft arm": known_arm,
+    "two segments": lambda: known_arm(2),
+}
 
 
-@pytest.fixture(params=[Stribeck, LoadDependent])
+@pytest.fixture(params=MODELS)
 def model(request):
-    model = known_model(gain_spread=0.3, friction=request.param)
+    model = MODELS[request.param]()
     generator = torch.Generator().manual_seed(3)
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.3, generator=generator)
@@ -42,20 +50,23 @@ def assert_close(actual, expected):
 
 def test_the_force_and_the_gains_by_the_parameters(model):
     q, v, a, u = torch.randn(4, 6, model.num_coordinates).double()
-    regressor = model.structure.regressor(q, v, a)
+    slopes = model.slopes()
+    force = differences(model, lambda: model.missing_force(q, v, a, u))
+    assert_close(slopes.by_parameters(q, v, a, u), force)
+    assert_close(slopes.gain(), differences(model, lambda: model.drive_gain()))
 
-    def force():
-        driven = model.friction.transmitted(v, model.drive_gain() * u)
-        return model.inverse_dynamics(q, v, a) - driven
 
-    sensitivity = Sensitivity(model)
-    assert_close(sensitivity.force(regressor, v, a, u), differences(model, force))
-    assert_close(sensitivity.gain(), differences(model, lambda: model.drive_gain()))
+def test_closed_formulas_are_the_slopes_of_every_model(model):
+    at = torch.randn(4, 6, model.num_coordinates).double()
+    own, plain = model.slopes(), Slopes(model)
+    assert_close(own.by_parameters(*at), plain.by_parameters(*at))
+    assert_close(own.by_state(*at), plain.by_state(*at))
+    assert_close(own.gain(), plain.gain())
 
 
 def test_fixed_gains_do_not_depend_on_the_parameters():
     model = known_model(gain_spread=0.0)
-    assert not Sensitivity(model).gain().any()
+    assert not model.slopes().gain().any()
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
@@ -64,4 +75,4 @@ def test_roll_outs_by_the_parameters(model, substeps):
     windows = windows_of(model, count=3, steps=3)
     increments = partial(model.increments, windows.start("qv"), windows.t, windows.input)
     expected = differences(model, lambda: increments()[:, 1:])
-    assert_close(Sensitivity(model).rollout(windows), expected)
+    assert_close(rollout_slopes(model, windows), expected)

@@ -1,0 +1,74 @@
+"""Closed formulas for how the force of known mechanics depends on its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import functional_call
+
+from pinn_dyn.models.learned_constants import Called, LearnedConstants, Slopes
+
+_BODIES = "model.bodies.z"
+
+
+class KnownSlopes(Slopes):
+    """Derivatives of :class:`~.known.KnownMechanics`, by the regressor Y of its bodies::
+
+        e = Y(q, v, a) pi(z) + drive force(v, a, u; z)
+        de/dz = Y dpi/dz + d(drive force)/dz
+
+    The bodies need Y alone; the drive of a joint depends on its own constants, so one reverse pass
+    through drives with constants of their own for each sample gives all of the rest.
+
+    Args:
+        model: at the z of interest.
+    """
+
+    def __init__(self, model: LearnedConstants):
+        super().__init__(model)
+        self._bodies = self._body_slopes()
+
+    def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        drives = self._drive_slopes(lambda m: m.drive_force(v, a, u), v)
+        regressor = self.model.structure.regressor(q, v, a)
+        return torch.cat([regressor @ self._bodies, drives], dim=-1)
+
+    def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        # Of the drive of a joint, by its own v alone.
+        by_q, by_v = self.model.structure.force_slopes(q, v, a, self.model.bodies())
+        speed = v.clone().requires_grad_()
+        with torch.enable_grad():
+            (drive,) = torch.autograd.grad(self.model.drive_force(speed, a, u).sum(), speed)
+        return torch.cat([by_q, by_v + torch.diag_embed(drive)], dim=-1)
+
+    def gain(self) -> Tensor:
+        gain = self.model.fixed_gain
+        # The zero keeps the sum differentiable where the gain is not learned.
+        drives = self._drive_slopes(lambda m: m.drive_gain() + 0 * m.offset(), gain)
+        return torch.cat([gain.new_zeros(len(gain), len(self._bodies)), drives], dim=-1)
+
+    def _body_slopes(self) -> Tensor:
+        """dpi/dz of the bodies, ``(10 n, 10 n)``: a block for each body."""
+        z = self.model.bodies.z.detach()
+        copies = z.expand(10, *z.shape).clone().requires_grad_()
+        with torch.enable_grad():
+            called = Called(self.model, lambda m: m.body_parameters())
+            table = functional_call(called, {_BODIES: copies}, ())
+            (slopes,) = torch.autograd.grad(table.diagonal(dim1=0, dim2=-1).sum(), copies)
+        return torch.block_diag(*slopes.movedim(0, 1))
+
+    def _drive_slopes(self, function: Callable[[Any], Tensor], like: Tensor) -> Tensor:
+        """d function_i / dz, ``(*batch, N, P - 10 n)``, of a function of the shape of ``like``."""
+        called = Called(self.model, function)
+        values = {
+            name: z.detach().expand_as(like).clone().requires_grad_()
+            for name, z in called.named_parameters()
+            if name != _BODIES
+        }
+        with torch.enable_grad():
+            total = functional_call(called, values, ()).sum()
+            slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
+        return torch.cat([torch.diag_embed(slope) for slope in slopes], dim=-1)

@@ -1,0 +1,140 @@
+"""Any analytic system as a model: its structure is known, its constants are learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem
+from pinn_dyn.models.known_constants import PositiveConstants
+from pinn_dyn.models.learned_constants import Called, LearnedConstants
+from pinn_dyn.models.statistics import Statistics
+
+
+@runtime_checkable
+class HasConstants(Protocol):
+    """A mechanical system that names its physical constants.
+
+    Attributes:
+        constants: for each buffer that is one, the units of its entries: {"mass": ["kg"]}.
+    """
+
+    constants: dict[str, list[str]]
+
+
+def _term(system: MechanicalSystem, name: str, *values: Tensor) -> Tensor:
+    return getattr(system, name)(*values)
+
+
+def _of_structure(name: str) -> Callable[..., Any]:
+    """The method of the structure, with the learned constants in the place of its own."""
+
+    def method(self: KnownSystem, *values: Tensor) -> Any:
+        learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in self.parts()}
+        return functional_call(self.structure, learned, (name, *values))
+
+    return method
+
+
+class KnownSystem(LearnedConstants):
+    """A mechanical system with known terms, linear or not in its constants c, which are learned::
+
+        c_i = start_i exp(spread z_i) > 0,      z_i standard normal a priori
+
+    Args:
+        statistics: scales of the data.
+        structure: a :class:`HasConstants`, such as :class:`~pinn_dyn.systems.SoftArm`. The
+            constants that it is built with are guesses, where the fit starts.
+        spread: standard deviation of log c a priori: 1.5 if a guess may be off by a factor of ten,
+            0.3 for a data sheet.
+        integrator: the method of integration.
+
+    Raises:
+        ValueError: if the data have other coordinates or inputs than the structure, the structure
+            names no constants, or those are no buffers, lack units, or are not positive.
+    """
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        structure: MechanicalSystem,
+        spread: float = 1.5,
+        integrator: Integrator | None = None,
+    ):
+        size, inputs = structure.num_coordinates, structure.num_inputs
+        if (statistics.num_coordinates, statistics.num_inputs) != (size, inputs):
+            raise ValueError(
+                f"the data have {statistics.num_coordinates} coordinates and "
+                f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
+                f"{size} and {inputs}: take the structure of this robot"
+            )
+        super().__init__(size, inputs)
+        self.integrator = integrator or RK4()
+        self.input_affine = structure.input_affine
+        self.has_residual = structure.has_residual
+        self.learned = nn.ModuleDict()
+        self.shapes: dict[str, torch.Size] = {}
+        for name, start, units in _constants_of(structure):
+            names = [name] if len(units) == 1 else [f"{name} {k + 1}" for k in range(len(units))]
+            self.learned[name] = PositiveConstants(start.flatten(), spread, names, units)
+            self.shapes[name] = start.shape
+        self.structure = Called(structure, _term)
+
+    def parts(self) -> list[tuple[str, PositiveConstants]]:
+        """The constants by the names of the structure."""
+        return list(self.learned.items())  # type: ignore[arg-type]
+
+    mass_matrix = _of_structure("mass_matrix")
+    potential_energy = _of_structure("potential_energy")
+    damping_matrix = _of_structure("damping_matrix")
+    input_matrix = _of_structure("input_matrix")
+    _potential_force = _of_structure("_potential_force")
+    _inertial_force = _of_structure("_inertial_force")
+    _acceleration = _of_structure("_acceleration")
+    _mass_and_bias = _of_structure("_mass_and_bias")
+    _damping_force = _of_structure("_damping_force")
+    _friction_force = _of_structure("_friction_force")
+    _friction_slope = _of_structure("_friction_slope")
+    _input_force = _of_structure("_input_force")
+    _residual_force = _of_structure("_residual_force")
+    _applied_force = _of_structure("_applied_force")
+    _hamiltonian_gradient = _of_structure("_hamiltonian_gradient")
+    _momentum = _of_structure("_momentum")
+    _velocity = _of_structure("_velocity")
+    _kinetic_gradient = _of_structure("_kinetic_gradient")
+
+
+def _constants_of(structure: MechanicalSystem) -> list[tuple[str, Tensor, list[str]]]:
+    """Name, start and units of each."""
+    kind = type(structure).__name__
+    if not isinstance(structure, HasConstants) or not structure.constants:
+        raise ValueError(
+            f"structure {kind} names no constants that could be learned: give it an attribute "
+            "constants, the units of its buffers by their names, as {'mass': ['kg']}; rigid chains "
+            "are learned by model=known"
+        )
+    if owned := [name for name, _ in structure.named_parameters()]:
+        raise ValueError(
+            f"structure {kind} has the parameters {', '.join(owned)}, expected constants that are "
+            "buffers (register_buffer), named in its attribute constants"
+        )
+    buffers = dict(structure.named_buffers())
+    found = []
+    for name, units in structure.constants.items():
+        if name not in buffers:
+            raise ValueError(
+                f"structure {kind}: constants names {name}, which is no buffer; expected one of "
+                f"{', '.join(buffers) or 'none'} (register_buffer)"
+            )
+        start = buffers[name]
+        if len(units) != start.numel():
+            raise ValueError(
+                f"structure {kind}: constants has {len(units)} units of {name}, which has "
+                f"{start.numel()} entries: expected as many"
+            )
+        found.append((name, start, units))
+    return found

@@ -1,0 +1,120 @@
+"""Mechanical systems whose parameters are physical constants: what a least-squares fit works on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, jacrev, vmap
+from torch.nn.utils import parameters_to_vector
+
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models.known_constants import Constants
+
+
+class Named(NamedTuple):
+    """Constants in physical units: n names, their units and values ``(n,)``."""
+
+    names: list[str]
+    units: list[str]
+    values: Tensor
+
+
+class LearnedConstants(MechanicalSystem):
+    """A mechanical system whose only parameters are :class:`~.known_constants.Constants`.
+
+    Its equation of motion is that of every mechanical system, as a force that is missing::
+
+        e(q, v, a, u; z) = M a + C v + G + D v + F - A u - r = 0
+
+    z ``(P,)`` are the standardized parameters, in the order of ``parameters()``. All below follows
+    from the terms; what has closed formulas may override it.
+    """
+
+    def parameter_names(self) -> list[str]:
+        """What each standardized parameter means, in the order of ``parameters()``."""
+        return [name for part in self._constants() for name in part.names]
+
+    def physical_constants(self) -> list[Named]:
+        """All constants in their units."""
+        return [Named(part.names, part.units, part().flatten()) for part in self._constants()]
+
+    def drive_gain(self) -> Tensor:
+        """k ``(N,)``, a factor of the force of each input: one, unless gains are learned.
+
+        An identification divides by it: it could shrink all constants, the gains too, otherwise.
+        """
+        return torch.ones(self.num_coordinates, dtype=next(self.parameters()).dtype)
+
+    def missing_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """e, ``(*batch, N)``: what the input lacks for the acceleration."""
+        return self.inverse_dynamics(q, v, a) - self._applied_force(q, v, u)
+
+    def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """Spread of A u / k over samples ``(K, N)``, of M a / k where no input acts, ``(N,)``."""
+        driven = (self._applied_force(q, v, u) / self.drive_gain()).std(0)
+        inertial = (matvec(self.mass_matrix(q), a) / self.drive_gain()).std(0)
+        scale = torch.where(driven > 1e-9 * inertial, driven, inertial)
+        return torch.where(scale > 0, scale, 1.0)  # what stays at rest has none
+
+    def slopes(self) -> Slopes:
+        """The derivatives of e at the present z."""
+        return Slopes(self)
+
+    def _constants(self) -> Iterator[Constants]:
+        parts: Iterator[nn.Module] = self.modules()
+        return (part for part in parts if isinstance(part, Constants))
+
+
+class Slopes:
+    """Derivatives of the missing force e, one reverse pass for each of its N entries.
+
+    Args:
+        model: at the z of interest.
+    """
+
+    def __init__(self, model: LearnedConstants):
+        self.model: Any = model
+
+    def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """de/dz, ``(B, N, P)``, from samples ``(B, N)`` and ``(B, M)``."""
+        of, z = self._of_parameters(lambda model, *sample: model.missing_force(*sample))
+        return vmap(jacrev(of), in_dims=(None, 0, 0, 0, 0))(z, q, v, a, u)
+
+    def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """de/d(q, v), ``(B, N, 2N)``, from samples ``(B, N)`` and ``(B, M)``."""
+        return torch.cat(vmap(jacrev(self.model.missing_force, (0, 1)))(q, v, a, u), dim=-1)
+
+    def gain(self) -> Tensor:
+        """dk/dz, ``(N, P)``, of the drive gains."""
+        of, z = self._of_parameters(lambda model: model.drive_gain())
+        return jacrev(of)(z)
+
+    def _of_parameters(
+        self, function: Callable[..., Tensor]
+    ) -> tuple[Callable[..., Tensor], Tensor]:
+        """A function of the model as one of z and its arguments, and the present z ``(P,)``."""
+        called = Called(self.model, function)
+        names, values = zip(*called.named_parameters(), strict=True)
+
+        def of(z: Tensor, *arguments: Tensor) -> Tensor:
+            parts = z.split([value.numel() for value in values])
+            shaped = (part.view_as(value) for part, value in zip(parts, values, strict=True))
+            return functional_call(called, dict(zip(names, shaped, strict=True)), arguments)
+
+        return of, parameters_to_vector(values).detach()
+
+
+class Called(nn.Module):
+    """A function of a model as the forward pass of a module."""
+
+    def __init__(self, model: nn.Module, function: Callable[..., Tensor]):
+        super().__init__()
+        self.model = model
+        self.function = function
+
+    def forward(self, *arguments: Any) -> Tensor:
+        return self.function(self.model, *arguments)

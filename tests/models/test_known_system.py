@@ -1,0 +1,168 @@
+"""Any system with constants as a model: its own terms, positive constants, bad input by name."""
+
+import pytest
+import torch
+from torch import nn
+
+from pinn_dyn.models import KnownMechanics, KnownSystem
+from pinn_dyn.systems import RigidChain, SoftArm
+from tests.contracts.mechanical_system import MechanicalSystemContract
+from tests.support.cart_pole import CartPole
+from tests.support.known import known_arm, known_cart_pole, statistics
+from tests.support.rigid_chains import TREE
+
+
+def anywhere(model, std, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=std, generator=generator)
+    return model
+
+
+class TestKnownSoftArmContract(MechanicalSystemContract):
+    """Away from the start; a segment of 2 m bends and lengthens by up to one."""
+
+    @pytest.fixture(params=[1, 2], ids=["one", "two"])
+    def system(self, request):
+        return anywhere(known_arm(request.param), std=0.3)
+
+
+class TestKnownCartPoleContract(MechanicalSystemContract):
+    """Of a system that gives its four terms alone, with fewer inputs than coordinates."""
+
+    @pytest.fixture
+    def system(self):
+        return anywhere(known_cart_pole(), std=0.1)
+
+
+def values(model):
+    return {
+        name: value
+        for item in model.physical_constants()
+        for name, value in zip(item.names, item.values.tolist(), strict=True)
+    }
+
+
+@pytest.mark.parametrize("segments", [1, 2])
+def test_the_model_is_the_system_of_the_learned_constants(segments):
+    model = anywhere(known_arm(segments), std=0.5)
+    entries = list(values(model).values())
+    n, size = segments, 3 * segments
+    arm = SoftArm(
+        segments,
+        length=2.0,
+        mass=entries[:n],
+        stiffness=entries[n : n + size],
+        damping=entries[n + size :],
+    )
+    at = 0.3 * torch.randn(3, 8, size, generator=torch.Generator().manual_seed(1)).double()
+    torch.testing.assert_close(model.inverse_dynamics(*at), arm.inverse_dynamics(*at))
+    torch.testing.assert_close(model.forward_dynamics(*at), arm.forward_dynamics(*at))
+    for own, expected in zip(model.terms(at[0]), arm.terms(at[0]), strict=True):
+        torch.testing.assert_close(own, expected)
+
+
+def test_the_missing_force_is_the_sum_of_what_each_constant_contributes():
+    """Linear in the constants: masses of point masses at Gauss nodes, springs and dampers by hand.
+
+    Inertia and weight of one segment by finite differences of the backbone along the motion
+    q + v t + a t^2 / 2, which know nothing of Jacobians and biases.
+    """
+    model = anywhere(known_arm(), std=0.5)
+    mass, *rest = values(model).values()
+    stiffness, damping = torch.tensor(rest).double().split(3)
+    q, v, a, u = 0.3 * torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(2)).double()
+    kinematics = SoftArm(1, length=2.0)
+
+    def positions(x):
+        return kinematics.backbone(x, kinematics._s).flatten(-3, -2)
+
+    step = 1e-4
+    path = [positions(q + v * t + a * t**2 / 2) for t in (-step, 0.0, step)]
+    acceleration = (path[0] - 2 * path[1] + path[2]) / step**2
+    pull = acceleration - torch.tensor([0, 0, 9.81]).double()
+    tiny = 1e-6 * torch.eye(3).double()
+    slopes = [(positions(q + d) - positions(q - d)) / 2e-6 for d in tiny]
+    weights = kinematics._weights[:, None]
+    inertial = torch.stack([(slope * pull * weights).sum((-2, -1)) for slope in slopes], -1)
+    driven = (kinematics.input_matrix(q) @ u.unsqueeze(-1)).squeeze(-1)
+    expected = mass * inertial + stiffness * q + damping * v - driven
+    torch.testing.assert_close(model.missing_force(q, v, a, u), expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_constants_are_positive_for_every_parameter(seed):
+    model = anywhere(known_arm(2), std=5.0, seed=seed)
+    assert min(values(model).values()) > 0
+
+
+def test_constants_have_names_and_units():
+    one, two = known_arm(1), known_arm(2)
+    assert one.parameter_names()[:2] == ["mass", "stiffness 1"]
+    assert two.parameter_names()[:3] == ["mass 1", "mass 2", "stiffness 1"]
+    assert len(two.parameter_names()) == sum(p.numel() for p in two.parameters()) == 14
+    units = [unit for item in one.physical_constants() for unit in item.units]
+    assert units == ["kg", "Nm/rad", "Nm/rad", "N/m", "Nms/rad", "Nms/rad", "Ns/m"]
+
+
+def test_what_acts_on_no_coordinate_is_weighed_by_its_inertia():
+    model = known_cart_pole()
+    q, v, a = torch.randn(3, 50, 2).double()
+    u = torch.randn(50, 1).double()
+    with torch.no_grad():
+        scale = model.force_scale(q, v, a, u)
+        inertia = (model.mass_matrix(q) @ a.unsqueeze(-1))[:, 1, 0]
+    assert float(scale[0]) == pytest.approx(float(u.std()))
+    assert float(scale[1]) == pytest.approx(float(inertia.std()))
+
+
+class Unnamed(SoftArm):
+    def __init__(self):
+        super().__init__()
+        self.constants = {}
+
+
+class Misnamed(SoftArm):
+    def __init__(self):
+        super().__init__()
+        self.constants = {"weight": ["N"]}
+
+
+class Unmeasured(SoftArm):
+    def __init__(self):
+        super().__init__()
+        self.constants = {"stiffness": ["N/m"]}
+
+
+class Owned(SoftArm):
+    def __init__(self):
+        super().__init__()
+        self.sag = nn.Parameter(torch.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("structure", "message"),
+    [
+        (Unnamed(), r"structure Unnamed names no constants .* \{'mass': \['kg'\]\}"),
+        (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain names no constants"),
+        (Misnamed(), "constants names weight, which is no buffer; expected one of mass, stiff"),
+        (Unmeasured(), "constants has 1 units of stiffness, which has 3 entries"),
+        (Owned(), r"has the parameters sag, expected constants that are buffers"),
+        (SoftArm(stiffness=0.0), r"stiffness 1 ...: start is .* expected positive"),
+        (SoftArm(2), "the data have 3 coordinates and 3 inputs, the structure SoftArm has 6 and 6"),
+        (CartPole(), "the structure CartPole has 2 and 1"),
+    ],
+)
+def test_a_structure_that_cannot_be_learned_is_refused_by_name(structure, message):
+    with pytest.raises(ValueError, match=message):
+        KnownSystem(statistics(3), structure)
+
+
+def test_known_mechanics_takes_rigid_bodies():
+    with pytest.raises(ValueError, match=r"structure is a SoftArm, .* by model=known_system"):
+        KnownMechanics(statistics(3), SoftArm())
+
+
+def test_a_spread_is_positive():
+    with pytest.raises(ValueError, match=r"spread 0\.0, expected positive"):
+        KnownSystem(statistics(3), SoftArm(), spread=0.0)
