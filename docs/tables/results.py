@@ -116,7 +116,7 @@ def logs() -> str:
 
 
 _RIGID_ROWS = (
-    *("identification", "known", "lnn", "acceleration", "mlp"),
+    *("identification", "known", "known_and_network", "lnn", "acceleration", "mlp"),
     *("keeps its velocity", "ARX"),
 )
 
