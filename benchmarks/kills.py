@@ -3,8 +3,8 @@
 Of each kill it is asked whether the same command then ends well and gives the same numbers, whether
 a process lives on, and whether a file of the dead one is left.
 
-    python benchmarks/kills.py                        # 50 kills, half of them with TMPDIR elsewhere
-    python benchmarks/kills.py --kills 6 --only train fit
+    python -m benchmarks.kills                        # 50 kills, half of them with TMPDIR elsewhere
+    python -m benchmarks.kills --kills 6 --only train fit
 
 Each kill adds a row to benchmarks/results/kills.csv. The fit needs the double pendulum's log, in
 the folder that PINN_DYN_LOGS names.
@@ -32,6 +32,7 @@ import torch
 
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.control import load_law
+from tests.support.processes import alive
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHER_DISK = Path("/dev/shm")  # a file system of its own
@@ -182,19 +183,6 @@ def start(words: list[str], folder: Path, temporary: Path) -> subprocess.Popen[b
             env={**os.environ, **places, "OMP_NUM_THREADS": "1"},
             start_new_session=True,
         )
-
-
-def alive(session: int) -> list[int]:
-    """Processes of a session that have not ended."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, _, own = path.read_text().rsplit(")", 1)[1].split()[:4]
-        except OSError:  # it has ended
-            continue
-        if int(own) == session and state != "Z":
-            found.append(int(path.parent.name))
-    return found
 
 
 def prepared(folder: Path, run: Path | None) -> Path:

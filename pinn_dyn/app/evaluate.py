@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -16,50 +15,45 @@ from tqdm import tqdm
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.evaluation_results import (
+    SPLITS,
+    Evaluation,
+    compare_with_truth,
+    draw,
+    shares,
+    terms_text,
+    torque_errors,
+    write_intervals,
+)
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
 from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run, write_json
 from pinn_dyn.app.trust import packages
-from pinn_dyn.data import DataSource, Splits
+from pinn_dyn.data import Splits
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
-    Calibration,
     Prediction,
     RunResult,
-    TermComparison,
     beaten_by_floors,
     build_floors,
     calibration,
-    calibration_figure,
-    calibration_table,
     common_stride,
-    compare_terms,
     default_horizon,
     default_windows,
-    error_figure,
     format_table,
     grouped_table,
     interval_lines,
     left_data,
     member_metrics,
-    part_shares,
     predict_trajectories,
     predict_windows,
-    residual_share,
     rollout_metrics,
-    save,
-    spread_figure,
     state_squared_error,
     summary_table,
-    terms_figure,
-    torque_error,
-    trajectory_figure,
     write_table,
 )
-from pinn_dyn.evaluation.drawing import with_unit
-from pinn_dyn.evaluation.figures import ERROR
 from pinn_dyn.evaluation.report import prediction_report
-from pinn_dyn.mechanics import MechanicalSystem, Predictor, Sum, Trajectory, samples_of, stack
+from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack
 
 log = logging.getLogger(__name__)
 
@@ -79,22 +73,6 @@ _SHOWN = (
     "spread_over_error",
     "input_delay_seconds",
 )
-
-# What each split of the data is called in tables and figures.
-_SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The roll-outs of one run, or of a floor, and the row of the table.
-
-    ``intervals`` are those of its windowed predictions, by window in s; none of a single network.
-    """
-
-    model: Predictor
-    prediction: Prediction
-    result: RunResult
-    intervals: dict[float, Calibration]
 
 
 def evaluate(cfg: DictConfig) -> float:
@@ -131,7 +109,7 @@ def evaluate(cfg: DictConfig) -> float:
     if not 0 <= config["trajectory"] < len(truth.q):
         raise ConfigError(
             f"trajectory is {config['trajectory']}, expected 0 to {len(truth.q) - 1}, one of the "
-            f"{len(truth.q)} {_SPLITS[split]}"
+            f"{len(truth.q)} {SPLITS[split]}"
         )
     sizes = [len(source.labels), len(source.input_labels)]
     if sizes != [len(trained_on.labels), len(trained_on.input_labels)]:
@@ -139,7 +117,7 @@ def evaluate(cfg: DictConfig) -> float:
             f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, the runs "
             f"were trained on {len(trained_on.labels)} and {len(trained_on.input_labels)}"
         )
-    log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], _SPLITS[split], source.name)
+    log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], SPLITS[split], source.name)
 
     labels = _labels(runs)
     rows = [_row(run, label, step) for run, label, step in zip(runs, labels, steps, strict=True)]
@@ -157,8 +135,8 @@ def evaluate(cfg: DictConfig) -> float:
         except ValueError as error:
             raise ConfigError(f"run '{row.run}': {error}") from error
     trained = evaluations[: len(runs)]
-    joints = _torque_errors(trained, truth, source)
-    parts = _shares(trained, truth)
+    joints = torque_errors(trained, truth, source)
+    parts = shares(trained, truth)
     summary = summary_table([item.result for item in evaluations])
     write_table(summary, folder, "summary")
     grouped = grouped_table(summary)
@@ -170,20 +148,16 @@ def evaluate(cfg: DictConfig) -> float:
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
     made = {"config": config, "dataset": runs[0].config["dataset"], **record}
     write_json(folder / "provenance.json", made)
-    _draw(evaluations, truth, source, config, folder)
-    intervals = {x.result.run: x.intervals for x in trained if x.intervals}
-    if intervals:
-        write_table(calibration_table(intervals), folder, "calibration")
-        title = f"{source.name}: intervals of predictions on {_SPLITS[split]}"
-        save(calibration_figure(intervals, title=title), folder / "calibration.png")
-    comparisons = _compare_with_truth(trained, source, folder)
+    draw(evaluations, truth, source, config, folder)
+    intervals = write_intervals(trained, source, split, folder)
+    comparisons = compare_with_truth(trained, source, folder)
 
     shown = ["run", "seed", "floor", "pairs", *_SHOWN]
     shown += [name for name in summary if name.startswith("valid_time_")]
     shown += [name for name in summary if name.endswith(("s_error_mean", "s_diverged"))]
-    text = _terms_text(comparisons)
+    text = terms_text(comparisons)
     print(f"\n{text}" if text else "")
-    trajectories = f"{truth.q.shape[0]} {_SPLITS[split]}"
+    trajectories = f"{truth.q.shape[0]} {SPLITS[split]}"
     print(f"{source.name}: {trajectories}, {config['horizon']:g} s open loop")
     headers = {name: name.removesuffix("_error_mean") for name in summary if "window_" in name}
     headers |= {"left_data_after": "after", "torque_share": "torque", "residual_share": "residual"}
@@ -319,103 +293,9 @@ def _evaluate(
         if members is not None:
             fits = seen is not None and seen.duration >= window
             known = predicted(predict_windows, truth=seen, window=window) if fits else None
-            intervals[window] = calibration(windowed, known)
-            metrics |= intervals[window].figures(f"window_{window:g}s")
+            found = intervals[window] = calibration(windowed, known)
+            metrics[f"window_{window:g}s_within"] = found.within
+            if found.within_corrected is not None and found.factor is not None:
+                metrics[f"window_{window:g}s_within_corrected"] = found.within_corrected
+                metrics[f"window_{window:g}s_factor"] = found.factor
     return Evaluation(model, prediction, replace(row, metrics=metrics), intervals)
-
-
-def _torque_errors(
-    evaluations: list[Evaluation], truth: Trajectory, source: DataSource
-) -> pd.DataFrame:
-    """Give mechanical models their torque error; returns it joint by joint."""
-    tables = []
-    for item in evaluations:
-        if isinstance(item.model, MechanicalSystem):
-            try:
-                found = torque_error(item.model, truth, system=source.system)
-            except ValueError as error:
-                log.warning("no torque error: %s", error)
-                break
-            item.result.metrics.update(torque_error=found.mean, torque_share=found.share)
-            tables.append(found.to_frame(source.labels).assign(run=item.result.run))
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-
-def _shares(evaluations: list[Evaluation], truth: Trajectory) -> pd.DataFrame:
-    """Give models with a residual force its share; returns what the parts of sums contribute."""
-    tables = []
-    for item in evaluations:
-        if isinstance(item.model, MechanicalSystem) and item.model.has_residual:
-            item.result.metrics["residual_share"] = residual_share(item.model, truth)
-        if isinstance(item.model, Sum):
-            tables.append(part_shares(item.model, truth).assign(run=item.result.run))
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
-
-
-def _draw(
-    evaluations: list[Evaluation],
-    truth: Trajectory,
-    source: DataSource,
-    config: dict[str, Any],
-    folder: Path,
-) -> None:
-    floors, predictions = (
-        {x.result.run: x.prediction for x in evaluations if x.result.floor == floor}
-        for floor in (True, False)
-    )
-    split = config["split"]
-    title = f"{source.name}, {_SPLITS[split]}, {config['horizon']:g} s open loop"
-    figure = trajectory_figure(
-        truth,
-        predictions,
-        trajectory=config["trajectory"],
-        title=f"{source.name}, {split} trajectory {config['trajectory']}, open loop",
-        labels=source.labels,
-        input_labels=source.input_labels,
-    )
-    save(figure, folder / "trajectory.png")
-    label = with_unit(ERROR, source.labels)
-    figure = error_figure(predictions, floors=floors, title=title, label=label)
-    save(figure, folder / "error.png")
-    for label, prediction in predictions.items():
-        if prediction.members is not None:
-            figure = spread_figure(
-                prediction, title=f"{title}\n{label}, {len(prediction.members)} members"
-            )
-            save(figure, folder / f"spread_{label.replace(' ', '_')}.png")
-
-
-def _compare_with_truth(
-    evaluations: list[Evaluation], source: DataSource, folder: Path
-) -> dict[str, TermComparison]:
-    """Write learned against true terms of each structured model; returns them by its label."""
-    if source.system is None or not source.configurations:
-        return {}
-    names = list(source.configurations)
-    q = torch.tensor([source.configurations[name] for name in names], dtype=torch.float64)
-    comparisons = {}
-    for item in evaluations:
-        model = item.model
-        if not isinstance(model, MechanicalSystem):
-            continue
-        comparison = compare_terms(model, source.system, q, names=names)
-        label = item.result.run
-        comparisons[label] = comparison
-        stem = label.replace(" ", "_")
-        write_table(comparison.to_frame(), folder, f"terms_{stem}")
-        for index, name in enumerate(names):
-            figure = terms_figure(
-                comparison,
-                configuration=index,
-                title=f"{label}: learned and true terms, {name}",
-                inverse_mass=model.state == "qp",
-            )
-            save(figure, folder / f"terms_{stem}_{name}.png")
-    write_whole(folder / "terms.txt", _terms_text(comparisons) + "\n")
-    return comparisons
-
-
-def _terms_text(comparisons: dict[str, TermComparison]) -> str:
-    return "\n\n".join(
-        f"{label}: learned and true terms\n{item.to_text()}" for label, item in comparisons.items()
-    )

@@ -68,8 +68,10 @@ class Run:
         Raises:
             ConfigError: if the covariance is none of the model.
         """
-        if self.covariance is None or isinstance(self.model, Ensemble):
-            return self.model if isinstance(self.model, Ensemble) else None
+        if isinstance(self.model, Ensemble):
+            return self.model
+        if self.covariance is None:
+            return None
         try:
             return posterior_draws(self.model, self.covariance)
         except ValueError as error:

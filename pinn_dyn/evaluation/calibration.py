@@ -20,6 +20,7 @@ LEVEL = 0.95
 """What an interval is said to hold, where one number is wanted."""
 
 _LEVELS = np.array([0.05, *np.arange(0.1, 0.91, 0.1), LEVEL, 0.99])
+_AT = -2  # of LEVEL among them
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,15 @@ class Calibration:
     corrected: np.ndarray | None
     factor: float | None
 
-    def figures(self, prefix: str) -> dict[str, float]:
-        """Of the 95 % interval: ``<prefix>_within``, ``_within_corrected`` and ``_factor``."""
-        (at,) = np.flatnonzero(self.level == LEVEL)
-        found = {f"{prefix}_within": float(self.share[at])}
-        if self.corrected is not None and self.factor is not None:
-            found[f"{prefix}_within_corrected"] = float(self.corrected[at])
-            found[f"{prefix}_factor"] = self.factor
-        return found
+    @property
+    def within(self) -> float:
+        """``share`` of the 95 % interval."""
+        return float(self.share[_AT])
+
+    @property
+    def within_corrected(self) -> float | None:
+        """``corrected`` of the 95 % interval."""
+        return None if self.corrected is None else float(self.corrected[_AT])
 
 
 def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
@@ -67,11 +69,10 @@ def standardized_errors(prediction: Prediction) -> Tensor:
     Raises:
         ValueError: on the prediction of a single model.
     """
-    if prediction.members is None:
-        raise ValueError("a single model has no spread: expected the prediction of an ensemble")
-    size = len(prediction.members)
+    deviation = prediction.deviation()[:, 1:]
+    assert prediction.members is not None
+    deviation = deviation * (1 + 1 / len(prediction.members)) ** 0.5
     error = (prediction.q - prediction.q_hat).abs()[:, 1:]
-    deviation = prediction.members.std(dim=0)[:, 1:] * (1 + 1 / size) ** 0.5
     ratio = torch.where(error > 0, error / deviation, 0.0).nan_to_num(torch.inf, posinf=torch.inf)
     lost = diverged_trajectories(prediction)
     return torch.where(lost[:, None, None], torch.inf, ratio)
@@ -98,8 +99,8 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
         return Calibration(_LEVELS, share, None, None)
     seen = standardized_errors(validation).flatten().numpy()
     needed = np.quantile(seen, _LEVELS, method="higher")
-    (at,) = np.flatnonzero(_LEVELS == LEVEL)
-    return Calibration(_LEVELS, share, _within(found, needed), float(needed[at] / width[at]))
+    factor = float(needed[_AT] / width[_AT])
+    return Calibration(_LEVELS, share, _within(found, needed), factor)
 
 
 def calibration_table(found: Mapping[str, Mapping[float, Calibration]]) -> pd.DataFrame:
@@ -126,11 +127,10 @@ def interval_lines(found: Mapping[str, Mapping[float, Calibration]]) -> list[str
     for run, windows in found.items():
         parts = []
         for window, item in windows.items():
-            figures = item.figures("")
-            text = f"{100 * figures['_within']:.0f} % after {window:g} s"
-            if item.factor is not None:
-                corrected = 100 * figures["_within_corrected"]
-                text += f" ({corrected:.0f} % with {item.factor:.3g} times the width)"
+            text = f"{100 * item.within:.0f} % after {window:g} s"
+            if item.within_corrected is not None:
+                corrected = f"{100 * item.within_corrected:.0f} %"
+                text += f" ({corrected} with {item.factor:.3g} times the width)"
             parts.append(text)
         if parts:
             lines.append(f"{run}: its 95 % intervals hold {', '.join(parts)} of the errors")

@@ -29,8 +29,8 @@ class Prediction:
         t: times, ``(T,)``, s.
         q_hat: predicted configuration, ``(K, T, N)``; not finite where the roll-out broke down.
         q: true configuration, ``(K, T, N)``.
-        members: of an ensemble, what each of its E members predicts, ``(E, K, T, N)``; q_hat is
-            their mean.
+        members: what each of E members predicts, ``(E, K, T, N)``: those of an ensemble, whose mean
+            q_hat is, or draws of fitted constants.
         v_hat, v: predicted and true velocity, ``(K, T, N)``; only of whole roll-outs of a single
             model.
     """
@@ -56,17 +56,25 @@ class Prediction:
         assert q is not None
         return Prediction(self.t[::samples], q_hat, q, *others)
 
-    def spread(self) -> Tensor:
-        """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
-
-            s(t)^2 = sum over members i of |q_hat_i(t) - q_hat(t)|^2 / (E - 1)
+    def deviation(self) -> Tensor:
+        """Standard deviation of each coordinate over the E members, ``(K, T, N)``.
 
         Raises:
-            ValueError: if this is not the prediction of an ensemble.
+            ValueError: if this is the prediction of a single model.
         """
         if self.members is None:
             raise ValueError("a single model has no spread: expected the prediction of an ensemble")
-        return self.members.var(dim=0).sum(-1).sqrt()
+        return self.members.std(dim=0)
+
+    def spread(self) -> Tensor:
+        """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
+
+            s(t)^2 = sum over members i of |q_hat_i(t) - mean(t)|^2 / (E - 1)
+
+        Raises:
+            ValueError: as :meth:`deviation`.
+        """
+        return torch.linalg.vector_norm(self.deviation(), dim=-1)
 
 
 def predict_trajectories(

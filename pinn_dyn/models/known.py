@@ -11,7 +11,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import RK4, Integrator
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
-from pinn_dyn.models.known_slopes import KnownSlopes
+from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants, Named
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
@@ -175,6 +175,10 @@ class KnownMechanics(LearnedConstants):
     def slopes(self) -> KnownSlopes:
         """The derivatives of the missing force, by closed formulas."""
         return KnownSlopes(self)
+
+    def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> KnownSamples:
+        """e at fixed samples, by their regressor."""
+        return KnownSamples(self, q, v, a, u)
 
     # The contract of a mechanical system.
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from pinn_dyn.models.learned_constants import Called, LearnedConstants, Slopes
+from pinn_dyn.models.learned_constants import Called, LearnedConstants, Samples, Slopes
 
 _BODIES = "model.bodies.z"
 
@@ -32,8 +32,11 @@ class KnownSlopes(Slopes):
         self._bodies = self._body_slopes()
 
     def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        return self.by_regressor(self.model.structure.regressor(q, v, a), v, a, u)
+
+    def by_regressor(self, regressor: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """The same from Y ``(*batch, N, 10 n)``."""
         drives = self._drive_slopes(lambda m: m.drive_force(v, a, u), v)
-        regressor = self.model.structure.regressor(q, v, a)
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
@@ -72,3 +75,18 @@ class KnownSlopes(Slopes):
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
         return torch.cat([torch.diag_embed(slope) for slope in slopes], dim=-1)
+
+
+class KnownSamples(Samples):
+    """Samples whose Y is computed once, as no parameter is in it."""
+
+    def __init__(self, model: LearnedConstants, q: Tensor, v: Tensor, a: Tensor, u: Tensor):
+        super().__init__(model, v, a, u)
+        self._regressor = self.model.structure.regressor(q, v, a)
+
+    def missing_force(self) -> Tensor:
+        bodies = self._regressor @ self.model.body_parameters().flatten()
+        return bodies + self.model.drive_force(*self.at)
+
+    def by_parameters(self) -> Tensor:
+        return self.model.slopes().by_regressor(self._regressor, *self.at)

@@ -64,6 +64,10 @@ class LearnedConstants(MechanicalSystem):
         """The derivatives of e at the present z."""
         return Slopes(self)
 
+    def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Samples:
+        """e at fixed samples of motion, each ``(K, N)`` or ``(K, M)``, as z changes."""
+        return Samples(self, q, v, a, u)
+
     def _constants(self) -> Iterator[Constants]:
         parts: Iterator[nn.Module] = self.modules()
         return (part for part in parts if isinstance(part, Constants))
@@ -106,6 +110,25 @@ class Slopes:
             return functional_call(called, dict(zip(names, shaped, strict=True)), arguments)
 
         return of, parameters_to_vector(values).detach()
+
+
+class Samples:
+    """The missing force e at K fixed samples of motion, for whatever z the model has by then.
+
+    What does not depend on z may be computed once.
+    """
+
+    def __init__(self, model: LearnedConstants, *at: Tensor):
+        self.model: Any = model
+        self.at = at
+
+    def missing_force(self) -> Tensor:
+        """e, ``(K, N)``."""
+        return self.model.missing_force(*self.at)
+
+    def by_parameters(self) -> Tensor:
+        """de/dz, ``(K, N, P)``."""
+        return self.model.slopes().by_parameters(*self.at)
 
 
 class Called(nn.Module):

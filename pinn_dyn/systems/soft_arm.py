@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, spd_solve
+from pinn_dyn.systems.segment_frames import Tip, in_world, tip_rotation, turning_bias
 from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
 
 
@@ -19,17 +20,6 @@ class _Points(NamedTuple):
 
     jacobian: Tensor  # (*batch, S, 3, N), dr/dq
     bias: Tensor | None  # (*batch, S, 3), (dJ/dt) v
-
-
-class _Tip(NamedTuple):
-    """Frame at the end of a segment, in the world frame."""
-
-    position: Tensor  # (*batch, 3)
-    rotation: Tensor  # (*batch, 3, 3)
-    linear: Tensor  # (*batch, 3, N), Jacobian of the position
-    angular: Tensor  # (*batch, 3, N), Jacobian of the angular velocity
-    linear_bias: Tensor  # (*batch, 3), (d linear/dt) v
-    angular_bias: Tensor  # (*batch, 3), (d angular/dt) v
 
 
 class SoftArm(MechanicalSystem):
@@ -228,12 +218,12 @@ class SoftArm(MechanicalSystem):
 
     def _chain(
         self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None
-    ) -> tuple[_Points, list[_Tip]]:
+    ) -> tuple[_Points, list[Tip]]:
         """Points at the nodes and tip frames of all segments; bias terms only where v is given."""
         batch, size = q.shape[:-1], self.num_coordinates
         s = (self._s if nodes is None else nodes).to(q)
         ends = torch.cat([s, s.new_ones(1)])
-        base: _Tip | None = None
+        base: Tip | None = None
         jacobians, biases, tips = [], [], []
         for index in range(self.segments):
             block = slice(3 * index, 3 * index + 3)
@@ -246,12 +236,12 @@ class SoftArm(MechanicalSystem):
                 wide_spin[..., block] = spin
                 jac, spin = wide, wide_spin
             if base is not None:
-                r, jac, bias, turn, spin, spin_bias = _carry(
+                r, jac, bias, turn, spin, spin_bias = in_world(
                     base, v, r, jac, bias, turn, spin, spin_bias
                 )
             jacobians.append(jac[..., :-1, :, :])
             biases.append(bias[..., :-1, :])
-            base = _Tip(r[..., -1, :], turn, jac[..., -1, :, :], spin, bias[..., -1, :], spin_bias)
+            base = Tip(r[..., -1, :], turn, jac[..., -1, :, :], spin, bias[..., -1, :], spin_bias)
             tips.append(base)
         points = _Points(torch.cat(jacobians, -3), None if v is None else torch.cat(biases, -2))
         return points, tips
@@ -285,7 +275,7 @@ class SoftArm(MechanicalSystem):
             ],
             dim=-2,
         )
-        turn, spin = _turn(q, c)
+        turn, spin = tip_rotation(q, c)
         if v is None:
             return r, jacobian, torch.zeros_like(r), turn, spin, torch.zeros_like(q)
 
@@ -305,7 +295,7 @@ class SoftArm(MechanicalSystem):
             ],
             dim=-1,
         )
-        return r, jacobian, bias, turn, spin, _spin_bias(q, v, c, c2x, c3x)
+        return r, jacobian, bias, turn, spin, turning_bias(q, v, c, c2x, c3x)
 
     def _local_points(self, q: Tensor, s: Tensor) -> Tensor:
         dx, dy, dl = (x.unsqueeze(-1) for x in q.unbind(-1))
@@ -319,7 +309,7 @@ class SoftArm(MechanicalSystem):
         block = q[..., 3 * index : 3 * index + 3]
         end = self._local_points(block, q.new_ones(1)).squeeze(-2)
         square = (block[..., :2] ** 2).sum(-1, keepdim=True)
-        turn, _ = _turn(block, stumpff(square))
+        turn, _ = tip_rotation(block, stumpff(square))
         return position + matvec(rotation, end), rotation @ turn
 
 
@@ -332,81 +322,3 @@ def _entries(name: str, value: float | Sequence[float], count: int) -> Tensor:
     if not all(x >= 0 for x in values):
         raise ValueError(f"SoftArm: {name} is {value}, expected zero or positive numbers")
     return torch.tensor(values, dtype=torch.float64)
-
-
-def _turn(q: Tensor, c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Rotation exp([w]x), w = (-dy, dx, 0), and the Jacobian of its angular velocity.
-
-    omega = (I + c_2 [w]x + c_3 [w]x^2) dw/dt in the frame of the base.
-    """
-    dx, dy, _ = q.unbind(-1)
-    w = torch.stack([-dy, dx, torch.zeros_like(dx)], dim=-1)
-    skew = _skew(w)
-    squared = skew @ skew
-    eye = torch.eye(3, dtype=q.dtype, device=q.device)
-    c1, c2, c3 = (c[k][..., -1, None, None] for k in (1, 2, 3))
-    to_axis = torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=q.dtype, device=q.device)
-    return eye + c1 * skew + c2 * squared, (eye + c2 * skew + c3 * squared) @ to_axis
-
-
-def _spin_bias(q: Tensor, v: Tensor, c: tuple[Tensor, ...], c2x: Tensor, c3x: Tensor) -> Tensor:
-    """d/dt of (I + c_2 [w]x + c_3 [w]x^2), times dw/dt: the bias of the angular acceleration."""
-    dx, dy, _ = q.unbind(-1)
-    vx, vy, _ = v.unbind(-1)
-    zero = torch.zeros_like(dx)
-    w, rate = torch.stack([-dy, dx, zero], -1), torch.stack([-vy, vx, zero], -1)
-    growth = 2 * (dx * vx + dy * vy).unsqueeze(-1)
-    c3, c2x, c3x = c[3][..., -1:], c2x[..., -1:], c3x[..., -1:]
-    w_rate = torch.linalg.cross(w, rate)
-    # [rate]x rate vanishes, and so does [w]x [rate]x rate.
-    return (
-        c2x * growth * w_rate
-        + c3x * growth * torch.linalg.cross(w, w_rate)
-        + c3 * torch.linalg.cross(rate, w_rate)
-    )
-
-
-def _carry(
-    base: _Tip,
-    v: Tensor | None,
-    r: Tensor,
-    jac: Tensor,
-    bias: Tensor,
-    turn: Tensor,
-    spin: Tensor,
-    spin_bias: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Move one segment's kinematics from the frame of its base into the world frame."""
-    rotation = base.rotation
-    arm = r @ rotation.transpose(-1, -2)  # (*batch, S, 3)
-    own = rotation.unsqueeze(-3) @ jac
-    world_r = base.position.unsqueeze(-2) + arm
-    world_jac = base.linear.unsqueeze(-3) + own - _skew(arm) @ base.angular.unsqueeze(-3)
-    world_spin = base.angular + rotation @ spin
-    if v is None:
-        return world_r, world_jac, bias, rotation @ turn, world_spin, spin_bias
-
-    omega = matvec(base.angular, v).unsqueeze(-2)
-    own_rate = matvec(own, v[..., None, :])
-    own_spin = matvec(rotation @ spin, v)
-    world_bias = (
-        base.linear_bias.unsqueeze(-2)
-        + torch.linalg.cross(base.angular_bias.unsqueeze(-2).expand_as(arm), arm)
-        + torch.linalg.cross(
-            omega.expand_as(arm), torch.linalg.cross(omega.expand_as(arm), arm) + 2 * own_rate
-        )
-        + bias @ rotation.transpose(-1, -2)
-    )
-    world_spin_bias = (
-        base.angular_bias
-        + matvec(rotation, spin_bias)
-        + torch.linalg.cross(omega.squeeze(-2), own_spin)
-    )
-    return world_r, world_jac, world_bias, rotation @ turn, world_spin, world_spin_bias
-
-
-def _skew(w: Tensor) -> Tensor:
-    """[w]x, ``(*batch, 3, 3)``, the matrix of the cross product with w ``(*batch, 3)``."""
-    x, y, z = w.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

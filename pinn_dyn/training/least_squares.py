@@ -215,16 +215,17 @@ class LeastSquares:
                 "show the constants: excite the robot"
             )
 
+        samples = model.samples(q, v, a, u)
+
         def errors() -> Tensor:
-            return model.missing_force(q, v, a, u) / model.drive_gain() / spread
+            return samples.missing_force() / model.drive_gain() / spread
 
         def residuals(derivative: bool) -> Tensor:
             error = errors()
             if not derivative:
                 return error[moves]
-            slopes = model.slopes()
-            by_gain = (error * spread).unsqueeze(-1) * slopes.gain()
-            by_z = slopes.by_parameters(q, v, a, u) - by_gain
+            by_gain = (error * spread).unsqueeze(-1) * model.slopes().gain()
+            by_z = samples.by_parameters() - by_gain
             return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
 
         self._solve("inverse dynamics", model, prior, residuals, correlated=1.0)

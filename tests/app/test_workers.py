@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.app.entry import NO_FIGURES, TINY, start_process
+from tests.support.processes import alive
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are seen in /proc")
 
@@ -56,19 +57,6 @@ def test_a_worker_whose_parent_is_killed_ends(tmp_path, moment):
     assert gone(Path(f"/proc/{worker}").exists, seconds=60)
 
 
-def session(leader):
-    """The processes of a session that have not ended."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, _, own = path.read_text().rsplit(")", 1)[1].split()[:4]
-        except OSError:  # it has ended
-            continue
-        if int(own) == leader and state != "Z":
-            found.append(int(path.parent.name))
-    return found
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("after", [0, 0.5, 3])
 def test_a_killed_sweep_leaves_no_process(tmp_path, after):
@@ -80,14 +68,14 @@ def test_a_killed_sweep_leaves_no_process(tmp_path, after):
         process = start_process(
             "train.py", *words, folder=tmp_path, output=output, start_new_session=True
         )
-        while len(session(process.pid)) < 4 and process.poll() is None:
+        while len(alive(process.pid)) < 4 and process.poll() is None:
             time.sleep(0.02)
         time.sleep(after)
-        assert len(session(process.pid)) >= 4  # two workers, and who tracks what they share
+        assert len(alive(process.pid)) >= 4  # two workers, and who tracks what they share
         process.kill()
         process.wait()
     try:
-        assert gone(lambda: session(process.pid), seconds=10)
+        assert gone(lambda: alive(process.pid), seconds=10)
     finally:
-        for pid in session(process.pid):
+        for pid in alive(process.pid):
             os.kill(pid, signal.SIGKILL)

@@ -39,10 +39,8 @@ def test_members_that_are_too_sure_are_corrected_on_validation():
     assert (found.share[:-1] < 0.75 * found.level[:-1]).all()
     assert found.corrected == pytest.approx(found.level, abs=0.02)
     assert found.factor == pytest.approx(3, rel=0.1)
-    figures = found.figures("window_1s")
-    assert figures["window_1s_within"] == found.share[list(found.level).index(0.95)]
-    assert figures["window_1s_within_corrected"] == pytest.approx(0.95, abs=0.02)
-    assert figures["window_1s_factor"] == found.factor
+    assert found.within == found.share[list(found.level).index(0.95)]
+    assert found.within_corrected == pytest.approx(0.95, abs=0.02)
 
 
 def test_two_members_have_the_quantiles_of_cauchy():
@@ -82,7 +80,7 @@ def test_the_table_the_lines_and_the_figure_say_the_same():
     found = {"lnn": {0.1: corrected, 1.0: wide}, "known": {1.0: corrected}}
     table = calibration_table(found)
     row = table.query("run == 'lnn' and window == 0.1 and level == 0.95").iloc[0]
-    assert row.share == corrected.figures("")["_within"]
+    assert row.share == corrected.within
     assert row.factor == corrected.factor
     assert np.isnan(table.query("run == 'lnn' and window == 1").factor).all()
     first, second = interval_lines(found)

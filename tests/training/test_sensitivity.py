@@ -64,6 +64,17 @@ def test_closed_formulas_are_the_slopes_of_every_model(model):
     assert_close(own.gain(), plain.gain())
 
 
+def test_samples_follow_the_parameters(model):
+    """Of fixed samples, whose regressor was computed before."""
+    at = torch.randn(4, 6, model.num_coordinates).double()
+    samples = model.samples(*at)
+    with torch.no_grad():
+        for part in model.parameters():
+            part += 0.1
+    assert_close(samples.missing_force(), model.missing_force(*at))
+    assert_close(samples.by_parameters(), Slopes(model).by_parameters(*at))
+
+
 def test_fixed_gains_do_not_depend_on_the_parameters():
     model = known_model(gain_spread=0.0)
     assert not model.slopes().gain().any()

@@ -1,0 +1,99 @@
+"""Frames of a bending segment, and of segments one behind the other."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics.arrays import matvec
+
+
+class Tip(NamedTuple):
+    """Frame at the end of a segment, in the world frame."""
+
+    position: Tensor  # (*batch, 3)
+    rotation: Tensor  # (*batch, 3, 3)
+    linear: Tensor  # (*batch, 3, N), Jacobian of the position
+    angular: Tensor  # (*batch, 3, N), Jacobian of the angular velocity
+    linear_bias: Tensor  # (*batch, 3), (d linear/dt) v
+    angular_bias: Tensor  # (*batch, 3), (d angular/dt) v
+
+
+def tip_rotation(q: Tensor, c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Rotation exp([w]x), w = (-dy, dx, 0), and the Jacobian of its angular velocity.
+
+    omega = (I + c_2 [w]x + c_3 [w]x^2) dw/dt in the frame of the base.
+    """
+    dx, dy, _ = q.unbind(-1)
+    w = torch.stack([-dy, dx, torch.zeros_like(dx)], dim=-1)
+    skew = cross_matrix(w)
+    squared = skew @ skew
+    eye = torch.eye(3, dtype=q.dtype, device=q.device)
+    c1, c2, c3 = (c[k][..., -1, None, None] for k in (1, 2, 3))
+    to_axis = torch.tensor([[0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=q.dtype, device=q.device)
+    return eye + c1 * skew + c2 * squared, (eye + c2 * skew + c3 * squared) @ to_axis
+
+
+def turning_bias(q: Tensor, v: Tensor, c: tuple[Tensor, ...], c2x: Tensor, c3x: Tensor) -> Tensor:
+    """d/dt of (I + c_2 [w]x + c_3 [w]x^2), times dw/dt: the bias of the angular acceleration."""
+    dx, dy, _ = q.unbind(-1)
+    vx, vy, _ = v.unbind(-1)
+    zero = torch.zeros_like(dx)
+    w, rate = torch.stack([-dy, dx, zero], -1), torch.stack([-vy, vx, zero], -1)
+    growth = 2 * (dx * vx + dy * vy).unsqueeze(-1)
+    c3, c2x, c3x = c[3][..., -1:], c2x[..., -1:], c3x[..., -1:]
+    w_rate = torch.linalg.cross(w, rate)
+    # [rate]x rate vanishes, and so does [w]x [rate]x rate.
+    return (
+        c2x * growth * w_rate
+        + c3x * growth * torch.linalg.cross(w, w_rate)
+        + c3 * torch.linalg.cross(rate, w_rate)
+    )
+
+
+def in_world(
+    base: Tip,
+    v: Tensor | None,
+    r: Tensor,
+    jac: Tensor,
+    bias: Tensor,
+    turn: Tensor,
+    spin: Tensor,
+    spin_bias: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Move one segment's kinematics from the frame of its base into the world frame."""
+    rotation = base.rotation
+    arm = r @ rotation.transpose(-1, -2)  # (*batch, S, 3)
+    own = rotation.unsqueeze(-3) @ jac
+    world_r = base.position.unsqueeze(-2) + arm
+    world_jac = base.linear.unsqueeze(-3) + own - cross_matrix(arm) @ base.angular.unsqueeze(-3)
+    world_spin = base.angular + rotation @ spin
+    if v is None:
+        return world_r, world_jac, bias, rotation @ turn, world_spin, spin_bias
+
+    omega = matvec(base.angular, v).unsqueeze(-2)
+    own_rate = matvec(own, v[..., None, :])
+    own_spin = matvec(rotation @ spin, v)
+    world_bias = (
+        base.linear_bias.unsqueeze(-2)
+        + torch.linalg.cross(base.angular_bias.unsqueeze(-2).expand_as(arm), arm)
+        + torch.linalg.cross(
+            omega.expand_as(arm), torch.linalg.cross(omega.expand_as(arm), arm) + 2 * own_rate
+        )
+        + bias @ rotation.transpose(-1, -2)
+    )
+    world_spin_bias = (
+        base.angular_bias
+        + matvec(rotation, spin_bias)
+        + torch.linalg.cross(omega.squeeze(-2), own_spin)
+    )
+    return world_r, world_jac, world_bias, rotation @ turn, world_spin, world_spin_bias
+
+
+def cross_matrix(w: Tensor) -> Tensor:
+    """[w]x, ``(*batch, 3, 3)``, the matrix of the cross product with w ``(*batch, 3)``."""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
