@@ -73,6 +73,10 @@ def summary() -> str:
     return table([*head, "trained by"], rows)
 
 
+_PANDA_STEPS = {"known": 20, "known_and_network": 10}
+"""Pairs in a training window, where it is not one."""
+
+
 def panda() -> str:
     """The Panda in PyBullet over windows of three lengths."""
     data = pd.read_csv(RESULTS / "panda" / "summary.csv")
@@ -82,7 +86,7 @@ def panda() -> str:
     for _, row in data.iterrows():
         cells = [bold(number(row[c]), row[c] == data[c].min()) for c in columns]
         diverged = f"{row['diverged']} of {row['trajectories']}"
-        pairs = row["pairs"] * read_entries()[f"panda/{row['model']}"].get("steps", 1)
+        pairs = row["pairs"] * _PANDA_STEPS.get(row["model"], 1)
         rows.append([f"`{row['model']}`", f"{pairs:,}", *cells, diverged])
     rows.append(["keeps its velocity", "–", *(number(floor[c]) for c in columns), "0 of 20"])
     head = ["model", "pairs", "0.05 s windows", "0.5 s windows", "2 s", "2 s, median", "diverged"]
@@ -137,6 +141,23 @@ def rigid() -> str:
             torque = "–" if pd.isna(row["torque_share"]) else number(row["torque_share"])
             rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells, torque])
     head = ["log", "model", "0.1 s windows", "1 s windows", "open loop", "torque error / spread"]
+    return table(head, rows)
+
+
+def intervals() -> str:
+    """What the 95 % intervals of predictions hold on the logs of rigid robots."""
+    rows = []
+    for name in RIGID:
+        data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "calibration.csv")
+        for run, windows in data[data["level"] == 0.95].groupby("run", sort=False):
+            kind = "ensemble of 5" if run == "lnn" else "fitted constants"
+            cells = []
+            for column in ("share", "corrected", "factor"):
+                unit, scale = ("", 1) if column == "factor" else (" %", 100)
+                shown = [number(scale * x) if x < float("inf") else "∞" for x in windows[column]]
+                cells.append(", ".join(f"{x}{unit}" for x in shown))
+            rows.append([f"`{name}`", f"`{run}`, {kind}", *cells])
+    head = ["log", "members from", "as the members say", "width from validation", "factor"]
     return table(head, rows)
 
 
@@ -274,6 +295,7 @@ TABLES = {
         "panda": panda(),
         "logs": logs(),
         "rigid": rigid(),
+        "intervals": intervals(),
         "verdict": verdict(),
         "neck": neck(),
         "long_rollout": long_rollout(),

@@ -147,10 +147,12 @@ def calibration_figure(found: Mapping[str, Mapping[float, Calibration]], *, titl
         title: data set.
     """
     windows = sorted({window for item in found.values() for window in item})
-    figure = Figure(figsize=(3.6 * len(windows) + 1.0, 4.9), layout="constrained")
+    size = (max(3.6 * len(windows) + 0.6, 6.0), 4.2 + 0.25 * len(found))
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
     for ax, window in zip(axes, windows, strict=True):
-        ax.plot([0, 100], [0, 100], color="black", linewidth=0.8)
+        honest = "what is promised; below: too narrow"
+        ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label=honest)
         for index, (run, item) in enumerate(found.items()):
             if window not in item:
                 continue
@@ -163,12 +165,10 @@ def calibration_figure(found: Mapping[str, Mapping[float, Calibration]], *, titl
         ax.set_xlabel("promised by the interval [%]")
         ax.set_xlim(0, 100)
         ax.set_ylim(0, 101)
-        ax.set_aspect("equal")
         ax.grid(True, alpha=0.3)
     axes[0].set_ylabel("errors within [%]")
-    axes[0].text(62, 55, "too narrow below", rotation=45, fontsize="x-small", va="center")
-    handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=2, fontsize="small")
+    named = dict(zip(*axes[0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(named.values(), named, loc="outside lower center", ncols=2, fontsize="small")
     figure.suptitle(title)
     return figure
 
