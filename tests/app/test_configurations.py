@@ -49,6 +49,10 @@ def of_arm_1(folder):
     return [*TINY_DATA, STRIDE]
 
 
+def of_arm_1_wide(folder):
+    return [*of_arm_1(folder), "data.steps=1"]  # windows of 20 steps are longer than the motions
+
+
 def of_arm_2(folder):
     short = ["dataset.test_duration=0.2", "dataset.keep_every=1", "dataset.compile=false"]
     return [*TINY_DATA, STRIDE, *short]
@@ -67,7 +71,7 @@ def of_logs(folder):
 # How to make each data set small, or to write a stand-in for it.
 DATA = {
     "soft_arm_1": of_arm_1,
-    "soft_arm_1_wide": of_arm_1,
+    "soft_arm_1_wide": of_arm_1_wide,
     "soft_arm_2": of_arm_2,
     "panda": of_panda,
     "neck": write_neck,
