@@ -95,7 +95,9 @@ class Columns:
 
     def to_si(self, raw: np.ndarray) -> np.ndarray:
         """Raw columns ``(T, K)`` in SI units."""
-        return (raw - self.offsets) * self.factors
+        values = raw - self.offsets
+        values *= self.factors
+        return values
 
     def from_si(self, values: np.ndarray) -> np.ndarray:
         """Columns ``(T, K)`` in SI units as the file has them."""
@@ -133,7 +135,7 @@ def check_units(name: str, columns: Columns, expected: Sequence[str]) -> None:
             )
 
 
-def check_columns(signals: Mapping[str, Columns | None]) -> None:
+def check_columns(signals: Mapping[str, Columns]) -> None:
     """Refuse a column that two signals ask for: one of them would explain the other.
 
     Raises:
@@ -141,7 +143,7 @@ def check_columns(signals: Mapping[str, Columns | None]) -> None:
     """
     taken: dict[str, str] = {}
     for signal, columns in signals.items():
-        for name in [] if columns is None else columns.columns:
+        for name in columns.columns:
             if name in taken:
                 raise LogError(
                     f"column {name!r} is given for {taken[name]} and for {signal}, expected for "

@@ -54,7 +54,7 @@ def check_rows(rows: Rows, t: np.ndarray, report: Report, *, jumps_are_removed: 
         LogError: on values above 1e12, an angle that wraps, and two runs row by row; names the
             file, the line and the column.
     """
-    large = np.argwhere(np.abs(rows.values) > _LARGEST)
+    large = np.argwhere((rows.values > _LARGEST) | (rows.values < -_LARGEST))
     if len(large):
         row, column = large[0]
         raise LogError(

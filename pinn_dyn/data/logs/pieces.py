@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,43 @@ class Cleaned:
     split: str
     raw: Recording
     clean: list[Recording]
+
+
+def long_enough(
+    name: str, cleaned: Sequence[Cleaned], least: Mapping[str, tuple[str, float]], report: Report
+) -> list[Cleaned]:
+    """Without the stretches that a step left too short to be of use.
+
+    Args:
+        name: of the step.
+        cleaned: all stretches.
+        least: for each split what sets the shortest stretch, and how long it is, s.
+        report: takes a warning of each that is dropped.
+
+    Raises:
+        LogError: where nothing of a split is left.
+    """
+    result = []
+    for part in cleaned:
+        key, shortest = least[part.split]
+        kept = []
+        for item in part.clean:
+            # Half a sample: times are rounded.
+            if len(item) > 1 and item.duration >= shortest - 0.5 * (item.t[1] - item.t[0]):
+                kept.append(item)
+            else:
+                report.warn(
+                    f"{part.split} {item.place} after {name}: {item.duration:.4g} s, less "
+                    f"than {key}, {shortest:g} s: dropped"
+                )
+        result.append(replace(part, clean=kept))
+    for split, (key, shortest) in least.items():
+        if not any(part.clean for part in result if part.split == split):
+            raise LogError(
+                f"{split}: after {name} no stretch is as long as {key}, {shortest:g} s: "
+                "lower it, or loosen the steps (the warnings name the stretches)"
+            )
+    return result
 
 
 def one_sample_time(cleaned: Sequence[Cleaned]) -> float:

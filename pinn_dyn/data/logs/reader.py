@@ -21,6 +21,9 @@ from pinn_dyn.data.logs.bags import is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes, shown
 from pinn_dyn.data.logs.parquet import read_parquet
 
+# A run of a table: its name, and which rows are its own.
+Group = tuple[str, slice | np.ndarray]
+
 _PART = 200_000  # rows of a CSV file that are parsed together
 _LONGEST_HEADER = 130_000
 _MOST_COLUMNS = 10_000
@@ -260,7 +263,7 @@ def _opened(path: Path) -> BinaryIO:
     return io.BytesIO(content)
 
 
-def runs_of(table: pd.DataFrame, path: Path, name: str) -> list[tuple[str, np.ndarray]]:
+def runs_of(table: pd.DataFrame, path: Path, name: str) -> list[Group]:
     """Names of the runs of a table, by a column, in order, and which of its rows are theirs.
 
     Raises:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 from scipy.signal import fftconvolve
 
@@ -23,7 +25,9 @@ def check_copies(parts: dict[str, list[Recording]], report: Report) -> None:
     first: dict[bytes, tuple[str, Recording]] = {}
     for split, recordings in parts.items():
         for item in recordings:
-            content = item.q.tobytes() + item.u.tobytes()
+            content = b"".join(
+                hashlib.blake2b(np.ascontiguousarray(x).data).digest() for x in (item.q, item.u)
+            )
             if content not in first:
                 first[content] = split, item
                 continue

@@ -28,8 +28,23 @@ from pinn_dyn.data.logs.columns import Columns, check_columns, check_units
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.jumps import Rows, check_rows
-from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
-from pinn_dyn.data.logs.reader import find_files, numbers, read_table, run_name, runs_of
+from pinn_dyn.data.logs.pieces import (
+    Cleaned,
+    long_enough,
+    one_sample_time,
+    pieces_of,
+    summary,
+    trajectory,
+)
+from pinn_dyn.data.logs.reader import (
+    Group,
+    column,
+    find_files,
+    numbers,
+    read_table,
+    run_name,
+    runs_of,
+)
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
@@ -121,7 +136,9 @@ class LogSource(DataSource):
             )
         check_units("q", self.q, ("rad", "m", "1"))
         check_units("u", self.u, sorted({unit for unit, _ in UNITS.values()} - {"s"}))
-        check_columns({"time": self.time, "q": self.q, "v": self.v, "u": self.u})
+        signals = {"time": self.time, "q": self.q, "v": self.v, "u": self.u}
+        self._signals = {key: columns for key, columns in signals.items() if columns is not None}
+        check_columns(self._signals)
         self.trajectory = trajectory
         if not max_age > 0:
             raise LogError(f"max_age is {max_age} s, expected more than 0")
@@ -133,6 +150,12 @@ class LogSource(DataSource):
             raise LogError(f"guard is {guard} and shortest {shortest} s, expected 0 or more")
         self.guard = guard
         self.shortest = shortest
+        self._shortest = {"train": ("shortest", shortest)}
+        for key, part in (("validation", self.validation), ("test", self.test)):
+            piece = part.piece
+            self._shortest[key] = (
+                ("shortest", shortest) if isinstance(piece, str) else ("its piece", piece)
+            )
         self.seed = seed
         self.interpolation = interpolation
         self.labels = labels or self.q.labels
@@ -190,12 +213,14 @@ class LogSource(DataSource):
                     "does not have: give it in the configuration, and train again"
                 )
         path = Path("the frame")
-        groups = [("the frame", np.full(len(frame), True))]
+        groups: list[Group] = [("the frame", slice(None))]
         if self.trajectory is not None and self.trajectory in frame.columns:
             groups = runs_of(frame, path, self.trajectory)
-        raws = self._recordings(frame, path, groups, Report(self.name))
+        raws = self._recordings(frame.copy(deep=False), path, groups, Report(self.name))
+        every = np.arange(len(frame))
         return [
-            (rows, raw, self._clean_alone(raw)) for (_, rows), raw in zip(groups, raws, strict=True)
+            (every[rows], raw, self._clean_alone(raw))
+            for (_, rows), raw in zip(groups, raws, strict=True)
         ]
 
     def _clean_alone(self, raw: Recording) -> Recording:
@@ -281,8 +306,7 @@ class LogSource(DataSource):
         paths = find_files(self.root, self.files)
         recordings: list[Recording] = []
         stems: dict[str, Path] = {}
-        signals = [x for x in (self.time, self.q, self.v, self.u) if x is not None]
-        asked = [name for signal in signals for name in signal.columns]
+        asked = [name for signal in self._signals.values() for name in signal.columns]
         asked += [] if self.trajectory is None else [self.trajectory]
         for path in paths:
             table = read_table(path, self.time.columns[0], asked, self.max_age)
@@ -294,7 +318,7 @@ class LogSource(DataSource):
                 )
             for note in table.attrs.get("notes", []):
                 report.warn(f"{path.name}: {note}")
-            groups = [(stem, np.full(len(table), True))]
+            groups: list[Group] = [(stem, slice(None))]
             if self.trajectory is not None:
                 prefix = f"{stem}:" if len(paths) > 1 else ""
                 runs = runs_of(table, path, self.trajectory)
@@ -306,36 +330,32 @@ class LogSource(DataSource):
         self,
         table: pd.DataFrame,
         path: Path,
-        groups: list[tuple[str, np.ndarray]],
+        groups: list[Group],
         report: Report,
     ) -> list[Recording]:
-        """The runs of a table in SI units, checked."""
+        """The runs of a table in SI units, checked; the table loses what it gives."""
         lines = table.index.to_numpy()
-        values = {
-            signal: columns.to_si(numbers(table, path, columns.columns, signal))
-            for signal, columns in (
-                ("time", self.time),
-                ("q", self.q),
-                ("v", self.v),
-                ("u", self.u),
-            )
-            if columns is not None
-        }
+        for signal, columns in self._signals.items():
+            for name in columns.columns:
+                column(table, path, name, signal)
+        values = {}
+        for signal, columns in self._signals.items():
+            values[signal] = columns.to_si(numbers(table, path, columns.columns, signal))
+            for name in columns.columns:  # of a large file there is no room for two copies
+                del table[name]
         steps = list(self.steps.values())
+        removed = {signal for x in steps if isinstance(x, RemoveJumps) for signal in x.signals}
+        clock, *clocks = self.time.columns
         recordings = []
         for run, rows in groups:
             t, *others = values["time"][rows].T
-            check_clock(t, lines[rows], path, self.time.columns[0], steps)
-            for name, other in zip(self.time.columns[1:], others, strict=True):
-                names = (self.time.columns[0], name)
-                check_second_clock(t, other, lines[rows], path, names)
-            for signal, columns in (("q", self.q), ("v", self.v), ("u", self.u)):
-                if columns is not None:
-                    signal_rows = Rows(path, lines[rows], signal, columns, values[signal][rows])
-                    repaired = any(
-                        isinstance(step, RemoveJumps) and signal in step.signals for step in steps
-                    )
-                    check_rows(signal_rows, t, report, jumps_are_removed=repaired)
+            check_clock(t, lines[rows], path, clock, steps)
+            for name, other in zip(clocks, others, strict=True):
+                check_second_clock(t, other, lines[rows], path, (clock, name))
+            for signal in ("q", "v", "u"):
+                if signal in values:
+                    found = (lines[rows], signal, self._signals[signal], values[signal][rows])
+                    check_rows(Rows(path, *found), t, report, jumps_are_removed=signal in removed)
             v = values["v"][rows] if "v" in values else None
             recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
             report.add("Read", run, f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}")
@@ -343,7 +363,7 @@ class LogSource(DataSource):
 
     def _clean(self, parts: dict[str, list[Recording]], report: Report) -> list[Cleaned]:
         whole = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
-        cleaned = self._long_enough("splitting", whole, report)
+        cleaned = long_enough("splitting", whole, self._shortest, report)
         for name, step in self.steps.items():
             fitted = step.fit([x for part in cleaned if part.split == "train" for x in part.clean])
             cleaned = self._apply(name, fitted, cleaned, report)
@@ -367,32 +387,4 @@ class LogSource(DataSource):
         )
         for text in step.losses(before, after):
             report.warn(f"{name}: {step}: {text}")
-        return self._long_enough(name, result, report)
-
-    def _long_enough(self, name: str, cleaned: list[Cleaned], report: Report) -> list[Cleaned]:
-        """Without the stretches that a step left too short to be of use."""
-        least = {"train": ("shortest", self.shortest)}
-        for key, split_part in (("validation", self.validation), ("test", self.test)):
-            piece = split_part.piece
-            least[key] = least["train"] if isinstance(piece, str) else ("its piece", piece)
-        result = []
-        for part in cleaned:
-            key, shortest = least[part.split]
-            kept = []
-            for item in part.clean:
-                # Half a sample: times are rounded.
-                if len(item) > 1 and item.duration >= shortest - 0.5 * (item.t[1] - item.t[0]):
-                    kept.append(item)
-                else:
-                    report.warn(
-                        f"{part.split} {item.place} after {name}: {item.duration:.4g} s, less "
-                        f"than {key}, {shortest:g} s: dropped"
-                    )
-            result.append(replace(part, clean=kept))
-        for split_name, (key, shortest) in least.items():
-            if not any(part.clean for part in result if part.split == split_name):
-                raise LogError(
-                    f"{split_name}: after {name} no stretch is as long as {key}, {shortest:g} s: "
-                    "lower it, or loosen the steps (the warnings name the stretches)"
-                )
-        return result
+        return long_enough(name, result, self._shortest, report)

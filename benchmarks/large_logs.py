@@ -1,7 +1,8 @@
-"""Time and memory to read large logs: python -m benchmarks.large_bag [gigabytes] [million rows].
+"""Time and memory to read large logs: python -m benchmarks.large_logs [gigabytes] [million rows].
 
 A bag of JointStates of seven joints and a CSV file of 22 columns are written into a temporary
-folder, without randomness, and read in a process each.
+folder, without randomness, and read in a process each; then the CSV file is loaded as a data
+source: read, checked, split and cut.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from pinn_dyn.data.logs import LogSource
 from pinn_dyn.data.logs.reader import read_table
 
 RATE = 1000.0
@@ -70,16 +73,36 @@ def write_csv(path: Path, rows: int) -> None:
         frame.to_csv(path, mode="a", header=not first, index=False, float_format="%.6f")
 
 
-def read(path: Path) -> None:
-    """Read all columns; prints rows, seconds and the most memory that it took."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    start, processor = time.perf_counter(), time.process_time()
+def read(path: Path) -> str:
+    """Read all columns; the number of rows in words."""
     table = read_table(path, "/joint_states/t", ["/joint_states/t", *COLUMNS], 0.1)
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     _, values = signals(len(table) - 1, 1)
     assert np.allclose(table[COLUMNS].iloc[-1], values, atol=1e-6)
+    return f"{len(table)} rows read"
+
+
+def load(path: Path) -> str:
+    """Load the file as a training does; the number of samples in words."""
+    q, v, u = (COLUMNS[7 * k : 7 * (k + 1)] for k in range(3))
+    ends = {"seconds": 100.0, "piece": 10.0}
+    splits = LogSource(
+        name="large", root=str(path.parent), files=path.name,
+        time={"columns": "/joint_states/t", "unit": "s"}, q={"columns": q, "unit": "rad"},
+        v={"columns": v, "unit": "rad/s"}, u={"columns": u, "unit": "Nm"},
+        validation=ends, test=ends,
+    ).load()  # fmt: skip
+    samples = sum(len(run.t) for run in splits.train)
+    return f"{samples} samples of training loaded"
+
+
+def measure(work: Callable[[Path], str], path: Path) -> None:
+    """Do it; prints what was done, seconds and the most memory that it took."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start, processor = time.perf_counter(), time.process_time()
+    done = work(path)
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(
-        f"{path.name}: {len(table)} rows in {time.perf_counter() - start:.1f} s "
+        f"{path.name}: {done} in {time.perf_counter() - start:.1f} s "
         f"({time.process_time() - processor:.1f} s of the processor), at most {most / 1e6:.2f} GB, "
         f"of which {before / 1e6:.2f} GB are Python's and the packages'",
         flush=True,
@@ -95,12 +118,15 @@ def main(gigabytes: float, million_rows: float) -> None:
         if million_rows:
             write_csv(place / "log.csv", round(1e6 * million_rows))
         for path in sorted(place.iterdir()):
-            subprocess.run([sys.executable, "-m", "benchmarks.large_bag", str(path)], check=True)
+            for work in ("read", "load") if path.suffix == ".csv" else ("read",):
+                subprocess.run(
+                    [sys.executable, "-m", "benchmarks.large_logs", work, str(path)], check=True
+                )
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 2 and Path(sys.argv[1]).exists():
-        read(Path(sys.argv[1]))
+    if sys.argv[1:2] in (["read"], ["load"]):
+        measure(read if sys.argv[1] == "read" else load, Path(sys.argv[2]))
     else:
         given = [float(word) for word in sys.argv[1:]] + [1.0, 5.0][len(sys.argv) - 1 :]
         main(*given)
