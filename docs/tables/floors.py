@@ -1,7 +1,10 @@
-"""The floor under every table: the error of a prediction that keeps its velocity, q + v t.
+"""The floor under every table, and the ground: what keeps its velocity, and the true equation.
 
     python -m docs.tables.floors                every test set, into results/floors.csv
     python -m docs.tables.floors soft_arm_1     some of them
+
+The first predicts q + v t. The second is the simulator's own equation of motion, rolled out by RK4
+in the steps of the models beside it: what integration alone costs.
 
 The logs of real robots are looked for in the folder PINN_DYN_LOGS. Only the test trajectories are
 simulated: they are drawn apart from those of training, so their number does not matter.
@@ -24,9 +27,11 @@ from pinn_dyn.evaluation import (
     predict_windows,
     rollout_metrics,
 )
-from pinn_dyn.mechanics import stack
+from pinn_dyn.mechanics import Predictor, stack
 
 FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
+FLOOR = "keeps its velocity"
+GROUND = "true equation"
 _ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.validation=1")
 # Of each data set: horizon, step of the roll-outs and windows, all in s, and what makes it small.
 SETS = {
@@ -41,33 +46,38 @@ SETS = {
 }
 
 
-def floor(name: str) -> dict[str, object]:
-    """Errors of q + v t on the test trajectories of one data set, as evaluate.py counts them."""
+def floors(name: str) -> list[dict[str, object]]:
+    """Errors on the test trajectories of one data set, as evaluate.py counts them."""
     horizon, step, windows, small = SETS[name]
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         cfg = hydra.compose("train", overrides=[f"dataset={name}", *small])
     dataset = OmegaConf.to_container(cfg.dataset, resolve=True)
-    truth = stack(build_source({"dataset": dataset}).load().test).until(horizon)
-    model = KeepsVelocity(truth.q.shape[-1], truth.u.shape[-1])
-    whole = predict_trajectories(model, truth, step=step)
-    figures = rollout_metrics(whole.q_hat, whole.q, whole.t, thresholds={})
-    row = {"dataset": name, "step": step, **figures.to_dict()}
-    for window in windows:
-        part = predict_windows(model, truth, window=window, step=step)
-        error = rollout_metrics(part.q_hat, part.q, part.t, thresholds={}).error_mean
-        row[f"window_{window:g}s_error_mean"] = error
-    return row
+    source = build_source({"dataset": dataset})
+    truth = stack(source.load().test).until(horizon)
+    models: dict[str, Predictor] = {FLOOR: KeepsVelocity(truth.q.shape[-1], truth.u.shape[-1])}
+    if source.system is not None:
+        models[GROUND] = source.system
+    rows = []
+    for label, model in models.items():
+        whole = predict_trajectories(model, truth, step=step)
+        figures = rollout_metrics(whole.q_hat, whole.q, whole.t, thresholds={})
+        row = {"dataset": name, "model": label, "step": step, **figures.to_dict()}
+        for window in windows:
+            part = predict_windows(model, truth, window=window, step=step)
+            error = rollout_metrics(part.q_hat, part.q, part.t, thresholds={}).error_mean
+            row[f"window_{window:g}s_error_mean"] = error
+        rows.append(row)
+    return rows
 
 
 if __name__ == "__main__":
     names = sys.argv[1:] or list(SETS)
     if unknown := set(names) - set(SETS):
         raise SystemExit(f"no data set {', '.join(unknown)}: expected some of {', '.join(SETS)}")
-    rows = pd.DataFrame([floor(name) for name in names])
+    rows = pd.DataFrame([row for name in names for row in floors(name)])
     if FILE.exists():
         old = pd.read_csv(FILE)
         rows = pd.concat([old[~old["dataset"].isin(names)], rows])
-    rows.sort_values("dataset").to_csv(FILE, index=False)
-    print(
-        rows[["dataset", "horizon", "error_mean", "error_std", "diverged"]].to_string(index=False)
-    )
+    rows.sort_values(["dataset", "model"]).to_csv(FILE, index=False)
+    shown = ["dataset", "model", "horizon", "error_mean", "error_median", "diverged"]
+    print(rows[shown].to_string(index=False))
