@@ -86,6 +86,10 @@ DATA = {
 }
 
 
+# Of a fit that would go on until nothing changes: what it finds is of tests/training.
+SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200"]
+
+
 @pytest.mark.parametrize(
     "experiment",
     [pytest.param(x, marks=needs_logs if x.startswith("logs/") else ()) for x in EXPERIMENTS],
@@ -96,12 +100,15 @@ def test_every_experiment_trains(tmp_path, monkeypatch, experiment):
     if experiment not in ("logs/trunk/lnn", "neck/lnn"):  # drawing takes longer than training
         monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
     choice = f"experiment={experiment}"
+    config = compose(choice)
+    least_squares = config.optimizer._target_ == "pinn_dyn.training.LeastSquares"
     folder = tmp_path / "run"
     run_script(
         "train.py",
         choice,
         *TINY_TRAINING,
-        *DATA[compose(choice).dataset.name](tmp_path),
+        *DATA[config.dataset.name](tmp_path),
+        *(SHORT_FIT if least_squares else ()),
         NO_FIGURES,
         "compile=false",
         f"hydra.run.dir={folder}",
