@@ -9,7 +9,7 @@ import pytest
 import tomllib
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import MissingConfigException
+from hydra.errors import ConfigCompositionException, MissingConfigException
 from omegaconf import OmegaConf, open_dict
 
 from pinn_dyn.app.config import checked, completed, config_folder
@@ -105,14 +105,15 @@ def compose(program, overrides, folder):
     """
     candidates = [folder, *sorted(path for path in folder.glob("*conf") if path.is_dir())]
     paths = ",".join(f"file://{path}" for path in candidates)
-    words = completed(program, [f"hydra.searchpath=[{paths}]", *overrides])
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(program))):
-        try:
-            cfg = hydra.compose(program, overrides=words, return_hydra_config=True)
-        except MissingConfigException as error:
-            if re.search(r"hydra/(launcher|sweeper)", str(error)):
-                pytest.skip(f"needs a plugin of Hydra: {error}")
-            raise
+    words = [f"hydra.searchpath=[{paths}]", *overrides]
+    try:
+        cfg = _composed(program, words)
+    except MissingConfigException as error:
+        if re.search(r"hydra/(launcher|sweeper)", str(error)):
+            pytest.skip(f"needs a plugin of Hydra: {error}")
+        raise
+    except ConfigCompositionException:  # a key that stands in no YAML, or does not exist
+        cfg = _composed(program, completed(program, words))
     HydraConfig.instance().set_config(cfg)
     with open_dict(cfg):
         del cfg["hydra"]
@@ -122,3 +123,8 @@ def compose(program, overrides, folder):
                 patch.syspath_prepend(str(place))
             return checked(program, cfg)
     return OmegaConf.to_container(cfg, resolve=False)
+
+
+def _composed(program, words):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(program))):
+        return hydra.compose(program, overrides=words, return_hydra_config=True)

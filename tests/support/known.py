@@ -77,19 +77,29 @@ def known_cart_pole():
     return KnownSystem(scales, KnownCartPole()).double()
 
 
-def motion(model, *, seconds=2.0, rate=200.0, seed=0):
-    """A motion of the model under a random smooth input, ``(T, N)``."""
-    generator = torch.Generator().manual_seed(seed)
+def motions(model, seeds, *, seconds=2.0, rate=200.0):
+    """Motions of the model under random smooth inputs, ``(T, N)`` each, rolled out side by side."""
     n = model.num_inputs
     t = torch.arange(int(seconds * rate) + 1, dtype=torch.float64) / rate
-    u = torch.zeros(len(t), n, dtype=torch.float64)
-    for k in range(1, 6):
-        weight, phase = torch.rand(2, n, generator=generator).double()
-        u += 4 * (weight - 0.5) * torch.sin(2 * torch.pi * 0.5 * k * t[:, None] + 6 * phase)
-    start = torch.rand(2 * model.num_coordinates, generator=generator).double() - 0.5
+    inputs, starts = [], []
+    for seed in seeds:
+        generator = torch.Generator().manual_seed(seed)
+        u = torch.zeros(len(t), n, dtype=torch.float64)
+        for k in range(1, 6):
+            weight, phase = torch.rand(2, n, generator=generator).double()
+            u += 4 * (weight - 0.5) * torch.sin(2 * torch.pi * 0.5 * k * t[:, None] + 6 * phase)
+        inputs.append(u)
+        starts.append(torch.rand(2 * model.num_coordinates, generator=generator).double() - 0.5)
     with torch.no_grad():
-        q, v = model.predict(start, t, Signal(t, u)).chunk(2, dim=-1)
-    return Trajectory(q, v, Signal(t, u))
+        states = model.predict(torch.stack(starts), t, Signal(t, torch.stack(inputs)))
+    return [
+        Trajectory(*x.chunk(2, dim=-1), Signal(t, u)) for x, u in zip(states, inputs, strict=True)
+    ]
+
+
+def motion(model, *, seconds=2.0, rate=200.0, seed=0):
+    """One motion of the model, ``(T, N)``."""
+    return motions(model, [seed], seconds=seconds, rate=rate)[0]
 
 
 def windows_of(model, *, count, steps, stride=2):

@@ -7,15 +7,19 @@ from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.training import LeastSquares
-from tests.support.known import known_arm, known_cart_pole, motion
+from tests.support.known import known_arm, known_cart_pole, motion, motions
 
 RATE = 100.0  # Hz
 
 
-def runs_of(truth, noise=0.0, seed=0):
-    """Two motions with white noise, a part of the spread of q and v."""
+def runs_of(truth, seed=0):
+    """Two motions."""
+    return motions(truth, [10 * seed, 10 * seed + 1], seconds=2.0, rate=RATE)
+
+
+def noisy(runs, noise=0.01, seed=0):
+    """The same with white noise, a part of the spread of q and v."""
     generator = torch.Generator().manual_seed(seed)
-    runs = [motion(truth, seconds=2.0, rate=RATE, seed=10 * seed + k) for k in range(2)]
     return [
         Trajectory(
             *(
@@ -26,6 +30,14 @@ def runs_of(truth, noise=0.0, seed=0):
         )
         for run in runs
     ]
+
+
+@pytest.fixture(scope="module")
+def arm_runs():
+    """Four pairs of motions of the soft arm; the first is what ``runs_of`` gives."""
+    seeds = [10 * seed + k for seed in range(4) for k in range(2)]
+    runs = motions(known_arm(), seeds, seconds=2.0, rate=RATE)
+    return [runs[2 * seed : 2 * seed + 2] for seed in range(4)]
 
 
 def fitted(model, runs, **settings):
@@ -47,9 +59,9 @@ STARTS = {
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_a_soft_arm_is_found_from_starts_that_are_far_off(start):
+def test_a_soft_arm_is_found_from_starts_that_are_far_off(arm_runs, start):
     truth = known_arm()
-    table, fit = fitted(known_arm(**STARTS[start]), runs_of(truth))
+    table, fit = fitted(known_arm(**STARTS[start]), arm_runs[0])
     assert fit.residual < 1e-6
     assert table.value.to_numpy() == pytest.approx(true_values(truth), rel=1e-5)
     assert (table.known > 0.999).all()
@@ -71,12 +83,12 @@ def test_constants_that_are_not_linear_are_found_with_fewer_inputs_than_coordina
 
 
 @pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "roll-outs"])
-def test_the_truth_lies_in_the_intervals(rollouts):
+def test_the_truth_lies_in_the_intervals(arm_runs, rollouts):
     """Of 4 fits of 7 constants from noisy motions 95 % should; five of 28 outside are unlikely."""
     truth, outside = known_arm(), 0
-    for seed in range(4):
+    for seed, runs in enumerate(arm_runs):
         start = known_arm(mass=1.5, stiffness=100.0, damping=0.5)
-        table, _ = fitted(start, runs_of(truth, noise=0.01, seed=seed), rollouts=rollouts)
+        table, _ = fitted(start, noisy(runs, seed=seed), rollouts=rollouts)
         true = true_values(truth)
         outside += int(((table.low > true) | (table.high < true)).sum())
         # Not by being wide: the intervals are a few per cent.
@@ -97,8 +109,8 @@ def test_what_no_motion_shows_is_named():
     assert found == {"stiffness 2", "damping 2"}
 
 
-def test_data_at_rest_are_refused():
-    run = runs_of(known_arm())[0]
+def test_data_at_rest_are_refused(arm_runs):
+    run = arm_runs[0][0]
     still = Trajectory(run.q[:1].expand_as(run.q), 0 * run.v, run.input)
     with pytest.raises(ValueError, match="nothing moves in the training trajectories"):
         fitted(known_arm(), [still])
@@ -106,12 +118,12 @@ def test_data_at_rest_are_refused():
 
 def test_a_segment_that_has_changed_is_free_again():
     """A payload on the second one: all else is held by what the first fit found."""
-    truth, model = known_arm(2), known_arm(2, mass=1.0)
-    _, before = fitted(model, runs_of(truth, noise=0.01), rollouts=False)
+    model, clean = known_arm(2, mass=1.0), runs_of(known_arm(2))
+    _, before = fitted(model, noisy(clean), rollouts=False)
     loaded, held = known_arm(2, mass=[0.5, 1.5]), model.learned["stiffness"].z.detach().clone()
-    windows = draw_windows(runs_of(truth), count=4, steps=1, stride=1, seed=0)
+    windows = draw_windows(clean, count=4, steps=1, stride=1, seed=0)
     solver = LeastSquares(cutoff=20.0, rollouts=False, changed=["mass 2"])
-    solver.fit(model, runs_of(loaded, noise=0.01, seed=1)[:1], windows, before.covariance)
+    solver.fit(model, noisy(runs_of(loaded, seed=1)[:1], seed=1), windows, before.covariance)
     mass = model.learned["mass"]().detach()
     assert float(mass[1]) == pytest.approx(1.5, rel=0.1)
     assert float(mass[0]) == pytest.approx(0.5, rel=0.2)

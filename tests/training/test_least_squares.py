@@ -12,7 +12,7 @@ from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.models import DriveCoulomb
 from pinn_dyn.training import LeastSquares
 from pinn_dyn.training.least_squares import correlation_length, filtered_motion
-from tests.support.known import known_model, motion
+from tests.support.known import known_model, motion, motions
 from tests.support.rigid_chains import joint, link, robot
 
 PENDULUM = robot(
@@ -40,7 +40,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def runs(truth):
-    return [motion(truth, seconds=3.0, rate=100.0, seed=k) for k in range(2)]
+    return motions(truth, range(2), seconds=3.0, rate=100.0)
 
 
 def held_out_error(model, truth):
