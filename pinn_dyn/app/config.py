@@ -14,7 +14,8 @@ from hydra.errors import ConfigCompositionException, HydraException, OverridePar
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.schema import KEYS, ConfigError, check, did_you_mean
+from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.schema import ConfigError, check, did_you_mean
 from pinn_dyn.app.schema import arguments as arguments_of
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.

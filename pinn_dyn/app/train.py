@@ -28,6 +28,7 @@ from pinn_dyn.app.build import (
     epochs,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -42,7 +43,7 @@ from pinn_dyn.app.run_folder import (
     recorded_error,
     write_json,
 )
-from pinn_dyn.app.schema import KEYS, check_value
+from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.data.whole import whole, write_whole
