@@ -37,6 +37,7 @@ from pinn_dyn.control import (
     ModelBasedLaw,
     ProportionalDerivative,
     Reference,
+    SetPoint,
     check_limits,
     check_without_truth,
     close_loop,
@@ -53,6 +54,8 @@ from pinn_dyn.systems import HasLimits
 
 log = logging.getLogger(__name__)
 
+MOST_INSTANTS = 1e8
+"""Of all runs of a controller: some GB."""
 # States per trajectory that a region of training data is drawn from.
 _REGION_SAMPLES = 200
 
@@ -99,6 +102,7 @@ def control(cfg: DictConfig) -> float:
     if isinstance(robot, HasLimits):
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
+    _check_length(config, reference, len(q0))
     if not 0 <= config["trajectory"] < len(q0):
         raise ConfigError(
             f"trajectory is {config['trajectory']}, expected one of the {len(q0)} runs, 0 to "
@@ -106,10 +110,10 @@ def control(cfg: DictConfig) -> float:
         )
     _check_box(config["stability"], robot.num_coordinates)
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    if config["export"]:
+    if config["export"] is not None:
         path = _export(laws, Path(config["export"]))
         log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
-    if config["guard"]["threshold"] is not None:
+    if config["guard"].get("threshold") is not None:
         laws["learned"] = _guarded(laws, config, source)
 
     records: dict[str, ClosedLoopRecord] = {}
@@ -175,11 +179,30 @@ def _check_box(box: dict[str, Any] | None, size: int) -> None:
     if box is None:
         return
     for key in ("q_low", "q_high"):
-        if len(box.get(key, ())) != size:
+        if len(box[key]) != size:
             raise ConfigError(
-                f"stability.{key} is {box.get(key)}, expected {size} numbers, one for each "
+                f"stability.{key} is {box[key]}, expected {size} numbers, one for each "
                 "coordinate of the robot"
             )
+    if any(low > high for low, high in zip(box["q_low"], box["q_high"], strict=True)):
+        raise ConfigError(
+            f"stability.q_low is {box['q_low']}, expected at most stability.q_high, {box['q_high']}"
+        )
+
+
+def _check_length(config: dict[str, Any], reference: Reference, runs: int) -> None:
+    """Refuse runs that no memory holds, or that end before their error is measured."""
+    key = "samples_rate" if config["rate"] is None else "rate"
+    duration, instants = config["duration"], config["duration"] * config[key] * runs
+    if not instants <= MOST_INSTANTS:
+        raise ConfigError(
+            f"duration is {duration} s, {key} {config[key]} Hz and runs {runs}: {instants:.2g} "
+            f"instants, expected at most {MOST_INSTANTS:.2g}"
+        )
+    if isinstance(reference, SetPoint) and config["settled_after"] > duration:
+        raise ConfigError(
+            f"settled_after is {config['settled_after']} s, expected at most duration, {duration} s"
+        )
 
 
 def _export(laws: dict[str, Controller], path: Path) -> Path:
@@ -200,7 +223,7 @@ def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSo
     train = source.load().train
     fallback = None
     with _errors_of("guard"):
-        if config["guard"]["fallback"]:
+        if config["guard"].get("fallback"):
             gains = config["gains"]
             fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
         region = DataRegion(

@@ -44,6 +44,7 @@ Index = Annotated[int, Range(0)]
 Positive = Annotated[float, Range(0, above=True)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 MOST_MEMBERS = 256
+MOST_RUNS = 100_000
 MOST_WEIGHTS = 250_000_000
 """Of all networks and members together: 4 GB with gradients and Adam's two moments."""
 Threads = Annotated[int, Range(1, 512)]
@@ -87,7 +88,7 @@ class Stability(Section):
     region: str
     q_low: Sequence[float]
     q_high: Sequence[float]
-    samples: Annotated[int, Range(1, 1_000_000)]
+    samples: Annotated[int, Range(1, 100_000)]
 
 
 # Arguments of the trainer that may be set; the program decides on the others.
@@ -159,7 +160,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "rate": Positive | None,
         "samples_rate": Positive,
         "initial_states": Annotated[Part, Kind("pinn_dyn.data.InitialStates")] | None,
-        "runs": Count,
+        "runs": Annotated[int, Range(1, MOST_RUNS)],
         "seed": Seed,
         "robot": Mapping[str, Any],
         "actuator": Annotated[Part, Kind("pinn_dyn.control.Actuator")],
@@ -168,7 +169,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "guard": Guard,
         "stability": Stability | None,
         "export": str | None,
-        "settle_fraction": Annotated[float, Range(0, 1, above=True)],
+        "settle_fraction": Annotated[float, Range(0, 0.999, above=True)],
         "settled_after": Annotated[float, Range(0)],
         "trajectory": Index,
         "animate": bool,
@@ -198,9 +199,10 @@ RANGES = {
     **dict.fromkeys(("harmonics", "nodes", "substeps"), Range(1, 1000)),
     "hidden": Range(1, 20_000),
     "segments": Range(1, 100),
+    "count": Range(1, MOST_RUNS),
+    "workers": Range(1, 512),
     **dict.fromkeys(("every_n_validations", "precondition_frequency"), Range(1)),
-    **dict.fromkeys(("duration", "horizon", "piece", "rate", "window"), Range(0, above=True)),
-    "lr": Range(0, 100, above=True),
+    **dict.fromkeys(("duration", "horizon", "lr", "piece", "rate", "window"), Range(0, above=True)),
     "weight_decay": Range(0, 1e6),
     **dict.fromkeys(("betas", "coverage", "momentum", "warm_up"), Range(0, 1)),
     **dict.fromkeys(("atol", "eps"), Range(0, 0.1, above=True)),

@@ -14,7 +14,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from pinn_dyn.app.keys import KEYS, Part
 from pinn_dyn.app.schema import ConfigError, check_value
 
-_HINTS = KEYS["control"] | KEYS["train"]
+_HINTS = KEYS["control"] | KEYS["train"] | {"robot": Part}
 _REFUSALS = (ValueError, TypeError, InstantiationException, MisconfigurationException)
 _MISSING = re.compile(r"(\w+)(?:\.__init__)?\(\) missing \d+ required [\w-]+ arguments?: (.*)")
 

@@ -52,9 +52,18 @@ def check(command: str, config: Mapping[str, Any]) -> None:
     for key, hint in known.items():
         # Trainings of earlier versions were of single models.
         if key not in config and key != "ensemble" and not fits(None, hint):
-            raise ConfigError(f"{key} is missing, expected {words(hint)}: give {key}=...")
+            raise _missing(key, hint)
     if command == "train":
+        for part, keys in NEEDED.items():
+            taken = arguments(config[part]["_target_"], part)
+            for key in keys:
+                if key in taken and key not in config[part]:
+                    raise _missing(f"{part}.{key}", taken[key])
         _check_weights(config)
+
+
+def _missing(path: str, hint: Any) -> ConfigError:
+    return ConfigError(f"{path} is missing, expected {words(hint)}: give {path}=...")
 
 
 def _check_weights(config: Mapping[str, Any]) -> None:
@@ -93,9 +102,7 @@ def check_value(path: str, value: Any, hint: Any) -> None:
         ConfigError: naming the path of the value.
     """
     if not fits(value, hint):
-        lacks = isinstance(value, Mapping) and not _is_part(value) and not fits({}, hint)
-        found = "has no _target_" if lacks else f"is {_shown(value)}"
-        raise ConfigError(f"{path} {found}, expected {words(hint)}")
+        raise ConfigError(f"{path} is {_shown(value)}, expected {words(hint)}")
     if _is_part(value):
         _check_part(path, value, hint)
         return
@@ -132,10 +139,7 @@ def _check_section(path: str, value: Mapping[str, Any], section: Any) -> None:
         if field.name in value:
             check_value(f"{path}.{field.name}", value[field.name], hints[field.name])
         elif field.default is dataclasses.MISSING:
-            raise ConfigError(
-                f"{path}.{field.name} is missing, expected {words(hints[field.name])}: give "
-                f"{path}.{field.name}=..."
-            )
+            raise _missing(f"{path}.{field.name}", hints[field.name])
 
 
 def _check_part(path: str, part: Mapping[str, Any], hint: Any) -> None:
@@ -158,11 +162,6 @@ def _check_part(path: str, part: Mapping[str, Any], hint: Any) -> None:
                 f"experiment has it for another class, remove it by '~{path}.{key}'"
             )
         check_value(f"{path}.{key}", value, known[key])
-    for key in NEEDED.get(path, ()):
-        if key in known and key not in part:
-            raise ConfigError(
-                f"{path}.{key} is missing, expected {words(known[key])}: give {path}.{key}=..."
-            )
 
 
 def _check_kind(path: str, part: Mapping[str, Any], hint: Any) -> None:
