@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.schema import ConfigError, check, did_you_mean
 from pinn_dyn.app.schema import arguments as arguments_of
-from pinn_dyn.app.words import check_words, is_group, parsed, said
+from pinn_dyn.app.words import check_words, chooses, parsed, said
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
@@ -146,7 +146,8 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
     if folders := _CONFIG_DIR.findall(" ".join(arguments)):
         words.append(f"hydra.searchpath=[file://{Path(folders[0]).resolve()}]")
     overrides = []
-    for word, override in zip(words, parsed(words), strict=True):
+    read = parsed(words)
+    for word, override in zip(words, read, strict=True):
         # Of a sweep the first choice stands for all, of an interval its start.
         value = override.value()
         if isinstance(value, IntervalSweep):
@@ -156,7 +157,10 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
         overrides.append(word)
     folder = config_folder(command)
     places = [word for word in overrides if word.startswith("hydra.searchpath=")]
-    groups = [*places, *(word for word in overrides if is_group(folder, word))]
+    groups = [
+        *places,
+        *(word for word, one in zip(overrides, read, strict=True) if chooses(folder, one)),
+    ]
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(folder)):
         try:
             hydra.compose(command, overrides=overrides)

@@ -46,6 +46,7 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
+from pinn_dyn.data.limits import HasDomain
 from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
@@ -54,6 +55,7 @@ from pinn_dyn.systems import HasLimits
 
 log = logging.getLogger(__name__)
 
+_DOMAIN_SAMPLES = 101  # of a reference
 MOST_INSTANTS = 1e8
 """Of all runs of a controller: some GB."""
 # States per trajectory that a region of training data is drawn from.
@@ -103,12 +105,19 @@ def control(cfg: DictConfig) -> float:
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
     _check_length(config, reference, len(q0))
+    if isinstance(robot, HasDomain):
+        moments = np.linspace(0.0, config["duration"], _DOMAIN_SAMPLES)
+        wanted = [reference(float(t)).q.reshape(-1, q0.shape[-1]) for t in moments]
+        visited = torch.cat([q0, *wanted]).numpy()
+        with _errors_of("reference"):
+            robot.check_domain(visited.min(0), visited.max(0))
     if not 0 <= config["trajectory"] < len(q0):
         raise ConfigError(
             f"trajectory is {config['trajectory']}, expected one of the {len(q0)} runs, 0 to "
             f"{len(q0) - 1}"
         )
     _check_box(config["stability"], robot.num_coordinates)
+    _check_learned(config)
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["export"] is not None:
         path = _export(laws, Path(config["export"]))
@@ -174,6 +183,23 @@ def _initial_states(config: dict[str, Any], reference: Reference) -> tuple[Tenso
     return torch.from_numpy(q0), torch.from_numpy(v0)
 
 
+def _check_learned(config: dict[str, Any]) -> None:
+    """Refuse to look at a controller named learned where there is none."""
+    if not config["controllers"]:
+        raise ConfigError("controllers is empty, expected at least one")
+    looks = {
+        "export": config["export"] is not None,
+        "guard.threshold": config["guard"].get("threshold") is not None,
+        "stability": config["stability"] is not None,
+    }
+    for key, looked_at in looks.items():
+        if looked_at and "learned" not in config["controllers"]:
+            raise ConfigError(
+                f"{key} is set, which looks at the controller 'learned', and there are "
+                f"{', '.join(config['controllers'])} alone: set {key}=null"
+            )
+
+
 def _check_box(box: dict[str, Any] | None, size: int) -> None:
     """Refuse a stability region that does not fit the robot, before anything is run."""
     if box is None:
@@ -206,8 +232,6 @@ def _check_length(config: dict[str, Any], reference: Reference, runs: int) -> No
 
 
 def _export(laws: dict[str, Controller], path: Path) -> Path:
-    if "learned" not in laws:
-        raise ConfigError("export: there is no controller named 'learned' to export")
     with _errors_of("export"):
         return export_law(laws["learned"], path)
 

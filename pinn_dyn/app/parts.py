@@ -56,8 +56,8 @@ def _said(name: str, config: dict[str, Any], error: BaseException) -> str:
         place = next(_places(name, config, builder), name)
         key = re.findall(r"'(\w+)'", keys)[0]
         return (
-            f"{place} lacks {keys}: give {place}.{key}=..., or leave out the ~{place}.{key} that "
-            "took it away"
+            f"{keys} of {place} is missing: give {place}.{key}=..., or leave out the "
+            f"~{place}.{key} that took it away"
         )
     if isinstance(
         error, (ValueError, TypeError, InstantiationException, MisconfigurationException)

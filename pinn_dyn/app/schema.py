@@ -171,16 +171,16 @@ def _check_kind(path: str, part: Mapping[str, Any], hint: Any) -> None:
         limit for option in options for limit in get_args(option)[1:] if isinstance(limit, Kind)
     ]
     wanted = [find(name) for kind in kinds for name in kind.names]
-    wanted += [option for option in options if isinstance(option, type) and option is not Part]
+    plain = (option for option in options if isinstance(option, type))
+    wanted += [option for option in plain if option not in (Part, type(None))]
     heads = [get_args(option)[-1] for option in options if _is_callable(option)]
     wanted += [head for head in heads if isinstance(head, type)]
     partial = part.get("_partial_", False)
     if not isinstance(partial, bool):
         raise ConfigError(f"{path}._partial_ is {_shown(partial)}, expected true or false")
     if wanted and not kinds and partial != bool(heads):
-        raise ConfigError(
-            f"{path}._partial_ is {partial}, expected {bool(heads)} for such an object"
-        )
+        right = str(bool(heads)).lower()
+        raise ConfigError(f"{path}._partial_ is {partial}, expected {right} for this object")
     made = find(part["_target_"], path)
     if inspect.isbuiltin(made):  # of Python itself, as os.system
         made = type(made)
@@ -188,11 +188,11 @@ def _check_kind(path: str, part: Mapping[str, Any], hint: Any) -> None:
         made = _hints(made).get("return")
     if not isinstance(made, type):
         return  # a function of one's own that does not say what it returns
-    plain = tuple(one for one in wanted if not getattr(one, "_is_protocol", False))
-    if wanted and len(plain) == len(wanted) and not issubclass(made, plain):
+    known = tuple(one for one in wanted if not getattr(one, "_is_protocol", False))
+    if wanted and len(known) == len(wanted) and not issubclass(made, known):
         raise ConfigError(
             f"{path}._target_ is {part['_target_']!r}, expected a "
-            f"{' or '.join(one.__name__ for one in plain)}"
+            f"{' or '.join(one.__name__ for one in known)}"
         )
 
 

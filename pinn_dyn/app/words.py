@@ -77,6 +77,13 @@ def _values(override: Override) -> list[Any]:
     return [] if isinstance(value, (IntervalSweep, RangeSweep)) else [value]
 
 
+def chooses(folder: Path, override: Override) -> bool:
+    """Whether an override names options of a group, not values of its keys."""
+    return is_group(folder, str(override.input_line)) and not any(
+        isinstance(value, dict) for value in _values(override)
+    )
+
+
 def is_group(folder: Path, override: str) -> bool:
     """Whether an override chooses an option of a group in a folder of configurations."""
     name = override.split("=")[0].lstrip("+~").split("@")[0]
@@ -122,6 +129,8 @@ def said(folder: Path, error: HydraException | OmegaConfBaseException) -> str:
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     key = getattr(cause, "full_key", None)
     lines = [f"{key}: {str(cause).splitlines()[0]}" if key else str(error).strip()]
+    if key and "Interpolation key" in lines[0]:
+        lines[0] += ": give it, or leave out what takes it away"
     if cause is not error:
         lines.insert(0, str(error).splitlines()[0])
     return "\n".join(lines)
