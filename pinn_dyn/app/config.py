@@ -40,17 +40,16 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         ConfigError: naming every value that is still missing, or one that cannot be computed.
     """
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        raise ConfigError(
-            f"no value for {', '.join(missing)}: give it on the command line, as in "
-            f"'{missing[0]}=...'"
-        )
     try:
+        missing = sorted(OmegaConf.missing_keys(cfg))
+        if missing:
+            raise ConfigError(
+                f"no value for {', '.join(missing)}: give it on the command line, as in "
+                f"'{missing[0]}=...'"
+            )
         values = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
-        said = str(error).splitlines()[0]
-        raise ConfigError(f"{getattr(error, 'full_key', '')}: {said}") from error
+        raise ConfigError(said(CONF, error)) from error
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 

@@ -53,7 +53,8 @@ def check_words(command: str, folder: Path, overrides: list[Override]) -> None:
             raise ConfigError(f"'{word}' is a sweep over {count:.6g} values, expected some")
         if key == "hydra" or is_group(folder, word):
             for value in _values(override):
-                if value is None or isinstance(value, (bool, int, float)):
+                items = value if isinstance(value, list) else [value]
+                if not all(isinstance(item, (str, dict)) for item in items):
                     raise ConfigError(
                         f"{key} is {value!r}, expected the name of an option: "
                         f"{', '.join(_options(folder, key)) or 'leave it out'}"
@@ -73,7 +74,7 @@ def _jobs(override: Override) -> float:
 def _values(override: Override) -> list[Any]:
     value = override.value()
     if isinstance(value, ChoiceSweep):
-        return list(value.list)
+        return [str(item) for item in value.list]
     return [] if isinstance(value, (IntervalSweep, RangeSweep)) else [value]
 
 
