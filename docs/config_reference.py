@@ -16,7 +16,8 @@ from pathlib import Path
 import griffe
 import yaml
 
-from pinn_dyn.app.schema import KEYS, ConfigError, arguments, find, words
+from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.schema import ConfigError, arguments, find, words
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"

@@ -1,23 +1,23 @@
-"""Builds objects from configurations; every call of Hydra's ``instantiate`` is in this file."""
+"""Builds the objects that a configuration describes, part by part."""
 
 from __future__ import annotations
 
 import os
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+import torch
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.keys import MOST_MEMBERS
+from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.progress import EpochLines
-from pinn_dyn.app.schema import MOST_MEMBERS, Part, arguments, check_value
+from pinn_dyn.app.schema import arguments
 from pinn_dyn.app.search import EqualSearch
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
@@ -42,32 +42,16 @@ VALIDATION_ERROR = "val/error_mean"
 _CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")  # of the trainer, done by the learner
 BEST_BY = "val/error_windowed"
 """What the best checkpoint is chosen by: a long roll-out may err least before it learns."""
-
-
-def _build(name: str, config: dict[str, Any], /, *given: Any, **extra: Any) -> Any:
-    """Instantiate a part of the configuration; its own error message comes first.
-
-    Raises:
-        ConfigError: naming the part, if its keys are not arguments of its constructor, or with what
-            its constructor said.
-    """
-    check_value(name, config, Part)
-    try:
-        # Plain lists and dicts reach the constructors: no room below knows a config object.
-        built = instantiate(config, _convert_="all")
-        if isinstance(built, partial):  # those of Hydra 1.4 cannot be sent to another process
-            built = partial(built.func, *built.args, **built.keywords)
-        return built(*given, **extra) if given or extra else built
-    except (InstantiationException, TypeError, ValueError, MemoryError) as error:
-        # Hydra wraps what a constructor said.
-        wrapped = isinstance(error, InstantiationException) and error.__cause__
-        said = str(wrapped or error)
-        raise ConfigError(f"{name}: {said}") from error
+MONITORED = (
+    *("train/loss", BEST_BY, VALIDATION_ERROR, "val/error_median", "val/error_worst"),
+    "val/diverged",
+)
+"""What a callback may watch."""
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
     """The data source of ``config["dataset"]``."""
-    return _build("dataset", {**_cache(config["dataset"]), **config["dataset"]})
+    return build_part("dataset", {**_cache(config["dataset"]), **config["dataset"]})
 
 
 def _cache(dataset: dict[str, Any]) -> dict[str, str]:
@@ -80,9 +64,9 @@ def _cache(dataset: dict[str, Any]) -> dict[str, str]:
 def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:
     """The data module of ``config["data"]``, on a source or else that of ``config["dataset"]``."""
     source = build_source(config) if source is None else source
-    part = {"seed": config["seed"], **config["data"], "_partial_": True}
+    part = {"seed": config["seed"], **config["data"]}
     _, batches, _ = epochs(config)
-    return _build("data", part, source=source, batches_per_epoch=batches)
+    return build_part("data", part, source=source, batches_per_epoch=batches)
 
 
 def epochs(config: dict[str, Any]) -> tuple[int, int, int]:
@@ -114,7 +98,7 @@ def epochs(config: dict[str, Any]) -> tuple[int, int, int]:
 
 def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
     """The model of ``config["model"]``, scaled to the data."""
-    return _build("model", config["model"], statistics=statistics)
+    return build_part("model", config["model"], statistics=statistics)
 
 
 def ensemble_size(config: dict[str, Any]) -> int:
@@ -134,7 +118,7 @@ def ensemble_size(config: dict[str, Any]) -> int:
 
 def build_search(config: dict[str, Any]) -> EqualSearch:
     """The search of ``config["search"]``."""
-    return _build("search", config)
+    return build_part("search", config)
 
 
 def build_predictor(config: dict[str, Any], statistics: Statistics) -> Predictor:
@@ -161,8 +145,9 @@ def build_learner(
     """
     ensemble = isinstance(model, Ensemble)
     single = model.member(0) if isinstance(model, Ensemble) else model
-    loss = _build("loss", config["loss"], statistics=statistics, model=single)
-    optimizer = _build("optimizer", config["optimizer"])
+    loss = build_part("loss", config["loss"], statistics=statistics, model=single)
+    steps = "params" in arguments(config["optimizer"]["_target_"], "optimizer")
+    optimizer = build_part("optimizer", config["optimizer"], partial_=steps)
     if isinstance(optimizer, LeastSquares):
         try:
             return LeastSquaresLearner(
@@ -175,17 +160,42 @@ def build_learner(
             )
         except TypeError as error:
             raise ConfigError(f"optimizer: {error}") from error
+    scheduler = build_part("scheduler", config["scheduler"], partial_=True)
+    _try_step(optimizer, scheduler, config["trainer"]["steps"])
     return (EnsembleLearner if ensemble else DynamicsLearner)(
         model,
         loss=loss,
         optimizer=optimizer,
-        scheduler=_build("scheduler", config["scheduler"]),
+        scheduler=scheduler,
         validator=validator,
         config=config,
         statistics=statistics,
         compile=compiles(config),
         **{key: config["trainer"][key] for key in _CLIPPING if key in config["trainer"]},
     )
+
+
+def _try_step(optimizer: Any, scheduler: Any, steps: int) -> None:
+    """Refuse settings that the first step of a training would, by a step on a small matrix."""
+    weights = torch.nn.Parameter(torch.eye(2))
+
+    def closure() -> torch.Tensor:
+        weights.grad = torch.ones_like(weights)
+        return weights.sum()
+
+    part = "optimizer"
+    try:
+        stepped = optimizer([weights])
+        part = "scheduler"
+        schedule = scheduler(stepped, total_steps=steps)
+        part = "optimizer"
+        stepped.step(closure)
+        part = "scheduler"
+        schedule.step()
+    except Exception as error:  # nobody's own classes raise one kind alone
+        raise ConfigError(
+            f"{part}: its settings are refused at the first step: {type(error).__name__}: {error}"
+        ) from error
 
 
 def compiles(config: dict[str, Any]) -> bool:
@@ -211,7 +221,7 @@ def compiles(config: dict[str, Any]) -> bool:
 
 def build_validator(config: dict[str, Any], training_step: float) -> RolloutValidator:
     """The validator of ``config["validator"]``."""
-    return _build("validator", config["validator"], training_step=training_step)
+    return build_part("validator", config["validator"], training_step=training_step)
 
 
 def build_trainer(
@@ -236,11 +246,12 @@ def build_trainer(
             "configurations": source.configurations,
         },
     }
-    callbacks = [
-        _build(f"callbacks.{name}", part, **needs.get(name, {}))
+    named = {
+        name: build_part(f"callbacks.{name}", part, **needs.get(name, {}))
         for name, part in config["callbacks"].items()
         if part is not None
-    ]
+    }
+    callbacks = list(named.values())
     # A resumed training finds them by these names.
     saved: dict[str, Any] = {
         "dirpath": str(folder / CHECKPOINTS),
@@ -249,7 +260,6 @@ def build_trainer(
     callbacks += [
         ModelCheckpoint(filename="best", monitor=BEST_BY, **saved),
         ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **saved),
-        LearningRateMonitor(),
         ValidationHistory(),
     ]
     ours = ("steps", "validations", *_CLIPPING)
@@ -257,11 +267,18 @@ def build_trainer(
     part["enable_progress_bar"] = part.get("enable_progress_bar", True) and sys.stdout.isatty()
     bar = part["enable_progress_bar"]
     callbacks.append(TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR))
-    loggers = [_build_logger(name, x, folder) for name, x in config["logger"].items()]
+    loggers = [_logger(name, x, folder) for name, x in config["logger"].items()]
+    if loggers:
+        callbacks.append(LearningRateMonitor())
+    for name, callback in named.items():
+        if (wanted := getattr(callback, "monitor", None)) not in (None, *MONITORED):
+            raise ConfigError(
+                f"callbacks.{name}.monitor is {wanted!r}, expected one of {', '.join(MONITORED)}"
+            )
     count, batches, every = epochs(config)
-    return _build(
+    return build_part(
         "trainer",
-        {**part, "_partial_": True},
+        part,
         max_epochs=count,
         check_val_every_n_epoch=every,
         callbacks=[*callbacks, description],
@@ -276,7 +293,7 @@ def build_trainer(
     )
 
 
-def _build_logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
+def _logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
     """A logger that knows the run folder."""
     extra: dict[str, Any] = {}
     if name == "tensorboard":  # one log for all parts of a training, also a resumed one
@@ -284,11 +301,13 @@ def _build_logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
     if name == "mlflow":
         extra = {"tags": {"folder": str(folder.resolve())}}
     try:
-        return _build(f"logger.{name}", config, save_dir=str(folder), **extra)
-    except ModuleNotFoundError as error:
+        return build_part(f"logger.{name}", config, save_dir=str(folder), **extra)
+    except ConfigError as error:
+        if not isinstance(error.__cause__, ModuleNotFoundError):
+            raise
         raise ConfigError(
             f"logger.{name}: a package is missing, install it with pip install "
-            f"'pinn_dyn[{name}]', or leave out logger={name} ({error})"
+            f"'pinn_dyn[{name}]', or leave out logger={name} ({error.__cause__})"
         ) from error
 
 
@@ -312,13 +331,13 @@ def check_processes(trainer: L.Trainer, batch_size: int) -> None:
 
 def build_robot(dataset: dict[str, Any], changes: dict[str, Any]) -> MechanicalSystem:
     """The system of a data set, with some arguments of its constructor changed."""
-    return _build("robot", {**dataset["system"], **changes})
+    return build_part("robot", {**dataset["system"], **changes})
 
 
 def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:
     """The reference of ``config["reference"]``; one that needs the robot's kinematics gets it."""
     part = config["reference"]
-    return _build("reference", part, *([robot] if part.get("_partial_") else []))
+    return build_part("reference", part, *([robot] if part.get("_partial_") else []))
 
 
 def build_law(
@@ -336,27 +355,27 @@ def build_law(
             f"controllers.{name}.terms is {part['terms']!r}, expected {' or '.join(models)}"
         )
     gains = {f"{key}_gain": value for key, value in config["gains"].items()}
-    law = _build(f"controllers.{name}.law", {**gains, **part["law"]}, models[part["terms"]])
-    if "observer" not in part:
+    law = build_part(f"controllers.{name}.law", {**gains, **part["law"]}, models[part["terms"]])
+    if part.get("observer") is None:
         return law
-    return _build(f"controllers.{name}.observer", part["observer"], law)
+    return build_part(f"controllers.{name}.observer", part["observer"], law)
 
 
 def build_plant(config: dict[str, Any], robot: MechanicalSystem) -> Plant:
     """The plant of ``config["plant"]``, made of the robot."""
-    return _build("plant", config["plant"], robot)
+    return build_part("plant", config["plant"], robot)
 
 
 def build_actuator(config: dict[str, Any]) -> Actuator:
     """The limits of ``config["actuator"]``."""
-    return _build("actuator", config["actuator"])
+    return build_part("actuator", config["actuator"])
 
 
 def build_sensor(config: dict[str, Any]) -> Sensor:
     """The noise of ``config["sensor"]``."""
-    return _build("sensor", {"seed": config["seed"], **config["sensor"]})
+    return build_part("sensor", {"seed": config["seed"], **config["sensor"]})
 
 
 def build_initial_states(config: dict[str, Any]) -> InitialStates:
     """The box of ``config["initial_states"]``."""
-    return _build("initial_states", config["initial_states"])
+    return build_part("initial_states", config["initial_states"])

@@ -23,6 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from pinn_dyn.app import words
 from pinn_dyn.app.config import ConfigError, completed, config_folder
 from pinn_dyn.app.sweep import how_to_go_on
 
@@ -55,7 +56,7 @@ def main(command: str) -> None:
             return task(cfg)
         except Exception as error:
             known = isinstance(error, (ConfigError, NonFiniteLossError, SimulationError))
-            said = str(error) if known else _in_a_line(error)
+            said = str(error) if known else _in_a_line(command, error)
             if said is None or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # SweepCallback then goes on with the other jobs
             raise SystemExit(f"Error: {said}") from error
@@ -68,7 +69,7 @@ def main(command: str) -> None:
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
     except Exception as error:
-        if (said := _in_a_line(error)) is None:
+        if (said := _in_a_line(command, error)) is None:
             raise
         raise SystemExit(f"Error: {said}") from error
     finally:
@@ -76,11 +77,12 @@ def main(command: str) -> None:
             print(hint, file=sys.stderr)
 
 
-def _in_a_line(error: BaseException) -> str | None:
+def _in_a_line(command: str, error: BaseException) -> str | None:
     """What Hydra or the system says that a user can mend; None of what looks like a bug."""
     if isinstance(error, (HydraException, OmegaConfBaseException)):
-        cause = error.__cause__
-        return f"{error}\n{cause}" if isinstance(cause, OmegaConfBaseException) else str(error)
+        return words.said(config_folder(command), error)
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+        return f"there is not enough memory ({error}): choose smaller sizes, as data.batch_size"
     if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
         error = error.__cause__  # logging says so of a file that it cannot open
     if isinstance(error, OSError) and error.errno in _DISK:

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
-from hydra.errors import ConfigCompositionException, HydraException, OverrideParseException
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.schema import KEYS, ConfigError, check, did_you_mean
+from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.schema import ConfigError, check, did_you_mean
 from pinn_dyn.app.schema import arguments as arguments_of
+from pinn_dyn.app.words import check_words, chooses, parsed, said
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
@@ -23,6 +24,7 @@ CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
 _OPEN = ("filter", "robot", "thresholds")  # mappings with keys of the user's choice
+_OVERRIDE = re.compile(r"~|[^-].*=", re.DOTALL)
 _CONFIG_DIR = re.compile(r"(?:--config-dir|-cd)[ =](\S+)")  # a user's own groups
 
 
@@ -38,17 +40,16 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         ConfigError: naming every value that is still missing, or one that cannot be computed.
     """
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        raise ConfigError(
-            f"no value for {', '.join(missing)}: give it on the command line, as in "
-            f"'{missing[0]}=...'"
-        )
     try:
+        missing = sorted(OmegaConf.missing_keys(cfg))
+        if missing:
+            raise ConfigError(
+                f"no value for {', '.join(missing)}: give it on the command line, as in "
+                f"'{missing[0]}=...'"
+            )
         values = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
-        said = str(error).splitlines()[0]
-        raise ConfigError(f"{getattr(error, 'full_key', '')}: {said}") from error
+        raise ConfigError(said(CONF, error)) from error
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 
@@ -75,8 +76,8 @@ def composed(command: str, overrides: list[str]) -> dict[str, Any]:
     try:
         with hydra.initialize_config_dir(version_base="1.3", config_dir=folder):
             return checked(command, hydra.compose(command, overrides=words))
-    except HydraException as error:
-        raise ConfigError(str(error)) from error
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(said(config_folder(command), error)) from error
 
 
 def completed(command: str, arguments: list[str]) -> list[str]:
@@ -89,6 +90,8 @@ def completed(command: str, arguments: list[str]) -> list[str]:
         ConfigError: on a key that does not exist, with those that were probably meant. What Hydra
             itself explains, a group's wrong option say, is left to it.
     """
+    words = [word for word in arguments if _OVERRIDE.match(word)]
+    check_words(command, config_folder(command), parsed(words))
     while (unknown := _unknown_key(command, arguments)) is not None:
         key, known = unknown
         before = arguments
@@ -138,42 +141,57 @@ def _takes(command: str, place: Any, path: str) -> dict[str, Any]:
 
 def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any]] | None:
     """The first key of the overrides that is in no YAML, and the configuration without it."""
-    words = [word for word in arguments if "=" in word and not word.startswith("-")]
+    words = [word for word in arguments if _OVERRIDE.match(word)]
     if folders := _CONFIG_DIR.findall(" ".join(arguments)):
         words.append(f"hydra.searchpath=[file://{Path(folders[0]).resolve()}]")
-    try:
-        overrides = []
-        for word, parsed in zip(
-            words, OverridesParser.create().parse_overrides(words), strict=True
-        ):
-            # Of a sweep the first choice stands for all, of an interval its start.
-            value = parsed.value()
-            if isinstance(value, IntervalSweep):
-                word = f"{word.split('=')[0]}={value.start}"
-            elif parsed.is_sweep_override():
-                word = f"{word.split('=')[0]}={next(parsed.sweep_string_iterator())}"
-            overrides.append(word)
-    except OverrideParseException:
-        return None
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(config_folder(command))):
+    overrides = []
+    read = parsed(words)
+    for word, override in zip(words, read, strict=True):
+        # Of a sweep the first choice stands for all, of an interval its start.
+        value = override.value()
+        if isinstance(value, IntervalSweep):
+            word = f"{word.split('=')[0]}={value.start}"
+        elif override.is_sweep_override():
+            word = f"{word.split('=')[0]}={next(override.sweep_string_iterator())}"
+        overrides.append(word)
+    folder = config_folder(command)
+    places = [word for word in overrides if word.startswith("hydra.searchpath=")]
+    groups = [
+        *places,
+        *(word for word, one in zip(overrides, read, strict=True) if chooses(folder, one)),
+    ]
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(folder)):
         try:
             hydra.compose(command, overrides=overrides)
+        except MissingConfigException as error:
+            raise ConfigError(said(folder, error)) from error
         except ConfigCompositionException as error:
             key = getattr(error.__cause__, "full_key", None)
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
-            folder = config_folder(command)
-            places = [o for o in overrides if o.startswith("hydra.searchpath=")]
-            groups = [*places, *(o for o in overrides if _is_group(folder, o))]
-            known = OmegaConf.to_container(hydra.compose(command, overrides=groups))
-            assert isinstance(known, dict)
-            return key, {str(name): value for name, value in known.items()}
+            return key, _plain_keys(hydra.compose(command, overrides=groups))
+        except (ValueError, TypeError, AttributeError, LookupError) as error:
+            known = _plain_keys(hydra.compose(command, overrides=groups))
+            raise ConfigError(_below_a_value(known, overrides) or str(error)) from error
     return None
 
 
-def _is_group(folder: Path, override: str) -> bool:
-    name = override.split("=")[0].lstrip("+~").split("@")[0]
-    return "." not in name and (folder / name).is_dir()
+def _plain_keys(cfg: DictConfig) -> dict[str, Any]:
+    known = OmegaConf.to_container(cfg)
+    assert isinstance(known, dict)
+    return {str(name): value for name, value in known.items()}
+
+
+def _below_a_value(known: dict[str, Any], words: list[str]) -> str | None:
+    """Which word gives a key to something that has none."""
+    for word in words:
+        path = word.split("=")[0].lstrip("+~")
+        while "." in path:
+            path = path.rpartition(".")[0]
+            value = _at(known, path)
+            if value is not None and not isinstance(value, dict):
+                return f"{word}: {path} is {value!r}, which has no keys: give {path}=..."
+    return None
 
 
 def _keys(values: dict[str, Any], prefix: str = "") -> Iterator[str]:

@@ -37,6 +37,7 @@ from pinn_dyn.control import (
     ModelBasedLaw,
     ProportionalDerivative,
     Reference,
+    SetPoint,
     check_limits,
     check_without_truth,
     close_loop,
@@ -45,6 +46,7 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
+from pinn_dyn.data.limits import HasDomain
 from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
@@ -53,6 +55,9 @@ from pinn_dyn.systems import HasLimits
 
 log = logging.getLogger(__name__)
 
+_DOMAIN_SAMPLES = 101  # of a reference
+MOST_INSTANTS = 1e8
+"""Of all runs of a controller: some GB."""
 # States per trajectory that a region of training data is drawn from.
 _REGION_SAMPLES = 200
 
@@ -99,17 +104,25 @@ def control(cfg: DictConfig) -> float:
     if isinstance(robot, HasLimits):
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
+    _check_length(config, reference, len(q0))
+    if isinstance(robot, HasDomain):
+        moments = np.linspace(0.0, config["duration"], _DOMAIN_SAMPLES)
+        wanted = [reference(float(t)).q.reshape(-1, q0.shape[-1]) for t in moments]
+        visited = torch.cat([q0, *wanted]).numpy()
+        with _errors_of("reference"):
+            robot.check_domain(visited.min(0), visited.max(0))
     if not 0 <= config["trajectory"] < len(q0):
         raise ConfigError(
             f"trajectory is {config['trajectory']}, expected one of the {len(q0)} runs, 0 to "
             f"{len(q0) - 1}"
         )
     _check_box(config["stability"], robot.num_coordinates)
+    _check_learned(config)
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    if config["export"]:
+    if config["export"] is not None:
         path = _export(laws, Path(config["export"]))
         log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
-    if config["guard"]["threshold"] is not None:
+    if config["guard"].get("threshold") is not None:
         laws["learned"] = _guarded(laws, config, source)
 
     records: dict[str, ClosedLoopRecord] = {}
@@ -170,21 +183,55 @@ def _initial_states(config: dict[str, Any], reference: Reference) -> tuple[Tenso
     return torch.from_numpy(q0), torch.from_numpy(v0)
 
 
+def _check_learned(config: dict[str, Any]) -> None:
+    """Refuse to look at a controller named learned where there is none."""
+    if not config["controllers"]:
+        raise ConfigError("controllers is empty, expected at least one")
+    looks = {
+        "export": config["export"] is not None,
+        "guard.threshold": config["guard"].get("threshold") is not None,
+        "stability": config["stability"] is not None,
+    }
+    for key, looked_at in looks.items():
+        if looked_at and "learned" not in config["controllers"]:
+            raise ConfigError(
+                f"{key} is set, which looks at the controller 'learned', and there are "
+                f"{', '.join(config['controllers'])} alone: set {key}=null"
+            )
+
+
 def _check_box(box: dict[str, Any] | None, size: int) -> None:
     """Refuse a stability region that does not fit the robot, before anything is run."""
     if box is None:
         return
     for key in ("q_low", "q_high"):
-        if len(box.get(key, ())) != size:
+        if len(box[key]) != size:
             raise ConfigError(
-                f"stability.{key} is {box.get(key)}, expected {size} numbers, one for each "
+                f"stability.{key} is {box[key]}, expected {size} numbers, one for each "
                 "coordinate of the robot"
             )
+    if any(low > high for low, high in zip(box["q_low"], box["q_high"], strict=True)):
+        raise ConfigError(
+            f"stability.q_low is {box['q_low']}, expected at most stability.q_high, {box['q_high']}"
+        )
+
+
+def _check_length(config: dict[str, Any], reference: Reference, runs: int) -> None:
+    """Refuse runs that no memory holds, or that end before their error is measured."""
+    key = "samples_rate" if config["rate"] is None else "rate"
+    duration, instants = config["duration"], config["duration"] * config[key] * runs
+    if not instants <= MOST_INSTANTS:
+        raise ConfigError(
+            f"duration is {duration} s, {key} {config[key]} Hz and runs {runs}: {instants:.2g} "
+            f"instants, expected at most {MOST_INSTANTS:.2g}"
+        )
+    if isinstance(reference, SetPoint) and config["settled_after"] > duration:
+        raise ConfigError(
+            f"settled_after is {config['settled_after']} s, expected at most duration, {duration} s"
+        )
 
 
 def _export(laws: dict[str, Controller], path: Path) -> Path:
-    if "learned" not in laws:
-        raise ConfigError("export: there is no controller named 'learned' to export")
     with _errors_of("export"):
         return export_law(laws["learned"], path)
 
@@ -200,7 +247,7 @@ def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSo
     train = source.load().train
     fallback = None
     with _errors_of("guard"):
-        if config["guard"]["fallback"]:
+        if config["guard"].get("fallback"):
             gains = config["gains"]
             fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
         region = DataRegion(

@@ -92,6 +92,12 @@ def evaluate(cfg: DictConfig) -> float:
     runs, damaged = _load_all(find_runs(config["runs"]), config["checkpoint"], trust)
     trained_on = build_source(_shared_dataset(runs))
     source = build_source(config) if config.get("dataset") else trained_on
+    sizes = [len(source.labels), len(source.input_labels)]
+    if sizes != [len(trained_on.labels), len(trained_on.input_labels)]:
+        raise ConfigError(
+            f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, the runs "
+            f"were trained on {len(trained_on.labels)} and {len(trained_on.input_labels)}"
+        )
     try:
         training = trained_on.load()
         truth = stack(getattr(source.load(), split))
@@ -110,12 +116,6 @@ def evaluate(cfg: DictConfig) -> float:
         raise ConfigError(
             f"trajectory is {config['trajectory']}, expected 0 to {len(truth.q) - 1}, one of the "
             f"{len(truth.q)} {SPLITS[split]}"
-        )
-    sizes = [len(source.labels), len(source.input_labels)]
-    if sizes != [len(trained_on.labels), len(trained_on.input_labels)]:
-        raise ConfigError(
-            f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, the runs "
-            f"were trained on {len(trained_on.labels)} and {len(trained_on.input_labels)}"
         )
     log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], SPLITS[split], source.name)
 

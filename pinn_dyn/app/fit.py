@@ -16,9 +16,10 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError, composed
 from pinn_dyn.app.frame import Signals, frame_dataset
+from pinn_dyn.app.keys import KEYS, Count
 from pinn_dyn.app.learned_model import LearnedModel, load
 from pinn_dyn.app.run_folder import CONFIG, claimed
-from pinn_dyn.app.schema import KEYS, Count, check_value
+from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.train import train_in
 from pinn_dyn.data import DataSource
 

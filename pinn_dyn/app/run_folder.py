@@ -21,7 +21,8 @@ from filelock import FileLock, Timeout
 from pinn_dyn import __version__
 from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.schema import KEYS, check_value
+from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import read_foreign
 from pinn_dyn.data import DataSource, fingerprint_changes
 from pinn_dyn.data.whole import write_whole

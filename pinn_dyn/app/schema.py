@@ -1,4 +1,4 @@
-"""What a configuration may hold: types of the top-level keys here, those of a part by its class.
+"""What a configuration may hold: the keys of a command are in :mod:`keys`, those of a part here.
 
 A part is a mapping with a ``_target_``; its keys are the arguments of that constructor, and the
 constructor's annotations are their types. ``RANGES`` adds what numbers of a name must keep to.
@@ -11,145 +11,33 @@ import dataclasses
 import difflib
 import importlib
 import inspect
+import itertools
 import math
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from pinn_dyn.app.keys import (
+    GIVEN,
+    KEYS,
+    MOST_WEIGHTS,
+    NEEDED,
+    RANGES,
+    TRAINER,
+    Kind,
+    Part,
+    Range,
+    Section,
+)
 
 
 class ConfigError(ValueError):
     """The configuration cannot be used as it is; the message says what to change."""
 
 
-class Part(NamedTuple):
-    """Stands for an object that is built: a mapping with a ``_target_``."""
-
-
-class Range(NamedTuple):
-    """Numbers from ``low`` to ``high``, or above ``low`` alone."""
-
-    low: float
-    high: float = math.inf
-    above: bool = False
-
-    def __contains__(self, value: object) -> bool:
-        assert isinstance(value, (int, float))
-        return (value > self.low if self.above else value >= self.low) and value <= self.high
-
-    def __str__(self) -> str:
-        if self.high < math.inf:
-            return f"from {self.low:g} to {self.high:g}"
-        return f"above {self.low:g}" if self.above else f"of at least {self.low:g}"
-
-
-Count = Annotated[int, Range(1)]
-Index = Annotated[int, Range(0)]
-Seconds = Annotated[float, Range(0, above=True)]
-MOST_MEMBERS = 1000
-Threads = Annotated[int, Range(1, 512)]
-Names = str | Sequence[str]
-
-KEYS: dict[str, dict[str, Any]] = {
-    "train": {
-        "name": str,
-        "model_name": str,
-        "seed": Annotated[int, Range(0, 2**32 - 1)],
-        "compile": bool | Literal["auto"],
-        "ensemble": Annotated[int, Range(1, MOST_MEMBERS)],
-        "threads": Threads,
-        "start_from": str | None,
-        "resume": str | None,
-        "resume_from": Literal["last", "best"] | None,
-        "trust": Names | None,
-        "search": Part | Mapping[str, Any] | None,  # of a finished run its draw alone
-        **dict.fromkeys(
-            ("dataset", "data", "model", "loss", "optimizer", "scheduler", "validator", "trainer"),
-            Part,
-        ),
-        "callbacks": Mapping[str, Part | None],  # null leaves one out
-        "logger": Mapping[str, Part],
-    },
-    "evaluate": {
-        "runs": Names,
-        "checkpoint": Literal["best", "last"],
-        "split": Literal["test", "validation"],
-        "dataset": Part | None,
-        "horizon": Seconds | None,
-        "step": Seconds | None,
-        "windows": Sequence[Seconds] | None,
-        "thresholds": Mapping[str, Annotated[float, Range(0, above=True)]],
-        "trajectory": Index,
-        "threads": Threads,
-        "trust": Names | None,
-    },
-    "control": {
-        "run": str,
-        "checkpoint": Literal["best", "last"],
-        "member": Index,
-        "gains": Mapping[str, float | Sequence[float]],
-        "duration": Seconds,
-        "rate": Annotated[float, Range(0, above=True)] | None,
-        "samples_rate": Annotated[float, Range(0, above=True)],
-        "initial_states": Part | None,
-        "runs": Count,
-        "seed": Annotated[int, Range(0, 2**32 - 1)],
-        "robot": Mapping[str, Any],
-        "actuator": Part,
-        "sensor": Part,
-        "delay": Index,
-        "guard": Mapping[str, Any],
-        "stability": Mapping[str, Any] | None,
-        "export": str | None,
-        "settle_fraction": Annotated[float, Range(0, 1, above=True)],
-        "settled_after": Annotated[float, Range(0)],
-        "trajectory": Index,
-        "animate": bool,
-        "threads": Threads,
-        "trust": Names | None,
-        "controllers": Mapping[str, Mapping[str, Any]],
-        "reference": Part,
-        "plant": Part,
-    },
-    "check": {"dataset": Part, "longest_delay": Seconds},
-    "gather": {
-        "runs": Names,
-        "evaluations": Names | None,
-        "filter": Mapping[str, Any] | None,
-        "sort": str,
-        "plot": str | None,
-        "plot_column": str | None,
-    },
-}
-
-# Of the numbers that constructors take under these names.
-RANGES = {
-    **dict.fromkeys(("batch_size", "keep_every", "pairs", "steps", "stride", "substeps"), Range(1)),
-    "hidden": Range(1, 20_000),  # two such layers have 1.6 GB
-    **dict.fromkeys(("harmonics", "nodes", "segments", "validations"), Range(1)),
-    **dict.fromkeys(("duration", "horizon", "lr", "piece", "rate", "window"), Range(0, above=True)),
-    **dict.fromkeys(("gradient_clip_val", "weight_decay"), Range(0)),
-    "coverage": Range(0, 1),
-    "seed": Range(0, 2**32 - 1),
-}
-
-# Arguments of a constructor that the program gives, and what to set instead.
-_LENGTH = "trainer.steps and trainer.validations"
-GIVEN = {
-    "data.batches_per_epoch": _LENGTH,
-    "trainer.max_epochs": _LENGTH,
-    "trainer.max_steps": _LENGTH,
-    "trainer.check_val_every_n_epoch": _LENGTH,
-    "trainer.val_check_interval": _LENGTH,
-    "trainer.callbacks": "callbacks",
-    "trainer.logger": "logger",
-    "trainer.default_root_dir": "hydra.run.dir",
-    "trainer.plugins": "trainer.precision and trainer.strategy",
-}
-
-
 def check(command: str, config: Mapping[str, Any]) -> None:
-    """Refuse a configuration with an unknown key, or a value of another type or out of range.
+    """Refuse a configuration that lacks a key, has an unknown one, or a value that does not fit.
 
     Raises:
         ConfigError: naming the key, what was found and what was expected.
@@ -161,6 +49,44 @@ def check(command: str, config: Mapping[str, Any]) -> None:
                 f"the configuration has no key {key!r}{did_you_mean(key, list(known))}"
             )
         check_value(key, value, known[key])
+    for key, hint in known.items():
+        # Trainings of earlier versions were of single models.
+        if key not in config and key != "ensemble" and not fits(None, hint):
+            raise _missing(key, hint)
+    if command == "train":
+        for part, keys in NEEDED.items():
+            taken = arguments(config[part]["_target_"], part)
+            for key in keys:
+                if key in taken and key not in config[part]:
+                    raise _missing(f"{part}.{key}", taken[key])
+        _check_weights(config)
+
+
+def _missing(path: str, hint: Any) -> ConfigError:
+    return ConfigError(f"{path} is missing, expected {words(hint)}: give {path}=...")
+
+
+def _check_weights(config: Mapping[str, Any]) -> None:
+    """Refuse networks that no machine holds, before they are built."""
+    members = config.get("ensemble", 1)
+    for path, widths in _layers("model", config["model"]):
+        if len(widths) > 100:
+            raise ConfigError(f"{path} has {len(widths)} layers, expected at most 100")
+        weights = members * sum(a * b for a, b in itertools.pairwise(widths))
+        if weights > MOST_WEIGHTS:
+            raise ConfigError(
+                f"{path} is {_shown(widths)}, {weights:.2g} weights with ensemble={members}: "
+                f"expected at most {MOST_WEIGHTS:.2g}, choose fewer or narrower layers"
+            )
+
+
+def _layers(path: str, part: Any) -> Iterator[tuple[str, list[int]]]:
+    """The widths of the layers of all networks in a part, with their places."""
+    if isinstance(part, Mapping):
+        for key, value in part.items():
+            if key == "hidden" and isinstance(value, list):
+                yield f"{path}.{key}", value
+            yield from _layers(f"{path}.{key}", value)
 
 
 def did_you_mean(key: str, known: Sequence[str]) -> str:
@@ -178,7 +104,7 @@ def check_value(path: str, value: Any, hint: Any) -> None:
     if not fits(value, hint):
         raise ConfigError(f"{path} is {_shown(value)}, expected {words(hint)}")
     if _is_part(value):
-        _check_part(path, value)
+        _check_part(path, value, hint)
         return
     name = path.rsplit(".", 1)[-1]
     numbers = value if isinstance(value, list) else [value]
@@ -186,32 +112,88 @@ def check_value(path: str, value: Any, hint: Any) -> None:
         if name in RANGES and _is_number(number) and number not in RANGES[name]:
             raise ConfigError(f"{path} is {_shown(value)}, expected numbers {RANGES[name]}")
     if isinstance(value, Mapping):
+        section = next((option for option in _options(hint) if _is_section(option)), None)
+        if section is not None:
+            _check_section(path, value, section)
+            return
         inner = next((get_args(h)[1] for h in _options(hint) if len(get_args(h)) == 2), Any)
         for key, item in value.items():
             check_value(f"{path}.{key}", item, inner)
     elif isinstance(value, list):
+        inner = next((get_args(h)[0] for h in _options(hint) if _is_list(h)), Any)
         for index, item in enumerate(value):
             if isinstance(item, (Mapping, list)):
-                check_value(f"{path}[{index}]", item, Any)
+                check_value(f"{path}[{index}]", item, inner)
 
 
-def _check_part(path: str, part: Mapping[str, Any]) -> None:
-    """Refuse what the constructor of a part does not take."""
+def _check_section(path: str, value: Mapping[str, Any], section: Any) -> None:
+    """Refuse a mapping without the keys of a section, or with others."""
+    hints = get_type_hints(section, include_extras=True)
+    for key in value:
+        if key not in hints:
+            raise ConfigError(
+                f"{path} takes no {key!r}{did_you_mean(key, list(hints))}; expected "
+                f"{', '.join(hints)}"
+            )
+    for field in dataclasses.fields(section):
+        if field.name in value:
+            check_value(f"{path}.{field.name}", value[field.name], hints[field.name])
+        elif field.default is dataclasses.MISSING:
+            raise _missing(f"{path}.{field.name}", hints[field.name])
+
+
+def _check_part(path: str, part: Mapping[str, Any], hint: Any) -> None:
+    """Refuse a part of another kind, or what its constructor does not take."""
     known = arguments(part["_target_"], path)
+    _check_kind(path, part, hint)
+    name = part["_target_"].rsplit(".", 1)[-1]
     for key, value in part.items():
         if key in ("_target_", "_partial_"):
             continue
         if instead := GIVEN.get(f"{path}.{key}"):
             raise ConfigError(f"{path}.{key} is not to be set: the program does, by {instead}")
+        if path == "trainer" and key in known and key not in TRAINER:
+            raise ConfigError(f"trainer.{key} is not to be set, only {', '.join(TRAINER)}")
         if key not in known:
             if known.get("**") is not None:
                 continue
-            name = part["_target_"].rsplit(".", 1)[-1]
             raise ConfigError(
                 f"{path}: {name} takes no {key!r}{did_you_mean(key, list(known))}; if an "
                 f"experiment has it for another class, remove it by '~{path}.{key}'"
             )
         check_value(f"{path}.{key}", value, known[key])
+
+
+def _check_kind(path: str, part: Mapping[str, Any], hint: Any) -> None:
+    """Refuse what builds an object of another class than an annotation says."""
+    options = _options(hint)
+    kinds = [
+        limit for option in options for limit in get_args(option)[1:] if isinstance(limit, Kind)
+    ]
+    wanted = [find(name) for kind in kinds for name in kind.names]
+    plain = (option for option in options if isinstance(option, type))
+    wanted += [option for option in plain if option not in (Part, type(None))]
+    heads = [get_args(option)[-1] for option in options if _is_callable(option)]
+    wanted += [head for head in heads if isinstance(head, type)]
+    partial = part.get("_partial_", False)
+    if not isinstance(partial, bool):
+        raise ConfigError(f"{path}._partial_ is {_shown(partial)}, expected true or false")
+    if wanted and not kinds and partial != bool(heads):
+        right = str(bool(heads)).lower()
+        raise ConfigError(f"{path}._partial_ is {partial}, expected {right} for this object")
+    made = find(part["_target_"], path)
+    if inspect.isbuiltin(made):  # of Python itself, as os.system
+        made = type(made)
+    elif not isinstance(made, type):
+        made = _hints(made).get("return")
+    if not isinstance(made, type):
+        return  # a function of one's own that does not say what it returns
+    known = tuple(one for one in wanted if not getattr(one, "_is_protocol", False))
+    if wanted and len(known) == len(wanted) and not issubclass(made, known):
+        raise ConfigError(
+            f"{path}._target_ is {part['_target_']!r}, expected a "
+            f"{' or '.join(one.__name__ for one in known)}"
+        )
 
 
 def arguments(target: Any, path: str = "_target_") -> dict[str, Any]:
@@ -224,19 +206,26 @@ def arguments(target: Any, path: str = "_target_") -> dict[str, Any]:
     described: Any = found
     if isinstance(found, type) and not dataclasses.is_dataclass(found):
         described = found.__init__  # type: ignore[misc]
-    try:
-        hints = get_type_hints(described, include_extras=True)
-    except Exception:  # names that exist for type checkers only, in other packages
-        hints = {}
+    hints = _hints(described)
     taken: dict[str, Any] = {}
-    for name, one in inspect.signature(found).parameters.items():
+    try:
+        parameters = inspect.signature(found).parameters
+    except ValueError:  # written in C, without a word about its arguments
+        return {"**": Any}
+    for name, one in parameters.items():
         if one.kind is one.VAR_KEYWORD:
             taken["**"] = Any
         elif one.kind is not one.VAR_POSITIONAL:
             taken[name] = hints.get(name, Any)
-    if path == "trainer":
-        taken |= {"steps": Count, "validations": Count}
-    return taken
+    return taken | TRAINER if path == "trainer" else taken
+
+
+def _hints(described: Any) -> dict[str, Any]:
+    """The annotations of a function or a class, evaluated; none if they cannot be."""
+    try:
+        return get_type_hints(described, include_extras=True)
+    except Exception:  # names that exist for type checkers only, in other packages
+        return {}
 
 
 def find(target: Any, path: str = "_target_") -> Any:
@@ -304,12 +293,14 @@ def _fits(value: Any, hint: Any) -> bool:
         return any(value == x and type(value) is type(x) for x in inner)
     if hint is Part:
         return _is_part(value)
+    if _is_section(hint):
+        return isinstance(value, Mapping) and not _is_part(value)
     if hint is bool:
         return isinstance(value, bool)
     if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
     if hint is float:
-        return _is_number(value) and math.isfinite(value)
+        return _is_number(value) and abs(value) < math.inf  # which NaN is not, nor any huge integer
     if hint in (str, Path):
         return isinstance(value, str)
     if (origin or hint) in _SEQUENCES:
@@ -323,8 +314,8 @@ def _fits(value: Any, hint: Any) -> bool:
     # A class, a protocol or something to call is built; numbers stand for tensors and arrays.
     if getattr(hint, "__name__", "") in ("Tensor", "ndarray"):
         return _is_number(value) or isinstance(value, list)
-    if isinstance(hint, type) or origin is collections.abc.Callable:
-        return isinstance(value, Mapping) or hint is object
+    if isinstance(hint, type) or _is_callable(hint):
+        return _is_part(value) or hint is object
     return True
 
 
@@ -351,6 +342,10 @@ def _words(hint: Any) -> str:
     }
     if origin is None and isinstance(hint, collections.abc.Hashable) and hint in plain:
         return plain[hint]
+    if hint is Part:
+        return "an object, a mapping with a _target_"
+    if _is_section(hint):
+        return f"a mapping with {', '.join(field.name for field in dataclasses.fields(hint))}"
     if origin is Annotated:
         return " ".join([words(inner[0]), *map(str, inner[1:])])
     if origin is Literal:
@@ -361,9 +356,21 @@ def _words(hint: Any) -> str:
         return "a mapping"
     if getattr(hint, "__name__", "") in ("Tensor", "ndarray"):
         return "numbers"
-    if isinstance(hint, type) or origin is collections.abc.Callable:
+    if isinstance(hint, type) or _is_callable(hint):
         return "an object, a mapping with a _target_"
     return "any value"
+
+
+def _is_section(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, Section)
+
+
+def _is_callable(hint: Any) -> bool:
+    return get_origin(hint) is collections.abc.Callable
+
+
+def _is_list(hint: Any) -> bool:
+    return (get_origin(hint) or hint) in _SEQUENCES and bool(get_args(hint))
 
 
 def _is_part(value: Any) -> bool:

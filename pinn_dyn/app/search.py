@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from scipy.stats import qmc
 
-from pinn_dyn.app.schema import ConfigError, Count, Index, Range
+from pinn_dyn.app.keys import Count, Index, Range
+from pinn_dyn.app.schema import ConfigError
 
 PositiveNumber = Annotated[float, Range(0, above=True)]
 T = TypeVar("T")

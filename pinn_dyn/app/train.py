@@ -28,6 +28,7 @@ from pinn_dyn.app.build import (
     epochs,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -42,7 +43,7 @@ from pinn_dyn.app.run_folder import (
     recorded_error,
     write_json,
 )
-from pinn_dyn.app.schema import KEYS, check_value
+from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.data.whole import whole, write_whole
@@ -211,10 +212,10 @@ def train_in(
             f"data.history is {data.history} s, but the model may look {model.input_history} s back"
             " (model.delay.longest): leave data.history out, it follows model.delay.longest"
         )
-    if config.get("start_from") and last is None:
+    if config.get("start_from") is not None and last is None:
         _take_weights(model, Path(config["start_from"]), trust)
     learner = build_learner(config, model, statistics, validator)
-    if isinstance(learner, LeastSquaresLearner) and config.get("start_from"):
+    if isinstance(learner, LeastSquaresLearner) and config.get("start_from") is not None:
         saved = read_checkpoint(Path(config["start_from"]) / CHECKPOINTS / "best.ckpt")
         if not isinstance(saved.get(COVARIANCE), torch.Tensor):
             raise ConfigError(
@@ -281,13 +282,16 @@ def _take_weights(model: Predictor, folder: Path, trust: tuple[str, ...]) -> Non
         raise ConfigError(f"start_from: {error}") from error
     if isinstance(model, KnownAndNetwork) and isinstance(trained, KnownMechanics):
         model = model.known
-    try:
-        model.load_state_dict(trained.state_dict())
-    except RuntimeError as error:
+    here, there = ({k: tuple(x.shape) for k, x in m.state_dict().items()} for m in (model, trained))
+    other = [key for key in {**here, **there} if here.get(key) != there.get(key)]
+    if other:
+        shown = [f"{k} is {here.get(k, 'absent')}, there {there.get(k, 'absent')}" for k in other]
         raise ConfigError(
             f"start_from: the run {folder} trained another model than this configuration has, "
-            f"expected the same classes and sizes: {error}"
-        ) from error
+            f"expected the same classes and sizes: {'; '.join(shown[:3])}"
+            f"{f'; and {len(shown) - 3} more' if len(shown) > 3 else ''}"
+        )
+    model.load_state_dict(trained.state_dict())
     log.info("starting from the weights of %s", folder)
 
 

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
-from pinn_dyn.data.simulation import SimulationError
+from pinn_dyn.data.simulation import SimulationError, check_amount
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.workers import end_with_parent
@@ -117,6 +117,7 @@ class RobotSource(DataSource):
             if fault is not None:
                 raise ValueError(f"{name}: configurations.{key}: {fault}")
         size = system.num_coordinates
+        check_amount(name, sum(counts.values()), duration, step, 3 * size)
         self.name = name
         self.robot: Robot = system
         self.system: MechanicalSystem = system

@@ -17,7 +17,7 @@ from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.limits import HasDomain, Limits
-from pinn_dyn.data.simulation import SimulationError, simulate
+from pinn_dyn.data.simulation import SimulationError, check_amount, simulate
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
@@ -131,6 +131,9 @@ class SimulatedSource(DataSource):
         ):
             if found != expected:
                 raise ValueError(f"{name}: {key} has {found} entries, the system needs {expected}")
+        trained = train_inputs * (train_initial_states if pairing == "product" else 1)
+        width = 2 * system.num_coordinates + system.num_inputs
+        check_amount(name, trained + validation + test, duration, step, width)
         ranges = {"initial_states": (initial_states.q_low, initial_states.q_high)}
         self.limits = None
         if q_limits is not None:

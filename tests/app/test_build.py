@@ -2,7 +2,7 @@
 
 import pytest
 
-from pinn_dyn.app import build
+from pinn_dyn.app import build, parts
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 
@@ -63,4 +63,4 @@ def test_an_option_of_another_class_says_how_to_remove_it(nested):
         key = "scales.hidden"
     says = rf"model.*: MeasuredVelocity takes no 'hidden'.*remove it by '~model\.{key}'"
     with pytest.raises(ConfigError, match=says):
-        build._build("model", config)
+        parts.build_part("model", config)

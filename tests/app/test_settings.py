@@ -4,7 +4,8 @@ import pytest
 
 from pinn_dyn.app.build import epochs
 from pinn_dyn.app.config import CONF, ConfigError, checked, completed, config_folder
-from pinn_dyn.app.schema import KEYS, arguments, fits, words
+from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.schema import arguments, fits, words
 from tests.app.entry import fails
 from tests.support.composing import GIVEN, compose
 

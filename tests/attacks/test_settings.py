@@ -4,7 +4,9 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.config import ConfigError, checked, plain
+from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.schema import check, fits
 from tests.support.composing import GIVEN, compose
 
 
@@ -16,6 +18,77 @@ def composed():
 
 MISTAKES = {
     "train": [
+        "data=null",
+        "trainer=x",
+        "optimizer=0.1",
+        "model={hidden: [8]}",
+        "dataset._target_=os.system",
+        "dataset._target_=pinn_dyn.mechanics.RK4",
+        "model._target_=pinn_dyn.data.Chirp",
+        "loss._target_=pinn_dyn.data.Chirp",
+        "optimizer._target_=builtins.dict",
+        "validator._target_=pinn_dyn.data.Chirp",
+        "scheduler._target_=torch.optim.SGD",
+        "trainer._target_=pinn_dyn.data.Chirp",
+        "model.inverse_mass._target_=pinn_dyn.mechanics.RK4",
+        "model.inverse_mass._partial_=false",
+        "model.integrator._partial_=true",
+        "model.integrator._partial_=3",
+        "dataset.system._target_=pinn_dyn.data.Chirp",
+        "dataset.excitation.parts=[3]",
+        "callbacks.figures._target_=builtins.dict",
+        "callbacks.more={}",
+        "callbacks.more={_target_: pinn_dyn.data.Chirp}",
+        "logger.tensorboard._target_=pinn_dyn.data.Chirp",
+        "logger.tensorboard=null",
+        "model.inverse_mass.hidden=[1000000, 1000000]",
+        "model.inverse_mass.hidden=[20000, 20000]",
+        "data.pairs=1000000000000",
+        "data.batch_size=10000000000",
+        "ensemble=1000000",
+        "trainer.steps=1000000000000000",
+        "trainer.validations=1000000000000",
+        "model.integrator.substeps=1000000000",
+        "dataset.train_inputs=1000000000",
+        "dataset.train_initial_states=1000000000",
+        "dataset.test=1000000000",
+        "dataset.validation=1000000000",
+        "dataset.system.segments=1000000",
+        "dataset.system.nodes=1000000000",
+        "seed=1000000000000000000000",
+        "dataset.rtol=-1",
+        "dataset.rtol=1",
+        "dataset.atol=0",
+        "optimizer.betas=[2, 3]",
+        "optimizer.eps=-1",
+        "optimizer.maximize=true",
+        "optimizer.params=[1]",
+        "scheduler.total_steps=3",
+        "scheduler.optimizer=3",
+        "scheduler.warm_up=2",
+        "trainer.gradient_clip_val=0",
+        "trainer.gradient_clip_algorithm=x",
+        "trainer.accelerator=tpu",
+        "trainer.accelerator=3",
+        "trainer.precision=64-true",
+        "trainer.precision=16-mixed",
+        "trainer.precision=8",
+        "trainer.devices=0",
+        "trainer.devices=x",
+        "trainer.devices=1.5",
+        "trainer.num_nodes=0",
+        "trainer.strategy=3",
+        "trainer.profiler=x",
+        "trainer.limit_train_batches=1",
+        "trainer.limit_val_batches=0",
+        "trainer.overfit_batches=1",
+        "trainer.fast_dev_run=true",
+        "trainer.min_epochs=100",
+        "trainer.max_time=x",
+        "trainer.accumulate_grad_batches=2",
+        "trainer.inference_mode=true",
+        "trainer.detect_anomaly=x",
+        "callbacks.figures.every_n_validations=0",
         "seed=abc",
         "seed=1.5",
         "seed=-1",
@@ -108,6 +181,12 @@ MISTAKES = {
         "trainer.callbacks=[]",
     ],
     "evaluate": [
+        "runs=[[a]]",
+        "dataset=3",
+        "dataset={_target_: os.getcwd}",
+        "windows=[null]",
+        "trajectory=1000000000000000000000",
+        "thresholds={a: {b: 1}}",
         "runs=3",
         "runs=null",
         "checkpoint=first",
@@ -132,6 +211,41 @@ MISTAKES = {
         "horizn=1",
     ],
     "control": [
+        "gains.force=1",
+        "gains.position=true",
+        "controllers.pd=3",
+        "controllers.more={}",
+        "controllers.more={terms: learned}",
+        "controllers.pd.law=3",
+        "controllers.learned.terms=both",
+        "controllers.learned.law=3",
+        "controllers.learned.law._target_=pinn_dyn.control.SystemPlant",
+        "controllers.learned.law._target_=builtins.dict",
+        "controllers.learned.observer=3",
+        "controllers.learned.observer={}",
+        "controllers.learned.observr={}",
+        "reference.q=x",
+        "reference._target_=pinn_dyn.control.SystemPlant",
+        "reference._target_=builtins.dict",
+        "plant._target_=pinn_dyn.control.Regulation",
+        "plant._target_=os.getcwd",
+        "plant.rtol=-1",
+        "plant.system=3",
+        "actuator._target_=builtins.dict",
+        "sensor._target_=pinn_dyn.control.Actuator",
+        "initial_states={_target_: pinn_dyn.data.Chirp}",
+        "guard.threshold=-1",
+        "guard.threshold=x",
+        "guard.fallback=x",
+        "guard.threshhold=1",
+        "stability={}",
+        "stability={region: a}",
+        "stability={region: a, q_low: [x], q_high: [1], samples: 5}",
+        "stability={region: a, q_low: 3, q_high: [1], samples: 5}",
+        "stability={region: a, q_low: [0], q_high: [1], samples: 1000000000}",
+        "stability={region: [a], q_low: [0], q_high: [1], samples: 5}",
+        "runs=1000000000",
+        "settle_fraction=1",
         "run=[x]",
         "checkpoint=none",
         "member=-1",
@@ -169,6 +283,8 @@ MISTAKES = {
         "ruun=x",
     ],
     "gather": [
+        "runs=[null]",
+        "evaluations=[1]",
         "runs=3",
         "evaluations=3",
         "filter=3",
@@ -180,6 +296,17 @@ MISTAKES = {
         "sorted=x",
     ],
 }
+
+MISTAKES["check"] = [
+    "longest_delay=0",
+    "longest_delay=null",
+    "longest_delay=[1]",
+    "dataset=3",
+    "dataset._target_=pinn_dyn.data.Chirp",
+    "dataset.files=3",
+    "dataset.steps=3",
+    "dataset.guard=x",
+]
 
 
 @pytest.mark.parametrize(
@@ -196,3 +323,18 @@ def test_a_wrong_value_is_refused_by_name(composed, command, mistake):
     assert "\n" not in said
     assert len(said) < 400
     assert "expected" in said or "takes no" in said or "no key" in said or "to be set" in said
+
+
+@pytest.mark.parametrize(
+    ("command", "key"),
+    [(name, key) for name in GIVEN for key, hint in KEYS[name].items() if not fits(None, hint)]
+    + [("train", key) for key in ("optimizer.lr", "trainer.steps", "trainer.accelerator")],
+)
+def test_a_key_that_is_missing_is_named(composed, command, key):
+    if key == "ensemble":  # which trainings of earlier versions did not have
+        return
+    config = plain(composed[command])
+    place, _, name = key.rpartition(".")
+    del (config[place] if place else config)[name]
+    with pytest.raises(ConfigError, match=rf"^{key} is missing, expected .*: give {key}=\.\.\.$"):
+        check(command, config)
