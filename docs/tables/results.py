@@ -23,7 +23,12 @@ NAMES = {
 SUMMARY = [
     ("one-segment soft arm, 5 s", "hnn", "soft_arm_1_wide/hnn", "soft_arm_1_wide/mlp"),
     ("", "lnn", "soft_arm_1_wide/lnn", "soft_arm_1_wide/mlp"),
-    ("two-segment soft arm, 10 s", "lnn", "soft_arm_2/lnn_1000hz_wide", "soft_arm_2/mlp_100hz"),
+    (
+        "two-segment soft arm at 100 Hz, 10 s",
+        "lnn",
+        "soft_arm_2/lnn_100hz_wide",
+        "soft_arm_2/mlp_100hz",
+    ),
     ("Panda in PyBullet, its kinematics known, 2 s", "known", "panda/known", "panda/mlp"),
     ("double pendulum, real, 2 s", "lnn", "double_pendulum/lnn", "double_pendulum/acceleration"),
     ("tendon-driven trunk, real, 10 s", "lnn", "trunk/lnn", "trunk/mlp"),
@@ -281,6 +286,8 @@ def tracking() -> str:
     found[2:2] = [
         ("the paper's law on known mechanics", "panda_known", "learned"),
         ("the same with the observer", "panda_known", "learned_observer"),
+        ("the paper's law on known mechanics and a network", "panda_sum", "learned"),
+        ("the same with the observer", "panda_sum", "learned_observer"),
     ]
     rows = []
     for name, robot, controller in found:
