@@ -1,4 +1,4 @@
-"""Words of a command line that name nothing, or too much, end in a sentence before anything runs."""
+"""Words of a command line that name nothing, or too much: a sentence before anything runs."""
 
 import numpy as np
 import pytest
