@@ -59,8 +59,9 @@ def test_an_option_of_another_class_says_how_to_remove_it(nested):
     config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "scales": None}
     key = "hidden"
     if nested:
-        config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "scales": config}
-        key = "scales.hidden"
-    says = rf"model.*: MeasuredVelocity takes no 'hidden'.*remove it by '~model\.{key}'"
+        head = {**config, "_partial_": True}
+        config = {"_target_": "pinn_dyn.models.LagrangianNetwork", "initial_velocity": head}
+        key = "initial_velocity.hidden"
+    says = rf"part.*: MeasuredVelocity takes no 'hidden'.*remove it by '~part\.{key}'"
     with pytest.raises(ConfigError, match=says):
-        parts.build_part("model", config)
+        parts.build_part("part", config)
