@@ -86,7 +86,7 @@ def test_every_program_says_why(tmp_path, monkeypatch, capsys, lnn_run, command)
         (lambda c: c.update(seed=2**80), "seed is 1208925819614629174706176, expected"),
         (lambda c: c.update(seed=-1), "seed is -1, expected"),
         (lambda c: c.update(seed=True), "seed is True, expected"),
-        (lambda c: c.update(ensemble=10**6), "ensemble is 1000000, expected .* up to 1000"),
+        (lambda c: c.update(ensemble=10**6), "ensemble is 1000000, expected .* up to 256"),
         (lambda c: c.update(ensemble="many"), "ensemble is many"),
         (lambda c: c["model"]["mass"].update(hidden=[10**9]), "hidden is .*from 1 to 20000"),
         (lambda c: c["model"]["mass"].update(activation="os.system"), "activation"),
