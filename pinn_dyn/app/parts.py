@@ -59,9 +59,7 @@ def _said(name: str, config: dict[str, Any], error: BaseException) -> str:
             f"{keys} of {place} is missing: give {place}.{key}=..., or leave out the "
             f"~{place}.{key} that took it away"
         )
-    if isinstance(
-        error, (ValueError, TypeError, InstantiationException, MisconfigurationException)
-    ):
+    if isinstance(error, _REFUSALS):
         return str(error)
     if isinstance(error, MemoryError):
         return "there is not enough memory: choose smaller sizes"

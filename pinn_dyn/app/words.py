@@ -50,7 +50,9 @@ def check_words(command: str, folder: Path, overrides: list[Override]) -> None:
                 )
             continue
         if override.is_sweep_override() and (count := _jobs(override)) not in range(1, MOST_JOBS):
-            raise ConfigError(f"'{word}' is a sweep over {count:.6g} values, expected some")
+            raise ConfigError(
+                f"'{word}' is a sweep over {count:.6g} values, expected 1 to {MOST_JOBS - 1}"
+            )
         if key == "hydra" or is_group(folder, word):
             for value in _values(override):
                 items = value if isinstance(value, list) else [value]
