@@ -24,7 +24,7 @@ from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import read_foreign
-from pinn_dyn.data import DataSource, fingerprint_changes
+from pinn_dyn.data import DataSource, fingerprint_changes, moments, same_moments
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.sweep_table import flatten
@@ -36,6 +36,9 @@ CONFIG = "config.yaml"
 METRICS = "metrics.json"
 DATA = "data.json"
 """The fingerprint of the data that the run was trained on."""
+
+_MOMENTS = "moments"
+"""In it, the moments of the data: what counts where only the code was edited."""
 
 _LOCK = ".lock"
 
@@ -295,6 +298,12 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
     write_whole(path, json.dumps(values, indent=2))
 
 
+def write_data(folder: Path, source: DataSource) -> None:
+    """Record what the data of a run are, for :func:`check_data`."""
+    record = {**source.fingerprint(), _MOMENTS: moments(source.load())}
+    write_json(folder / DATA, record)
+
+
 def check_data(folder: Path, source: DataSource) -> None:
     """Refuse data that are not those that a run was trained on; warn where the run does not say.
 
@@ -314,7 +323,12 @@ def check_data(folder: Path, source: DataSource) -> None:
         return
     now = source.fingerprint()
     try:
-        changes = fingerprint_changes(json.loads(path.read_text()), now)
+        recorded = json.loads(path.read_text())
+        seen = recorded.pop(_MOMENTS, None)
+        changes = fingerprint_changes(recorded, now)
+        if changes and seen and not fingerprint_changes(recorded, now, code=False):
+            # Another version of the code that makes the same data of the same files and settings.
+            changes = [] if same_moments(seen, moments(source.load())) else changes
     except (ValueError, AttributeError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"{path} cannot be read, it may be damaged: {error}") from error
     if changes:

@@ -33,7 +33,6 @@ from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     CONFIG,
-    DATA,
     METRICS,
     check_data,
     claimed,
@@ -41,6 +40,7 @@ from pinn_dyn.app.run_folder import (
     read_checkpoint,
     read_config,
     recorded_error,
+    write_data,
     write_json,
 )
 from pinn_dyn.app.schema import check_value
@@ -190,7 +190,7 @@ def train_in(
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem
     if last is None:
-        write_json(folder / DATA, data.source.fingerprint())
+        write_data(folder, data.source)
     else:
         check_data(folder, data.source)
     if isinstance(data.source, LogSource):

@@ -1,6 +1,6 @@
 """Data: excitation signals, simulated data sets, logs, windows and the LightningDataModule."""
 
-from pinn_dyn.data.changes import fingerprint_changes
+from pinn_dyn.data.changes import fingerprint_changes, moments, same_moments
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
 from pinn_dyn.data.initial_states import InitialStates
@@ -40,5 +40,7 @@ __all__ = [
     "Windows",
     "draw_windows",
     "fingerprint_changes",
+    "moments",
+    "same_moments",
     "simulate",
 ]

@@ -6,15 +6,58 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+import torch
 
-def fingerprint_changes(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+from pinn_dyn.data.source import SPLITS, Splits
+
+
+def moments(splits: Splits) -> dict[str, Any]:
+    """Number, mean and standard deviation of the samples of each split, JSON-serializable.
+
+    They tell whether edited code still gives the same data, on a machine that rounds otherwise too.
+    """
+    found: dict[str, Any] = {}
+    for name in SPLITS:
+        trajectories = getattr(splits, name)
+        found[name] = {"lengths": [len(item.t) for item in trajectories]}
+        for key in ("q", "v", "u"):
+            samples = torch.cat([getattr(item, key) for item in trajectories]).double()
+            std = samples.std(0, correction=0)
+            found[name][key] = {"mean": samples.mean(0).tolist(), "std": std.tolist()}
+    return found
+
+
+def same_moments(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether two :func:`moments` are of the same data but for rounding: 1e-6 of the spread."""
+    for name in SPLITS:
+        if recorded[name]["lengths"] != now[name]["lengths"]:
+            return False
+        for key in ("q", "v", "u"):
+            before, after = recorded[name][key], now[name][key]
+            std = np.asarray(after["std"])
+            for moment in ("mean", "std"):
+                values = np.asarray(before[moment], dtype=float), np.asarray(after[moment])
+                if values[0].shape != values[1].shape:
+                    return False
+                if not (abs(values[0] - values[1]) <= 1e-6 * std + 1e-12).all():
+                    return False
+    return True
+
+
+def fingerprint_changes(
+    recorded: Mapping[str, Any], now: Mapping[str, Any], *, code: bool = True
+) -> list[str]:
     """What is different now, a sentence each; empty if nothing is.
 
     Args:
         recorded: what :meth:`DataSource.fingerprint` gave then, also read back from JSON.
         now: what it gives now.
+        code: whether edited code of a class counts.
     """
     before, after = (json.loads(json.dumps(one)) for one in (recorded, now))
+    if not code:
+        before, after = _without_code(before), _without_code(after)
     changes = _files(before.pop("files", {}), after.pop("files", {}))
     changes += _runs(before.pop("splits", {}), after.pop("splits", {}))
     return changes + _settings("", before, after)
@@ -65,8 +108,22 @@ def _settings(place: str, before: Any, after: Any) -> list[str]:
     return changes
 
 
+def _without_code(value: Any) -> Any:
+    """A fingerprint in which a class is its name alone."""
+    if isinstance(value, dict):
+        return {
+            key: _name(item) if key == "class" else _without_code(item)
+            for key, item in value.items()
+        }
+    return [_without_code(item) for item in value] if isinstance(value, list) else value
+
+
+def _name(text: Any) -> str:
+    return str(text).split()[0]
+
+
 def _same_name(before: Any, after: Any) -> bool:
-    return before != after and str(before).split()[0] == str(after).split()[0]
+    return before != after and _name(before) == _name(after)
 
 
 def _short(value: Any) -> str:

@@ -19,13 +19,12 @@ from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
 from pinn_dyn.data.simulation import SimulationError, check_amount
-from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.workers import end_with_parent
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 4
-_SPLITS = ("train", "validation", "test")
 _DRAWS = 20
 
 
@@ -137,7 +136,7 @@ class RobotSource(DataSource):
         arrays = load_or_make(self.cache, self.name, self.fingerprint(), self.simulate)
         t = torch.from_numpy(arrays["t"][:-1])
         splits: dict[str, list[Trajectory]] = {}
-        for split in _SPLITS:
+        for split in SPLITS:
             q, v, u = (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
             q, v, u = q[:, :-1], (v[:, :-1] + v[:, 1:]) / 2, u[:, :-1]
             splits[split] = [
@@ -168,7 +167,7 @@ class RobotSource(DataSource):
             ValueError: from an excitation that the robot cannot follow.
         """
         tasks = [
-            (index, k) for index, split in enumerate(_SPLITS) for k in range(self.counts[split])
+            (index, k) for index, split in enumerate(SPLITS) for k in range(self.counts[split])
         ]
         t = np.arange(round(self.duration / self.step) + 2) * self.step
         record = functools.partial(_record, self.robot, self.excitations, t, self.seed)
@@ -190,7 +189,7 @@ class RobotSource(DataSource):
                         "without `if __name__ == '__main__':`): use workers=1"
                     ) from error
         arrays = {"t": t}
-        for index, split in enumerate(_SPLITS):
+        for index, split in enumerate(SPLITS):
             chosen = [part for task, part in zip(tasks, records, strict=True) if task[0] == index]
             q, v, u = (np.stack(parts) for parts in zip(*chosen, strict=True))
             arrays |= {f"{split}_q": q, f"{split}_v": v, f"{split}_u": u}
@@ -226,7 +225,7 @@ def _record(
         if fault is None:
             return q, v, u
     raise SimulationError(
-        f"trajectory {task[1]} of the {_SPLITS[task[0]]} split: {fault}; the same in {_DRAWS} "
+        f"trajectory {task[1]} of the {SPLITS[task[0]]} split: {fault}; the same in {_DRAWS} "
         f"draws: lower the reach, speed or amplitude of {type(excitation).__name__}"
     )
 

@@ -18,12 +18,11 @@ from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.limits import HasDomain, Limits
 from pinn_dyn.data.simulation import SimulationError, check_amount, simulate
-from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 3
-_SPLITS = ("train", "validation", "test")
 # Within limits: how often a motion is drawn anew, and how many draws are simulated at once.
 _DRAWS = 40
 _AT_ONCE = 3
@@ -180,7 +179,7 @@ class SimulatedSource(DataSource):
         arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
         t = torch.from_numpy(arrays["t"][:: self.keep_every])
         splits: dict[str, list[Trajectory]] = {}
-        for split in _SPLITS:
+        for split in SPLITS:
             q, v, u = (
                 torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
             )
@@ -219,21 +218,21 @@ class SimulatedSource(DataSource):
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
         # Splits of one duration are one batch.
         if self.test_duration == self.duration:
-            return self._simulate(_SPLITS, self.duration, 0)
+            return self._simulate(SPLITS, self.duration, 0)
         # Two batches of one size: the compiled equation of motion serves both.
         states, inputs = self.counts["train"]
         train = states * inputs if self.pairing == "product" else states
         size = max(train, self.counts["validation"][0] + self.counts["test"][0])
         return {
-            **self._simulate(_SPLITS[1:], self.test_duration, size),
-            **self._simulate(_SPLITS[:1], self.duration, size),  # the longer times, "t", last
+            **self._simulate(SPLITS[1:], self.test_duration, size),
+            **self._simulate(SPLITS[:1], self.duration, size),  # the longer times, "t", last
         }
 
     def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
         """Trajectories of some splits in one batch, filled up with copies to ``size``."""
         t = np.arange(round(duration / self.step) + 1) * self.step
         # One generator per split: more test trajectories do not change the training set.
-        rngs = [np.random.default_rng([self.seed, _SPLITS.index(split)]) for split in splits]
+        rngs = [np.random.default_rng([self.seed, SPLITS.index(split)]) for split in splits]
         first = self._draw(splits, rngs)
         count = len(first.q0)
         rows = np.arange(max(count, size)) % count

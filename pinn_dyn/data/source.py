@@ -10,6 +10,8 @@ from types import MappingProxyType
 
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 
+SPLITS = ("train", "validation", "test")
+
 
 @dataclass(frozen=True)
 class Splits:
@@ -58,7 +60,7 @@ class DataSource(abc.ABC):
         """
         splits = self.load()
         hashes: dict[str, object] = {}
-        for split in ("train", "validation", "test"):
+        for split in SPLITS:
             content = hashlib.sha256()
             trajectories: list[Trajectory] = getattr(splits, split)
             for item in trajectories:

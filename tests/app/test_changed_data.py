@@ -1,6 +1,7 @@
 """Data that have changed since a training: evaluate.py and resume= say what, and refuse."""
 
 import json
+import re
 import shutil
 
 import pandas as pd
@@ -126,4 +127,46 @@ def test_a_simulated_data_set_with_another_constant_is_refused(tmp_path, lnn_run
     record["step"] = 0.5
     (run / "data.json").write_text(json.dumps(record))
     with pytest.raises(ConfigError, match=r"step was 0\.5, now it is 0\.002"):
+        check(run)
+
+
+def edit_code(record):
+    """As if another version of the program had written it."""
+    text = json.dumps(record)
+    edited = re.sub(r'("class": "\w+ )[0-9a-f]{16}"', r'\g<1>0123456789abcdef"', text)
+    assert edited != text
+    return json.loads(edited)
+
+
+def test_edited_code_that_makes_the_same_data_is_accepted(run):
+    """A run of an older version; where its data come out otherwise, the code is named."""
+    path = run / "data.json"
+    record = edit_code(json.loads(path.read_text()))
+    path.write_text(json.dumps(record))
+    check(run)
+    record["moments"]["test"]["q"]["mean"][0] += 1e-3
+    path.write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match=r"the code of .* was edited"):
+        check(run)
+
+
+def test_same_moments_do_not_excuse_another_file(run):
+    path = run / "data.json"
+    record = edit_code(json.loads(path.read_text()))
+    record["files"][LOG]["bytes"] += 1
+    path.write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match=f"file {LOG} was edited"):
+        check(run)
+
+
+def test_edited_code_of_a_simulation(tmp_path, lnn_run):
+    run = tmp_path / "run"
+    shutil.copytree(lnn_run, run)
+    path = run / "data.json"
+    record = edit_code(json.loads(path.read_text()))
+    path.write_text(json.dumps(record))
+    check(run)
+    record["moments"]["train"]["u"]["std"][0] *= 1.001
+    path.write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match="the code of system was edited"):
         check(run)

@@ -48,10 +48,10 @@ from pinn_dyn.data.logs.reader import (
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
-from pinn_dyn.data.logs.splits import SPLITS, Part, split
+from pinn_dyn.data.logs.splits import Part, split
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.units import UNITS
-from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
 # What the trajectories depend on beside the files.

@@ -10,8 +10,8 @@ import numpy as np
 
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.source import SPLITS
 
-SPLITS = ("train", "validation", "test")
 _KEYS = ("runs", "seconds", "blocks", "piece")
 WHOLE: Literal["whole"] = "whole"
 """As a piece: one roll-out of each stretch, all as long as the shortest stretch."""
