@@ -12,7 +12,7 @@ from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models.mlp import Tape, columns, rows
 from pinn_dyn.models.positivity import Positive, Positivity
 from pinn_dyn.models.scales import Scales
-from pinn_dyn.models.triangular import square
+from pinn_dyn.models.triangular import UNROLLED, square
 
 
 class CholeskyFactor(nn.Module, abc.ABC):
@@ -93,6 +93,7 @@ class NetworkCholesky(CholeskyFactor):
     """
 
     placement: Tensor
+    order: Tensor
 
     def __init__(
         self,
@@ -125,6 +126,7 @@ class NetworkCholesky(CholeskyFactor):
             order % size if transposed else order // size
         ]
         self.register_buffer("placement", placement)
+        self.register_buffer("order", order.unsqueeze(1), persistent=False)
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
         y, tape = self.network.linearize(q)
@@ -154,7 +156,7 @@ class NetworkCholesky(CholeskyFactor):
 
     def _scales(self, y: Tensor) -> Tensor:
         """Scale of the row of L that each entry is in, to multiply y ``(K, ...)`` with."""
-        return self.placement.sum(1).reshape(-1, *[1] * (y.ndim - 1))
+        return self.placement.gather(1, self.order).reshape(-1, *[1] * (y.ndim - 1))
 
     def _assemble(self, values: Tensor) -> Tensor:
         """L, ``(N, N, ...)``, from its entries ``(K, ...)``; cheaper than indexing backwards."""
@@ -169,15 +171,19 @@ class NetworkCholesky(CholeskyFactor):
     def _take(self, matrix: Tensor) -> Tensor:
         """The transpose of :meth:`_assemble`: entries ``(K, B)`` of a matrix ``(N * N, B)``."""
         size = self.size
-        lower = [matrix[i * size : i * size + i] for i in range(1, size)]
-        entries = torch.cat([matrix[:: size + 1], *lower])
+        # One split: the gradient of a slice is as large as the matrix.
+        lengths = [length for i in range(size) for length in (i, 1, size - 1 - i)]
+        parts = matrix.split(lengths)
+        entries = torch.cat([*parts[1::3], *parts[3::3]])
         return entries * self._scales(entries)
 
 
 def _matrices(square: Tensor, like: Tensor) -> Tensor:
-    """``(N, N, B)`` as ``(*batch, N, N)``, a view, for ``like`` ``(*batch, k)``."""
+    """``(N, N, B)`` as ``(*batch, N, N)``, for ``like`` ``(*batch, k)``; a view of small ones."""
     size = square.shape[0]
-    return rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
+    matrices = rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
+    # The library copies what is not in rows, at every solve.
+    return matrices.contiguous() if size > UNROLLED else matrices
 
 
 class _ConstantFactor(CholeskyFactor):
