@@ -1,59 +1,77 @@
-"""How the cost of a Lagrangian network grows with its number of coordinates.
+"""How the cost grows with the number of coordinates: soft arms of 1 to 16 segments.
 
-    python benchmarks/coordinates.py
+    python benchmarks/coordinates.py           # the table of README.md
+    python benchmarks/coordinates.py 4         # arms of up to so many segments
 
-Eager accelerations and the gradient of their square by all weights, batch 256, one thread: the
-best of five. Networks of one layer of 32 units, so that what is seen is the mechanics.
+A row for each arm, N = 3 coordinates a segment: an evaluation of its equation of motion for 16
+states (float64, what simulating its data costs), and a training step of a Lagrangian network,
+loss and gradient of the midpoint loss at batch 256, eager and compiled, after so many seconds of
+compiling. Best of five, in seconds of the processor on one thread; compiling in seconds of the
+clock.
 """
 
 from __future__ import annotations
 
+import sys
 import time
-from functools import partial
+from collections.abc import Callable
 
 import torch
+from training_step import make_model, make_windows
 
-from pinn_dyn.models import (
-    LagrangianNetwork,
-    NetworkCholesky,
-    NetworkInput,
-    NetworkPotential,
-    Statistics,
-)
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.systems import SoftArm
+from pinn_dyn.training import MidpointLoss, ParameterVector
+from pinn_dyn.training.gradients import Compiled, Eager
 
 BATCH = 256
-SIZES = (3, 6, 12, 24, 48)
+SEGMENTS = (1, 2, 4, 8, 16)
 
 
-def make_model(size: int) -> LagrangianNetwork:
-    """A network with N inputs on scales that are all one."""
-    torch.manual_seed(0)
-    one, increment = torch.ones(size), torch.ones(1, 2 * size)
-    statistics = Statistics(
-        0 * one, one, -3 * one, 3 * one, one, one, 0 * one, one, increment, increment, 1.0
-    )
-    head = partial(NetworkCholesky, hidden=[32])
-    potential, matrix = (partial(kind, hidden=[32]) for kind in (NetworkPotential, NetworkInput))
-    return LagrangianNetwork(statistics, head, potential, head, matrix)
-
-
-def seconds(size: int) -> float:
-    """Of one forward and backward pass."""
-    model = make_model(size)
-    q, v, u = (torch.randn(BATCH, size) for _ in range(3))
+def milliseconds(step: Callable[[], object]) -> float:
+    """Of the processor, the best of five."""
     best = float("inf")
     for _ in range(5):
-        start = time.perf_counter()
-        model.forward_dynamics(q, v, u).square().mean().backward()
-        best = min(best, time.perf_counter() - start)
-    return best
+        start = time.process_time()
+        step()
+        best = min(best, time.process_time() - start)
+    return 1e3 * best
+
+
+def equation(segments: int) -> float:
+    """Milliseconds of an evaluation of the true equation of motion."""
+    arm = SoftArm(segments)
+    q, v, u = (torch.randn(3, 16, arm.num_coordinates, dtype=torch.float64) * 0.1).unbind()
+    return milliseconds(lambda: arm.forward_dynamics(q, v, u))
+
+
+def training(kind: type[Eager | Compiled], size: int) -> tuple[float, float]:
+    """Milliseconds of a step, and seconds that the first one takes."""
+    torch._dynamo.reset()
+    model, scales = make_model(size, torch.float32)
+    windows = make_windows(size, BATCH, torch.float32)
+    loss, vector = MidpointLoss(scales, model), ParameterVector(model.parameters())
+    steps = (STEPS_FOR_PROGRAM,) if kind is Compiled else ()
+    engine = kind(loss, model, vector, *steps)
+    start = time.perf_counter()
+    engine(windows)
+    first = time.perf_counter() - start
+    return milliseconds(lambda: engine(windows)), first
 
 
 def main() -> None:
-    """Print a row for each number of coordinates."""
+    """Print the rows."""
     torch.set_num_threads(1)
-    for size in SIZES:
-        print(f"N = {size:2d}: {1e3 * seconds(size):7.1f} ms")
+    largest = int(sys.argv[1]) if len(sys.argv) > 1 else SEGMENTS[-1]
+    print("|  N | equation, ms | eager, ms | compiled, ms | compiling, s |\n|---|---|---|---|---|")
+    for segments in (count for count in SEGMENTS if count <= largest):
+        size = 3 * segments
+        eager, _ = training(Eager, size)
+        compiled, first = training(Compiled, size)
+        print(
+            f"| {size} | {equation(segments):.2f} | {eager:.1f} | {compiled:.1f} | {first:.0f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

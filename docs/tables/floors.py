@@ -27,7 +27,7 @@ from pinn_dyn.evaluation import (
     predict_windows,
     rollout_metrics,
 )
-from pinn_dyn.mechanics import Predictor, stack
+from pinn_dyn.mechanics import Predictor, stack_until
 
 FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
 FLOOR = "keeps its velocity"
@@ -53,7 +53,7 @@ def floors(name: str) -> list[dict[str, object]]:
         cfg = hydra.compose("train", overrides=[f"dataset={name}", *small])
     dataset = OmegaConf.to_container(cfg.dataset, resolve=True)
     source = build_source({"dataset": dataset})
-    truth = stack(source.load().test).until(horizon)
+    truth = stack_until(source.load().test, horizon)
     models: dict[str, Predictor] = {FLOOR: KeepsVelocity(truth.q.shape[-1], truth.u.shape[-1])}
     if source.system is not None:
         models[GROUND] = source.system

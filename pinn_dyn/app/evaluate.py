@@ -53,7 +53,7 @@ from pinn_dyn.evaluation import (
     write_table,
 )
 from pinn_dyn.evaluation.report import prediction_report
-from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack
+from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack_until
 
 log = logging.getLogger(__name__)
 
@@ -100,9 +100,10 @@ def evaluate(cfg: DictConfig) -> float:
         )
     try:
         training = trained_on.load()
-        truth = stack(getattr(source.load(), split))
+        trajectories = getattr(source.load(), split)
+        truth = stack_until(trajectories)
         config["horizon"] = config["horizon"] or default_horizon(truth.duration)
-        truth = truth.until(config["horizon"])
+        truth = stack_until(trajectories, config["horizon"])
         steps = [run.model.fixed_step or config["step"] or run.statistics.step for run in runs]
         stride = common_stride(steps, truth.t)
     except ValueError as error:
@@ -116,6 +117,11 @@ def evaluate(cfg: DictConfig) -> float:
         raise ConfigError(
             f"trajectory is {config['trajectory']}, expected 0 to {len(truth.q) - 1}, one of the "
             f"{len(truth.q)} {SPLITS[split]}"
+        )
+    if (dropped := len(trajectories) - len(truth.q)) > 0:
+        log.warning(
+            "%d of %d %s of %s are shorter than horizon=%g and left out",
+            *(dropped, len(trajectories), SPLITS[split], source.name, config["horizon"]),
         )
     log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], SPLITS[split], source.name)
 
@@ -283,7 +289,7 @@ def _evaluate(
     if prediction.members is not None:
         metrics |= member_metrics(prediction)
     # The model was chosen by these motions, but not fitted to them.
-    seen = stack(training.validation) if config["split"] == "test" else None
+    seen = stack_until(training.validation) if config["split"] == "test" else None
     intervals = {}
     for window in config["windows"]:
         windowed = predicted(predict_windows, truth=truth, window=window)

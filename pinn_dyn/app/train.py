@@ -51,7 +51,7 @@ from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
 from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
-from pinn_dyn.mechanics import Predictor
+from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, LearnedConstants
 from pinn_dyn.training import COVARIANCE, Fit, LeastSquaresLearner
 
@@ -197,7 +197,7 @@ def train_in(
         _write_report(data.source, folder)
     validator = build_validator(config, statistics.step)
     try:
-        validator.check(data.splits.validation[0])
+        validator.check(stack_until(data.splits.validation))
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
     model = build_predictor(config, statistics)

@@ -17,7 +17,7 @@ from pinn_dyn.data.windows import (
     Windows,
     draw_windows,
 )
-from pinn_dyn.mechanics import Trajectory, samples_of, stack
+from pinn_dyn.mechanics import Trajectory, samples_of, stack_until
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -138,5 +138,5 @@ class DynamicsData(L.LightningDataModule):
         return WindowLoader(self.windows.to(device, torch.float32), sampler)
 
     def val_dataloader(self) -> DataLoader[Trajectory]:
-        """One batch: all validation trajectories."""
-        return DataLoader([stack(self.splits.validation)], batch_size=None)  # type: ignore[arg-type]
+        """One batch: all validation trajectories, up to the end of the shortest."""
+        return DataLoader([stack_until(self.splits.validation)], batch_size=None)  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ from pinn_dyn.mechanics.rollout import rollout
 from pinn_dyn.mechanics.signal import Interpolation, Signal
 from pinn_dyn.mechanics.sum import Sum
 from pinn_dyn.mechanics.system import MechanicalSystem, Terms
-from pinn_dyn.mechanics.trajectory import State, Trajectory, samples_of, stack
+from pinn_dyn.mechanics.trajectory import State, Trajectory, samples_of, stack, stack_until
 
 __all__ = [
     "RK4",
@@ -25,4 +25,5 @@ __all__ = [
     "rollout",
     "samples_of",
     "stack",
+    "stack_until",
 ]

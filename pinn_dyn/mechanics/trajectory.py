@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -162,6 +162,26 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         input=stacked([item.input for item in trajectories], first.t - first.t[0]),
         past=_stacked_past(trajectories),
     )
+
+
+def stack_until(trajectories: Sequence[Trajectory], duration: float | None = None) -> Trajectory:
+    """Those that last so long, cut to it, as one batched trajectory.
+
+    Args:
+        trajectories: of any lengths, with one sample time.
+        duration: in s; None: of the shortest, so that all of them are kept.
+
+    Raises:
+        ValueError: if none lasts so long, or they cannot be stacked; see :func:`stack`.
+    """
+    if not trajectories:
+        return stack([])
+    if duration is None:
+        duration = min(item.duration for item in trajectories)
+    longest = max(trajectories, key=lambda item: item.duration)
+    step = float(longest.t[1] - longest.t[0])
+    long_enough = [item for item in trajectories if item.duration >= duration - 0.5 * step]
+    return stack([item.until(duration) for item in long_enough or [longest]])
 
 
 def _stacked_past(trajectories: list[Trajectory]) -> Tensor | None:

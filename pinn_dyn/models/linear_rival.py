@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import Predictor, Signal, Trajectory, samples_of, stack
+from pinn_dyn.mechanics import Predictor, Signal, Trajectory, samples_of, stack_until
 
 _ROWS = 10_000  # windows of a fit, at most
 _FEATURES = 300  # of a fit, at most
@@ -133,7 +133,7 @@ def fit_linear_rival(
     Raises:
         ValueError: if no number of lags can be fitted; see :class:`LinearRival`.
     """
-    truth = stack(list(validation))
+    truth = stack_until(validation)
     stride = samples_of("step", step, truth.t)
     truth = truth.until(min(truth.duration, step * _STEPS))
     best: tuple[float, LinearRival] | None = None

@@ -112,6 +112,19 @@ def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):
     assert "horizon is 6" in said(error, capsys)
 
 
+def test_a_horizon_takes_the_test_motions_that_are_long_enough(run, tmp_path, capsys):
+    """Whole runs of 5 s, one of which is cut to 3 s."""
+    log = pd.read_csv(EXAMPLES / "example_log.csv")
+    runs = list(log["run"].unique()[-3:])
+    log[(log["run"] != runs[0]) | (log["t"] <= 3.0)].to_csv(tmp_path / "example_log.csv")
+    words = ["dataset=example_log", f"dataset.root='{tmp_path}'", "horizon=4", "windows=[]"]
+    words += [f"dataset.test={{runs: {runs}, piece: whole}}"]
+    run_script("evaluate.py", *words, *evaluation_of(run, tmp_path / "out"))
+    assert "2 unseen test trajectories, 4 s" in capsys.readouterr().out
+    said = (tmp_path / "out" / "evaluate.log").read_text()
+    assert "1 of 3 unseen test trajectories of example_log are shorter than horizon=4" in said
+
+
 def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
     log = run.parent / "example_log.csv"
     log.rename(tmp_path / "elsewhere.csv")

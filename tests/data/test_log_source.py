@@ -340,9 +340,9 @@ def test_whole_runs_of_unequal_length_are_one_roll_out_each(tmp_path):
         test=dict(runs=["run_1", "run_2"], piece="whole"),
     )
     found = log.load().test
-    assert [item.duration for item in found] == pytest.approx([2.5, 2.5])
+    assert [item.duration for item in found] == pytest.approx([3.0, 2.5])
     assert float(found[0].q[0, 0]) == pytest.approx(motion(3.0, phase=0.3)["q1"][0])
-    assert "0.5 s are left over and dropped" in log.report
+    assert "2 trajectories of 2.5 to 3 s" in log.report
     with pytest.raises(LogError, match=r"piece is 'all', expected a time in s, or 'whole'"):
         source(tmp_path, test=dict(runs=1, piece="all"))
 

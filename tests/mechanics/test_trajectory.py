@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from pinn_dyn.mechanics import Signal, Trajectory, stack
+from pinn_dyn.mechanics import Signal, Trajectory, stack, stack_until
 
 
 def twice(q, v):
@@ -130,3 +130,15 @@ def test_stack_refuses_mixed_interpolations():
 def test_stack_refuses_an_empty_list():
     with pytest.raises(ValueError, match="trajectories is empty"):
         stack([])
+
+
+def test_of_unequal_lengths_those_are_stacked_that_last_long_enough():
+    three = [trajectory(samples=count) for count in (11, 6, 8)]
+    assert stack_until(three).q.shape[:2] == (3, 6)
+    longer = stack_until(three, 0.7)
+    assert longer.q.shape[:2] == (2, 8)
+    assert torch.equal(longer.q[1], three[2].q)
+    with pytest.raises(ValueError, match=r"horizon is 2.0 s, but the trajectory lasts only 1 s"):
+        stack_until(three, 2.0)
+    with pytest.raises(ValueError, match="trajectories is empty"):
+        stack_until([])

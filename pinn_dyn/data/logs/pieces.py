@@ -92,7 +92,7 @@ def one_sample_time(cleaned: Sequence[Cleaned]) -> float:
 def pieces_of(
     name: str, part: Part, cleaned: Sequence[Cleaned], step: float, report: Report
 ) -> list[Recording]:
-    """Roll-outs of one length; neighbours share the sample between them, or two.
+    """Roll-outs of one length, or whole stretches; neighbours share a sample, or two.
 
     A stretch of T samples that lasts one sample less than n pieces has n of them all the same.
 
@@ -108,23 +108,22 @@ def pieces_of(
     """
     stretches = [item for one in cleaned if one.split == name for item in one.clean]
     if isinstance(part.piece, str):
-        span = min(len(item) for item in stretches) - 1
-        starts = [[0] for _ in stretches]
-    else:
-        span = round(part.piece / step)
-        if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
-            raise LogError(
-                f"{name}.piece is {part.piece} s, expected a multiple of the sample time, "
-                f"{step:g} s, or 'whole'"
-            )
-        starts = [_starts(len(item), span) for item in stretches]
+        pieces = [replace(item, past=item.u[:0]) for item in stretches]
+        report.add("Splits", name, f"{summary(pieces, step)}, each a roll-out of its own")
+        return pieces
+    span = round(part.piece / step)
+    if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
+        raise LogError(
+            f"{name}.piece is {part.piece} s, expected a multiple of the sample time, {step:g} s, "
+            "or 'whole'"
+        )
     pieces = [
         replace(
             item.rows(slice(first, first + span + 1)),
             past=item.u[max(first - round(_PAST / step), 0) : first],
         )
-        for item, each in zip(stretches, starts, strict=True)
-        for first in each
+        for item in stretches
+        for first in _starts(len(item), span)
     ]
     if not pieces:
         longest = max(item.duration for item in stretches)

@@ -14,7 +14,7 @@ from pinn_dyn.data.source import SPLITS
 
 _KEYS = ("runs", "seconds", "blocks", "piece")
 WHOLE: Literal["whole"] = "whole"
-"""As a piece: one roll-out of each stretch, all as long as the shortest stretch."""
+"""As a piece: one roll-out of each stretch, as long as it is."""
 
 
 class Part:
@@ -22,7 +22,7 @@ class Part:
 
     Args:
         piece: length of the roll-outs that it is cut into, s; ``"whole"``: each stretch is one,
-            from its start, as long as the shortest of them.
+            as long as it is; an evaluation takes those that last as long as its horizon.
         runs: number of runs, drawn by the seed, or the names of the runs.
         seconds: the last so many seconds of every run that is not named elsewhere.
         blocks: with ``seconds``, so many blocks of that length spread evenly along every such run,
