@@ -111,7 +111,7 @@ def logs() -> str:
     for name, unit in LOGS.items():
         data, floor = read_log(name), floors().loc[name]
         means = data.groupby("model")[WINDOWS].mean()
-        rows_of_log = ("lnn", "acceleration", "mlp", *_LINEAR)
+        rows_of_log = ("lnn", "lnn_residual", "acceleration", "mlp", *_LINEAR)
         present = [model for model in rows_of_log if model in means.index]
         for index, model in enumerate(present):
             runs = data[data["model"] == model]
