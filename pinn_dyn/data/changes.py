@@ -11,6 +11,8 @@ import torch
 
 from pinn_dyn.data.source import SPLITS, Splits
 
+_SIGNALS = ("q", "v", "u")
+
 
 def moments(splits: Splits) -> dict[str, Any]:
     """Number, mean and standard deviation of the samples of each split, JSON-serializable.
@@ -21,10 +23,15 @@ def moments(splits: Splits) -> dict[str, Any]:
     for name in SPLITS:
         trajectories = getattr(splits, name)
         found[name] = {"lengths": [len(item.t) for item in trajectories]}
-        for key in ("q", "v", "u"):
-            samples = torch.cat([getattr(item, key) for item in trajectories]).double()
-            std = samples.std(0, correction=0)
-            found[name][key] = {"mean": samples.mean(0).tolist(), "std": std.tolist()}
+        lengths = torch.tensor(found[name]["lengths"], dtype=torch.float64)
+        share = lengths / lengths.sum()
+        for key in _SIGNALS if trajectories else ():
+            # Trajectory by trajectory: one tensor of all would be a copy of the data.
+            each = [torch.var_mean(getattr(x, key).double(), 0, correction=0) for x in trajectories]
+            variances, means = map(torch.stack, zip(*each, strict=True))
+            mean = share @ means
+            std = (share @ (variances + (means - mean).square())).sqrt()
+            found[name][key] = {"mean": mean.tolist(), "std": std.tolist()}
     return found
 
 
@@ -33,7 +40,7 @@ def same_moments(recorded: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     for name in SPLITS:
         if recorded[name]["lengths"] != now[name]["lengths"]:
             return False
-        for key in ("q", "v", "u"):
+        for key in _SIGNALS if now[name]["lengths"] else ():
             before, after = recorded[name][key], now[name][key]
             std = np.asarray(after["std"])
             for moment in ("mean", "std"):

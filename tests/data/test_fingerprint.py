@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.data import fingerprint_changes
+from pinn_dyn.data import Splits, fingerprint_changes, moments, same_moments
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.logs import Butterworth, MovingAverage
 from pinn_dyn.systems import SoftArm
@@ -213,3 +213,19 @@ def test_another_cleaning_is_named(recorded):
 def test_edited_code_is_said_as_such():
     before, after = {"system": {"class": "Arm 12ab"}}, {"system": {"class": "Arm 34cd"}}
     assert fingerprint_changes(before, after) == ["the code of system was edited"]
+
+
+def test_moments_are_those_of_all_samples_and_tell_data_apart(tmp_path):
+    write(tmp_path, motion(9.0), "one.csv")
+    write(tmp_path, motion(8.0, phase=0.5), "two.csv")
+    write(tmp_path, motion(7.5, phase=1.0), "three.csv")
+    splits = source(tmp_path).load()
+    found = json.loads(json.dumps(moments(splits)))
+    every = np.concatenate([item.v.numpy() for item in splits.train])
+    assert found["train"]["v"]["mean"] == pytest.approx(every.mean(0))
+    assert found["train"]["v"]["std"] == pytest.approx(every.std(0))
+    assert same_moments(found, moments(splits))
+    assert not same_moments(found, moments(Splits(splits.train, splits.test, splits.validation)))
+    without_test = Splits(splits.train, splits.validation, [])
+    assert not same_moments(found, moments(without_test))
+    assert same_moments(moments(without_test), moments(without_test))
