@@ -161,6 +161,10 @@ class NetworkCholesky(CholeskyFactor):
     def _assemble(self, values: Tensor) -> Tensor:
         """L, ``(N, N, ...)``, from its entries ``(K, ...)``; cheaper than indexing backwards."""
         values = values * self._scales(values)
+        if self.size > UNROLLED:
+            flat = values.new_zeros(self.size**2, *values.shape[1:])
+            flat = flat.index_copy(0, self.order[:, 0], values)
+            return flat.unflatten(0, (self.size, self.size))
         diagonal, *lower = values.split([self.size, *range(1, self.size)])
         zero = torch.zeros_like(diagonal)
         pieces = [diagonal[:1], zero[1:]]
@@ -171,10 +175,11 @@ class NetworkCholesky(CholeskyFactor):
     def _take(self, matrix: Tensor) -> Tensor:
         """The transpose of :meth:`_assemble`: entries ``(K, B)`` of a matrix ``(N * N, B)``."""
         size = self.size
-        # One split: the gradient of a slice is as large as the matrix.
-        lengths = [length for i in range(size) for length in (i, 1, size - 1 - i)]
-        parts = matrix.split(lengths)
-        entries = torch.cat([*parts[1::3], *parts[3::3]])
+        if size > UNROLLED:
+            entries = matrix.index_select(0, self.order[:, 0])
+        else:
+            lower = [matrix[i * size : i * size + i] for i in range(1, size)]
+            entries = torch.cat([matrix[:: size + 1], *lower])
         return entries * self._scales(entries)
 
 

@@ -6,7 +6,14 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from pinn_dyn.models import Bounded, ConstantCholesky, FixedCholesky, NetworkCholesky, Positive
+from pinn_dyn.models import (
+    Bounded,
+    ConstantCholesky,
+    FixedCholesky,
+    NetworkCholesky,
+    Positive,
+    cholesky,
+)
 from tests.contracts.cholesky_head import CholeskyHeadContract
 from tests.models.builders import make_scales, perturb, positive_matrix
 from tests.support.finite_differences import assert_near
@@ -60,6 +67,24 @@ class TestWithAngles(CholeskyHeadContract):
         """Bounded, but not at rest: the angle turns on."""
         largest = float(head.matrix(1e3 * q).abs().max())
         assert float(head.matrix(1e5 * q).abs().max()) < 2 * largest
+
+
+class TestBeyondTheUnrolled(CholeskyHeadContract):
+    """More coordinates are placed by their index; here so few are."""
+
+    @pytest.fixture(autouse=True)
+    def by_index(self, monkeypatch):
+        monkeypatch.setattr(cholesky, "UNROLLED", SIZE - 1)
+
+    @pytest.fixture
+    def head(self):
+        return make(HEADS["softplus"])
+
+    def test_the_matrices_are_the_same(self, head, q, monkeypatch):
+        found = head(q)
+        assert found.is_contiguous()
+        monkeypatch.setattr(cholesky, "UNROLLED", SIZE)
+        assert torch.equal(found, head(q))
 
 
 def outputs(head, q):
