@@ -19,7 +19,8 @@ class Kind:
         self.names = names
 
     def __str__(self) -> str:
-        return "that names a " + " or ".join(name.rsplit(".", 1)[-1] for name in self.names)
+        names = [name.rsplit(".", 1)[-1] for name in self.names]
+        return f"that names {'an' if names[0][0] in 'AEIO' else 'a'} {' or '.join(names)}"
 
 
 class Range(NamedTuple):
@@ -35,7 +36,7 @@ class Range(NamedTuple):
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:.10g}"
         return f"above {self.low:g}" if self.above else f"of at least {self.low:g}"
 
 
