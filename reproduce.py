@@ -67,7 +67,7 @@ def read_entries(path: Path = ENTRIES) -> dict[str, Entry]:
     Raises:
         ConfigError: on a file that cannot be read, or an entry that cannot be run.
     """
-    entries = read_yaml(path).get("entries")
+    entries: Any = read_yaml(path).get("entries")
     try:
         check_value("entries", entries, Mapping[str, _Keys])
         for name, entry in entries.items():

@@ -94,16 +94,23 @@ def completed(command: str, arguments: list[str]) -> list[str]:
     while (unknown := _unknown_key(command, arguments)) is not None:
         key, known = unknown
         before = arguments
-        arguments = [f"++{x}" if _is_unlisted(command, known, x) else x for x in before]
+        place, _, name = key.rpartition(".")
+        exists = name in _takes(command, known, place)
+        arguments = [
+            f"++{x}"
+            # Also of a mapping, as dataset.test={seconds: 1, piece: 1}.
+            if _is_unlisted(command, known, x) or (exists and x.startswith(f"{place}="))
+            else x
+            for x in before
+        ]
         if arguments == before:
             if key.startswith("hydra."):
                 raise ConfigError(
-                    f"Hydra has no key '{key}': see all with 'python {command}.py --cfg hydra', and "
-                    f"put a + before one that is new, as '+{key}=...'"
+                    f"Hydra has no key '{key}': see all with 'python {command}.py --cfg hydra', "
+                    f"and put a + before one that is new, as '+{key}=...'"
                 )
-            path, _, name = key.rpartition(".")
-            taken = _takes(command, known, path)
-            also = (f"{path}.{one}" if path else one for one in taken)
+            taken = _takes(command, known, place)
+            also = (f"{place}.{one}" if place else one for one in taken)
             keys = list(dict.fromkeys([*_keys(known), *also]))
             close = did_you_mean(key, keys)
             if not close and (same := [k for k in keys if k.split(".")[-1] == name]):

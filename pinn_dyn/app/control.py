@@ -101,6 +101,11 @@ def control(cfg: DictConfig) -> float:
     robot = build_robot(run.config["dataset"], config["robot"])
     reference = build_reference(config, robot)
     q0, v0 = _initial_states(config, reference)
+    for key, size in (("reference", reference(0.0).q.shape[-1]), ("initial_states", q0.shape[-1])):
+        if size != robot.num_coordinates:
+            raise ConfigError(
+                f"{key} has {size} coordinates, expected {robot.num_coordinates}, as the robot has"
+            )
     if isinstance(robot, HasLimits):
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +84,8 @@ def _described(name: str, given: Signals) -> dict[str, Any]:
     if isinstance(given, Mapping):
         plain = (str, int, float)
         return {k: x if isinstance(x, plain) else list(x) for k, x in given.items()}
+    if isinstance(given, bytes) or not isinstance(given, Iterable):
+        raise LogError(f"{name} is {given!r}, expected names of columns, as ['{name}1', '{name}2']")
     unit = {"time": "s", "v": "1/s"}.get(name, "1")
     return {"columns": given if isinstance(given, str) else list(given), "unit": unit}
 

@@ -43,6 +43,8 @@ class Range(NamedTuple):
 Count = Annotated[int, Range(1)]
 Index = Annotated[int, Range(0)]
 Positive = Annotated[float, Range(0, above=True)]
+_GAIN = Range(0, 1e7, above=True)
+Gain = Annotated[float, _GAIN]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 MOST_MEMBERS = 256
 MOST_RUNS = 100_000
@@ -61,8 +63,8 @@ class Section:
 class Gains(Section):
     """Of the control laws: one number, or one for each coordinate."""
 
-    position: float | Sequence[float]
-    velocity: float | Sequence[float]
+    position: Gain | Sequence[Gain]
+    velocity: Gain | Sequence[Gain]
 
 
 @dataclass
@@ -203,7 +205,9 @@ RANGES = {
     "count": Range(1, MOST_RUNS),
     "workers": Range(1, 512),
     **dict.fromkeys(("every_n_validations", "precondition_frequency"), Range(1)),
-    **dict.fromkeys(("duration", "horizon", "lr", "piece", "rate", "window"), Range(0, above=True)),
+    **dict.fromkeys(("duration", "horizon", "piece", "rate", "window"), Range(0, above=True)),
+    **dict.fromkeys(("position_gain", "velocity_gain"), _GAIN),
+    "lr": Range(1e-9, 100),  # with less the weights keep their digits
     "weight_decay": Range(0, 1e6),
     **dict.fromkeys(("betas", "coverage", "momentum", "warm_up"), Range(0, 1)),
     **dict.fromkeys(("atol", "eps"), Range(0, 0.1, above=True)),

@@ -43,7 +43,8 @@ def check(command: str, config: Mapping[str, Any]) -> None:
         ConfigError: naming the key, what was found and what was expected.
     """
     known = KEYS[command]
-    for key, value in config.items():
+    # Sections last: they take up values of others, as reference.seed=${seed}.
+    for key, value in sorted(config.items(), key=lambda item: isinstance(item[1], Mapping)):
         if key not in known:
             raise ConfigError(
                 f"the configuration has no key {key!r}{did_you_mean(key, list(known))}"
@@ -121,7 +122,8 @@ def check_value(path: str, value: Any, hint: Any) -> None:
         for key, item in value.items():
             check_value(f"{path}.{key}", item, known.get(key, inner))
     elif isinstance(value, list):
-        inner = next((get_args(h)[0] for h in _options(hint) if _is_list(h)), Any)
+        fitting = (h for h in _options(hint) if _is_list(h) and _fits(value, h))
+        inner = next((get_args(h)[0] for h in fitting), Any)
         for index, item in enumerate(value):
             if isinstance(item, (Mapping, list)):
                 check_value(f"{path}[{index}]", item, inner)

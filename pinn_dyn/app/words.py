@@ -22,6 +22,7 @@ _INSTEAD = {
     "Interpolation key": ": give it, or leave out what takes it away",
     "Environment variable": ": set it, or give another value",
     "merge DictConfig with ListConfig": ": expected a list for a list, keys for keys",
+    "HydraConfig was not set": ": where the key is there already, leave out the + before it",
     "extraneous input": ": expected ${key}, as ${seed}",
 }
 MOST_JOBS = 100_000
@@ -76,7 +77,7 @@ def check_words(command: str, folder: Path, overrides: list[Override]) -> None:
         if key == "hydra" or is_group(folder, word):
             for value in _values(override):
                 items = value if isinstance(value, list) else [value]
-                if not all(isinstance(item, (str, dict)) for item in items):
+                if not items or not all(map(_names, items)):
                     raise ConfigError(
                         f"{key} is {value!r}, expected the name of an option: "
                         f"{', '.join(_options(folder, key)) or 'leave it out'}"
@@ -91,6 +92,11 @@ def _jobs(override: Override) -> float:
     if isinstance(value, RangeSweep) and None not in (value.start, value.stop):
         return max(0, -(-(value.stop - value.start) // (value.step or 1)))  # type: ignore[operator]
     return 1
+
+
+def _names(item: Any) -> bool:
+    """Whether a value can name an option, or hold the keys of one."""
+    return isinstance(item, dict) or (isinstance(item, str) and "${" not in item)
 
 
 def _values(override: Override) -> list[Any]:
@@ -160,5 +166,5 @@ def said(folder: Path, error: HydraException | OmegaConfBaseException) -> str:
         if key and piece in lines[0]:
             lines[0] += instead
     if cause is not error:
-        lines.insert(0, str(error).splitlines()[0])
+        lines[:0] = str(error).splitlines()[:1]
     return "\n".join(lines)

@@ -34,7 +34,7 @@ PREDICTIONS = {
     "NaN": ((X0 * np.nan, U, T), "start"),
     "infinite inputs": ((X0, U + np.inf, T), "u"),
     "inputs of NaN": ((X0, U * np.nan, T), "u"),
-    "times of NaN": ((X0, U, T * np.nan), "t must increase"),
+    "times of NaN": ((X0, U, T * np.nan), "t has 11 non-finite entries"),
     "times backwards": ((X0, U, T[::-1].copy()), "t must increase"),
     "one time": ((X0, U[:1], T[:1]), "at least 2 times"),
     "no time": ((X0, U[:0], T[:0]), "t|u"),
