@@ -112,6 +112,8 @@ def completed(command: str, arguments: list[str]) -> list[str]:
             taken = _takes(command, known, place)
             also = (f"{place}.{one}" if place else one for one in taken)
             keys = list(dict.fromkeys([*_keys(known), *also]))
+            if key in keys:  # under a part that another word takes away
+                raise ConfigError(f"there is no {place} for '{key}' with {' '.join(before)}")
             close = did_you_mean(key, keys)
             if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
                 close = f": did you mean {' or '.join(same[:3])}?"

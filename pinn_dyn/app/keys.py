@@ -103,7 +103,7 @@ TRAINER: dict[str, Any] = {
     "num_nodes": Count,
     "strategy": str,
     "precision": Literal["32-true", "32", 32, "bf16-mixed", "bf16"] | None,
-    "gradient_clip_val": Positive | None,
+    "gradient_clip_val": Annotated[float, Range(1e-9)] | None,
     "gradient_clip_algorithm": Literal["norm", "value"] | None,
     "enable_progress_bar": bool,
     "benchmark": bool | None,
@@ -207,6 +207,9 @@ RANGES = {
     **dict.fromkeys(("every_n_validations", "precondition_frequency"), Range(1)),
     **dict.fromkeys(("duration", "horizon", "piece", "rate", "window"), Range(0, above=True)),
     **dict.fromkeys(("position_gain", "velocity_gain"), _GAIN),
+    **dict.fromkeys(("huber", "velocity_weight"), Range(1e-6, 1e6)),
+    **dict.fromkeys(("floor", "mass"), Range(0, 1e6)),
+    "length": Range(1e-6, 1e6),
     "lr": Range(1e-9, 100),  # with less the weights keep their digits
     "weight_decay": Range(0, 1e6),
     **dict.fromkeys(("betas", "coverage", "momentum", "warm_up"), Range(0, 1)),
