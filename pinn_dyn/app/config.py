@@ -99,7 +99,7 @@ def completed(command: str, arguments: list[str]) -> list[str]:
         arguments = [
             f"++{x}"
             # Also of a mapping, as dataset.test={seconds: 1, piece: 1}.
-            if _is_unlisted(command, known, x) or (exists and x.startswith(f"{place}="))
+            if _is_unlisted(command, known, x) or (exists and x.startswith(f"{place}={{"))
             else x
             for x in before
         ]
@@ -115,6 +115,11 @@ def completed(command: str, arguments: list[str]) -> list[str]:
             if key in keys:  # under a part that another word takes away
                 raise ConfigError(f"there is no {place} for '{key}' with {' '.join(before)}")
             close = did_you_mean(key, keys)
+            inside = _at(known, place)
+            if place and inside is None and place in keys:
+                close = f": {place} is null, give {place}={{{name}: ...}}."
+            elif place and isinstance(inside, dict) and not taken:
+                close = f"{close.rstrip('?')}? To add it, put a + before it."
             if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
                 close = f": did you mean {' or '.join(same[:3])}?"
             raise ConfigError(

@@ -182,7 +182,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "reference": Annotated[Part, Kind("pinn_dyn.control.Reference")],
         "plant": Annotated[Part, Kind("pinn_dyn.control.Plant")],
     },
-    "check": {"dataset": _Source, "longest_delay": Positive},
+    "check": {"dataset": _Source, "longest_delay": Annotated[float, Range(0, 100, above=True)]},
     "gather": {
         "runs": Names,
         "evaluations": Names | None,

@@ -325,7 +325,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, Mapping) and not _is_part(value)
     # A class, a protocol or something to call is built; numbers stand for tensors and arrays.
     if getattr(hint, "__name__", "") in ("Tensor", "ndarray"):
-        return _is_number(value) or isinstance(value, list)
+        return _is_number(value) or (isinstance(value, list) and all(fits(x, hint) for x in value))
     if isinstance(hint, type) or _is_callable(hint):
         return _is_part(value) or hint is object
     return True

@@ -167,4 +167,4 @@ def said(folder: Path, error: HydraException | OmegaConfBaseException) -> str:
             lines[0] += instead
     if cause is not error:
         lines[:0] = str(error).splitlines()[:1]
-    return "\n".join(lines)
+    return "\n".join(lines).replace("\\'", "'")

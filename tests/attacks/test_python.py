@@ -166,7 +166,6 @@ FITS = {
     ),
     "a list for a run": (TABLE, NAMES | dict(run=["t"]), r"run is \['t'\], expected the name"),
     "runs of NaN": (TABLE.assign(r=np.nan), NAMES | dict(run="r"), "some rows belong to no run"),
-    "complex": (TABLE.assign(q1=1j), NAMES, "expected a number"),
     "lists in cells": (TABLE.assign(q1=[[0]] * len(TABLE)), NAMES, r"the value is '\[0\]'"),
     "a folder of no name": (TABLE, NAMES | dict(folder=""), "folder is '', expected the name"),
     "a folder of bytes": (TABLE, NAMES | dict(folder=b"x"), "folder is b'x', expected the name"),

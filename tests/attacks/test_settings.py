@@ -309,6 +309,7 @@ MISTAKES = {
 
 MISTAKES["check"] = [
     "longest_delay=0",
+    "longest_delay=1e300",
     "longest_delay=null",
     "longest_delay=[1]",
     "dataset=3",

@@ -37,6 +37,8 @@ WORDS = [
     ("check", ["dataset=/dev/full"], "'dataset//dev/full' does not exist. Options of dataset: csv"),
     ("check", ["dataset.q.sgn=1"], "no key 'dataset.q.sgn': did you mean dataset.q.sign"),
     ("check", ["dataset.test={secnds: 1, piece: 1}"], "did you mean dataset.test.seconds"),
+    ("check", ["dataset.steps.x={a: 1}"], "no key 'dataset.steps.x'.* To add it, put a \\+ before"),
+    ("gather", ["filter.a=1"], "no key 'filter.a': filter is null, give filter={a: ...}"),
     ("control", ["guard.treshold=3"], "no key 'guard.treshold': did you mean guard.threshold"),
     ("train", ["dataset.labels=é"], "in quotes what has other signs than plain letters"),
     ("train", ["hydra.job.env_set.A=1"], r"put a \+ before one that is new, as '\+hydra.job.env_s"),
@@ -70,7 +72,6 @@ def test_words_that_name_nothing(command, words, says):
         (["data=[1]"], "data is"),
         (["dataset.system=[1]"], "dataset.system: .*expected a list for a list, keys for keys"),
         (["dataset.step=${.}"], r"dataset.step: .*: expected \$\{key\}, as \$\{seed\}"),
-        (["+name=false"], "name: .*leave out the \\+ before it"),
     ],
 )
 def test_keys_that_are_taken_away_in_a_part(words, says):
@@ -84,7 +85,8 @@ LOG += ["dataset.u={columns: b, unit: Nm}", "dataset.validation={seconds: 1, pie
 
 def test_keys_of_short_forms_need_no_plus():
     words = ["dataset.test.seconds=2", "dataset.test.piece=1", "dataset.q.sign=-1"]
-    dataset = composed("check", [*LOG, *words])["dataset"]
+    dataset = composed("check", [*LOG, *words, "dataset.shortest=0.5"])["dataset"]
+    assert dataset["shortest"] == 0.5
     assert dataset["test"] == {"seconds": 2, "piece": 1}
     assert dataset["validation"] == {"seconds": 1, "piece": 1}
     assert dataset["q"] == {"columns": "a", "unit": "rad", "sign": -1}
