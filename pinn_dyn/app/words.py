@@ -21,7 +21,7 @@ _RAISED = re.compile(r"\w+ raised while resolving interpolation: ")
 _INSTEAD = {
     "Interpolation key": ": give it, or leave out what takes it away",
     "Environment variable": ": set it, or give another value",
-    "merge DictConfig with ListConfig": ": expected a list for a list, keys for keys",
+    "merge DictConfig with ListConfig": ": give [...] for a list, {...} for keys",
     "HydraConfig was not set": ": where the key is there already, leave out the + before it",
     "extraneous input": ": expected ${key}, as ${seed}",
 }

@@ -70,7 +70,7 @@ def test_words_that_name_nothing(command, words, says):
         (["seed=${seed}"], "seed: Recursive interpolation"),
         (["data.pairs=${oc.env:NOWHERE_AT_ALL}"], r"data\.pairs: .*NOWHERE_AT_ALL.*: set it, or"),
         (["data=[1]"], "data is"),
-        (["dataset.system=[1]"], "dataset.system: .*expected a list for a list, keys for keys"),
+        (["dataset.system=[1]"], r"dataset.system: .*: give \[\.\.\.\] for a list, \{"),
         (["dataset.step=${.}"], r"dataset.step: .*: expected \$\{key\}, as \$\{seed\}"),
     ],
 )
