@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import re
 import shlex
 import subprocess
 import sys
@@ -199,8 +200,10 @@ def run(name: str, entry: Entry, folder: Path) -> None:
 
 def _quoted(path: Path) -> str:
     """A path as a value of an override, whatever characters it has."""
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
+    text = str(path)
+    if re.fullmatch(r"[\w./-]+", text, re.ASCII):
+        return text
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def call(program: str, *words: str) -> None:

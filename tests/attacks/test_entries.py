@@ -7,6 +7,7 @@ import yaml
 
 import reproduce
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.words import parsed
 
 TRAINS = {"train": ["seed=0"], "evaluate": [], "minutes": 1}
 GOOD = {"a/lnn": TRAINS, "control/a": {"control": [], "run": "a/lnn", "minutes": 1}}
@@ -94,3 +95,9 @@ def test_a_training_that_leaves_nothing(monkeypatch):
     monkeypatch.setattr(reproduce, "call", lambda *words: None)
     with pytest.raises(reproduce.EntryError, match="left no finished training"):
         reproduce.run("a/lnn", TRAINS, Path("out"))
+
+
+@pytest.mark.parametrize("folder", ["my runs", "a,b=[c]", "it's {x}", "é", "plain/a-1"])
+def test_any_folder_is_a_value(folder):
+    word = f"hydra.sweep.dir={reproduce._quoted(Path(folder))}"
+    assert parsed([word])[0].value() == folder
