@@ -210,7 +210,7 @@ RANGES = {
     **dict.fromkeys(("huber", "velocity_weight"), Range(1e-6, 1e6)),
     **dict.fromkeys(("floor", "mass"), Range(0, 1e6)),
     "length": Range(1e-6, 1e6),
-    "lr": Range(1e-9, 100),  # with less the weights keep their digits
+    "lr": Range(1e-9, 1e12),  # with less the weights keep their digits
     "weight_decay": Range(0, 1e6),
     **dict.fromkeys(("betas", "coverage", "momentum", "warm_up"), Range(0, 1)),
     **dict.fromkeys(("atol", "eps"), Range(0, 0.1, above=True)),
