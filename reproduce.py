@@ -12,14 +12,21 @@ refused, with the keys that differ. An entry that fails does not stop the others
 from __future__ import annotations
 
 import argparse
+import difflib
+import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
+
+from pinn_dyn.app.keys import Positive, Section
+from pinn_dyn.app.schema import ConfigError, check_value
+from pinn_dyn.app.trust import read_yaml
 
 ROOT = Path(__file__).resolve().parent
 ENTRIES = ROOT / "results" / "reproduction.yaml"
@@ -28,13 +35,65 @@ SUMMARY = "summary.csv"
 Entry = dict[str, Any]
 
 
+@dataclass
+class _Keys(Section):
+    """Of an entry: what results/reproduction.yaml says of them."""
+
+    train: Sequence[str] = ()
+    evaluate: Sequence[str] = ()
+    control: Sequence[str] = ()
+    run: str = ""
+    results: str = ""
+    select: Mapping[str, Any] | None = None
+    metric: str = ""
+    unit: str = ""
+    minutes: Positive = 1.0
+    paper: str = ""
+    pairs: int = 0
+    steps: int = 0
+    missing: str = ""
+
+
+_WHOLE = ({"train", "evaluate"}, {"control", "run", "minutes"}, {"missing"})
+"""Keys that an entry needs, of one kind or another."""
+
+
 class EntryError(Exception):
     """A program of an entry ended with an error, or has nothing to start from."""
 
 
 def read_entries(path: Path = ENTRIES) -> dict[str, Entry]:
-    """The entries by name; results/reproduction.yaml says what is in one."""
-    return yaml.safe_load(path.read_text())["entries"]
+    """The entries by name; results/reproduction.yaml says what is in one.
+
+    Raises:
+        ConfigError: on a file that cannot be read, or an entry that cannot be run.
+    """
+    entries: Any = read_yaml(path).get("entries")
+    try:
+        check_value("entries", entries, Mapping[str, _Keys])
+        for name, entry in entries.items():
+            _check_entry(name, entry, entries)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return entries
+
+
+def _check_entry(name: str, entry: Entry, entries: dict[str, Entry]) -> None:
+    """Refuse an entry that nothing can be run of, or whose folder would be elsewhere."""
+    parts = Path(name).parts if isinstance(name, str) else ()
+    if not parts or Path(name).is_absolute() or ".." in parts:
+        raise ConfigError(f"entries has {name!r}, expected the name of a folder below --folder")
+    if not any(keys <= entry.keys() for keys in _WHOLE):
+        raise ConfigError(
+            f"entries.{name} has {', '.join(entry) or 'nothing'}, expected train and evaluate, or "
+            "control, run and minutes, or missing"
+        )
+    if "run" in entry and "train" not in entries.get(entry["run"], {}):
+        raise ConfigError(f"entries.{name}.run is {entry['run']!r}, expected an entry that trains")
+    if Path(entry.get("results", "")).is_absolute():
+        raise ConfigError(
+            f"entries.{name}.results is {entry['results']!r}, expected files below {ROOT}"
+        )
 
 
 def recorded(entry: Entry) -> pd.DataFrame:
@@ -44,17 +103,39 @@ def recorded(entry: Entry) -> pd.DataFrame:
 
 
 def selected(entry: Entry, files: list[Path]) -> pd.DataFrame:
-    """The rows of an entry in tables that evaluate.py or control.py wrote."""
-    if not files:
-        return pd.DataFrame()
-    rows = pd.concat([pd.read_csv(path) for path in files])
-    for column, value in entry.get("select", {}).items():
-        rows = rows[rows[column] == value]
-    return rows
+    """The rows of an entry in tables that evaluate.py or control.py wrote.
+
+    Raises:
+        ConfigError: naming the table that cannot be read, or has no such column.
+    """
+    found = []
+    for path in files:
+        try:
+            rows = pd.read_csv(path)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path} cannot be read, delete it and run again: {error}") from error
+        for column, value in (entry.get("select") or {}).items():
+            if column not in rows:
+                raise ConfigError(
+                    f"{path} has no column {column!r}, by which its entry selects rows: "
+                    f"there are {', '.join(rows)}"
+                )
+            rows = rows[rows[column] == value]
+        found.append(rows)
+    return pd.concat(found) if found else pd.DataFrame()
 
 
 def training_seconds(rows: pd.DataFrame) -> pd.Series:
-    """Seconds on a core; wall-clock seconds where the run did not count them."""
+    """Seconds on a core; wall-clock seconds where the run did not count them.
+
+    Raises:
+        ConfigError: if the tables do not have them.
+    """
+    if not {"training_cpu_seconds", "training_seconds"} <= {*rows}:
+        raise ConfigError(
+            "the tables of an entry have no columns training_cpu_seconds and training_seconds, "
+            f"there are {', '.join(rows)}: give results that evaluate.py wrote, or minutes"
+        )
     return rows["training_cpu_seconds"].fillna(rows["training_seconds"])
 
 
@@ -101,17 +182,28 @@ def run(name: str, entry: Entry, folder: Path) -> None:
             raise EntryError(f"needs {entry['run']}, which has no finished training")
         for path in runs:
             if not (folder / name / path.name / SUMMARY).is_file():
-                out = f"hydra.run.dir={folder / name / path.name}"
-                call("control.py", *entry["control"], f"run={path}", out)
+                out = f"hydra.run.dir={_quoted(folder / name / path.name)}"
+                call("control.py", *entry["control"], f"run={_quoted(path)}", out)
         return
     # train.py itself passes over what is finished, and goes on with what is not.
-    call("train.py", "-m", *entry["train"], f"hydra.sweep.dir={folder / name}")
+    call("train.py", "-m", *entry["train"], f"hydra.sweep.dir={_quoted(folder / name)}")
     (table,) = tables(name, entry, folder)
-    newest = max(path.stat().st_mtime for path in (folder / name).glob("*/metrics.json"))
+    runs = trained(folder / name)
+    if not runs:
+        raise EntryError("train.py left no finished training")
+    newest = max((path / "metrics.json").stat().st_mtime for path in runs)
     if not table.is_file() or table.stat().st_mtime < newest:
-        found = ",".join(str(path) for path in trained(folder / name))
-        out = f"hydra.run.dir={table.parent}"
+        found = ",".join(_quoted(path) for path in runs)
+        out = f"hydra.run.dir={_quoted(table.parent)}"
         call("evaluate.py", f"runs=[{found}]", *entry["evaluate"], out)
+
+
+def _quoted(path: Path) -> str:
+    """A path as a value of an override, whatever characters it has."""
+    text = str(path)
+    if re.fullmatch(r"[\w./-]+", text, re.ASCII):
+        return text
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def call(program: str, *words: str) -> None:
@@ -136,7 +228,7 @@ def comparison(entries: dict[str, Entry], names: list[str], folder: Path) -> str
         metric = entry.get("metric", "error_mean")
         files = [path for path in tables(name, entry, folder) if path.is_file()]
         means = [
-            f"{rows[metric].mean():.3g}" if len(rows) else "-"
+            f"{rows[metric].mean():.3g}" if len(rows) and metric in rows else "-"
             for rows in (selected(entry, files), recorded(entry))
         ]
         lines.append(f"{name:<30}{means[0]:>12}{means[1]:>12}   {entry.get('paper', '-')}")
@@ -146,7 +238,9 @@ def comparison(entries: dict[str, Entry], names: list[str], folder: Path) -> str
 def chosen(entries: dict[str, Entry], only: list[str] | None) -> list[str]:
     """The entries to run, those that others need first."""
     if unknown := set(only or []) - set(entries):
-        raise SystemExit(f"no entry {', '.join(sorted(unknown))}; --list shows them")
+        close = difflib.get_close_matches(min(unknown), entries)
+        hint = f": did you mean {' or '.join(close)}?" if close else "; --list shows them"
+        raise SystemExit(f"no entry {', '.join(sorted(unknown))}{hint}")
     wanted = only or [name for name, entry in entries.items() if "missing" not in entry]
     if lacking := [name for name in wanted if "missing" in entries[name]]:
         raise SystemExit(f"{', '.join(lacking)}: the paper's log is not published")
@@ -164,16 +258,28 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--folder", type=Path, default=Path("runs/reproduce"))
     parser.add_argument("--entries", type=Path, default=ENTRIES, help="another list of entries")
     given = parser.parse_args(arguments)
-    entries, folder = read_entries(given.entries), given.folder
-    if given.list:
+    try:
+        _remake(read_entries(given.entries), given.folder, given.only, listed=given.list)
+    except ConfigError as error:
+        raise SystemExit(f"Error: {error}") from error
+
+
+def _remake(
+    entries: dict[str, Entry], folder: Path, only: list[str] | None, *, listed: bool
+) -> None:
+    if listed:
         for name, entry in entries.items():
             took = "" if "missing" in entry else f"{minutes(entry):.0f} min"
             print(f"{name:<30}{took:>8}   {state(name, entry, folder)}")
-    names = chosen(entries, given.only)
+    names = chosen(entries, only)
     left = [name for name in names if state(name, entries[name], folder) != "done"]
     print(f"{sum(minutes(entries[name]) for name in left):.0f} min to go, on one core")
-    if given.list:
+    if listed:
         return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--folder is {folder}, which cannot be written to: {error}") from error
     failures = {}
     for number, name in enumerate(names, start=1):
         takes = f"{minutes(entries[name]):.0f} min" if name in left else "done, looking for changes"

@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app import words
 from pinn_dyn.app.config import ConfigError, completed, config_folder
+from pinn_dyn.app.flags import in_order
 from pinn_dyn.app.sweep import how_to_go_on
 
 # Of a disk that is full, also by a quota or a limit on one file, or that may only be read.
@@ -37,13 +38,17 @@ def main(command: str) -> None:
     A misspelt key ends the program before anything is written, with the keys that were probably
     meant; so does an error that the user can mend, without a traceback.
     """
-    if not {"-sc", "--shell-completion"} & set(sys.argv):  # whose words are no overrides
-        try:
+    try:
+        sys.argv[1:] = in_order(command, sys.argv[1:])
+        if not {"-sc", "--shell-completion"} & set(sys.argv):  # whose words are no overrides
             sys.argv[1:] = completed(command, sys.argv[1:])
-        except ConfigError as error:
-            raise SystemExit(f"Error: {error}") from error
+    except ConfigError as error:
+        raise SystemExit(f"Error: {error}") from error
+    began = False
 
     def run(cfg: DictConfig) -> object:
+        nonlocal began
+        began = True
         # PyTorch and Lightning take seconds to import, which --help and a misspelt key do not need.
         from pinn_dyn.data import SimulationError
         from pinn_dyn.training import NonFiniteLossError
@@ -68,8 +73,14 @@ def main(command: str) -> None:
         hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
+    except BrokenPipeError:  # of head, say, which has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except Exception as error:
-        if (said := _in_a_line(command, error)) is None:
+        said = _in_a_line(command, error)
+        if said is None and not began and any("hydra" in word for word in sys.argv[1:]):
+            said = words.refused(sys.argv[1:], error)
+        if said is None:
             raise
         raise SystemExit(f"Error: {said}") from error
     finally:

@@ -14,9 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.keys import KEYS
-from pinn_dyn.app.schema import ConfigError, check, did_you_mean
+from pinn_dyn.app.schema import ConfigError, check, did_you_mean, short_form
 from pinn_dyn.app.schema import arguments as arguments_of
-from pinn_dyn.app.words import check_words, chooses, parsed, said
+from pinn_dyn.app.words import OVERRIDE, check_words, chooses, parsed, refused, said
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
@@ -24,7 +24,6 @@ CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
 _OPEN = ("filter", "robot", "thresholds")  # mappings with keys of the user's choice
-_OVERRIDE = re.compile(r"~|[^-].*=", re.DOTALL)
 _CONFIG_DIR = re.compile(r"(?:--config-dir|-cd)[ =](\S+)")  # a user's own groups
 
 
@@ -90,18 +89,37 @@ def completed(command: str, arguments: list[str]) -> list[str]:
         ConfigError: on a key that does not exist, with those that were probably meant. What Hydra
             itself explains, a group's wrong option say, is left to it.
     """
-    words = [word for word in arguments if _OVERRIDE.match(word)]
+    words = [word for word in arguments if OVERRIDE.match(word)]
     check_words(command, config_folder(command), parsed(words))
     while (unknown := _unknown_key(command, arguments)) is not None:
         key, known = unknown
         before = arguments
-        arguments = [f"++{x}" if _is_unlisted(command, known, x) else x for x in before]
+        place, _, name = key.rpartition(".")
+        exists = name in _takes(command, known, place)
+        arguments = [
+            f"++{x}"
+            # Also of a mapping, as dataset.test={seconds: 1, piece: 1}.
+            if _is_unlisted(command, known, x) or (exists and x.startswith(f"{place}={{"))
+            else x
+            for x in before
+        ]
         if arguments == before:
-            path, _, name = key.rpartition(".")
-            taken = _takes(command, _at(known, path), path)
-            also = (f"{path}.{one}" if path else one for one in taken)
+            if key.startswith("hydra."):
+                raise ConfigError(
+                    f"Hydra has no key '{key}': see all with 'python {command}.py --cfg hydra', "
+                    f"and put a + before one that is new, as '+{key}=...'"
+                )
+            taken = _takes(command, known, place)
+            also = (f"{place}.{one}" if place else one for one in taken)
             keys = list(dict.fromkeys([*_keys(known), *also]))
+            if key in keys:  # under a part that another word takes away
+                raise ConfigError(f"there is no {place} for '{key}' with {' '.join(before)}")
             close = did_you_mean(key, keys)
+            inside = _at(known, place)
+            if place and inside is None and place in keys:
+                close = f": {place} is null, give {place}={{{name}: ...}}."
+            elif place and isinstance(inside, dict) and not taken:
+                close = f"{close.rstrip('?')}? To add it, put a + before it."
             if not close and (same := [k for k in keys if k.split(".")[-1] == name]):
                 close = f": did you mean {' or '.join(same[:3])}?"
             raise ConfigError(
@@ -120,7 +138,7 @@ def _is_unlisted(command: str, known: dict[str, Any], word: str) -> bool:
     place = _at(known, path)
     if not isinstance(place, dict) or name in place:
         return False
-    return path in _OPEN or name in _takes(command, place, path)
+    return path in _OPEN or name in _takes(command, known, path)
 
 
 def _at(known: Any, path: str) -> Any:
@@ -130,18 +148,20 @@ def _at(known: Any, path: str) -> Any:
     return known
 
 
-def _takes(command: str, place: Any, path: str) -> dict[str, Any]:
+def _takes(command: str, known: dict[str, Any], path: str) -> dict[str, Any]:
     """What may be set at a place of the configuration."""
     if not path:
         return KEYS[command]
+    place = _at(known, path)
     if isinstance(place, dict) and "_target_" in place:
         return arguments_of(place["_target_"], path)
-    return {}
+    above, _, name = path.rpartition(".")
+    return short_form(_takes(command, known, above).get(name))
 
 
 def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any]] | None:
     """The first key of the overrides that is in no YAML, and the configuration without it."""
-    words = [word for word in arguments if _OVERRIDE.match(word)]
+    words = [word for word in arguments if OVERRIDE.match(word)]
     if folders := _CONFIG_DIR.findall(" ".join(arguments)):
         words.append(f"hydra.searchpath=[file://{Path(folders[0]).resolve()}]")
     overrides = []
@@ -172,7 +192,8 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
             return key, _plain_keys(hydra.compose(command, overrides=groups))
         except (ValueError, TypeError, AttributeError, LookupError) as error:
             known = _plain_keys(hydra.compose(command, overrides=groups))
-            raise ConfigError(_below_a_value(known, overrides) or str(error)) from error
+            said_by_hydra = refused(words, error)
+            raise ConfigError(_below_a_value(known, overrides) or said_by_hydra) from error
     return None
 
 

@@ -101,6 +101,11 @@ def control(cfg: DictConfig) -> float:
     robot = build_robot(run.config["dataset"], config["robot"])
     reference = build_reference(config, robot)
     q0, v0 = _initial_states(config, reference)
+    for key, size in (("reference", reference(0.0).q.shape[-1]), ("initial_states", q0.shape[-1])):
+        if size != robot.num_coordinates:
+            raise ConfigError(
+                f"{key} has {size} coordinates, expected {robot.num_coordinates}, as the robot has"
+            )
     if isinstance(robot, HasLimits):
         with _errors_of("reference"):
             check_limits(reference, robot.q_low, robot.q_high, config["duration"], robot.v_max)
@@ -116,7 +121,7 @@ def control(cfg: DictConfig) -> float:
             f"trajectory is {config['trajectory']}, expected one of the {len(q0)} runs, 0 to "
             f"{len(q0) - 1}"
         )
-    _check_box(config["stability"], robot.num_coordinates)
+    _check_box(config["stability"], robot)
     _check_learned(config)
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["export"] is not None:
@@ -200,10 +205,11 @@ def _check_learned(config: dict[str, Any]) -> None:
             )
 
 
-def _check_box(box: dict[str, Any] | None, size: int) -> None:
+def _check_box(box: dict[str, Any] | None, robot: MechanicalSystem) -> None:
     """Refuse a stability region that does not fit the robot, before anything is run."""
     if box is None:
         return
+    size = robot.num_coordinates
     for key in ("q_low", "q_high"):
         if len(box[key]) != size:
             raise ConfigError(
@@ -214,6 +220,9 @@ def _check_box(box: dict[str, Any] | None, size: int) -> None:
         raise ConfigError(
             f"stability.q_low is {box['q_low']}, expected at most stability.q_high, {box['q_high']}"
         )
+    if isinstance(robot, HasDomain):
+        with _errors_of("stability"):
+            robot.check_domain(np.array(box["q_low"], float), np.array(box["q_high"], float))
 
 
 def _check_length(config: dict[str, Any], reference: Reference, runs: int) -> None:

@@ -6,9 +6,11 @@ import contextlib
 import re
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from lightning.pytorch.utilities.seed import isolate_rng
@@ -21,6 +23,7 @@ from pinn_dyn.app.learned_model import LearnedModel, load
 from pinn_dyn.app.run_folder import CONFIG, claimed
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.train import train_in
+from pinn_dyn.app.words import OVERRIDE
 from pinn_dyn.data import DataSource
 
 STEPS = 1000
@@ -67,15 +70,19 @@ def fit(
         ValueError: on columns, units, clocks or settings that cannot be used; names them.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
+    seed, steps = _whole(seed), _whole(steps)
+    overrides = _words(overrides, own_data=not isinstance(data, str))
     with contextlib.ExitStack() as stack:
         temporary = folder is None
         if folder is None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="pinn_dyn-"))
-        place = Path(folder).expanduser().resolve()
+        if not isinstance(folder, (str, Path)) or not str(folder) or "${" in str(folder):
+            raise ConfigError(f"folder is {folder!r}, expected the name of one, or None")
         try:
+            place = Path(folder).expanduser().resolve()
             place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"folder is {place}, which cannot be written to: {error}") from error
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"folder is {folder}, which cannot be written to: {error}") from error
         if (place / CONFIG).exists():
             raise ConfigError(f"folder is {place}, which holds a training: give another one")
         for name, number in (("seed", seed), ("steps", 1 if steps is None else steps)):
@@ -90,19 +97,19 @@ def fit(
             words += frame_dataset(data, signals, run, seed, place)
             if steps is None:
                 steps = STEPS
+        elif not isinstance(data, (str, DataSource)):
+            raise TypeError(
+                f"data is a {type(data).__name__}, expected a data frame, as of pandas.read_csv, a "
+                "data source or the name of a data set"
+            )
         elif any(given is not None for given in (q, u, v, run)):
             raise TypeError(
                 "q, u, v and run describe a data frame: leave them out beside a data set"
             )
         elif isinstance(data, str):
             words.append(f"dataset={data}")
-        elif isinstance(data, DataSource):
-            words.append(f"dataset.name={data.name}")
         else:
-            raise TypeError(
-                f"data is a {type(data).__name__}, expected a data frame, a data source or the "
-                "name of a data set"
-            )
+            words.append(f"dataset.name={data.name}")
         if steps is not None:
             words += [f"trainer.steps={steps}", f"trainer.validations={_validations(steps)}"]
         config = composed("train", [*words, *overrides])
@@ -122,6 +129,29 @@ def fit(
         except SystemExit as stop:  # Lightning's end of an interrupted training
             raise KeyboardInterrupt from stop
         return load(place)
+
+
+def _whole(number: Any) -> Any:
+    """A whole number of NumPy as one of Python; anything else as it is."""
+    return int(number) if isinstance(number, np.integer) else number
+
+
+def _words(overrides: Sequence[str], *, own_data: bool) -> list[str]:
+    """Overrides that are some, and choose neither other data nor what only train.py has.
+
+    Raises:
+        ConfigError: naming the one that is not.
+    """
+    given = [] if isinstance(overrides, (str, Mapping)) else list(overrides or ())
+    if not given and overrides:
+        raise ConfigError(f"overrides is {overrides!r}, expected a list, as ['optimizer.lr=0.002']")
+    for word in given:
+        if not isinstance(word, str) or not OVERRIDE.match(word):
+            raise ConfigError(f"overrides has {word!r}, expected words as 'optimizer.lr=0.002'")
+        key = word.lstrip("+~").partition("=")[0]
+        if key.split(".")[0].split("/")[0] == "hydra" or (own_data and key == "dataset"):
+            raise ConfigError(f"overrides has '{word}', which is for train.py: leave it out")
+    return given
 
 
 def _validations(steps: int) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ def frame_dataset(
     Raises:
         LogError: on columns that are not there or hold no numbers, or too few rows.
     """
+    if run is not None and not isinstance(run, str):
+        raise LogError(f"run is {run!r}, expected the name of a column, or None")
     described = {name: _described(name, given) for name, given in signals.items()}
     columns = {name: Columns.from_config(name, given) for name, given in described.items()}
     path = Path("the frame")
@@ -49,6 +51,8 @@ def frame_dataset(
         raise LogError("the frame has no rows, expected a log")
     t = columns["time"].to_si(values["time"])[:, 0]
     ids = ["frame"] * len(frame) if run is None else column(frame, path, run, "run")
+    if pd.isna(np.asarray(ids)).any():
+        raise LogError(f"the frame, column '{run}' (run): some rows belong to no run, give it")
     runs = {str(key): x.to_numpy() for key, x in pd.Series(t).groupby(np.asarray(ids), sort=False)}
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,11 +85,23 @@ def frame_dataset(
 
 def _described(name: str, given: Signals) -> dict[str, Any]:
     """A signal as a configuration has it; names alone have SI units."""
-    if isinstance(given, Mapping):
-        plain = (str, int, float)
-        return {k: x if isinstance(x, plain) else list(x) for k, x in given.items()}
-    unit = {"time": "s", "v": "1/s"}.get(name, "1")
-    return {"columns": given if isinstance(given, str) else list(given), "unit": unit}
+    if isinstance(given, (bytes, Set)) or not isinstance(given, Iterable):
+        raise LogError(f"{name} is {given!r}, expected names of columns, as ['{name}1', '{name}2']")
+    if not isinstance(given, Mapping):
+        given = {"columns": given, "unit": {"time": "s", "v": "1/s"}.get(name, "1")}
+    plain = {key: _plain(value) for key, value in given.items()}
+    columns = plain.get("columns")
+    for one in [columns] if isinstance(columns, str) else columns or ():
+        if not isinstance(one, str) or "${" in one or one == "???":  # of a configuration
+            raise LogError(f"{name} names the column {one!r}, expected a text without '${{'")
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    """A value of Python and YAML, also of what NumPy or pandas holds."""
+    if isinstance(value, str) or value is None:
+        return value
+    return np.asarray(list(value) if isinstance(value, Iterable) else value).tolist()
 
 
 def _split(runs: dict[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, float]]:

@@ -41,6 +41,10 @@ def gather(cfg: DictConfig) -> None:
         ConfigError: if no run is found or left by the filter, or a column does not exist.
     """
     config = checked("gather", cfg)
+    if config["plot"] is None and config["plot_column"] != config["sort"]:
+        raise ConfigError(
+            "plot_column is set, but plot is null: give plot=..., what to draw against"
+        )
     folder = Path(HydraConfig.get().runtime.output_dir)
     jobs = filter_jobs(find_jobs(config["runs"]), config["filter"] or {})
     finished = [job for job in jobs if job.record is not None]

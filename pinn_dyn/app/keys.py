@@ -19,7 +19,8 @@ class Kind:
         self.names = names
 
     def __str__(self) -> str:
-        return "that names a " + " or ".join(name.rsplit(".", 1)[-1] for name in self.names)
+        names = [name.rsplit(".", 1)[-1] for name in self.names]
+        return f"that names {'an' if names[0][0] in 'AEIO' else 'a'} {' or '.join(names)}"
 
 
 class Range(NamedTuple):
@@ -35,13 +36,15 @@ class Range(NamedTuple):
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:.10g}"
         return f"above {self.low:g}" if self.above else f"of at least {self.low:g}"
 
 
 Count = Annotated[int, Range(1)]
 Index = Annotated[int, Range(0)]
 Positive = Annotated[float, Range(0, above=True)]
+_GAIN = Range(0, 1e7, above=True)
+Gain = Annotated[float, _GAIN]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 MOST_MEMBERS = 256
 MOST_RUNS = 100_000
@@ -60,8 +63,8 @@ class Section:
 class Gains(Section):
     """Of the control laws: one number, or one for each coordinate."""
 
-    position: float | Sequence[float]
-    velocity: float | Sequence[float]
+    position: Gain | Sequence[Gain]
+    velocity: Gain | Sequence[Gain]
 
 
 @dataclass
@@ -100,7 +103,7 @@ TRAINER: dict[str, Any] = {
     "num_nodes": Count,
     "strategy": str,
     "precision": Literal["32-true", "32", 32, "bf16-mixed", "bf16"] | None,
-    "gradient_clip_val": Positive | None,
+    "gradient_clip_val": Annotated[float, Range(1e-9)] | None,
     "gradient_clip_algorithm": Literal["norm", "value"] | None,
     "enable_progress_bar": bool,
     "benchmark": bool | None,
@@ -179,7 +182,7 @@ KEYS: dict[str, dict[str, Any]] = {
         "reference": Annotated[Part, Kind("pinn_dyn.control.Reference")],
         "plant": Annotated[Part, Kind("pinn_dyn.control.Plant")],
     },
-    "check": {"dataset": _Source, "longest_delay": Positive},
+    "check": {"dataset": _Source, "longest_delay": Annotated[float, Range(0, 100, above=True)]},
     "gather": {
         "runs": Names,
         "evaluations": Names | None,
@@ -202,7 +205,12 @@ RANGES = {
     "count": Range(1, MOST_RUNS),
     "workers": Range(1, 512),
     **dict.fromkeys(("every_n_validations", "precondition_frequency"), Range(1)),
-    **dict.fromkeys(("duration", "horizon", "lr", "piece", "rate", "window"), Range(0, above=True)),
+    **dict.fromkeys(("duration", "horizon", "piece", "rate", "window"), Range(0, above=True)),
+    **dict.fromkeys(("position_gain", "velocity_gain"), _GAIN),
+    **dict.fromkeys(("huber", "velocity_weight"), Range(1e-6, 1e6)),
+    **dict.fromkeys(("floor", "mass"), Range(0, 1e6)),
+    "length": Range(1e-6, 1e6),
+    "lr": Range(1e-9, 1e12),  # with less the weights keep their digits
     "weight_decay": Range(0, 1e6),
     **dict.fromkeys(("betas", "coverage", "momentum", "warm_up"), Range(0, 1)),
     **dict.fromkeys(("atol", "eps"), Range(0, 0.1, above=True)),

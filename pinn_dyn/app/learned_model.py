@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple, cast, overload
 
@@ -52,12 +55,21 @@ def load(
         trust: packages of your own whose classes the run may build: SECURITY.md.
 
     Raises:
+        TypeError: if the folder is no path, or trust no names.
         ValueError: if the folder is no run folder, its training has not ended, a file of it is
             damaged, or another version made it.
     """
+    if not isinstance(run_folder, (str, os.PathLike)):
+        raise TypeError(f"run_folder is {run_folder!r}, expected the path of a run folder")
+    names = [trust] if isinstance(trust, str) else trust
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise TypeError(f"trust is {trust!r}, expected names of packages, as trust=['my_package']")
     folder = Path(run_folder).expanduser()
-    require_finished(folder)
-    trusted = packages(trust if isinstance(trust, str) else list(trust))
+    try:
+        require_finished(folder)
+    except OSError as error:
+        raise ValueError(f"run_folder is {str(folder)[:80]!r}: {error.strerror}") from error
+    trusted = packages(list(names))
     with isolate_rng():  # models draw their first weights when they are built
         return LearnedModel(load_run(folder, checkpoint, trusted))
 
@@ -192,10 +204,10 @@ class LearnedModel:
             TypeError: if the model is a single network, which has no spread.
             ValueError: as :meth:`predict`; on a level or a factor that is none.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level is {level}, expected a probability between 0 and 1")
-        if not factor > 0:
-            raise ValueError(f"factor is {factor}, expected a positive number")
+        if not isinstance(level, Real) or not 0 < level < 1:
+            raise ValueError(f"level is {level!r}, expected a probability between 0 and 1")
+        if not isinstance(factor, Real) or not 0 < factor < math.inf:
+            raise ValueError(f"factor is {factor!r}, expected a positive number")
         members = self._run.members()
         if members is None:
             raise TypeError(
@@ -232,7 +244,7 @@ class LearnedModel:
         if isinstance(u, Signal):
             self._array("u", u.u, size, "M")
             signal = u.to("cpu", torch.float64)
-            times = signal.t if t is None else _tensor("t", t)
+            times = signal.t if t is None else _times(t)
             first, last = float(signal.t[0]), float(signal.t[-1])
             outside = (times < first - 1e-9) | (times > last + 1e-9)
             if outside.any():
@@ -243,7 +255,7 @@ class LearnedModel:
             return signal, times
         if t is None:
             raise TypeError("predict(start, u) lacks the times t of the samples of u")
-        times, samples = _tensor("t", t), self._array("u", u, size, "M")
+        times, samples = _times(t), self._array("u", u, size, "M")
         if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != times.shape[0]:
             raise ValueError(
                 f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}, expected "
@@ -336,6 +348,13 @@ def _together(**values: Tensor) -> tuple[Tensor, ...]:
         raise ValueError(f"the batches differ: {shapes}; expected one for all") from error
 
 
+def _times(t: Values) -> Tensor:
+    """Finite times, s."""
+    times = _tensor("t", t)
+    require_finite("t", times)
+    return times
+
+
 def _tensor(name: str, value: Values) -> Tensor:
     """Real numbers in float64.
 
@@ -346,6 +365,10 @@ def _tensor(name: str, value: Values) -> Tensor:
         array = value.detach().cpu() if isinstance(value, Tensor) else np.asarray(value)
         if np.iscomplexobj(array):
             raise TypeError("they are complex")
+        if np.ma.is_masked(value):  # whose hidden entries would be read
+            raise TypeError("some are masked")
+        if isinstance(array, np.ndarray) and array.dtype.kind in "mM":
+            raise TypeError("they are dates or durations, not seconds")
         if isinstance(array, Tensor):
             return array.double()
         return torch.from_numpy(np.array(array, dtype=float))

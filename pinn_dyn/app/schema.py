@@ -14,7 +14,7 @@ import inspect
 import itertools
 import math
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -43,7 +43,8 @@ def check(command: str, config: Mapping[str, Any]) -> None:
         ConfigError: naming the key, what was found and what was expected.
     """
     known = KEYS[command]
-    for key, value in config.items():
+    # Sections last: they take up values of others, as reference.seed=${seed}.
+    for key, value in sorted(config.items(), key=lambda item: isinstance(item[1], Mapping)):
         if key not in known:
             raise ConfigError(
                 f"the configuration has no key {key!r}{did_you_mean(key, list(known))}"
@@ -117,10 +118,12 @@ def check_value(path: str, value: Any, hint: Any) -> None:
             _check_section(path, value, section)
             return
         inner = next((get_args(h)[1] for h in _options(hint) if len(get_args(h)) == 2), Any)
+        known = short_form(hint)  # whose missing and misspelt keys from_config names
         for key, item in value.items():
-            check_value(f"{path}.{key}", item, inner)
+            check_value(f"{path}.{key}", item, known.get(key, inner))
     elif isinstance(value, list):
-        inner = next((get_args(h)[0] for h in _options(hint) if _is_list(h)), Any)
+        fitting = (h for h in _options(hint) if _is_list(h) and _fits(value, h))
+        inner = next((get_args(h)[0] for h in fitting), Any)
         for index, item in enumerate(value):
             if isinstance(item, (Mapping, list)):
                 check_value(f"{path}[{index}]", item, inner)
@@ -128,7 +131,7 @@ def check_value(path: str, value: Any, hint: Any) -> None:
 
 def _check_section(path: str, value: Mapping[str, Any], section: Any) -> None:
     """Refuse a mapping without the keys of a section, or with others."""
-    hints = get_type_hints(section, include_extras=True)
+    hints = short_form(section)
     for key in value:
         if key not in hints:
             raise ConfigError(
@@ -202,7 +205,12 @@ def arguments(target: Any, path: str = "_target_") -> dict[str, Any]:
     Raises:
         ConfigError: if there is no such class or function.
     """
-    found = find(target, path)
+    taken = _parameters(find(target, path))
+    return taken | TRAINER if path == "trainer" else taken
+
+
+def _parameters(found: Any) -> dict[str, Any]:
+    """The arguments of a class or function with their annotations; ``**``: any others."""
     described: Any = found
     if isinstance(found, type) and not dataclasses.is_dataclass(found):
         described = found.__init__  # type: ignore[misc]
@@ -217,7 +225,17 @@ def arguments(target: Any, path: str = "_target_") -> dict[str, Any]:
             taken["**"] = Any
         elif one.kind is not one.VAR_POSITIONAL:
             taken[name] = hints.get(name, Any)
-    return taken | TRAINER if path == "trainer" else taken
+    return taken
+
+
+def short_form(hint: Any) -> dict[str, Any]:
+    """The keys, with their annotations, of a mapping without a ``_target_``; none if it has any."""
+    for option in _options(hint):
+        if _is_section(option):
+            return get_type_hints(option, include_extras=True)
+        if hasattr(option, "from_config"):
+            return _parameters(option)
+    return {}
 
 
 def _hints(described: Any) -> dict[str, Any]:
@@ -270,14 +288,8 @@ def _options(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
-_SEQUENCES = (
-    list,
-    tuple,
-    collections.abc.Sequence,
-    collections.abc.Iterable,
-    collections.abc.Collection,
-)
-_MAPPINGS = (dict, collections.abc.Mapping, collections.abc.MutableMapping)
+_SEQUENCES = (list, tuple, Sequence, Iterable, Collection)
+_MAPPINGS = (dict, Mapping, MutableMapping)
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -313,7 +325,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, Mapping) and not _is_part(value)
     # A class, a protocol or something to call is built; numbers stand for tensors and arrays.
     if getattr(hint, "__name__", "") in ("Tensor", "ndarray"):
-        return _is_number(value) or isinstance(value, list)
+        return _is_number(value) or (isinstance(value, list) and all(fits(x, hint) for x in value))
     if isinstance(hint, type) or _is_callable(hint):
         return _is_part(value) or hint is object
     return True
@@ -321,11 +333,12 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def words(hint: Any) -> str:
     """An annotation in words, for messages and for the configuration reference."""
-    names: list[str] = []
-    for option in _options(hint):
-        if (text := _words(option)) not in names:
-            names.append(text)
-    return " or ".join(names)
+    options = _options(hint)
+    if any(hasattr(option, "from_config") for option in options):  # beside its plain mapping
+        options = tuple(one for one in options if (get_origin(one) or one) not in _MAPPINGS)
+    texts = list(dict.fromkeys(map(_words, options)))
+    lists = [text for text in texts if text.startswith("a list")]  # last: a comma ends none
+    return " or ".join([text for text in texts if text not in lists] + lists)
 
 
 def _words(hint: Any) -> str:
@@ -344,8 +357,8 @@ def _words(hint: Any) -> str:
         return plain[hint]
     if hint is Part:
         return "an object, a mapping with a _target_"
-    if _is_section(hint):
-        return f"a mapping with {', '.join(field.name for field in dataclasses.fields(hint))}"
+    if known := short_form(hint):
+        return f"a mapping with {', '.join(known)}"
     if origin is Annotated:
         return " ".join([words(inner[0]), *map(str, inner[1:])])
     if origin is Literal:

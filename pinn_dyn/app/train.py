@@ -44,7 +44,7 @@ from pinn_dyn.app.run_folder import (
     write_json,
 )
 from pinn_dyn.app.schema import check_value
-from pinn_dyn.app.trust import packages
+from pinn_dyn.app.trust import check_name, packages
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
@@ -88,6 +88,9 @@ def train(cfg: DictConfig) -> float:
     name = cfg.get("resume_from") or "last"
     if cfg.get("resume") is None:
         config = checked("train", cfg)
+        check_name("model_name", config["model_name"])  # as who reads the run will
+        if "name" in config["dataset"]:
+            check_name("dataset.name", config["dataset"]["name"])
         if config.get("search"):
             config = build_search(config["search"]).applied(config)
         if config.get("resume_from"):

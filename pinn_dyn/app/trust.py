@@ -109,11 +109,11 @@ def read_foreign(path: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
     for where, part in _mappings(config, ""):
         _check_mapping(path, where, part, trust)
     if isinstance(dataset, dict):
-        _check_name(path, "dataset.name", dataset.get("name"))
+        check_name(f"{path}: dataset.name", dataset.get("name"))
         for name in dataset.get("configurations") or ():
-            _check_name(path, "dataset.configurations", name)
+            check_name(f"{path}: dataset.configurations", name)
     if "model_name" in config:
-        _check_name(path, "model_name", config["model_name"])
+        check_name(f"{path}: model_name", config["model_name"])
     return config
 
 
@@ -243,11 +243,15 @@ def _trusted(target: str, trust: tuple[str, ...]) -> bool:
     return False
 
 
-def _check_name(path: Path, where: str, name: Any) -> None:
-    """Refuse what would lead out of a folder: files are named by it."""
+def check_name(where: str, name: Any) -> None:
+    """Refuse what would lead out of a folder: files are named by it.
+
+    Raises:
+        ConfigError: saying where the name stands.
+    """
     unusable = not isinstance(name, str) or len(name) > _LONGEST_NAME or set(name) & set("/\\\0\n")
     if unusable or name in ("", ".", ".."):
         raise ConfigError(
-            f"{path}: {where} is {str(name)[:80]!r}, expected a name without separators of at most "
+            f"{where} is {str(name)[:80]!r}, expected a name without separators of at most "
             f"{_LONGEST_NAME} letters, as files are named by it"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,27 @@ from omegaconf.errors import OmegaConfBaseException
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.schema import ConfigError, did_you_mean
 
+OVERRIDE = re.compile(r"~|[^-=].*=", re.DOTALL)
+_RAISED = re.compile(r"\w+ raised while resolving interpolation: ")
+# Beside what OmegaConf says: what to do about it.
+_INSTEAD = {
+    "Interpolation key": ": give it, or leave out what takes it away",
+    "Environment variable": ": set it, or give another value",
+    "merge DictConfig with ListConfig": ": give [...] for a list, {...} for keys",
+    "HydraConfig was not set": ": where the key is there already, leave out the + before it",
+    "extraneous input": ": expected ${key}, as ${seed}",
+}
 MOST_JOBS = 100_000
 """Of a sweep."""
+
+
+def refused(words: list[str], error: BaseException) -> str:
+    """Which settings of Hydra itself an error may be about that is raised outside of our code."""
+    settings = [word for word in words if word.lstrip("+~").startswith("hydra")]
+    return (
+        f"Hydra cannot start with {', '.join(settings) or 'these words'}: {type(error).__name__}: "
+        f"{' '.join(str(error).split())}"
+    )
 
 
 def parsed(words: list[str]) -> list[Override]:
@@ -29,7 +49,8 @@ def parsed(words: list[str]) -> list[Override]:
     except OverrideParseException as error:
         raise ConfigError(
             f"{error.override!r} cannot be read: expected key=value, brackets and braces closed, "
-            "and what has spaces, commas or quotes in quotes"
+            "and in quotes what has other signs than plain letters, digits and ._-/, as "
+            "\"name='arm, é'\""
         ) from error
 
 
@@ -56,7 +77,7 @@ def check_words(command: str, folder: Path, overrides: list[Override]) -> None:
         if key == "hydra" or is_group(folder, word):
             for value in _values(override):
                 items = value if isinstance(value, list) else [value]
-                if not all(isinstance(item, (str, dict)) for item in items):
+                if not items or not all(map(_names, items)):
                     raise ConfigError(
                         f"{key} is {value!r}, expected the name of an option: "
                         f"{', '.join(_options(folder, key)) or 'leave it out'}"
@@ -73,11 +94,18 @@ def _jobs(override: Override) -> float:
     return 1
 
 
+def _names(item: Any) -> bool:
+    """Whether a value can name an option, or hold the keys of one."""
+    return isinstance(item, dict) or (isinstance(item, str) and "${" not in item)
+
+
 def _values(override: Override) -> list[Any]:
     value = override.value()
     if isinstance(value, ChoiceSweep):
         return [str(item) for item in value.list]
-    return [] if isinstance(value, (IntervalSweep, RangeSweep)) else [value]
+    if isinstance(value, (IntervalSweep, RangeSweep)):
+        return [value.start]
+    return [value]
 
 
 def chooses(folder: Path, override: Override) -> bool:
@@ -103,6 +131,7 @@ def _options(folder: Path, group: str) -> list[str]:
 def no_option(folder: Path, error: MissingConfigException) -> str:
     """What an option may have meant that does not exist."""
     group, _, choice = str(error.missing_cfg_file).rpartition("/")
+    group = group.partition("//")[0]  # of an option that is a path
     while group and not (folder / group).is_dir() and not error.options:
         group, _, above = group.rpartition("/")  # of an experiment in a folder
         choice = f"{above}/{choice}"
@@ -132,8 +161,10 @@ def said(folder: Path, error: HydraException | OmegaConfBaseException) -> str:
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     key = getattr(cause, "full_key", None)
     lines = [f"{key}: {str(cause).splitlines()[0]}" if key else str(error).strip()]
-    if key and "Interpolation key" in lines[0]:
-        lines[0] += ": give it, or leave out what takes it away"
+    lines[0] = _RAISED.sub("", lines[0])
+    for piece, instead in _INSTEAD.items():
+        if key and piece in lines[0]:
+            lines[0] += instead
     if cause is not error:
-        lines.insert(0, str(error).splitlines()[0])
-    return "\n".join(lines)
+        lines[:0] = str(error).splitlines()[:1]
+    return "\n".join(lines).replace("\\'", "'")

@@ -145,13 +145,22 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
         sha256: the 64 hexadecimal digits of ``<path>.sha256``, compared before anything is loaded.
 
     Raises:
+        TypeError: if the path is none.
         FileNotFoundError: if there is no such file.
-        ValueError: if the file has another checksum, holds entries that lead out of the folder that
-            it is unpacked in, or was not written by :func:`export_law`.
+        ValueError: if sha256 is no checksum, the file has another one, holds entries that lead out
+            of the folder that it is unpacked in, or was not written by :func:`export_law`.
         RuntimeError: if it was exported by another version of PyTorch, or misses the values that
             travel with it by more than 1e-5 of their norm.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path is {path!r}, expected that of a file that export_law wrote")
     path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file, expected one that export_law wrote")
+    if sha256 is not None and not re.fullmatch(r"\s*[0-9a-fA-F]{64}\s*", str(sha256)):
+        raise ValueError(
+            f"sha256 is {sha256!r}, expected the 64 hexadecimal digits in {path.name}.sha256"
+        )
     if sha256 is not None and (digest := _digest(path)) != sha256.strip().lower():
         raise ValueError(
             f"{path} has the SHA-256 {digest}, expected {sha256}: it is not the file that was "

@@ -112,6 +112,11 @@ class SimulatedSource(DataSource):
         ):
             if value < 1:
                 raise ValueError(f"{name}: {key} is {value}, expected at least 1")
+        if keep_every * step > self.test_duration:
+            raise ValueError(
+                f"{name}: keep_every is {keep_every}, one in {keep_every * step:g} s, expected "
+                f"at least two in {self.test_duration} s"
+            )
         if pairing not in ("product", "matched"):
             raise ValueError(f"{name}: pairing is {pairing!r}, expected 'product' or 'matched'")
         if pairing == "matched" and train_initial_states != train_inputs:

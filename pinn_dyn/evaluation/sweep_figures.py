@@ -32,9 +32,12 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: list[str], y: str) -> Fig
         ValueError: if x or y is no column, no figure is finite, or there are more lines than can
             be told apart.
     """
-    for argument, name in (("x", x), ("y", y)):
+    for argument, name in (("the horizontal axis", x), ("the vertical axis", y)):
         if name not in runs:
-            raise ValueError(f"{argument} is '{name}', expected one of {', '.join(runs.columns)}")
+            raise ValueError(
+                f"{argument} is '{name}', expected a column of the table, which has what varies: "
+                f"{', '.join(runs.columns)}"
+            )
     known = runs[runs[x].notna() & runs[y].notna()]
     finite = known[np.isfinite(known[y].astype(float))]
     if finite.empty:

@@ -113,7 +113,7 @@ class Trajectory:
         """The part of the trajectory up to ``horizon`` seconds after its start.
 
         Raises:
-            ValueError: if the trajectory is shorter than the horizon.
+            ValueError: if the trajectory is shorter than the horizon, or its step longer.
         """
         step = float(self.t[1] - self.t[0])
         if self.duration < horizon - 0.5 * step:
@@ -121,6 +121,10 @@ class Trajectory:
                 f"horizon is {horizon} s, but the trajectory lasts only {self.duration:g} s"
             )
         count = int(torch.searchsorted(self.t, self.t[0] + horizon + 0.5 * step))
+        if count < 2:
+            raise ValueError(
+                f"horizon is {horizon} s, expected at least one step of the trajectory, {step:g} s"
+            )
         return replace(
             self,
             q=self.q[..., :count, :],

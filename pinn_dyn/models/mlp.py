@@ -92,8 +92,10 @@ class MLP(nn.Module):
             )
         if any(width < 1 for width in hidden):
             raise ValueError(f"hidden is {list(hidden)}, expected widths of at least 1")
-        if any(not 0 <= index < inputs for index in angles):
-            raise ValueError(f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}")
+        if any(not 0 <= index < inputs for index in angles) or len({*angles}) < len(angles):
+            raise ValueError(
+                f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}, each once"
+            )
         self._activation = ACTIVATIONS[activation]
         self._has_angles = len(angles) > 0
         is_angle = torch.zeros(inputs, dtype=torch.bool)

@@ -28,7 +28,7 @@ def one_cycle(optimizer: Optimizer, *, total_steps: int, warm_up: float = 0.05) 
         optimizer,
         [group["lr"] for group in optimizer.param_groups],
         total_steps=total_steps,
-        pct_start=warm_up,
+        pct_start=float(warm_up),
         cycle_momentum=False,
         final_div_factor=1000.0,
     )

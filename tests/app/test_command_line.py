@@ -107,7 +107,7 @@ def test_missing_runs_are_asked_for_by_name(capsys):
     ("overrides", "words"),
     [
         (["dataset.train_inputs=0"], ["dataset", "train_inputs is 0"]),
-        (["dataset.system.mass=-1"], ["dataset", "SoftArm: mass is -1"]),
+        (["dataset.system.mass=-1"], ["dataset.system.mass is -1", "from 0 to"]),
         (["data.batch_size=65"], ["data", "batch_size is 65", "64"]),
         (["model=mlp", "model.activation=gelu"], ["model", "gelu", "softplus"]),
         (["model=lnn", "model/damping=fixed", "model.damping.value=[[1,2],[3,4]]"], ["model"]),

@@ -154,7 +154,7 @@ def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["gains.position=-1"], ["controllers.learned", "position_gain", "-1"]),
+        (["gains.position=-1"], ["gains.position is -1", "above 0 to 1"]),
         (["gains.position=[1,2]"], ["controllers.learned", "position_gain"]),
         (["reference.q_low=[0,0]", "reference.q_high=[0,0]"], ["reference"]),
         (["controllers.learned.terms=guess"], ["controllers.learned.terms", "guess", "truth"]),

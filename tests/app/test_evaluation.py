@@ -250,8 +250,8 @@ def test_horizon_and_windows_fit_the_data_by_themselves(tmp_path, mlp_run):
         ("horizon=nan", "horizon is nan, expected a number above 0 or null"),
         ("horizon=long", "horizon is 'long', expected a number above 0 or null"),
         ("step=-1", "step is -1, expected a number above 0 or null"),
-        ("windows=text", "windows is 'text', expected a list"),
-        ("windows=[0.1,nan]", "windows is [0.1, nan], expected a list"),
+        ("windows=text", "windows is 'text', expected null or a list"),
+        ("windows=[0.1,nan]", "windows is [0.1, nan], expected null or a list"),
         ("trajectory=9", "trajectory is 9, expected 0 to 1"),
     ],
 )

@@ -156,6 +156,12 @@ MISTAKES = {
         "loss.velocity_weight=x",
         "loss.hubber=1",
         "optimizer.lr=0",
+        "optimizer.lr=1e-300",
+        "optimizer.lr=1e300",
+        "loss.huber=1e300",
+        "loss.velocity_weight=1e300",
+        "trainer.gradient_clip_val=1e-300",
+        "model.inverse_mass.positivity.floor=1e300",
         "optimizer.lr=-0.1",
         "optimizer.lr=nan",
         "optimizer.lr=fast",
@@ -212,6 +218,10 @@ MISTAKES = {
     ],
     "control": [
         "gains.force=1",
+        "gains.position=1e300",
+        "gains.velocity=-1",
+        "controllers.pd.law.position_gain=1e300",
+        "reference.q=[[0.1], [x]]",
         "gains.position=true",
         "controllers.pd=3",
         "controllers.more={}",
@@ -299,6 +309,7 @@ MISTAKES = {
 
 MISTAKES["check"] = [
     "longest_delay=0",
+    "longest_delay=1e300",
     "longest_delay=null",
     "longest_delay=[1]",
     "dataset=3",
@@ -306,6 +317,12 @@ MISTAKES["check"] = [
     "dataset.files=3",
     "dataset.steps=3",
     "dataset.guard=x",
+    "dataset.q.unit=3",
+    "dataset.q.columns=nan",
+    "dataset.test=-1",
+    "dataset.test.runs=x",
+    "dataset.test.seconds=[-1]",
+    "dataset.validation.piece={a: 1}",
 ]
 
 

@@ -5,9 +5,11 @@ import pytest
 
 from pinn_dyn.app.build import _try_step
 from pinn_dyn.app.config import ConfigError, completed, composed
+from pinn_dyn.app.flags import in_order
 from pinn_dyn.app.parts import build_part
 from pinn_dyn.data.simulation import check_amount
 from pinn_dyn.training import SOAP
+from tests.app.entry import refused_text
 
 WORDS = [
     ("train", ["~validator"], "'~validator' takes away a key that train.py needs"),
@@ -29,6 +31,18 @@ WORDS = [
     ("train", ["experiment=soft_arm_1/hn"], "did you mean .*hnn"),
     ("control", ["reference=sett_point"], r"did you mean set_point"),
     ("train", ["model.inverse_mass.hidden.x=3"], "hidden is .*, which has no keys"),
+    ("train", ["scheduler=[]"], r"scheduler is \[\], expected the name of an option: one_cycle"),
+    ("check", ["dataset=range(3)"], "dataset is 0, expected the name of an option: .*example_log"),
+    ("check", ["dataset=${.}"], r"dataset is '\$\{\.\}', expected the name of an option"),
+    ("check", ["dataset=/dev/full"], "'dataset//dev/full' does not exist. Options of dataset: csv"),
+    ("check", ["dataset.q.sgn=1"], "no key 'dataset.q.sgn': did you mean dataset.q.sign"),
+    ("check", ["dataset.test={secnds: 1, piece: 1}"], "did you mean dataset.test.seconds"),
+    ("check", ["dataset.steps.x={a: 1}"], "no key 'dataset.steps.x'.* To add it, put a \\+ before"),
+    ("gather", ["filter.a=1"], "no key 'filter.a': filter is null, give filter={a: ...}"),
+    ("control", ["guard.treshold=3"], "no key 'guard.treshold': did you mean guard.threshold"),
+    ("train", ["dataset.labels=é"], "in quotes what has other signs than plain letters"),
+    ("train", ["hydra.job.env_set.A=1"], r"put a \+ before one that is new, as '\+hydra.job.env_s"),
+    ("train", ["hydra.job.env_copy=[NOWHERE]"], "cannot start with hydra.job.env_copy=.*NOWHERE"),
     ("train", ["seed=range(1,1)"], "is a sweep over 0 values"),
     ("train", ["seed=range(1000000000000)"], r"is a sweep over 1e\+12 values"),
     ("train", ["seed=[1"], r"'seed=\[1' cannot be read: expected key=value"),
@@ -54,11 +68,74 @@ def test_words_that_name_nothing(command, words, says):
         (["~trainer.steps"], r"^trainer\.steps is missing"),
         (["~dataset.name"], "dataset.name' not found: give it, or leave out what"),
         (["seed=${seed}"], "seed: Recursive interpolation"),
+        (["data.pairs=${oc.env:NOWHERE_AT_ALL}"], r"data\.pairs: .*NOWHERE_AT_ALL.*: set it, or"),
+        (["data=[1]"], "data is"),
+        (["dataset.system=[1]"], r"dataset.system: .*: give \[\.\.\.\] for a list, \{"),
+        (["dataset.step=${.}"], r"dataset.step: .*: expected \$\{key\}, as \$\{seed\}"),
     ],
 )
 def test_keys_that_are_taken_away_in_a_part(words, says):
     with pytest.raises(ConfigError, match=says):
         composed("train", ["model_name=x", *words])
+
+
+LOG = [*("dataset=csv_log", "dataset.files=a.csv", "dataset.q={columns: a, unit: rad}")]
+LOG += ["dataset.u={columns: b, unit: Nm}", "dataset.validation={seconds: 1, piece: 1}"]
+
+
+def test_keys_of_short_forms_need_no_plus():
+    words = ["dataset.test.seconds=2", "dataset.test.piece=1", "dataset.q.sign=-1"]
+    dataset = composed("check", [*LOG, *words, "dataset.shortest=0.5"])["dataset"]
+    assert dataset["shortest"] == 0.5
+    assert dataset["test"] == {"seconds": 2, "piece": 1}
+    assert dataset["validation"] == {"seconds": 1, "piece": 1}
+    assert dataset["q"] == {"columns": "a", "unit": "rad", "sign": -1}
+
+
+def test_a_set_point_for_each_run_has_the_right_kind():
+    words = ["run=x", "reference.q=[[0.1, 0.1, 0.2], [0, 0, 0.2]]"]
+    assert len(composed("control", words)["reference"]["q"]) == 2
+
+
+FLAGS = [
+    (["--resolve"], "--resolve belongs to --cfg, .*: give --cfg job with it"),
+    (["-p", "model"], "--package belongs to --cfg"),
+    (["--cfg", "job", "-m"], "--multirun and --cfg do not go together: give one of them"),
+    (["--run", "--multirun"], "--run and --multirun do not go together"),
+    (["--cfg"], "argument --cfg/-c: expected one argument"),
+    (["--cfg", "x"], "invalid choice: 'x'"),
+    (["-cn", "evaluate"], "--config-name is evaluate, expected none, as train.py has its own"),
+    (["-cp", "/tmp"], "--config-path is /tmp, expected none, .*: add groups .* by --config-dir"),
+    (["-cd", "/nowhere"], "--config-dir is /nowhere, expected a folder with groups"),
+    (["--experimental-rerun", "x"], "reads a pickle, which may run code"),
+    (["--multirum", "seed=1"], "unrecognized arguments: --multirum. A key has no dashes"),
+    (["--seed=1"], "unrecognized arguments: --seed=1. A key has no dashes, as seed=1"),
+    (["-sc"], "lacks one of install, uninstall, query"),
+    *[([word], f"'{word}' is no override, expected key=value") for word in ("seed", "", "=", "-")],
+    (["runs/x", "-m"], "'runs/x' is no override"),
+]
+
+
+@pytest.mark.parametrize(("words", "says"), FLAGS, ids=[" ".join(x[0]) for x in FLAGS])
+def test_flags_that_do_not_go(words, says):
+    with pytest.raises(ConfigError, match=says):
+        in_order("train", words)
+
+
+def test_flags_stand_anywhere():
+    ordered = ["-m", "--config-dir", ".", "model=lnn", "seed=1,2"]
+    assert in_order("train", ["model=lnn", "-m", "seed=1,2", "--config-dir", "."]) == ordered
+    assert in_order("train", ["seed=1", "--cfg", "job", "a=2"]) == ["--cfg", "job", "seed=1", "a=2"]
+    completion = ["-sc", "install=bash"]
+    assert in_order("train", completion) == completion
+
+
+@pytest.mark.parametrize(
+    "words", [["hydra.job_logging.version=3"], ["-m", "hydra.launcher=null"], ["--run", "-m"]]
+)
+def test_settings_of_hydra_that_break_it(monkeypatch, capsys, words):
+    said = refused_text(capsys, "gather.py", "runs=[x]", *words)
+    assert "Hydra cannot start with hydra." in said or "do not go together" in said
 
 
 def test_what_a_constructor_lacks_is_named_with_its_place():
