@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.data_record import check_data
 from pinn_dyn.app.evaluation_results import (
     SPLITS,
     Evaluation,
@@ -26,7 +27,7 @@ from pinn_dyn.app.evaluation_results import (
     write_intervals,
 )
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
-from pinn_dyn.app.run_folder import CONFIG, Run, check_data, find_runs, load_run, write_json
+from pinn_dyn.app.run_folder import CONFIG, Run, find_runs, load_run, write_json
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import Splits
 from pinn_dyn.data.whole import write_whole

@@ -28,19 +28,18 @@ from pinn_dyn.app.build import (
     epochs,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.data_record import check_data, write_data
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     CONFIG,
     METRICS,
-    check_data,
     claimed,
     load_run,
     read_checkpoint,
     read_config,
     recorded_error,
-    write_data,
     write_json,
 )
 from pinn_dyn.app.schema import check_value

@@ -9,7 +9,8 @@ import pytest
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.run_folder import check_data, read_config
+from pinn_dyn.app.data_record import check_data
+from pinn_dyn.app.run_folder import read_config
 from tests.app.entry import NO_FIGURES, ROOT, TINY_TRAINING, refused_text, run_script
 from tests.support.foreign_runs import foreign
 
