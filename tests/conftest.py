@@ -3,8 +3,17 @@
 import pytest
 import torch
 
+from tests.support.compositions import keep_compositions
+
 # The tests' tensors are small: threads beyond one only slow them down.
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kept_compositions():
+    with pytest.MonkeyPatch.context() as patch:
+        keep_compositions(patch)
+        yield
 
 
 @pytest.fixture
