@@ -15,6 +15,7 @@ import hydra
 import pytest
 
 from pinn_dyn.app.config import CONF
+from tests.support.processes import fork
 
 ROOT = Path(__file__).parents[2]
 
@@ -133,6 +134,18 @@ def start_process(script, *arguments, folder, output, **options):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **options,
     )
+
+
+def fork_script(script, *arguments, folder, output, own_session=False):
+    """The same in a copy of this process: PyTorch and Lightning take six seconds to import."""
+
+    def work():
+        if own_session:
+            os.setsid()
+        os.chdir(folder)
+        run_script(script, *arguments, checked=True)
+
+    return fork(work, output)
 
 
 def compose(*overrides):
