@@ -23,3 +23,15 @@ def traced(monkeypatch):
     Each kind of program is built by one test.
     """
     monkeypatch.setattr("pinn_dyn.mechanics.compilation._compile", lambda function, _: function)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """No pictures and no pages of the programs: they take longer than all else."""
+    monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+    monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
+    monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
+    monkeypatch.setattr("pinn_dyn.app.evaluate.draw", lambda *_: None)
+    monkeypatch.setattr("pinn_dyn.app.evaluate.prediction_report", lambda **_: "")
+    for name in ("terms_figure", "calibration_figure", "save"):
+        monkeypatch.setattr(f"pinn_dyn.app.evaluation_results.{name}", lambda *_, **__: None)

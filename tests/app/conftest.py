@@ -31,14 +31,3 @@ def lnn_run(tmp_path_factory):
 def mlp_run(tmp_path_factory):
     """The paper's black box."""
     return train(tmp_path_factory.mktemp("runs") / "mlp", "model=mlp", NO_FIGURES)
-
-
-@pytest.fixture
-def undrawn(monkeypatch):
-    """No pictures and no page of evaluate.py or control.py: they take longer than all else."""
-    monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
-    monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
-    monkeypatch.setattr("pinn_dyn.app.evaluate.draw", lambda *_: None)
-    monkeypatch.setattr("pinn_dyn.app.evaluate.prediction_report", lambda **_: "")
-    for name in ("terms_figure", "calibration_figure", "save"):
-        monkeypatch.setattr(f"pinn_dyn.app.evaluation_results.{name}", lambda *_, **__: None)
