@@ -5,6 +5,7 @@ import dataclasses
 
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.defaults_list import Overrides
 
 from pinn_dyn.app.config import CONF
@@ -34,6 +35,8 @@ def keep_compositions(patch):
             configs[key] = compose(self, defaults, repo)
         return copy.deepcopy(configs[key])
 
+    # Hydra copies all that its plugins stored for each question about a group.
+    patch.setattr(ConfigRepository, "__deepcopy__", lambda self, _: copy.copy(self), raising=False)
     patch.setattr(config_loader_impl, "create_defaults_list", kept_list)
     patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", kept_config)
 
