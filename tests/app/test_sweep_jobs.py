@@ -182,7 +182,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
     first = tmp_path / "sweep" / "0_lnn-seed0"
     log = tmp_path / "log.txt"
     with log.open("w") as output:
-        at = dict(folder=tmp_path, output=output)
+        at = dict(folder=tmp_path, output=output, anew=launcher == "joblib")
         process = fork_script("train.py", *words, **at, own_session=True)
         wait_for(process, (first / "checkpoints" / "last.ckpt").exists)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
