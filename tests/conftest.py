@@ -3,8 +3,17 @@
 import pytest
 import torch
 
+from tests.support.compositions import keep_compositions
+
 # The tests' tensors are small: threads beyond one only slow them down.
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kept_compositions():
+    with pytest.MonkeyPatch.context() as patch:
+        keep_compositions(patch)
+        yield
 
 
 @pytest.fixture
@@ -14,3 +23,15 @@ def traced(monkeypatch):
     Each kind of program is built by one test.
     """
     monkeypatch.setattr("pinn_dyn.mechanics.compilation._compile", lambda function, _: function)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """No pictures and no pages of the programs: they take longer than all else."""
+    monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+    monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
+    monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
+    monkeypatch.setattr("pinn_dyn.app.evaluate.draw", lambda *_: None)
+    monkeypatch.setattr("pinn_dyn.app.evaluate.prediction_report", lambda **_: "")
+    for name in ("terms_figure", "calibration_figure", "save"):
+        monkeypatch.setattr(f"pinn_dyn.app.evaluation_results.{name}", lambda *_, **__: None)

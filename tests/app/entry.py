@@ -6,8 +6,6 @@ import logging
 import os
 import re
 import runpy
-import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import hydra
 import pytest
 
 from pinn_dyn.app.config import CONF
+from tests.support.processes import fork
 
 ROOT = Path(__file__).parents[2]
 
@@ -121,18 +120,24 @@ def refused_text(capsys, script, *arguments):
     return text
 
 
-def start_process(script, *arguments, folder, output, **options):
-    """Start an entry script in another process, with its output going to a file."""
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / script), *arguments],
-        cwd=folder,
-        stdout=output,
-        stderr=subprocess.STDOUT,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        # A background shell makes its children ignore Ctrl-C; a terminal does not.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-        **options,
-    )
+def fork_script(script, *arguments, folder, output, own_session=False, anew=False):
+    """Run an entry script in a copy of this process, with its output going to a file.
+
+    The copy has imported PyTorch, which takes a program of its own six seconds; ``anew`` makes it
+    one, as joblib's workers need at its end.
+    """
+
+    def work():
+        if own_session:
+            os.setsid()
+        os.chdir(folder)
+        if anew:
+            environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+            words = [sys.executable, str(ROOT / script), *arguments]
+            os.execve(sys.executable, words, environment)
+        run_script(script, *arguments, checked=True)
+
+    return fork(work, output)
 
 
 def compose(*overrides):

@@ -37,7 +37,9 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(folder):
-    return pinn_dyn.fit(log(), q=Q, u=U, run="run", steps=2, folder=folder, overrides=SHORT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+        return pinn_dyn.fit(log(), q=Q, u=U, run="run", steps=2, folder=folder, overrides=SHORT)
 
 
 @pytest.fixture(scope="module")

@@ -58,14 +58,14 @@ def test_a_misspelt_key_in_a_sweep_is_answered_before_any_run(elsewhere):
 
 def test_a_misspelt_key_ends_the_real_program_with_an_error(elsewhere):
     done = subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), "data.pair=64"],
+        [sys.executable, str(ROOT / "train.py"), "sed=1"],
         capture_output=True,
         text=True,
         check=False,
         timeout=600,
     )
     assert done.returncode != 0
-    assert "did you mean data.pairs" in done.stderr
+    assert "did you mean seed" in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(elsewhere.iterdir())
 

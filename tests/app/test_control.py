@@ -47,13 +47,6 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """No pictures and no page: they take longer than the closed loop itself."""
-    monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
-    monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
-
-
 @pytest.fixture(scope="module")
 def results(tmp_path_factory, lnn_run):
     """Three runs at 200 Hz with an animation."""

@@ -104,6 +104,7 @@ def test_an_interval_holds_the_predictions_of_the_members(ensemble_run, lnn_run)
             model.predict_interval(start, u, t, **wrong)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_controller_takes_one_member(tmp_path, capsys, monkeypatch, ensemble_run, lnn_run):
     monkeypatch.chdir(tmp_path)
 

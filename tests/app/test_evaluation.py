@@ -135,6 +135,7 @@ def test_an_unknown_split_is_refused(capsys, mlp_run):
     assert "split is 'train', expected test or validation" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_seeds_of_a_model_are_grouped_and_globs_find_them(tmp_path, hnn_run, mlp_run, capsys):
     runs = tmp_path / "runs"
     shutil.copytree(hnn_run, runs / "a")
@@ -203,6 +204,7 @@ def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, mlp_run, capsys):
     assert str(run / "checkpoints" / "best.ckpt") in refused(capsys, run)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_missing_checkpoint_is_refused_with_those_there_are(tmp_path, mlp_run, capsys):
     run = copy(mlp_run, tmp_path / "mlp")
     (run / "checkpoints" / "best.ckpt").unlink()
@@ -237,6 +239,7 @@ def test_a_horizon_beyond_the_data_is_refused(hnn_run, capsys):
     assert "lasts only 0.2 s" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_horizon_and_windows_fit_the_data_by_themselves(tmp_path, mlp_run):
     run_script("evaluate.py", f"runs=[{mlp_run}]", f"hydra.run.dir={tmp_path / 'out'}")
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
@@ -265,6 +268,7 @@ def test_no_runs_are_refused_by_name(capsys):
     assert "runs is empty, expected run folders" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("damage", ["config.yaml", "metrics.json", "checkpoints/best.ckpt"])
 def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, capsys, damage):
     whole, cut = copy(mlp_run, tmp_path / "a"), copy(mlp_run, tmp_path / "b")

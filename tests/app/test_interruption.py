@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pinn_dyn.training import WholeCheckpoints
-from tests.app.entry import NO_FIGURES, TINY, start_process
+from tests.app.entry import NO_FIGURES, TINY, fork_script
 
 
 def test_a_checkpoint_is_replaced_only_by_a_whole_one(tmp_path, monkeypatch):
@@ -55,15 +55,15 @@ def test_a_terminated_training_ends_with_a_status_and_can_go_on(tmp_path, sweep)
     with log.open("w") as output:
         length = ["trainer.steps=50000", "trainer.validations=1000", "compile=false", "model=lnn"]
         words = [*TINY, *length, NO_FIGURES, *where]
-        process = start_process("train.py", *words, folder=tmp_path, output=output)
+        process = fork_script("train.py", *words, folder=tmp_path, output=output)
         try:
-            while not last.is_file() and process.poll() is None:
+            while not last.is_file() and process.is_alive():
                 time.sleep(0.05)
             process.terminate()
-            status = process.wait(timeout=120)
+            process.join(120)
         finally:
             process.kill()
-    assert status == 128 + signal.SIGTERM, log.read_text()
+    assert process.exitcode == 128 + signal.SIGTERM, log.read_text()
     text = log.read_text()
     assert f"train.py resume={folder}" in text or (sweep and "the sweep is not finished" in text)
     assert torch.load(last, weights_only=True)["global_step"] > 0

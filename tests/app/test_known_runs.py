@@ -1,6 +1,7 @@
 """Runs of known mechanics that others start from: a network on top, or the robot with a load."""
 
 import re
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -17,15 +18,17 @@ WINDOWS = ["data.pairs=20", "data.batch_size=20", "data.steps=2", NO_FIGURES]
 SMALL = [*WINDOWS, "optimizer.rollouts=false"]
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))
-    monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PINN_DYN_LOGS", str(LOGS))
+        patch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+        yield
 
 
-@pytest.fixture
-def fitted(tmp_path):
-    folder = tmp_path / "known"
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory, quick):
+    folder = tmp_path_factory.mktemp("runs") / "known"
     run_script("train.py", KNOWN, *SMALL, f"hydra.run.dir={folder}")
     return folder
 
@@ -67,6 +70,7 @@ def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted):
     assert apart < 0.5 * max(float((else_where[k] - before[k]).abs().max()) for k in before)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
     run_script(
         "evaluate.py",
@@ -100,11 +104,12 @@ FORGED = {
 
 
 def test_a_covariance_that_is_none_is_no_prior(tmp_path, fitted, capsys):
-    path = fitted / "checkpoints" / "best.ckpt"
+    forged = shutil.copytree(fitted, tmp_path / "forged")
+    path = forged / "checkpoints" / "best.ckpt"
     whole = torch.load(path, weights_only=True)
     for change, message in FORGED.values():
         torch.save({**whole, "covariance": change(whole["covariance"])}, path)
-        start = [f"start_from={fitted}", f"hydra.run.dir={tmp_path / 'no'}"]
+        start = [f"start_from={forged}", f"hydra.run.dir={tmp_path / 'no'}"]
         text = refused_text(capsys, "train.py", KNOWN, *SMALL, *start)
         assert re.search(message, text, re.DOTALL)
 

@@ -137,6 +137,7 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
     assert str(run.parent) in text
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("mistake", "words"),
     [
@@ -191,6 +192,7 @@ def test_presets_of_hardware_have_the_structure_of_the_paper():
         assert preset.model.friction._target_.endswith("CoulombFriction")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
     table = motion(6.0)
     formats.write_bag(tmp_path / "run", table)

@@ -14,8 +14,8 @@ from tests.app.entry import (
     STRIDE,
     TINY,
     fails,
+    fork_script,
     run_script,
-    start_process,
 )
 
 
@@ -144,45 +144,30 @@ def test_a_search_goes_past_diverged_trials_and_asks_for_the_same_ones_again(swe
     assert len(list((tmp_path / "sweep").glob("*/.hydra"))) == 4
 
 
-SIDE_BY_SIDE = [
-    "-m",
-    "hydra/launcher=joblib",
-    "hydra.launcher.n_jobs=2",
-    *TINY,
-    NO_FIGURES,
-    "hydra.sweep.dir=sweep",
-]
-
-
 def ended(process, log, seconds=300):
-    try:
-        return process.wait(timeout=seconds), log.read_text()
-    finally:
-        process.kill()
+    process.join(seconds)
+    process.kill()  # if it has not ended
+    return process.exitcode, log.read_text()
 
 
-def test_jobs_side_by_side_simulate_once_lose_one_and_the_others_are_done(tmp_path, monkeypatch):
+def test_jobs_side_by_side_simulate_once_lose_one_and_the_others_are_done(
+    sweep, tmp_path, monkeypatch
+):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    loky = pytest.importorskip("joblib.externals.loky")
     monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "cold"))
-    log = tmp_path / "log.txt"
-    with log.open("w") as output:
-        process = start_process(
-            "train.py",
-            *SIDE_BY_SIDE,
-            "model=lnn",
-            "optimizer.lr=0.005,0.01,1e9",
-            folder=tmp_path,
-            output=output,
-        )
-        code, said = ended(process, log)
-    assert code == 1, said
+    two = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    try:
+        said = sweep(*two, "model=lnn", "optimizer.lr=0.005,0.01,1e9")
+    finally:
+        loky.get_reusable_executor().shutdown()
     assert "1 job failed:\n  sweep/2_lnn-seed0\n    NonFiniteLossError" in said
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 2
     assert len(list((tmp_path / "cold").glob("*.npz"))) == 1
 
 
 def wait_for(process, condition):
-    while not condition() and process.poll() is None:
+    while not condition() and process.is_alive():
         time.sleep(0.05)
 
 
@@ -192,39 +177,41 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = [
         *("-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"),
-        *(f"hydra/launcher={launcher}", "trainer.steps=400", "trainer.validations=40"),
+        *(f"hydra/launcher={launcher}", "trainer.steps=100", "trainer.validations=10"),
     ]
     first = tmp_path / "sweep" / "0_lnn-seed0"
     log = tmp_path / "log.txt"
     with log.open("w") as output:
-        at = dict(folder=tmp_path, output=output)
-        process = start_process("train.py", *words, **at, start_new_session=True)
+        at = dict(folder=tmp_path, output=output, anew=launcher == "joblib")
+        process = fork_script("train.py", *words, **at, own_session=True)
         wait_for(process, (first / "checkpoints" / "last.ckpt").exists)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
         code, said = ended(process, log)
         assert code not in (0, None), said
         assert "the sweep is not finished; go on with: python train.py -m " in said
         assert not (first / "metrics.json").exists()
-        code, said = ended(start_process("train.py", *words, **at), log)
+        code, said = ended(fork_script("train.py", *words, **at), log)
     assert code == 0, said
     assert f"going on with the training in {first}" in (first / "train.log").read_text()
     for seed in (0, 1):
         folder = tmp_path / "sweep" / f"{seed}_lnn-seed{seed}"
-        assert record(folder)["steps"] == 400
+        assert record(folder)["steps"] == 100
 
 
-def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
-    words = ["-m", *TINY, NO_FIGURES, "model=lnn,mlp", STRIDE, "trainer.steps=5"]
+@pytest.mark.parametrize("models", ["lnn", pytest.param("lnn,mlp", marks=pytest.mark.slow)])
+def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path, models):
+    """Of a sweep each job starts two, which import PyTorch."""
+    words = ["-m", *TINY, NO_FIGURES, f"model={models}", STRIDE, "trainer.steps=5"]
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         at = dict(folder=tmp_path, output=output)
-        process = start_process("train.py", *words, "trainer=ddp", "hydra.sweep.dir=ddp", **at)
+        process = fork_script("train.py", *words, "trainer=ddp", "hydra.sweep.dir=ddp", **at)
         try:
             run_script("train.py", *words, f"hydra.sweep.dir={tmp_path / 'cpu'}")
         finally:
             code, said = ended(process, log)
     assert code == 0, said
-    for name in ("0_lnn-seed0", "1_mlp-seed0"):
+    for name in (f"{number}_{model}-seed0" for number, model in enumerate(models.split(","))):
         alone, together = (tmp_path / trainer / name for trainer in ("cpu", "ddp"))
         one, two = (
             torch.load(path / "checkpoints" / "last.ckpt", weights_only=True)

@@ -284,6 +284,7 @@ def test_the_figure_is_written(sweep, gather):
     assert (sweep.parent / "gathered" / "sweep.png").stat().st_size > 10_000
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_real_runs_are_gathered_with_their_evaluation(
     tmp_path, gather, monkeypatch, hnn_run, lnn_run, mlp_run
 ):

@@ -44,7 +44,7 @@ def test_trust_ends_where_the_package_ends(target):
     assert not trust.may_build(target, ("my_arms",))
 
 
-@pytest.mark.usefixtures("my_package")
+@pytest.mark.usefixtures("my_package", "undrawn")
 def test_trust_is_given_on_the_command_line(tmp_path, monkeypatch, lnn_run):
     monkeypatch.chdir(tmp_path)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.app.entry import NO_FIGURES, TINY, start_process
+from tests.app.entry import NO_FIGURES, TINY, fork_script
 from tests.support.processes import alive
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are seen in /proc")
@@ -65,15 +65,14 @@ def test_a_killed_sweep_leaves_no_process(tmp_path, after):
     words = ["-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"]
     words += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "trainer.steps=400"]
     with (tmp_path / "log.txt").open("w") as output:
-        process = start_process(
-            "train.py", *words, folder=tmp_path, output=output, start_new_session=True
-        )
-        while len(alive(process.pid)) < 4 and process.poll() is None:
+        at = dict(folder=tmp_path, output=output, own_session=True, anew=True)
+        process = fork_script("train.py", *words, **at)
+        while len(alive(process.pid)) < 4 and process.is_alive():
             time.sleep(0.02)
         time.sleep(after)
         assert len(alive(process.pid)) >= 4  # two workers, and who tracks what they share
         process.kill()
-        process.wait()
+        process.join()
     try:
         assert gone(lambda: alive(process.pid), seconds=10)
     finally:

@@ -2,13 +2,13 @@
 
 import logging
 import multiprocessing
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pinn_dyn.data.cache import cache_key, load_or_make
-from tests.data.cache_worker import load_slowly
 
 DESCRIPTION = {"mass": 0.3, "counts": [2, 3], "name": "arm"}
 
@@ -172,8 +172,22 @@ def test_the_final_name_appears_only_with_the_whole_file(tmp_path, make, monkeyp
     assert seen == [[".lock", ".partial"]]
 
 
+def load_slowly(folder, barrier, results):
+    """Load an entry whose making takes a while and leaves a line in a file."""
+
+    def make():
+        with (folder / "makes.txt").open("a") as file:
+            file.write("made\n")
+        time.sleep(0.5)
+        return {"t": np.array([0.0, 0.5, 1.0])}
+
+    barrier.wait(timeout=600)
+    arrays = load_or_make(folder / "cache", "arm", DESCRIPTION, make)
+    results.put({key: value.tolist() for key, value in arrays.items()})
+
+
 def test_two_processes_at_once_make_the_file_once(tmp_path: Path):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")  # which has imported everything
     barrier, results = context.Barrier(2), context.Queue()
     workers = [
         context.Process(target=load_slowly, args=(tmp_path, barrier, results)) for _ in range(2)

@@ -104,8 +104,8 @@ def compose(program, overrides, folder):
     Types and ranges are checked too, unless a value is missing, which no command of ours gives.
     """
     candidates = [folder, *sorted(path for path in folder.glob("*conf") if path.is_dir())]
-    paths = ",".join(f"file://{path}" for path in candidates)
-    words = [f"hydra.searchpath=[{paths}]", *overrides]
+    paths = [f"file://{path}" for path in candidates if any(path.glob("*/*.yaml"))]
+    words = [f"hydra.searchpath=[{','.join(paths)}]", *overrides] if paths else overrides
     try:
         cfg = _composed(program, words)
     except MissingConfigException as error:

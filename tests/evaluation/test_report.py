@@ -281,7 +281,7 @@ def test_floors_are_in_brackets_and_a_model_that_loses_to_one_has_no_bold_figure
     assert "No model beats every floor in error_mean: 'hnn' has" in page.text
 
 
-def test_parts_of_sums_have_a_section_where_there_are_any():
+def test_parts_of_sums_have_a_section_where_there_are_any(prediction):
     parts = pd.DataFrame(
         {
             "part": ["known", "network"],
@@ -294,7 +294,7 @@ def test_parts_of_sums_have_a_section_where_there_are_any():
     rows = Page(prediction_page(parts=parts)[0]).table("share of all parts")
     assert [row["part"][0] for row in rows] == ["known", "network"]
     assert rows[1]["share of all parts"][0] == "0.048"
-    assert "share of all parts" not in prediction_page()[0]
+    assert "share of all parts" not in prediction[0]
 
 
 def test_torque_errors_have_a_section_where_there_are_any():

@@ -25,6 +25,8 @@ def home(tmp_path_factory):
         patch.chdir(folder)
         patch.setenv("HOME", str(folder))
         patch.setenv("PINN_DYN_CACHE", str(folder / "cache"))
+        # The picture of the cleaning takes longer than the training.
+        patch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
         yield folder
 
 

@@ -41,7 +41,7 @@ def arm_runs():
 
 
 def fitted(model, runs, **settings):
-    windows = draw_windows(runs, count=30, steps=4, stride=1, seed=0)
+    windows = draw_windows(runs, count=60, steps=2, stride=1, seed=0)
     fit = LeastSquares(cutoff=20.0, **settings).fit(model, runs, windows)
     return constants_table(model, fit).set_index("name"), fit
 

@@ -6,9 +6,9 @@ import time
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.app.entry import NO_FIGURES, TINY, run_script, start_process
+from tests.app.entry import NO_FIGURES, TINY, fork_script, run_script
 
-EPOCHS, BATCHES = 8, 25
+EPOCHS, BATCHES = 8, 10
 LONG = [
     *TINY,
     NO_FIGURES,
@@ -40,21 +40,23 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         at = dict(folder=tmp_path, output=output)
-        process = start_process("train.py", *LONG, f"hydra.run.dir={killed}", **at)
+        process = fork_script("train.py", *LONG, f"hydra.run.dir={killed}", **at)
         try:
-            while epoch_of(last) < 1 and process.poll() is None:
+            while epoch_of(last) < 1 and process.is_alive():
                 time.sleep(0.02)
         finally:
             process.kill()
-        assert process.wait(timeout=10) == -signal.SIGKILL, log.read_text()
+        process.join(10)
+        assert process.exitcode == -signal.SIGKILL, log.read_text()
         assert not (killed / "metrics.json").exists()
         cut = torch.load(last, weights_only=True)
         assert 1 <= cut["epoch"] < EPOCHS - 1
         logs = set(killed.rglob("events.out.tfevents.*"))
-        process = start_process("train.py", f"resume={killed}", **at)
+        process = fork_script("train.py", f"resume={killed}", **at)
         try:
             run_script("train.py", *LONG, f"hydra.run.dir={whole}")
-            assert process.wait(timeout=600) == 0, log.read_text()
+            process.join(600)
+            assert process.exitcode == 0, log.read_text()
         finally:
             process.kill()
     first, second = (
