@@ -14,8 +14,8 @@ class OutsideTheDataContract:
     """The suite, at states up to ``times`` the range of the data."""
 
     times = 5.0
-    duration = 20.0
-    """Of a roll-out without input, s: what is far from the data is over."""
+    duration = 100.0
+    """Of a roll-out without input, s."""
     tolerance = 1e-5
     """Of the integrator, relative."""
 
