@@ -88,12 +88,15 @@ def panda() -> str:
     """The Panda in PyBullet over windows of three lengths."""
     data = pd.read_csv(RESULTS / "panda" / "summary.csv")
     columns = ["window_0.05s_error_mean", "window_0.5s_error_mean", "error_mean", "error_median"]
+    runs = data.groupby(["model", "pairs"], sort=False)
+    means, counts = runs[columns].mean(), runs[["diverged", "trajectories"]].sum()
     rows = []
-    for _, row in data.iterrows():
-        cells = [bold(number(row[c]), row[c] == data[c].min()) for c in columns]
-        diverged = f"{row['diverged']} of {row['trajectories']}"
-        pairs = row["pairs"] * _PANDA_STEPS.get(row["model"], 1)
-        rows.append([f"`{row['model']}`", f"{pairs:,}", *cells, diverged])
+    for (model, windows), row in means.iterrows():
+        cells = [bold(number(row[c]), row[c] == means[c].min()) for c in columns]
+        lost, every = counts.loc[(model, windows)]
+        diverged = f"{lost} of {every}"
+        pairs = windows * _PANDA_STEPS.get(model, 1)
+        rows.append([f"`{model}`", f"{pairs:,}", *cells, diverged])
     for label, name in (("keeps its velocity", FLOOR), ("true equation, the same RK4", GROUND)):
         figures = floors(name).loc["panda"]
         rows.append([label, "–", *(number(figures[c]) for c in columns), "0 of 20"])
