@@ -147,7 +147,7 @@ def test_a_filter_keeps_what_meets_all_its_conditions(sweep, gather, condition, 
 
 
 def test_sorting_takes_numbers_as_numbers(sweep, gather):
-    table, _ = gather(f"runs=[{sweep}]", "sort=data.pairs", "plot_column=val/error_mean")
+    table, _ = gather(f"runs=[{sweep}]", "sort=data.pairs")
     assert list(table["data.pairs"]) == [16, 16, 128, 128]
 
 
