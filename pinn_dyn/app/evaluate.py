@@ -59,6 +59,7 @@ from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack_until
 log = logging.getLogger(__name__)
 
 # Columns of the terminal's table; the files hold all of them.
+_PRINTED = 8  # coordinates whose matrices a terminal has room for
 _SHOWN = (
     "error_mean",
     "error_std",
@@ -163,6 +164,8 @@ def evaluate(cfg: DictConfig) -> float:
     shown += [name for name in summary if name.startswith("valid_time_")]
     shown += [name for name in summary if name.endswith(("s_error_mean", "s_diverged"))]
     text = terms_text(comparisons)
+    if comparisons and len(source.labels) > _PRINTED:
+        text = f"learned and true terms are in {folder / 'terms.txt'}"
     print(f"\n{text}" if text else "")
     trajectories = f"{truth.q.shape[0]} {SPLITS[split]}"
     print(f"{source.name}: {trajectories}, {config['horizon']:g} s open loop")
