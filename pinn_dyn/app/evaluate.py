@@ -58,8 +58,8 @@ from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack_until
 
 log = logging.getLogger(__name__)
 
-# Columns of the terminal's table; the files hold all of them.
 _PRINTED = 8  # coordinates whose matrices a terminal has room for
+# Columns of the terminal's table; the files hold all of them.
 _SHOWN = (
     "error_mean",
     "error_std",
