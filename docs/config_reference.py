@@ -181,8 +181,9 @@ def _find(package, target: str):
 
 
 def _linked(package, target: str) -> str:
-    name = target.rsplit(".", 1)[-1]
-    return f"`{target}`" if _find(package, target) is None else f"[`{name}`][{target}]"
+    if target.startswith("pinn_dyn.app.") or _find(package, target) is None:  # without a page
+        return f"`{target}`"
+    return f"[`{target.rsplit('.', 1)[-1]}`][{target}]"
 
 
 def _classes(package, value: yaml.Node) -> list[str]:
