@@ -57,7 +57,7 @@ lint: $(VENV)/.installed-dev  ## check style, types and import order
 	$(BIN)/lint-imports
 
 docs: $(VENV)/.installed-docs  ## build the documentation into site/index.html
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs --quiet build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 notebooks: $(VENV)/.installed-notebooks  ## run the notebooks and keep what they show
 	$(BIN)/jupyter execute --inplace --timeout=900 notebooks/*.ipynb
