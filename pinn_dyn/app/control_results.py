@@ -38,6 +38,7 @@ from pinn_dyn.evaluation import (
     tip_path_figure,
     write_table,
 )
+from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
@@ -205,7 +206,8 @@ def _figures(
     )
     first = next(iter(records.values()))
     if isinstance(robot, Drawable):
-        times = [time for time in _STRIP_TIMES if time <= config["duration"]]
+        end = float(first.t[samples_before_stop(first, run) - 1])
+        times = [time for time in _STRIP_TIMES if time <= end]
         figures["strip"] = pose_strip(
             first, run, robot, times, title=f"{source.name}, {next(iter(records))} controller"
         )

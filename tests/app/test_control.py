@@ -120,6 +120,14 @@ def test_limits_noise_and_delay_reach_the_loop(tmp_path, results, lnn_run, undra
     assert pd.read_csv(folder / "summary.csv")["saturated_samples"].sum() > 0
 
 
+def test_a_run_that_was_stopped_is_drawn_up_to_there(tmp_path, lnn_run):
+    words = ["gains.position=1e5", "gains.velocity=1e3", "rate=100", "duration=0.4", "runs=1"]
+    folder = control(tmp_path / "out", lnn_run, *words, "settled_after=0.2")
+    assert pd.read_csv(folder / "summary.csv").set_index("controller").loc["learned", "stopped"]
+    assert (folder / "strip.png").is_file()
+    assert "the plant diverged" in (folder / "report.html").read_text()
+
+
 def test_the_stability_report_has_the_conditions_and_every_set_point(tmp_path, lnn_run, undrawn):
     box = f"stability={{region: a small box, q_low: {LOW}, q_high: {HIGH}, samples: 20}}"
     folder = control(tmp_path, lnn_run, "rate=200", box, "~controllers.pd", "~controllers.truth")
