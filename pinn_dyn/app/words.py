@@ -22,7 +22,7 @@ _INSTEAD = {
     "Interpolation key": ": give it, or leave out what takes it away",
     "Environment variable": ": set it, or give another value",
     "merge DictConfig with ListConfig": ": give [...] for a list, {...} for keys",
-    "merge incompatible container types": ": give [...] for a list, {...} for keys",  # OmegaConf 2.4
+    "merge incompatible container types": ": give [...] for a list, {...} for keys",  # 2.4
     "HydraConfig was not set": ": where the key is there already, leave out the + before it",
     "extraneous input": ": expected ${key}, as ${seed}",
 }
