@@ -204,7 +204,13 @@ def require_same(path: Path, saved: dict[str, Any], folder: Path, config: dict[s
                 f"{path} holds weights of another {_WHAT[part]} than {folder / CONFIG} describes "
                 f"({_differing(here, there)})"
             )
-    here, there = ({k: one[k] for k in _LEARNING if k in one} for one in (config, saved))
+    here, there = (
+        {
+            **{key: one[key] for key in _LEARNING if key in one},
+            "trainer": {k: v for k, v in dict(one.get("trainer") or {}).items() if k == "steps"},
+        }
+        for one in (config, saved)
+    )
     if there != here:
         raise ConfigError(
             f"{path} is of another training than {folder / CONFIG} describes "

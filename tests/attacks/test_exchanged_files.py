@@ -38,6 +38,7 @@ def exchange(run, other, name):
     [
         ("optimizer", {"lr": 0.5}, "optimizer.lr is 0.5, the checkpoint has "),
         ("data", {"pairs": 1000}, "data.pairs is 1000, the checkpoint has 64"),
+        ("trainer", {"steps": 8}, "trainer.steps is 8, the checkpoint has 2"),
         (None, {"seed": 7}, "seed is 7, the checkpoint has 0"),
     ],
 )
