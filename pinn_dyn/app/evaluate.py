@@ -27,7 +27,7 @@ from pinn_dyn.app.evaluation_results import (
     write_intervals,
 )
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
-from pinn_dyn.app.run_folder import CONFIG, Run, find_runs, load_run, write_json
+from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, write_json
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import Splits
 from pinn_dyn.data.whole import write_whole
@@ -222,6 +222,12 @@ def _load_all(
             ]:
                 raise ConfigError(f"its {CONFIG} has no {', '.join(missing)}, it may be cut short")
             runs.append(run)
+            if not (folder / METRICS).is_file():
+                log.warning(
+                    "%s has no %s: its training goes on, or was interrupted, and the errors are "
+                    "those of what it has learned so far",
+                    *(folder, METRICS),
+                )
         except Exception as error:  # a file that is cut short raises nearly anything
             said = f"{type(error).__name__} {error}"
             text = str(error) if isinstance(error, ConfigError) else f"it may be cut short: {said}"

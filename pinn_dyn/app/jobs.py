@@ -58,6 +58,8 @@ def find_jobs(patterns: list[str] | str) -> list[Job]:
     found: dict[Path, Job] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         places = [Path(p) for p in sorted(glob.glob(os.path.expanduser(pattern)))]
+        if pattern and not places and Path(pattern).is_dir():  # a name with [ or * in it
+            places = [Path(pattern)]
         below = {
             path.parent.parent if path.parent.name == ".hydra" else path.parent
             for place in places
@@ -92,6 +94,9 @@ def _read_job(folder: Path) -> Job | None:
             problem = _last_words(folder)
         elif not resolved or not isinstance(config.get("seed"), int):
             record, problem = None, f"failed: {CONFIG} cannot be read"
+        elif record.get("seed", config["seed"]) != config["seed"]:
+            problem = f"failed: {METRICS} is of seed {record['seed']}, {CONFIG} of another one"
+            record = None
     return Job(folder, config, derived, record, problem)
 
 

@@ -38,6 +38,8 @@ _LOCK = ".lock"
 log = logging.getLogger(__name__)
 
 _PLACES = ("dataset.cache",)  # where things lie does not change what is learned
+# Beside the model and the data set, what decides which weights come out.
+_LEARNING = ("seed", "data", "loss", "optimizer", "scheduler")
 # Of a record, beside those of its validation.
 _NUMBERS = ("pairs", "parameters", "steps", "training_seconds", "training_cpu_seconds")
 
@@ -164,14 +166,7 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
     path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
     saved = read_checkpoint(path)
     parameters = saved["hyper_parameters"]
-    for part in ("model", "dataset"):
-        there = {k: v for k, v in parameters["config"][part].items() if k != "cache"}
-        here = {k: v for k, v in config[part].items() if k != "cache"}
-        if there != here:
-            raise ConfigError(
-                f"{path} holds weights of another {_WHAT[part]} than {folder / CONFIG} describes "
-                f"({_differing(here, there)})"
-            )
+    require_same(path, parameters["config"], folder, config)
     try:
         statistics = Statistics.from_dict(parameters["statistics"])
     except ValueError as error:
@@ -180,7 +175,48 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
     _take_weights(model, path, folder, saved["state_dict"])
     found = saved.get(COVARIANCE)
     covariance = found if isinstance(found, torch.Tensor) and found.ndim == 2 else None
-    return Run(folder, config, model.eval(), statistics, read_metrics(folder) or {}, covariance)
+    metrics = read_metrics(folder) or {}
+    if metrics.get("seed", config["seed"]) != config["seed"]:
+        raise ConfigError(
+            f"{folder / METRICS} is of another run: its seed is {metrics['seed']}, and that of "
+            f"{folder / CONFIG} is {config['seed']}: bring its own back, or train it again"
+        )
+    return Run(folder, config, model.eval(), statistics, metrics, covariance)
+
+
+def require_same(path: Path, saved: dict[str, Any], folder: Path, config: dict[str, Any]) -> None:
+    """Refuse a checkpoint whose training was not that of a run's configuration.
+
+    Args:
+        path: the checkpoint.
+        saved: the configuration that it holds.
+        folder: the run folder.
+        config: the configuration of the run.
+
+    Raises:
+        ConfigError: with the first value that differs.
+    """
+    for part in ("model", "dataset"):
+        there = {k: v for k, v in saved[part].items() if k != "cache"}
+        here = {k: v for k, v in config[part].items() if k != "cache"}
+        if there != here:
+            raise ConfigError(
+                f"{path} holds weights of another {_WHAT[part]} than {folder / CONFIG} describes "
+                f"({_differing(here, there)})"
+            )
+    here, there = (
+        {
+            **{key: one[key] for key in _LEARNING if key in one},
+            "trainer": {k: v for k, v in dict(one.get("trainer") or {}).items() if k == "steps"},
+        }
+        for one in (config, saved)
+    )
+    if there != here:
+        raise ConfigError(
+            f"{path} is of another training than {folder / CONFIG} describes "
+            f"({_differing(here, there)}): bring back the file that was exchanged or edited, or "
+            "train again in a folder of its own"
+        )
 
 
 def _take_weights(
@@ -298,15 +334,18 @@ def find_runs(patterns: list[str] | str) -> list[Path]:
     """
     if not patterns:
         raise ConfigError("runs is empty, expected run folders or globs, as runs=[runs/my_arm/*]")
-    found: list[Path] = []
+    found: dict[Path, Path] = {}  # a run that is linked, or named in two ways, is one
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = sorted(Path(p) for p in glob.glob(os.path.expanduser(pattern)))
+        if not matches and (Path(pattern) / CONFIG).is_file():  # a name with [ or * in it
+            matches = [Path(pattern)]
         folders = [p for p in matches if (p / CONFIG).is_file()]
         if not folders:
             what = "matches nothing" if not matches else f"matches no run folder (no {CONFIG})"
             raise ConfigError(f"runs: '{pattern}' {what}; give folders that train.py wrote")
-        found += [p for p in folders if p not in found]
-    return found
+        for p in folders:
+            found.setdefault(p.resolve(), p)
+    return list(found.values())
 
 
 @contextlib.contextmanager

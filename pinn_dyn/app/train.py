@@ -40,6 +40,7 @@ from pinn_dyn.app.run_folder import (
     read_checkpoint,
     read_config,
     recorded_error,
+    require_same,
     write_json,
 )
 from pinn_dyn.app.schema import check_value
@@ -119,7 +120,7 @@ def train(cfg: DictConfig) -> float:
             log.info("already trained, to train again delete %s", folder)
             return error
         try:
-            return train_in(folder, config, _whole(folder, checkpoint), trust)
+            return train_in(folder, config, _whole(folder, checkpoint, trust), trust)
         except SystemExit as stop:  # Lightning's end of an interrupted training
             if HydraConfig.get().mode == RunMode.RUN:
                 log.warning("interrupted; go on with: python train.py resume=%s", folder)
@@ -127,11 +128,12 @@ def train(cfg: DictConfig) -> float:
             raise SystemExit(stop.code or 128 + signal.SIGTERM) from stop
 
 
-def _whole(folder: Path, checkpoint: Path) -> Path | None:
+def _whole(folder: Path, checkpoint: Path, trust: tuple[str, ...] = ()) -> Path | None:
     """The checkpoint that the training of a folder goes on from; None if it starts anew.
 
     Raises:
-        ConfigError: if the checkpoint is damaged; says from which other one to go on.
+        ConfigError: if the checkpoint is damaged; says from which other one to go on. Also if it
+            is of another training.
     """
     if not checkpoint.is_file():
         return None
@@ -149,6 +151,8 @@ def _whole(folder: Path, checkpoint: Path) -> Path | None:
             f"{error}\nGo on from the best checkpoint, of step {step}, with: python train.py "
             f"resume={folder} resume_from=best"
         ) from error
+    saved = read_checkpoint(checkpoint)["hyper_parameters"]["config"]
+    require_same(checkpoint, saved, folder, read_config(folder, trust))
     log.info("going on with the training in %s from step %d", folder, step)
     return checkpoint
 

@@ -57,7 +57,7 @@ def test_a_pickle_that_runs_code_is_refused(run, tmp_path, capsys):
 def test_the_trainer_itself_reads_no_code(run, tmp_path, monkeypatch):
     """Behind the check of the file, which is taken away here."""
     change(run, payload=Marker(tmp_path / "was_here"))
-    monkeypatch.setattr(training, "_whole", lambda folder, checkpoint: checkpoint)
+    monkeypatch.setattr(training, "_whole", lambda folder, checkpoint, trust: checkpoint)
     with pytest.raises(UnpicklingError, match="Weights only load failed"):
         run_script("train.py", f"resume={run}")
     assert not (tmp_path / "was_here").exists()

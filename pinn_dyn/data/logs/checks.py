@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,8 @@ _SAMPLE_TIMES = (1e-5, 0.5)
 # What factor between dq/dt and v needs no warning, and the correlation that determines it.
 _FACTORS = (0.8, 1.25)
 _CLEAR = 0.8
+# The factor of one run alone, which noise in its v makes smaller.
+_FACTORS_OF_A_RUN = (0.5, 2.0)
 # Share of the samples in which a robot may rest without a warning.
 _AT_REST = 0.9
 # Share of rows right after the one before from which stamps come in bursts.
@@ -276,6 +279,49 @@ def check_velocities(
                 f"{name}: v is not the derivative of q, their correlation is {correlation:.2f}, "
                 f"expected nearly 1: {cause}"
             )
+
+
+def check_velocities_of_runs(
+    parts: Mapping[str, list[Recording]], q: Columns, v: Columns, step: float, report: Report
+) -> None:
+    """Warns of single runs whose v has another unit or sign than that of most runs.
+
+    Args:
+        parts: the stretches of training, validation and test.
+        q, v: their columns.
+        step: the sample time, s.
+        report: takes the warnings.
+    """
+    runs: dict[tuple[str, str], list[Recording]] = {}
+    for split, stretches in parts.items():
+        for item in stretches:
+            runs.setdefault((item.run, split), []).append(item)
+    factors = np.array([_clear_factors(own, step) for own in runs.values()])
+    low, high = _FACTORS_OF_A_RUN
+    for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
+        clear = factors[~np.isnan(factors[:, k]), k]
+        if not len(clear):  # the training is warned of as a whole
+            continue
+        usual = float(np.median(clear))
+        for ((run, split), own), factor in zip(runs.items(), factors[:, k], strict=True):
+            place = f"{run} ({split}), columns {a!r} and {b!r}"
+            if moves(own, k) and not any(item.v[:, k].any() for item in own if item.v is not None):
+                report.warn(f"{place}: v is zero throughout this run, while q moves")
+            if not np.isnan(factor) and not low <= factor / usual <= high:
+                report.warn(
+                    f"{place}: the derivative of q is {factor:.4g} times v in this run, and "
+                    f"{usual:.4g} times in most: has it other units or signs?"
+                )
+
+
+def _clear_factors(stretches: list[Recording], step: float) -> np.ndarray:
+    """What v is multiplied by to be the derivative of q, ``(N,)``; NaN where that is not clear."""
+    found = [_agreement(stretches, step, samples) for samples in (10, 100, 1000)]
+    correlations = np.abs([np.diag(c) for c, _ in found])
+    best = correlations.argmax(axis=0)[None]
+    clear = np.take_along_axis(correlations, best, 0)[0] >= _CLEAR
+    factors = np.take_along_axis(np.array([np.diag(f) for _, f in found]), best, 0)[0]
+    return np.where(clear, factors, np.nan)
 
 
 def moves(training: list[Recording], k: int) -> bool:

@@ -13,6 +13,8 @@ from pinn_dyn.data.logs.step import Step
 
 # A row may be this much late, as a multiple of the median sample time, before it counts as a gap.
 GAP_FACTOR = 3.0
+# Share of rows like the one before from which a log has them twice.
+_WRITTEN_TWICE = 0.2
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,14 @@ class RowClock(Step):
                 f" off a clock of {step:.6g} s, more than longest, {self.longest} s: rows are "
                 "missing, or the rate changes: put SplitGaps before it, or raise longest to the "
                 "length of some bursts"
+            )
+        signals = [x for x in (recording.q, recording.v, recording.u) if x is not None]
+        again = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in signals], axis=0)
+        twice = again & (np.diff(recording.t) == 0)
+        if twice.mean() > _WRITTEN_TWICE:
+            raise LogError(
+                f"{recording.place}: RowClock found {int(twice.sum())} rows with the stamp and all "
+                "the values of the row before: they were written twice; put Deduplicate before it"
             )
         text = f"t from the row number, {step:.6g} s a row; stamps were up to {off[k]:.4g} s off"
         return [replace(recording, t=recording.t[0] + line)], text

@@ -18,6 +18,8 @@ _LARGEST = 1e12
 # A row further from its neighbours than so many times what is usual is no motion.
 _FACTOR = {"q": 10.0, "v": 10.0, "u": 20.0}
 _NEIGHBOURS = 7
+# So often one value far from its neighbours stands for none; how far, in usual steps.
+_OFTEN, _FAR = 4, 20.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ def check_rows(rows: Rows, t: np.ndarray, report: Report, *, jumps_are_removed: 
                 _check_wrap(rows, k, in_step)
             _check_mixture(rows, k)
         if not jumps_are_removed:
+            _check_dropouts(rows, k, report)
             _check_jumps(rows, k, in_step, report)
 
 
@@ -96,6 +99,25 @@ def _check_mixture(rows: Rows, k: int) -> None:
             f"{rows.place(1, k)}: rows go to and fro by {one:.4g} {rows.columns.units[k]}, and "
             f"every second row by {two:.4g}: two runs share the clock; name the column that tells "
             "them apart in 'trajectory', or write each to a file of its own"
+        )
+
+
+def _check_dropouts(rows: Rows, k: int, report: Report) -> None:
+    """One value in single rows, far from their neighbours: so many that no step is unusual."""
+    x = rows.values[:, k]
+    # Of a long log so many steps tell what is usual.
+    steps = np.abs(np.diff(x))[:: 1 + len(x) // 50_000]
+    if rows.signal == "u" or not steps.any():
+        return
+    far = np.abs(x - median_filter(x, _NEIGHBOURS, mode="nearest"))
+    spikes = np.flatnonzero(far > _FAR * np.median(steps[steps > 0]))
+    found, first, counts = np.unique(x[spikes], return_index=True, return_counts=True)
+    if len(found) and counts.max() >= _OFTEN:
+        most = int(counts.argmax())
+        report.warn(
+            f"{rows.place(int(spikes[first[most]]), k)}: the value {found[most]:.5g} "
+            f"{rows.columns.units[k]} comes in {counts[most]} rows, each far from its neighbours: "
+            "does it stand for 'no value'? Remove these rows, or add a RemoveJumps step"
         )
 
 

@@ -27,6 +27,15 @@ Group = tuple[str, slice | np.ndarray]
 _PART = 200_000  # rows of a CSV file that are parsed together
 _LONGEST_HEADER = 130_000
 _MOST_COLUMNS = 10_000
+# What a file that is no text begins with, and what to do with it.
+_NO_TEXT = {
+    b"\x1f\x8b": "it is packed by gzip: end its name in .gz, or unpack it",
+    b"PK\x03\x04": "it is a zip archive, or a table of Excel: unpack it, or save it as CSV",
+    b"\xfd7zXZ": "it is packed by xz: unpack it",
+    b"BZh": "it is packed by bzip2: unpack it",
+    b"(\xb5/\xfd": "it is packed by zstd: unpack it",
+    b"\x00\x05\x16\x07": "macOS writes such files beside others: delete it",
+}
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
@@ -151,10 +160,15 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
         if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", str(raw.iloc[k])):
             what += ", with a decimal comma: write points (in a file whose columns are separated by"
             what += " ';', replace every ',' by '.')"
+        cure = "repair or remove these rows"
+        if signal == "time" and bad.all() and re.search(r"\d:\d", str(raw.iloc[k])):
+            cure = (
+                "write seconds instead, as by (t - t.iloc[0]).dt.total_seconds() after "
+                "t = pandas.to_datetime(table[...])"
+            )
         raise LogError(
             f"{path}, line {table.index[k]}, column {name!r} ({signal}): the value {what}, "
-            f"expected a number ({int(bad.sum())} such rows in this column): repair or remove "
-            "these rows"
+            f"expected a number ({int(bad.sum())} such rows in this column): {cure}"
         )
     return values
 
@@ -230,7 +244,10 @@ def _read_csv(path: Path) -> pd.DataFrame:
         EOFError,
         zlib.error,
     ) as error:
-        raise LogError(f"{path}: cannot be read as CSV with a header line: {error}") from error
+        said = " ".join(str(error).split())
+        raise LogError(
+            f"{path}: cannot be read as CSV with a header line: {_cause(path) or said}"
+        ) from error
     # Pandas would number columns of one name.
     names = next(csv.reader([header], delimiter=separator, skipinitialspace=True), [])
     found = names if len(names) == table.shape[1] else table.columns
@@ -242,6 +259,28 @@ def _read_csv(path: Path) -> pd.DataFrame:
     if not filled:
         raise LogError(f"{path}: has no rows, expected a header line and rows of numbers")
     return table.iloc[:filled]
+
+
+def _cause(path: Path) -> str | None:
+    """What pandas does not say: a file that is no text, or lines above the header."""
+    if path.suffix == ".gz":
+        return None
+    with path.open("rb") as file:
+        start = file.read(2 * _LONGEST_HEADER)
+    for magic, what in _NO_TEXT.items():
+        if start.startswith(magic):
+            return what
+    first, *others = start.decode("utf-8", "ignore").splitlines()[:8] or [""]
+    if first.lower().startswith("sep="):
+        return f"line 1 is {shown(first)}, which Excel alone understands: delete it"
+    counts = [max(line.count(separator) for separator in ",;\t") for line in (first, *others)]
+    more = max(counts, default=0)
+    if more > counts[0]:
+        return (
+            f"line 1 has {counts[0] + 1} columns and line {counts.index(more) + 1} has {more + 1}: "
+            "is line 1 the header? Delete lines above it, and name each column"
+        )
+    return None
 
 
 def _opened(path: Path) -> BinaryIO:

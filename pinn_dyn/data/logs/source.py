@@ -23,6 +23,7 @@ from pinn_dyn.data.logs.checks import (
     check_stamps,
     check_unseen_inputs,
     check_velocities,
+    check_velocities_of_runs,
 )
 from pinn_dyn.data.logs.columns import Columns, check_columns, check_units
 from pinn_dyn.data.logs.errors import LogError
@@ -50,6 +51,7 @@ from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import Part, split
 from pinn_dyn.data.logs.step import Step
+from pinn_dyn.data.logs.twins import check_twins, check_units_of_runs
 from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
@@ -278,13 +280,20 @@ class LogSource(DataSource):
             check_stamps(recordings, list(self.steps.values()), report)
             check_inputs(recordings, self.u, report)
             check_angles(recordings, self.q, report)
+            measured = {key: x for key, x in self._signals.items() if key != "time"}
+            check_twins(recordings, measured, report)
+            check_units_of_runs(recordings, measured, report)
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
             check_copies(parts, report)
             cleaned = self._clean(parts, report)
             step = one_sample_time(cleaned)
-            training = [item for part in cleaned if part.split == "train" for item in part.clean]
+            stretches: dict[str, list[Recording]] = {split: [] for split in SPLITS}
+            for one in cleaned:
+                stretches[one.split] += one.clean
+            training = stretches["train"]
             if self.v is not None:
                 check_velocities(training, self.q, self.v, step, report)
+                check_velocities_of_runs(stretches, self.q, self.v, step, report)
             check_force_signs(training, self.u, step, report)
             check_rest(training, self.q, report)
             report.add("Splits", "train", summary(training, step))
@@ -292,7 +301,8 @@ class LogSource(DataSource):
             for name, part in (("validation", self.validation), ("test", self.test)):
                 kept[name] = pieces_of(name, part, cleaned, step, report)
             check_unseen_inputs(training, kept["validation"] + kept["test"], self.u, report)
-            check_repeats(training, kept["test"], "test", report)
+            for name in ("validation", "test"):
+                check_repeats(training, kept[name], name, report)
             splits = Splits(
                 **{
                     name: [trajectory(item, step, self.interpolation) for item in items]
