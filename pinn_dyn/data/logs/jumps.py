@@ -105,12 +105,14 @@ def _check_mixture(rows: Rows, k: int) -> None:
 def _check_dropouts(rows: Rows, k: int, report: Report) -> None:
     """One value in single rows, far from their neighbours: so many that no step is unusual."""
     x = rows.values[:, k]
-    # Of a long log so many steps tell what is usual.
-    steps = np.abs(np.diff(x))[:: 1 + len(x) // 50_000]
-    if rows.signal == "u" or not steps.any():
+    if rows.signal == "u":
         return
-    far = np.abs(x - median_filter(x, _NEIGHBOURS, mode="nearest"))
-    spikes = np.flatnonzero(far > _FAR * np.median(steps[steps > 0]))
+    every = np.abs(np.diff(x))
+    steps = every[:: 1 + len(x) // 50_000]  # of a long log so many tell what is usual
+    if not steps.any() or not (every > (far := _FAR * np.median(steps[steps > 0]))).any():
+        return
+    off = np.abs(x - median_filter(x, _NEIGHBOURS, mode="nearest"))
+    spikes = np.flatnonzero(off > far)
     found, first, counts = np.unique(x[spikes], return_index=True, return_counts=True)
     if len(found) and counts.max() >= _OFTEN:
         most = int(counts.argmax())

@@ -75,9 +75,9 @@ def _distance(q: np.ndarray, track: np.ndarray, thin: int) -> float:
     """Smallest mean square distance of q ``(T, N)`` from every ``thin``-th sample of a track."""
     best = np.inf
     centre = q.mean(axis=0)
-    q, track = q - centre, track - centre
+    q = q - centre
     for start in range(0, thin, max(1, thin // 4)):
-        other = track[start::thin]
+        other = track[start::thin] - centre
         if len(other) >= len(q):
             squares = np.cumsum(np.r_[0.0, (other**2).sum(axis=1)])
             energy = squares[len(q) :] - squares[: -len(q)]
