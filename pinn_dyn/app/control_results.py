@@ -208,9 +208,9 @@ def _figures(
     if isinstance(robot, Drawable):
         end = float(first.t[samples_before_stop(first, run) - 1])
         times = [time for time in _STRIP_TIMES if time <= end]
-        figures["strip"] = pose_strip(
-            first, run, robot, times, title=f"{source.name}, {next(iter(records))} controller"
-        )
+        if first.stopped[run] is None or len(times) > 1:  # one pose is no motion
+            title = f"{source.name}, {next(iter(records))} controller"
+            figures["strip"] = pose_strip(first, run, robot, times, title=title)
     if isinstance(reference, Helix) and isinstance(robot, HasTip):
         figures["tip_path"] = tip_path_figure(
             first.t,

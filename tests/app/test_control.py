@@ -120,11 +120,12 @@ def test_limits_noise_and_delay_reach_the_loop(tmp_path, results, lnn_run, undra
     assert pd.read_csv(folder / "summary.csv")["saturated_samples"].sum() > 0
 
 
-def test_a_run_that_was_stopped_is_drawn_up_to_there(tmp_path, lnn_run):
+def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, lnn_run):
     words = ["gains.position=1e5", "gains.velocity=1e3", "rate=100", "duration=0.4", "runs=1"]
     folder = control(tmp_path / "out", lnn_run, *words, "settled_after=0.2")
     assert pd.read_csv(folder / "summary.csv").set_index("controller").loc["learned", "stopped"]
-    assert (folder / "strip.png").is_file()
+    assert (folder / "closed_loop_learned.png").is_file()
+    assert not (folder / "strip.png").exists()  # one pose is no motion
     assert "the plant diverged" in (folder / "report.html").read_text()
 
 
