@@ -15,6 +15,7 @@ import sys
 import traceback
 import warnings
 from functools import partial
+from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -26,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pinn_dyn.app import words
 from pinn_dyn.app.config import ConfigError, completed, config_folder
 from pinn_dyn.app.flags import in_order
-from pinn_dyn.app.sweep import how_to_go_on
+from pinn_dyn.app.sweep import how_to_go_on, write_error
 
 # Of a disk that is full, also by a quota or a limit on one file, or that may only be read.
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -64,6 +65,7 @@ def main(command: str) -> None:
             said = str(error) if known else _in_a_line(command, error)
             if said is None or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # SweepCallback then goes on with the other jobs
+            write_error(Path(HydraConfig.get().runtime.output_dir), error)
             raise SystemExit(f"Error: {said}") from error
 
     hush()

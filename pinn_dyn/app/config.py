@@ -13,7 +13,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.keys import GIVEN, KEYS
 from pinn_dyn.app.schema import ConfigError, check, did_you_mean, short_form
 from pinn_dyn.app.schema import arguments as arguments_of
 from pinn_dyn.app.words import OVERRIDE, check_words, chooses, parsed, refused, said
@@ -114,7 +114,7 @@ def completed(command: str, arguments: list[str]) -> list[str]:
             keys = list(dict.fromkeys([*_keys(known), *also]))
             if key in keys:  # under a part that another word takes away
                 raise ConfigError(f"there is no {place} for '{key}' with {' '.join(before)}")
-            close = did_you_mean(key, keys)
+            close = did_you_mean(key, [one for one in keys if one not in GIVEN])
             inside = _at(known, place)
             if place and inside is None and place in keys:
                 close = f": {place} is null, give {place}={{{name}: ...}}."

@@ -56,15 +56,9 @@ class SweepCallback(Callback):
         if isinstance(error, BaseException) and not isinstance(error, Exception):
             return  # an end that was asked for, of which Hydra 1.4 tells too
         if job_return.status == JobStatus.FAILED:
-            said = f"{type(error).__name__}: {error}"
-            details = "".join(traceback.format_exception(error))
-            path = Path(config.hydra.runtime.output_dir) / ERROR
-            try:
-                path.write_text(f"{said}\n\n{details}")
-            except OSError as problem:  # a full disk leaves an empty file, which counts too
-                log.error("%s cannot be written: %s", path, problem)
+            write_error(Path(config.hydra.runtime.output_dir), error)
             if sweep:
-                log.error("failed: %s", said)
+                log.error("failed: %s: %s", type(error).__name__, error)
                 job_return.status = JobStatus.COMPLETED
                 job_return.return_value = math.inf
         elif sweep and math.isnan(job_return.return_value):
@@ -87,6 +81,16 @@ class SweepCallback(Callback):
                 lines += [f"  {path.parent}", f"    {first_line(path)}"]
             lines.append(f"run what is missing with: {_same_command(folder)}")
             raise SystemExit("\n".join(lines))
+
+
+def write_error(folder: Path, error: Exception) -> None:
+    """Leave an ``error.txt`` in the folder of a job, for those who gather its results."""
+    said = f"{type(error).__name__}: {error}"
+    details = "".join(traceback.format_exception(error))
+    try:
+        (folder / ERROR).write_text(f"{said}\n\n{details}")
+    except OSError as problem:  # a full disk leaves an empty file, which counts too
+        log.error("%s cannot be written: %s", folder / ERROR, problem)
 
 
 def first_line(path: Path) -> str:

@@ -55,6 +55,15 @@ def test_a_failed_job_does_not_end_the_sweep_and_is_listed_with_its_error(sweep,
         assert not (job(tmp_path, name) / "error.txt").exists()
 
 
+def test_a_single_run_that_failed_leaves_its_error_too(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="data: 100000 windows"):
+        run_script("train.py", *TINY, NO_FIGURES, "data.pairs=100000", "hydra.run.dir=one")
+    assert "Traceback" in (tmp_path / "one" / "error.txt").read_text()
+    run_script("gather.py", "runs=[one]", "plot=null", "hydra.run.dir=gathered")
+    assert "failed: ConfigError: data: 100000 windows" in capsys.readouterr().out
+
+
 def test_the_same_sweep_again_skips_what_is_done_and_runs_the_rest(sweep, tmp_path, monkeypatch):
     choices = ["model=lnn", "seed=0,1", "trainer.steps=4"]
     assert sweep(*choices) is None

@@ -39,6 +39,7 @@ WORDS = [
     ("check", ["dataset.test={secnds: 1, piece: 1}"], "did you mean dataset.test.seconds"),
     ("check", ["dataset.steps.x={a: 1}"], "no key 'dataset.steps.x'.* To add it, put a \\+ before"),
     ("gather", ["filter.a=1"], "no key 'filter.a': filter is null, give filter={a: ...}"),
+    ("train", ["trainer.stpes=3"], "no key 'trainer.stpes': did you mean (?!.*max_steps).*steps"),
     ("control", ["guard.treshold=3"], "no key 'guard.treshold': did you mean guard.threshold"),
     ("train", ["dataset.labels=é"], "in quotes what has other signs than plain letters"),
     ("train", ["hydra.job.env_set.A=1"], r"put a \+ before one that is new, as '\+hydra.job.env_s"),
