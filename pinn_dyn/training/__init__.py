@@ -1,7 +1,6 @@
 """Training: the LightningModule, losses, gradients, schedule."""
 
 from pinn_dyn.training.checkpoints import WholeCheckpoints
-from pinn_dyn.training.fit import fit
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.least_squares import Fit, LeastSquares
 from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
@@ -25,6 +24,5 @@ __all__ = [
     "Penalized",
     "WholeCheckpoints",
     "WindowLoss",
-    "fit",
     "one_cycle",
 ]
