@@ -24,10 +24,12 @@ from pinn_dyn.app.run_folder import CONFIG, claimed
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.train import train_in
 from pinn_dyn.app.words import OVERRIDE
-from pinn_dyn.data import DataSource
+from pinn_dyn.data import DataSource, store
 
 STEPS = 1000
 """Of the optimizer, on a data frame: a minute or two."""
+TRAJECTORIES = "trajectories.npz"
+"""In a run folder, the data of a source that Python made."""
 _VALIDATIONS = 10  # at most, in such a training
 
 
@@ -117,9 +119,8 @@ def fit(
             config["callbacks"].pop("figures", None)  # which nobody could see
         source = data if isinstance(data, DataSource) else None
         if source is not None:
-            # An object has no configuration: what the run folder can say of it.
-            labels = {"labels": list(source.labels), "input_labels": list(source.input_labels)}
-            config["dataset"] = {"name": source.name, **labels}
+            # An object has no configuration: its trajectories stay in the run folder.
+            config["dataset"] = store(source, place / TRAJECTORIES)
         threads = torch.get_num_threads()
         stack.callback(torch.set_num_threads, threads)
         try:

@@ -247,16 +247,17 @@ def test_the_same_training_by_train_has_the_same_weights(model, folder, tmp_path
         assert torch.equal(value.float(), expected[name].float()), name
 
 
+class Still(pinn_dyn.DataSource):
+    name, labels, input_labels = "still", ["q [m]"], ["u [N]"]
+
+    def load(self):
+        t = torch.arange(21, dtype=torch.float64) * 0.01
+        q, u = (t**2 / 2).unsqueeze(1), torch.ones(21, 1).double()
+        one = pinn_dyn.Trajectory(q, t.unsqueeze(1), pinn_dyn.Signal(t, u))
+        return pinn_dyn.Splits([one], [one], [one])
+
+
 def test_fit_leaves_the_random_numbers_and_the_threads_alone(black_box, folder):
-    class Still(pinn_dyn.DataSource):
-        name, labels, input_labels = "still", ["q [m]"], ["u [N]"]
-
-        def load(self):
-            t = torch.arange(21, dtype=torch.float64) * 0.01
-            q, u = (t**2 / 2).unsqueeze(1), torch.ones(21, 1).double()
-            one = pinn_dyn.Trajectory(q, t.unsqueeze(1), pinn_dyn.Signal(t, u))
-            return pinn_dyn.Splits([one], [one], [one])
-
     torch.manual_seed(5)
     expected = torch.rand(2)
     torch.manual_seed(5)
@@ -268,6 +269,18 @@ def test_fit_leaves_the_random_numbers_and_the_threads_alone(black_box, folder):
     assert not fitted.folder.exists()
     assert fitted.labels == ["q [m]"]
     assert fitted.predict([0.0, 0.0], np.ones((3, 1)), [0, 0.01, 0.02]).shape == (3, 2)
+
+
+def test_a_source_made_in_python_can_be_evaluated_and_controlled_from_its_folder(tmp_path):
+    short = ["data.pairs=8", "data.batch_size=8", "data.stride=1", "validator.horizon=0.1"]
+    run = tmp_path / "run"
+    pinn_dyn.fit(Still(), model="lnn", steps=1, overrides=short, folder=run)
+    run_script("evaluate.py", f"runs=[{run}]", f"hydra.run.dir={tmp_path / 'evaluation'}")
+    rows = pd.read_csv(tmp_path / "evaluation" / "summary.csv")
+    assert {"lnn", "stands still", "keeps its velocity"} <= set(rows["model"])
+    wanted = ["reference.q=[0.1]", f"hydra.run.dir={tmp_path / 'control'}"]
+    run_script("control.py", f"run={run}", *wanted)
+    assert (tmp_path / "control" / "report.html").is_file()
 
 
 @pytest.mark.parametrize(
