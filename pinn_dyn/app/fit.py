@@ -17,7 +17,7 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError, composed
-from pinn_dyn.app.frame import Signals, frame_dataset
+from pinn_dyn.app.frame import Signals, frame_dataset, in_frame
 from pinn_dyn.app.keys import KEYS, Count
 from pinn_dyn.app.learned_model import LearnedModel, load
 from pinn_dyn.app.run_folder import CONFIG, claimed
@@ -127,6 +127,8 @@ def fit(
             with isolate_rng(), warnings.catch_warnings(), claimed(place, config):
                 hush()
                 train_in(place, config, source=source)
+        except ConfigError as error:
+            raise ConfigError(in_frame(str(error), place)) from error
         except SystemExit as stop:  # Lightning's end of an interrupted training
             raise KeyboardInterrupt from stop
         return load(place)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pandas as pd
 import yaml
 
 from pinn_dyn.data.logs import Columns, LogError
-from pinn_dyn.data.logs.reader import column, numbers
+from pinn_dyn.data.logs.reader import THE_FRAME, column, numbers
 from pinn_dyn.data.whole import whole, write_whole
 
 Signals = str | Sequence[str] | Mapping[str, Any]
@@ -45,8 +46,9 @@ def frame_dataset(
         raise LogError(f"run is {run!r}, expected the name of a column, or None")
     described = {name: _described(name, given) for name, given in signals.items()}
     columns = {name: Columns.from_config(name, given) for name, given in described.items()}
-    path = Path("the frame")
-    values = {name: numbers(frame, path, x.columns, name) for name, x in columns.items()}
+    path = THE_FRAME
+    rows = frame.reset_index(drop=True)
+    values = {name: numbers(rows, path, x.columns, name) for name, x in columns.items()}
     if not len(frame):
         raise LogError("the frame has no rows, expected a log")
     t = columns["time"].to_si(values["time"])[:, 0]
@@ -81,6 +83,13 @@ def frame_dataset(
         "data=multi_step",
         *(f"{key}={value}" for key, value in settings.items()),
     ]
+
+
+def in_frame(said: str, folder: Path) -> str:
+    """What an error says of a line in the written file, as of a row of the frame, from 0 on."""
+    place = re.escape(str(folder / FRAME))
+    said = re.sub(rf"{place}, line (\d+)", lambda line: f"the frame, row {int(line[1]) - 2}", said)
+    return said.replace("otherwise repair the file", "otherwise repair the frame")
 
 
 def _described(name: str, given: Signals) -> dict[str, Any]:

@@ -154,7 +154,7 @@ def test_a_lacking_argument_is_named(model):
     ("change", "expected"),
     [
         (lambda x: x.rename(columns={"bend_x": "bendx"}), "no column 'bend_x'.*mean 'bendx'"),
-        (lambda x: x.assign(force=np.nan), "the frame, line 251, column 'force' .*empty or NaN"),
+        (lambda x: x.assign(force=np.nan), "the frame, row 251, column 'force' .*empty or NaN"),
         (lambda x: x.assign(t=x.t * 1000), "unit of the time wrong"),
         (lambda x: x[:0], "the frame has no rows"),
         (lambda x: x[:5], "5 samples are too few for SavitzkyGolayVelocity"),
@@ -300,6 +300,16 @@ def test_what_cannot_be_fitted_is_refused_by_name(changes, expected):
     arguments = {"q": Q, "u": U, "run": "run", "steps": 1, "overrides": SHORT, **changes}
     with pytest.raises(ValueError, match=expected):
         pinn_dyn.fit(log(), **arguments)
+
+
+def test_a_row_of_a_frame_is_named_by_its_number_not_by_a_line_of_a_file_that_is_gone():
+    frame = log()
+    frame.loc[260, "t"] = 0.0
+    with pytest.raises(ValueError, match=r"data: the frame, row 260, column 't': the time goes"):
+        pinn_dyn.fit(frame, q=Q, u=U, run="run", steps=1, overrides=SHORT)
+    frame.loc[260, "t"] = np.nan
+    with pytest.raises(ValueError, match=r"the frame, row 260, column 't' .*empty or NaN"):
+        pinn_dyn.fit(frame, q=Q, u=U, run="run", steps=1, overrides=SHORT)
 
 
 def test_columns_belong_to_a_frame(folder, model):
