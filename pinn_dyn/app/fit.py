@@ -128,7 +128,9 @@ def fit(
                 hush()
                 train_in(place, config, source=source)
         except ConfigError as error:
-            raise ConfigError(in_frame(str(error), place)) from error
+            if not isinstance(data, pd.DataFrame):
+                raise
+            raise ConfigError(in_frame(str(error), data, place)) from error
         except SystemExit as stop:  # Lightning's end of an interrupted training
             raise KeyboardInterrupt from stop
         return load(place)

@@ -47,8 +47,7 @@ def frame_dataset(
     described = {name: _described(name, given) for name, given in signals.items()}
     columns = {name: Columns.from_config(name, given) for name, given in described.items()}
     path = THE_FRAME
-    rows = frame.reset_index(drop=True)
-    values = {name: numbers(rows, path, x.columns, name) for name, x in columns.items()}
+    values = {name: numbers(frame, path, x.columns, name) for name, x in columns.items()}
     if not len(frame):
         raise LogError("the frame has no rows, expected a log")
     t = columns["time"].to_si(values["time"])[:, 0]
@@ -85,10 +84,13 @@ def frame_dataset(
     ]
 
 
-def in_frame(said: str, folder: Path) -> str:
-    """What an error says of a line in the written file, as of a row of the frame, from 0 on."""
-    place = re.escape(str(folder / FRAME))
-    said = re.sub(rf"{place}, line (\d+)", lambda line: f"the frame, row {int(line[1]) - 2}", said)
+def in_frame(said: str, frame: pd.DataFrame, folder: Path) -> str:
+    """What an error says of a line in the written file, as of a row by the index of the frame."""
+    said = re.sub(
+        rf"{re.escape(str(folder / FRAME))}, line (\d+)",
+        lambda line: f"the frame, row {frame.index[int(line[1]) - 2]}",
+        said,
+    )
     return said.replace("otherwise repair the file", "otherwise repair the frame")
 
 
