@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.models.friction import Friction
-from pinn_dyn.models.known_constants import PositiveConstants
+from pinn_dyn.models.known_constants import Named, PositiveConstants
 from pinn_dyn.models.scales import Scales
 
 _SLOWEST = 0.01
@@ -37,17 +37,27 @@ class DriveCoulomb(Friction):
         super().__init__()
         force, v_std = scales.value, scales.statistics.v_std.double()
         self.slowest = _SLOWEST * float(v_std.mean())
-        joints = [str(k + 1) for k in range(scales.size)]
+        names = [joint.name for joint in scales.joints]
+        self.forces = [joint.force for joint in scales.joints]
+        self.speeds = [joint.speed for joint in scales.joints]
         self.level = PositiveConstants(
-            level * force, spread, [f"Coulomb friction of joint {k}" for k in joints]
+            level * force, spread, [f"Coulomb friction of {name}" for name in names], self.forces
         )
         self.width = PositiveConstants(
-            width * v_std, spread, [f"width of the friction of joint {k}" for k in joints]
+            width * v_std, spread, [f"friction width of {name}" for name in names], self.speeds
         )
-        self._add_constants(scales, joints)
+        self._add_constants(scales, names)
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
         """What a law of a higher rung has besides level and width."""
+
+    def physical_constants(self) -> list[Named]:
+        """The level or levels, and the width that acts: with the least one in it."""
+        width = self.width.named()
+        return [*self._levels(), width._replace(values=self._width(), lower=self.slowest)]
+
+    def _levels(self) -> list[Named]:
+        return [self.level.named()]
 
     def forward(self, v: Tensor) -> Tensor:
         return self._level(v)[0] * torch.tanh(v / self._width())
@@ -71,10 +81,19 @@ class AsymmetricCoulomb(DriveCoulomb):
     A level for each direction, as worn and preloaded gears have. Arguments as of the rung below.
     """
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
-        # c+ and c- are the level times e^r and e^-r.
-        names = [f"asymmetry of the friction of joint {k}" for k in joints]
-        self.ratio = PositiveConstants(torch.ones(scales.size), 0.5, names)
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        # c+ and c- are the level times the asymmetry, and divided by it.
+        asymmetries = [f"friction asymmetry of {name}" for name in names]
+        ones = torch.ones(scales.size)
+        self.ratio = PositiveConstants(ones, 0.5, asymmetries, ["1"] * scales.size)
+
+    def _levels(self) -> list[Named]:
+        level, ratio = self.level(), self.ratio()
+        found = []
+        for sign, values in ((">", level * ratio), ("<", level / ratio)):
+            names = [name.replace(" of ", f" (v {sign} 0) of ", 1) for name in self.level.names]
+            found.append(Named(names, self.forces, values, lower=0.0))
+        return found
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
         level, ratio = self.level(), self.ratio()
@@ -89,12 +108,15 @@ class Stribeck(AsymmetricCoulomb):
     the rungs below.
     """
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
-        super()._add_constants(scales, joints)
-        rises = [f"Stribeck rise of joint {k}" for k in joints]
-        speeds = [f"Stribeck speed of joint {k}" for k in joints]
-        self.rise = PositiveConstants(0.03 * scales.value, 1.0, rises)
-        self.speed = PositiveConstants(0.3 * scales.statistics.v_std, 1.0, speeds)
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        super()._add_constants(scales, names)
+        rises = [f"Stribeck rise of {name}" for name in names]
+        speeds = [f"Stribeck speed of {name}" for name in names]
+        self.rise = PositiveConstants(0.03 * scales.value, 1.0, rises, self.forces)
+        self.speed = PositiveConstants(0.3 * scales.statistics.v_std, 1.0, speeds, self.speeds)
+
+    def physical_constants(self) -> list[Named]:
+        return [*super().physical_constants(), self.rise.named(), self.speed.named()]
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
         level, _ = super()._level(v)
@@ -117,12 +139,22 @@ class LoadDependent(Stribeck):
 
     by_load = True
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
-        super()._add_constants(scales, joints)
-        names = [f"loss by load of joint {k}" for k in joints]
-        self.odds = PositiveConstants(torch.full((scales.size,), 0.05), 1.0, names)
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        super()._add_constants(scales, names)
+        losses, start = (
+            [f"loss by load of {name}" for name in names],
+            torch.full((scales.size,), 0.05),
+        )
+        self.odds = PositiveConstants(start, 1.0, losses, ["1"] * scales.size)
+
+    def physical_constants(self) -> list[Named]:
+        return [*super().physical_constants(), self.odds.named()._replace(values=self._loss())]
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """f - l |f| tanh(v / w), with l = odds / (1 + odds)."""
+        """f - l |f| tanh(v / w)."""
+        return force - self._loss() * force.abs() * torch.tanh(v / self._width())
+
+    def _loss(self) -> Tensor:
+        """l, from its odds."""
         odds = self.odds()
-        return force - odds / (1 + odds) * force.abs() * torch.tanh(v / self._width())
+        return odds / (1 + odds)
