@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 _CONSTANTS = "constants.csv"
 _UNDETERMINED = "undetermined.md"
-_SHOWN = 3  # lines of it in the log
+_SHOWN = 2  # lines of each kind in the log
 
 
 def write_constants(model: Predictor, result: Fit, source: DataSource, folder: Path) -> None:
@@ -38,19 +38,20 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
         table.to_csv(partial, index=False)
     log.info("constants and their intervals are in %s", folder / _CONSTANTS)
     left = undetermined(model, result)
-    lines = [
+    known = [
         f"{row.name}: only this is determined, {row.value:.4g} ({row.low:.4g} to {row.high:.4g}) "
         f"{row.unit}"
         for row in together.itertuples(index=False)
     ]
-    lines += left
     head = f"{len(left)} of {len(model.parameter_names())} directions of the constants are held by "
     head += "the prior, not by the data"
     path = folder / _UNDETERMINED
-    write_whole(path, f"{head}.\n\n" + "".join(f"- {line}\n" for line in lines))
-    if lines:
-        more = f"; and {len(lines) - _SHOWN} more" if len(lines) > _SHOWN else ""
-        log.warning("%s (%s): %s%s", head, path, "; ".join(lines[:_SHOWN]), more)
+    write_whole(path, f"{head}.\n\n" + "".join(f"- {line}\n" for line in [*known, *left]))
+    if known or left:
+        shown = [*known[:_SHOWN], *left[:_SHOWN]]
+        more = len(known) + len(left) - len(shown)
+        shown += [f"and {more} more lines in {path}" if more else f"see {path}"]
+        log.warning("%s: %s", head, "; ".join(shown))
 
 
 def read_constants(folders: Mapping[str, Path]) -> dict[str, pd.DataFrame]:

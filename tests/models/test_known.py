@@ -100,8 +100,8 @@ def test_a_body_that_cannot_be_is_named():
 
 
 def test_standardized_constants():
-    positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"])
-    real = RealConstants(torch.tensor([4.0]), ["c"])
+    positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"], ["kg", "kg"])
+    real = RealConstants(torch.tensor([4.0]), ["c"], ["N"])
     assert positive().tolist() == [2.0, 3.0]
     assert real().tolist() == [0.0]
     with torch.no_grad():
@@ -110,7 +110,7 @@ def test_standardized_constants():
     assert positive().tolist() == pytest.approx([2 * 1.6487213, 3 * 1.6487213])
     assert real().tolist() == [-8.0]
     with pytest.raises(ValueError, match=r"start is .* expected positive"):
-        PositiveConstants(torch.tensor([0.0]), 0.5, ["a"])
+        PositiveConstants(torch.tensor([0.0]), 0.5, ["a"], ["kg"])
 
 
 @pytest.mark.parametrize("law", LADDER)
@@ -167,13 +167,35 @@ def test_the_motion_obeys_the_equation_with_load():
     assert float(left.abs().max()) < 1e-9 * float(bodies.abs().max())
 
 
+def test_reported_friction_is_what_acts():
+    """Level of each direction, width and loss, against forces of the law itself."""
+    model = anywhere(known_model(friction=LoadDependent), std=0.4)
+    found = {n: x for c in model.physical_constants() for n, x in zip(*c[::2], strict=True)}
+    law, slide = model.friction, model.structure.joint_names.index("slide")
+    fast = torch.full((4,), 1e3).double()
+    assert float(law(fast)[slide]) == pytest.approx(
+        float(found["Coulomb friction (v > 0) of slide"])
+    )
+    assert float(law(-fast)[slide]) == pytest.approx(
+        -float(found["Coulomb friction (v < 0) of slide"])
+    )
+    lost = 1 - law.transmitted(fast, torch.ones(4).double())
+    assert float(lost[slide]) == pytest.approx(float(found["loss by load of slide"]))
+    # Near rest F = (c + s) v / w, with c of the direction.
+    slope = law.slope(torch.full((4,), 1e-9).double())[slide]
+    level = found["Coulomb friction (v > 0) of slide"] + found["Stribeck rise of slide"]
+    width = float(found["friction width of slide"])
+    assert width == pytest.approx(float(level / slope), rel=1e-6)
+    assert width > law.slowest
+
+
 def test_names_and_units_of_all_constants():
     model = known_model(gain_spread=0.5)
     count = sum(p.numel() for p in model.parameters())
     assert len(model.parameter_names()) == count == len(set(model.parameter_names()))
     constants = model.physical_constants()
     for item in constants:
-        assert len(item.names) == len(item.values)
+        assert len(item.names) == len(item.units) == len(item.values)
     assert "drive gain of turn" in [name for item in constants for name in item.names]
 
 
