@@ -22,7 +22,7 @@ COLUMNS = ["name", "value", "low", "high", "unit", "start", "known"]
 """Of the table of constants."""
 OPEN = 0.5
 """Variance of a constant or direction, as a part of the prior's, from which it is left open."""
-_TOGETHER = 0.25
+_TOGETHER = 1 / 3
 """Width of a sum or ratio, as a part of what either part gives it, below which it is named."""
 _WIDE = 0.1
 """Half of a 95 % interval, as a part of the value, above which a constant is not known alone."""
@@ -91,8 +91,8 @@ def determined_together(
 
     Sums of two constants of one unit, as of a sliding mass and the armature of its drive; armature
     and friction of a joint over its drive gain. Both parts have intervals of more than 10 % of
-    their values to either side, and the interval of the sum or ratio is a quarter of what either
-    part alone would give it, or less. Arguments and columns as of :func:`constants_table`.
+    their values to either side, and the interval of the sum or ratio is less than a third of what
+    either part alone would give it. Arguments and columns as of :func:`constants_table`.
     """
     of = _posterior(model, fit, input_units)
     sigma = np.sqrt(of.covariance.diagonal())

@@ -132,29 +132,56 @@ class LoadDependent(Stribeck):
 
     Teeth that transmit more press harder on each other: l_i, between 0 and 1, is the part of the
     force that gets lost while the drive moves; driven backwards the gear takes as much more. Since
-    v_i l_i |f_i| tanh(v_i / w_i) >= 0 it only takes energy. Models M3 to M6 of Duclusaud et al.
-    2025, "Extended friction models for the physics simulation of servo actuators" (BAM). Arguments
-    as of the rungs below.
+    v_i l_i |f_i| tanh(v_i / w_i) >= 0 it only takes energy. Model M3 of Duclusaud et al. 2025,
+    "Extended friction models for the physics simulation of servo actuators" (BAM), with the rise
+    of M2; their load is the force of the drive less that of the arm, here that of the drive.
+    Arguments as of the rungs below.
     """
 
     by_load = True
 
     def _add_constants(self, scales: Scales, names: list[str]) -> None:
         super()._add_constants(scales, names)
-        losses, start = (
-            [f"loss by load of {name}" for name in names],
-            torch.full((scales.size,), 0.05),
-        )
-        self.odds = PositiveConstants(start, 1.0, losses, ["1"] * scales.size)
+        self.odds = self._odds_of("loss by load", 0.05, names)
+
+    def _odds_of(self, what: str, start: float, names: list[str]) -> PositiveConstants:
+        full = torch.full((len(names),), start)
+        return PositiveConstants(full, 1.0, [f"{what} of {n}" for n in names], ["1"] * len(names))
 
     def physical_constants(self) -> list[Named]:
-        return [*super().physical_constants(), self.odds.named()._replace(values=self._loss())]
+        loss = self.odds.named()
+        return [*super().physical_constants(), loss._replace(values=_part(self.odds()))]
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
         """f - l |f| tanh(v / w)."""
-        return force - self._loss() * force.abs() * torch.tanh(v / self._width())
+        return force - self._loss(v) * force.abs() * torch.tanh(v / self._width())
 
-    def _loss(self) -> Tensor:
-        """l, from its odds."""
-        odds = self.odds()
-        return odds / (1 + odds)
+    def _loss(self, v: Tensor) -> Tensor:
+        """l at v, from its odds."""
+        return _part(self.odds())
+
+
+class LoadDependentStribeck(LoadDependent):
+    """As the rung below, with a loss that is larger near rest, as the friction is::
+
+        l_i(v) = o_i / (1 + o_i),     o_i = odds_i + rise_i exp(-(v_i / b_i)^2)
+
+    b_i is the Stribeck speed. 0 < l_i < 1 at every v, so it only takes energy. Model M4 of the same
+    source. Arguments as of the rungs below.
+    """
+
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        super()._add_constants(scales, names)
+        self.odds_rise = self._odds_of("loss by load near rest", 0.02, names)
+
+    def physical_constants(self) -> list[Named]:
+        rest = self.odds_rise.named()._replace(values=_part(self.odds() + self.odds_rise()))
+        return [*super().physical_constants(), rest]
+
+    def _loss(self, v: Tensor) -> Tensor:
+        return _part(self.odds() + self.odds_rise() * torch.exp(-((v / self.speed()) ** 2)))
+
+
+def _part(odds: Tensor) -> Tensor:
+    """Of the whole, between 0 and 1."""
+    return odds / (1 + odds)
