@@ -59,6 +59,7 @@ def prediction_report(
     trajectories: str,
     summary: pd.DataFrame,
     grouped: pd.DataFrame,
+    notes: Sequence[str],
     truth: Trajectory,
     predictions: Mapping[str, Prediction],
     trajectory: int,
@@ -77,6 +78,7 @@ def prediction_report(
         trajectories: what they are, and how many, for the line below it.
         summary: one row per run, as :func:`pinn_dyn.evaluation.summary_table` makes it.
         grouped: one row per model, as :func:`pinn_dyn.evaluation.grouped_table` makes it.
+        notes: what to know of some of the rows.
         truth: the K trajectories stacked, q ``(K, T, N)``, over the horizon.
         predictions: names of runs and floors, and their roll-outs of the same K trajectories.
         trajectory: which of the K to show first.
@@ -95,7 +97,7 @@ def prediction_report(
     )
     trained = summary[~summary["floor"]]
     sections = [
-        Section("Summary", _summary(summary, grouped, labels)),
+        Section("Summary", _summary(summary, grouped, notes, labels)),
         error_section(
             prediction_errors(models, below, with_unit(ERROR, labels)),
             one="trajectory",
@@ -117,7 +119,9 @@ def prediction_report(
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
-def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]) -> list[Markup]:
+def _summary(
+    summary: pd.DataFrame, grouped: pd.DataFrame, notes: Sequence[str], labels: Sequence[str]
+) -> list[Markup]:
     headers = {name: text for name, text in _HEADERS.items() if name in summary}
     for name in summary:
         if name.startswith("valid_time_"):
@@ -137,7 +141,7 @@ def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]
             "is bold if it beats them all. A number under the pointer shows all its digits."
         ),
         table(bracketed(summary), headers=headers, best=marks, spread={"error_mean": "error_std"}),
-        *map(paragraph, beaten_by_floors(summary)),
+        *map(paragraph, [*notes, *beaten_by_floors(summary)]),
     ]
     if len(grouped) < len(summary):
         shown = {name: text for name, text in _GROUP_HEADERS.items() if name in grouped}
