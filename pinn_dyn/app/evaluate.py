@@ -37,6 +37,7 @@ from pinn_dyn.evaluation import (
     Prediction,
     RunResult,
     beaten_by_floors,
+    best_floor,
     build_floors,
     calibration,
     common_stride,
@@ -166,7 +167,7 @@ def evaluate(cfg: DictConfig) -> float:
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
     made = {"config": config, "dataset": runs[plain].config["dataset"], **record}
     write_json(folder / "provenance.json", made)
-    draw(evaluations, truth, source, config, folder)
+    draw(evaluations, best_floor(summary), truth, source, config, folder)
     intervals = write_intervals(trained, source, split, folder)
     comparisons = compare_with_truth(trained, source, folder)
 

@@ -83,12 +83,16 @@ def shares(evaluations: list[Evaluation]) -> pd.DataFrame:
 
 def draw(
     evaluations: list[Evaluation],
+    lowest: str | None,
     truth: Trajectory,
     source: DataSource,
     config: dict[str, Any],
     folder: Path,
 ) -> None:
-    """Write the figures of one trajectory, of errors over time, and of the spread of members."""
+    """Write the figures of one trajectory, of errors over time, and of the spread of members.
+
+    Of all floors the figure of a trajectory has the ``lowest``, and that of the errors each.
+    """
     floors, predictions = (
         {x.result.run: x.prediction for x in evaluations if x.result.floor == floor}
         for floor in (True, False)
@@ -102,6 +106,7 @@ def draw(
         title=f"{source.name}, {split} trajectory {config['trajectory']}, open loop",
         labels=source.labels,
         input_labels=source.input_labels,
+        floors={name: item for name, item in floors.items() if name == lowest},
     )
     save(figure, folder / "trajectory.png")
     label = with_unit(ERROR, source.labels)

@@ -64,5 +64,7 @@ def _fitted(run: Run, data: RunData) -> Predictor:
     windows = build_data(run.config, data.trained_on).windows
     solver.fit(model, data.training.train, windows)
     took = time.process_time() - start
-    log.info("identification: inverse dynamics on the training motions, %.1f s", took)
+    log.info(
+        "identification: inverse dynamics on the training motions, %.1f s of processor time", took
+    )
     return model

@@ -63,12 +63,11 @@ def test_runs_with_and_without_a_delay_are_one_table(runs, tmp_path, capsys):
     assert table.index.tolist()[:3] == ["mlp", "mlp with delay", "stands still"]
     assert table["model"].tolist()[:2] == ["mlp", "mlp with delay"]  # no seeds of one model
     # The first piece of 1 s lost its first 0.05 s, and steps are 0.02 s.
-    assert (table["horizon"] == pytest.approx(0.94)).all()
+    np.testing.assert_allclose(table["horizon"], 0.94)
     assert (table["trajectories"] == 3).all()
     assert table["error_mean"].iloc[0] != table["error_mean"].iloc[1]
     note = "with delay: trained and predicting on inputs as their own data sets prepare them"
     assert note in capsys.readouterr().out
-    assert note in (tmp_path / "report.html").read_text()
     record = json.loads((tmp_path / "provenance.json").read_text())
     assert not record["dataset"]["steps"]
 

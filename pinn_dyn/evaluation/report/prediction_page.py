@@ -26,7 +26,7 @@ from pinn_dyn.evaluation.report.page import (
     table,
     turned,
 )
-from pinn_dyn.evaluation.tables import beaten_by_floors, best, bracketed
+from pinn_dyn.evaluation.tables import beaten_by_floors, best, best_floor, bracketed
 from pinn_dyn.mechanics import Trajectory
 
 _HEADERS = {
@@ -105,7 +105,15 @@ def prediction_report(
         ),
         Section(
             "Trajectories",
-            _trajectories(trained, truth, models, trajectory, labels, input_labels),
+            _trajectories(
+                trained,
+                truth,
+                models,
+                {name: item for name, item in below.items() if name == best_floor(summary)},
+                trajectory,
+                labels,
+                input_labels,
+            ),
         ),
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
@@ -155,12 +163,13 @@ def _trajectories(
     summary: pd.DataFrame,
     truth: Trajectory,
     predictions: Mapping[str, Prediction],
+    floors: Mapping[str, Prediction],
     first: int,
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Markup]:
     states, inputs = trajectory_panels(
-        truth, predictions, labels, input_labels, with_unit(ERROR, labels)
+        truth, predictions, labels, input_labels, with_unit(ERROR, labels), floors
     )
     count = len(truth.q)
     worst = {int(row.worst_trajectory): row.run for row in summary.itertuples()}
