@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, LogError, Resample, common_motions
+from pinn_dyn.data.logs import (
+    Butterworth,
+    InputDelay,
+    LogError,
+    Resample,
+    SubtractStart,
+    common_motions,
+)
 from tests.data.logs_files import RATE, motion, source, write
 
 DELAY = 0.05
@@ -90,3 +97,12 @@ def test_no_motion_in_common_is_refused(tmp_path):
     )
     with pytest.raises(LogError, match="no motion has inputs in every preparation of oscillator"):
         common_motions([first, second], "test")
+
+
+def test_a_step_that_makes_other_coordinates_is_refused(log):
+    folder, _ = log
+    shifted = whole(folder, start=SubtractStart(samples=1))
+    with pytest.raises(LogError, match=r"make coordinate 1 differ by .*Evaluate the runs"):
+        common_motions([whole(folder), shifted], "test")
+    filtered = whole(folder, filter=Butterworth(cutoff=2.0))
+    assert len(common_motions([whole(folder), filtered], "test")[1]) == 1

@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 
 _ROUNDED = 1e-6
 """Of a sample time: how far apart equal times of two clocks may be."""
+_OTHER = 0.2
+"""Part of the spread of a coordinate by which no filter moves its mean."""
 
 
 def common_motions(sources: Sequence[LogSource], split: str) -> list[list[Trajectory]]:
@@ -34,7 +36,8 @@ def common_motions(sources: Sequence[LogSource], split: str) -> list[list[Trajec
         For each source the trajectories, in the same order and at the same times.
 
     Raises:
-        LogError: if there is no motion for which all of them have inputs.
+        LogError: if there is no motion for which all of them have inputs, or a step of one of them
+            makes other coordinates of q.
     """
     first = sources[0]
     step = one_sample_time(first.cleaned)
@@ -51,6 +54,7 @@ def common_motions(sources: Sequence[LogSource], split: str) -> list[list[Trajec
         if len(kept) < 2:
             continue
         for source, stretch, trajectories in zip(sources, known, found, strict=True):
+            _check_coordinates(kept, stretch)
             trajectories.append(_with_inputs(kept, stretch, source, step))
     if not found[0]:
         raise LogError(
@@ -74,6 +78,19 @@ def _longest_overlap(source: LogSource, split: str, piece: Recording) -> Recordi
     stretches = [x for one in source.cleaned if one.split == split for x in one.clean]
     best = max((x for x in stretches if x.run == piece.run), key=shared, default=None)
     return best if best is not None and shared(best) > 0 else None
+
+
+def _check_coordinates(kept: Recording, stretch: Recording) -> None:
+    """Refuse a stretch whose q is another one: a model of it would start from the wrong place."""
+    own = np.column_stack([np.interp(kept.t, stretch.t, column) for column in stretch.q.T])
+    off = np.abs((own - kept.q).mean(axis=0))  # noise that one of them filters has no mean
+    spread = stretch.q.std(axis=0)
+    for k in np.flatnonzero(off > _OTHER * spread):
+        raise LogError(
+            f"{kept.place}: the steps of two data sets make coordinate {k + 1} differ by "
+            f"{off[k]:.3g}, of a spread of {spread[k]:.3g}: expected steps that shift no "
+            "coordinate, as filters, delays and rates. Evaluate the runs separately"
+        )
 
 
 def _with_inputs(kept: Recording, stretch: Recording, source: LogSource, step: float) -> Trajectory:
