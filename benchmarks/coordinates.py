@@ -1,7 +1,7 @@
 """How the cost grows with the number of coordinates: soft arms of 1 to 16 segments.
 
-    python benchmarks/coordinates.py           # the table of README.md, into results/
-    python benchmarks/coordinates.py 4         # arms of up to so many segments; no file
+    python benchmarks/coordinates.py           # all arms that results/coordinates.csv lacks
+    python benchmarks/coordinates.py 4         # those of up to so many segments
 
 A row for each arm, N = 3 coordinates a segment: an evaluation of its equation of motion for 16
 states (float64), a short data set of 16 motions that begin at rest and hang, and a training step of
@@ -12,7 +12,6 @@ compiler's included.
 
 from __future__ import annotations
 
-import csv
 import os
 import sys
 import time
@@ -20,7 +19,8 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from training_step import RESULTS, make_model, make_windows
+from training_loop import RESULTS, append, rows_of
+from training_step import make_model, make_windows
 
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.data.simulation import simulate
@@ -78,27 +78,24 @@ def training(kind: type[Eager | Compiled], size: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the rows, and write them where all arms are timed."""
+    """Measure the arms that the file lacks; each row is written at once."""
     torch.set_num_threads(1)
     largest = int(sys.argv[1]) if len(sys.argv) > 1 else SEGMENTS[-1]
     record = {key: provenance()[key] for key in ("hardware", "torch", "commit")}
-    rows = []
-    for segments in (count for count in SEGMENTS if count <= largest):
+    path = RESULTS / "coordinates.csv"
+    there = {row["coordinates"] for row in rows_of(path)}
+    for segments in SEGMENTS:
         size = 3 * segments
+        if segments > largest or str(size) in there:
+            continue
         row: dict[str, object] = {"coordinates": size}
         row["equation_ms"] = round(equation(segments), 2)
         row["data_set_s"] = round(data_set(segments), 2)
         row["eager_ms"] = round(training(Eager, size)[0], 2)
         compiled, first = training(Compiled, size)
-        row |= {"compiled_ms": round(compiled, 2), "compiling_s": round(first, 1)}
+        row |= {"compiled_ms": round(compiled, 2), "compiling_s": round(first, 1), **record}
+        append(row, path)
         print(row, flush=True)
-        rows.append({**row, **record})
-    if largest < SEGMENTS[-1]:
-        return
-    with (RESULTS / "coordinates.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":
