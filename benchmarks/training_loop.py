@@ -5,14 +5,18 @@ TensorBoard log that the app builds of a configuration, compiled. JAX is a loop 
 is jitted as one: it picks the batch by index, takes loss and gradient, clips by the global norm and
 moves the weights by AdamW (optax); or a scan of such steps, also jitted, whichever is faster. Both
 start from the same network, see the same batches, take the same schedule, and are first checked to
-end with the same weights.
+end with the same weights. SOAP, which optax lacks, is timed alone.
 
-    python benchmarks/training_loop.py                       # the tables of README.md
-    python benchmarks/training_loop.py --quick               # a smoke run, no file
+    python benchmarks/training_loop.py                              # all cells that the file lacks
+    python benchmarks/training_loop.py --sizes 3 --batches 256      # some of them
+    python benchmarks/training_loop.py --quick                      # a smoke run, no file
+    python benchmarks/training_loop.py --quick --optimizers soap    # without jax and optax
 
-One core and one thread. After each epoch of ours, JAX takes as many steps, and so does our loss and
-gradient alone: what an epoch takes beyond them is the loop and the optimizer. Clocks are the
-processor time of the process, which others on the machine hardly disturb.
+A cell is written as soon as it is measured, and one that is there is not measured again: a run that
+was stopped goes on. One core and one thread. After each epoch of ours, JAX takes as many steps, and
+so does our loss and gradient alone: what an epoch takes beyond them is the loop and the optimizer.
+Shares and ratios are of the processor time of the process, which others on the machine hardly
+disturb; wall time stands beside it.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from importlib import metadata
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -45,6 +50,14 @@ STEP = 2e-3
 PAIRS = 16_384
 CHECKED = 20
 """Steps after which the weights of both sides are compared."""
+CELL = ("coordinates", "batch", "loss", "optimizer")
+"""What a row is of."""
+
+Row = dict[str, Any]
+Turn = dict[str, tuple[float, float]]
+"""Processor and wall time of each way in a round, s."""
+Loop = Callable[[Iterator[Tensor]], Any]
+"""Takes a step at each batch of positions, and gives the weights."""
 
 
 class Sines(DataSource):
@@ -72,7 +85,10 @@ class Sines(DataSource):
         return Splits(motions[:4], motions[4:5], motions[5:])
 
 
-def configuration(size: int, batch: int, loss: str, optimizer: str) -> dict[str, Any]:
+def configuration(
+    size: int, batch: int, loss: str, optimizer: str, compiled: bool
+) -> dict[str, Any]:
+    """That of a long training, of which the first epochs are run, up to no validation."""
     words = [
         "model=lnn",
         "model_name=lnn",
@@ -83,13 +99,22 @@ def configuration(size: int, batch: int, loss: str, optimizer: str) -> dict[str,
         f"data.batch_size={batch}",
         f"trainer.steps={STEPS_FOR_PROGRAM}",
         "trainer.validations=1",
-        "+trainer.limit_val_batches=0",
-        "compile=true",
+        f"compile={str(compiled).lower()}",
         "~callbacks.figures",
     ]
     config = composed("train", words)
     config["dataset"] = {"name": "sines", "size": size}
     return config
+
+
+def clocks() -> tuple[float, float]:
+    """Of the processor and on the wall, s."""
+    return time.process_time(), time.perf_counter()
+
+
+def since(start: tuple[float, float]) -> tuple[float, float]:
+    now = clocks()
+    return now[0] - start[0], now[1] - start[1]
 
 
 class Turns(L.Callback):
@@ -103,164 +128,85 @@ class Turns(L.Callback):
     def __init__(self, others: dict[str, Callable[[], Any]], rounds: int):
         self.others = others
         self.rounds = rounds
-        self.times: list[dict[str, float]] = []
-        self._start: float | None = None
+        self.times: list[Turn] = []
+        self._start: tuple[float, float] | None = None
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if self._start is None:
-            self._start = time.process_time()
+            self._start = clocks()
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         # What follows of an epoch, such as its checkpoint, counts to the next one.
         assert self._start is not None
-        row = {"ours": time.process_time() - self._start}
+        turn = {"ours": since(self._start)}
         for name, run in self.others.items():
-            start = time.process_time()
+            start = clocks()
             run()
-            row[name] = time.process_time() - start
-        self.times.append(row)
+            turn[name] = since(start)
+        self.times.append(turn)
         trainer.should_stop = len(self.times) > self.rounds
-        self._start = time.process_time()
-
-
-Loop = Callable[[Iterator[Tensor]], Any]
-"""Takes a step at each batch of positions, and gives the weights."""
-
-
-class JaxLoops:
-    """Loops of training steps from the weights of ``model``."""
-
-    def __init__(self, model: Any, data: Any, learner: Any, rates: list[float], loss: str):
-        import jax.numpy as jnp
-        import jax_networks
-        import optax
-
-        self.parameters = jax_networks.parameters_of(model)
-        self.network = jax_networks.Network(model)
-        self.loss, self.scale = jax_networks.LOSSES[loss], learner.loss.scale.numpy().reshape(-1)
-        windows = data.windows.to(torch.device("cpu"), torch.float32)
-        pairs = {
-            "x0": windows.start("qv"),
-            "u": windows.u,
-            "measured": windows.increments("qv")[:, 0],
-        }
-        self.arrays = jax_networks.to_jax(pairs)
-        table = jnp.asarray(rates)
-        self.chain = optax.chain(
-            optax.clip_by_global_norm(1.0),
-            optax.adamw(lambda count: table[count], weight_decay=1e-5),
-        )
-
-    def _step(self, spelling: str) -> Callable[[Any, Any], Any]:
-        import jax
-        import optax
-
-        acceleration = getattr(self.network, spelling)
-
-        def step(carry: Any, index: Any) -> Any:
-            p, state = carry
-            batch = {name: array[index] for name, array in self.arrays.items()}
-            error, gradient = jax.value_and_grad(
-                lambda p: self.loss(acceleration, p, batch, STEP, self.scale)
-            )(p)
-            updates, state = self.chain.update(gradient, state, p)
-            return (optax.apply_updates(p, updates), state), error
-
-        return step
-
-    def _carry(self) -> Any:
-        import jax
-
-        p = jax.tree.map(lambda value: value.copy(), self.parameters)
-        return p, self.chain.init(p)
-
-    def one_by_one(self, spelling: str) -> Loop:
-        """A jitted step, called from Python."""
-        import jax
-
-        step, carry = jax.jit(self._step(spelling), donate_argnums=0), self._carry()
-
-        def run(batches: Iterator[Tensor]) -> Any:
-            nonlocal carry
-            for index in batches:
-                carry, _ = step(carry, index.numpy())
-            return jax.block_until_ready(carry)[0]
-
-        return run
-
-    def scan(self, spelling: str) -> Loop:
-        """A jitted loop over so many steps at once."""
-        import jax
-
-        step, carry = self._step(spelling), self._carry()
-        scanned = jax.jit(lambda carry, order: jax.lax.scan(step, carry, order), donate_argnums=0)
-
-        def run(batches: Iterator[Tensor]) -> Any:
-            nonlocal carry
-            while order := list(islice(batches, CHECKED)):
-                carry, _ = scanned(carry, torch.stack(order).numpy())
-            return jax.block_until_ready(carry)[0]
-
-        return run
+        self._start = clocks()
 
 
 def run_cell(
-    size: int, batch: int, loss: str, optimizer: str, rounds: int, steps: int | None
-) -> dict[str, object]:
+    size: int,
+    batch: int,
+    loss: str,
+    optimizer: str,
+    *,
+    rounds: int,
+    steps: int | None = None,
+    compiled: bool = True,
+) -> Row:
+    """The row of a cell: ``rounds`` epochs of ``steps`` steps, by default some 10 s of them."""
     torch._dynamo.reset()
     if steps is None:  # an epoch has half of the usual steps; of large batches fewer will do
         most = min(max(200_000 // batch, 40), 500)
         steps = next(n for n in range(most, 0, -1) if STEPS_FOR_PROGRAM % n == 0)
     build.LONGEST_EPOCH = steps
-    config = configuration(size, batch, loss, optimizer)
+    config = configuration(size, batch, loss, optimizer, compiled)
     L.seed_everything(0, verbose=False)
     data = build.build_data(config, Sines(size))
     model = build.build_model(config, data.statistics)
     validator = build.build_validator(config, data.statistics.step)
     learner = build.build_learner(config, model, data.statistics, validator)
-    rates = schedule(config, learner)
-    others: dict[str, Callable[[], Any]] = {}
+    windows = data.windows.to(torch.device("cpu"), torch.float32)
+    first = windows[next(iter(data.sampler(0)))]
+    others: dict[str, Callable[[], Any]] = {
+        "loss and gradient": lambda: [learner._gradients(first) for _ in range(steps)]
+    }
     chosen = ""
     if optimizer == "adamw":
-        chosen, fastest = rival(JaxLoops(model, data, learner, rates, loss), config, data)
+        import jax_loops
+
+        scale = learner.loss.scale.numpy().reshape(-1)
+        rates = schedule(config, learner)
+        loops = jax_loops.JaxLoops(model, windows, loss, scale, STEP, rates)
+        chosen, fastest = rival(loops, config, data)
         others["jax"] = lambda: fastest(islice(data.sampler(0), steps))
-    order = iter(data.sampler(0))
-    windows = data.windows.to(torch.device("cpu"), torch.float32)[next(order)]
-    others["loss and gradient"] = lambda: [learner._gradients(windows) for _ in range(steps)]
     turns = Turns(others, rounds)
-    first = time.perf_counter()
     fit(config, data, learner, validator, turns)
-    print(f"{time.perf_counter() - first:.0f} s, of which compiling {turns.times[0]['ours']:.0f} s")
     times = turns.times[1:]
 
-    def median(value: Callable[[dict[str, float]], float]) -> float:
-        return statistics.median(value(row) for row in times)
+    def milliseconds(name: str, clock: int) -> float:
+        return round(1e3 * statistics.median(turn[name][clock] for turn in times) / steps, 3)
 
-    row: dict[str, object] = {
-        "coordinates": size,
-        "batch": batch,
-        "loss": loss,
-        "optimizer": optimizer,
-        "ms": round(1e3 * median(lambda row: row["ours"]) / steps, 3),
-        "loss_and_gradient_ms": round(
-            1e3 * median(lambda row: row["loss and gradient"]) / steps, 3
-        ),
-        "loop_and_optimizer": round(
-            median(lambda row: 1 - row["loss and gradient"] / row["ours"]), 3
-        ),
-        "jax_ms": round(1e3 * median(lambda row: row["jax"]) / steps, 3) if chosen else "",
-        "jax_slower": round(median(lambda row: row["jax"] / row["ours"]), 3) if chosen else "",
-        "smallest": round(min(row["jax"] / row["ours"] for row in times), 3) if chosen else "",
-        "largest": round(max(row["jax"] / row["ours"] for row in times), 3) if chosen else "",
-        "jax_loop": chosen,
-        "rounds": len(times),
-        "steps_in_a_round": steps,
-    }
-    print(row, flush=True)
-    return row
+    row: Row = dict(zip(CELL, (size, batch, loss, optimizer), strict=True))
+    row |= {"ms": milliseconds("ours", 0), "wall_ms": milliseconds("ours", 1)}
+    row["loss_and_gradient_ms"] = milliseconds("loss and gradient", 0)
+    shares = [1 - turn["loss and gradient"][0] / turn["ours"][0] for turn in times]
+    row["loop_and_optimizer"] = round(statistics.median(shares), 3)
+    row |= dict.fromkeys(("jax_ms", "jax_wall_ms", "jax_slower", "smallest", "largest"), "")
+    if chosen:
+        ratios = [turn["jax"][0] / turn["ours"][0] for turn in times]
+        row |= {"jax_ms": milliseconds("jax", 0), "jax_wall_ms": milliseconds("jax", 1)}
+        row["jax_slower"] = round(statistics.median(ratios), 3)
+        row |= {"smallest": round(min(ratios), 3), "largest": round(max(ratios), 3)}
+    row |= {"jax_loop": chosen, "rounds": len(times), "steps_in_a_round": steps}
+    return {**row, "first_epoch_s": round(turns.times[0]["ours"][1], 1)}
 
 
-def rival(loops: JaxLoops, config: dict[str, Any], data: Any) -> tuple[str, Loop]:
+def rival(loops: Any, config: dict[str, Any], data: Any) -> tuple[str, Loop]:
     """The fastest loop of JAX, and its name: of two spellings, step by step or as a scan."""
 
     def checked(make: Callable[[str], Loop], spelling: str) -> tuple[float, str, Loop]:
@@ -334,7 +280,48 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
         raise RuntimeError(f"{name}: the weights end {share:.2g} of their way apart")
 
 
-def main() -> None:
+def rows_of(path: Path) -> list[Row]:
+    """What was measured before."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(row: Row, path: Path) -> None:
+    """Write a row, below a header where it is the first."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def versions() -> dict[str, str]:
+    """Those of the rivals, empty where they are not installed."""
+    found = {}
+    for name in ("jax", "optax"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = ""
+    return found
+
+
+def summary(rows: list[Row]) -> str:
+    """The geometric mean over the cells that JAX has."""
+    ratios = [float(row["jax_slower"]) for row in rows if row["jax_slower"]]
+    if not ratios:
+        return "no cell beside JAX"
+    return (
+        f"JAX and optax take {statistics.geometric_mean(ratios):.2f} times as long in the "
+        f"geometric mean of {len(ratios)} cells, {min(ratios):.2f} in the closest"
+    )
+
+
+def main(words: list[str] | None = None) -> None:
+    """Measure the cells that the command line names and the file lacks."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[3, 6, 7], help="N")
     parser.add_argument("--batches", type=int, nargs="+", default=[256, 1024, 8192])
@@ -342,38 +329,37 @@ def main() -> None:
     parser.add_argument("--optimizers", nargs="+", default=["adamw", "soap"])
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, help="steps in a round")
-    parser.add_argument("--quick", action="store_true", help="smoke run: one small cell, no file")
+    parser.add_argument("--quick", action="store_true", help="smoke run: a small cell, no file")
     parser.add_argument("--output", type=Path, default=RESULTS / "training_loop.csv")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
+    if "adamw" in arguments.optimizers and "" in versions().values():
+        parser.error(
+            "adamw is timed beside jax and optax, which are not installed: "
+            "pip install -e '.[bench]', or take --optimizers soap"
+        )
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
     torch.set_num_threads(1)
     if arguments.quick:
-        run_cell(2, 32, "midpoint", "adamw", 1, 20)
+        for optimizer in arguments.optimizers:
+            print(run_cell(2, 32, "midpoint", optimizer, rounds=1, steps=20, compiled=False))
         return
-    rows = [
-        run_cell(size, batch, loss, optimizer, arguments.rounds, arguments.steps)
-        for optimizer in arguments.optimizers
-        for loss in arguments.losses
-        for size in arguments.sizes
-        for batch in arguments.batches
-        if optimizer == "adamw" or batch == min(arguments.batches)
-    ]
-    ratios = [float(str(row["jax_slower"])) for row in rows if row["jax_slower"]]
-    if ratios:
-        print(
-            f"JAX and optax take {statistics.geometric_mean(ratios):.2f} times as long in the "
-            f"geometric mean, {min(ratios):.2f} in the closest cell"
-        )
-    import jax
-    import optax
-
-    record = {key: provenance()[key] for key in ("hardware", "torch", "commit")}
-    with arguments.output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*rows[0], *record, "jax", "optax"])
-        writer.writeheader()
-        versions = {"jax": jax.__version__, "optax": optax.__version__}
-        writer.writerows({**row, **record, **versions} for row in rows)
-    print(f"wrote {arguments.output}")
+    rows = rows_of(arguments.output)
+    there = {tuple(row[key] for key in CELL) for row in rows}
+    record = {key: provenance()[key] for key in ("hardware", "torch", "commit")} | versions()
+    for optimizer in arguments.optimizers:
+        for loss in arguments.losses:
+            for size in arguments.sizes:
+                for batch in arguments.batches:
+                    cell = (str(size), str(batch), loss, optimizer)
+                    if cell in there:
+                        print(f"{', '.join(cell)}: is in {arguments.output}", flush=True)
+                        continue
+                    rounds, steps = arguments.rounds, arguments.steps
+                    row = run_cell(size, batch, loss, optimizer, rounds=rounds, steps=steps)
+                    row |= record
+                    append(row, arguments.output)
+                    print(row, flush=True)
+    print(summary(rows_of(arguments.output)))
 
 
 if __name__ == "__main__":

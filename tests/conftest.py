@@ -22,7 +22,9 @@ def traced(monkeypatch):
 
     Each kind of program is built by one test.
     """
-    monkeypatch.setattr("pinn_dyn.mechanics.compilation._compile", lambda function, _: function)
+    room = "pinn_dyn.mechanics.compilation"
+    monkeypatch.setattr(f"{room}._compile", lambda function, _: function)
+    monkeypatch.setattr(f"{room}.compile_fx_graph", lambda graph, *_: graph)
 
 
 @pytest.fixture

@@ -244,4 +244,6 @@ def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> 
     if by_value:
         return gradient.clamp(-largest, largest)
     norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+    if norm.numel() == 1 and float(norm) < largest:  # as in most steps: one operation, not five
+        return gradient
     return gradient * (largest / (norm + 1e-6)).clamp(max=1.0)

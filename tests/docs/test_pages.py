@@ -10,7 +10,10 @@ import yaml
 from pinn_dyn.app.config import CONF
 from tests.docs.blocks import ROOT, blocks
 
-DIARY = r"(?i)\b(asked|missed|met|allowed|private (script|loop|code)|(an)?other job|busy machine)\b"
+DIARY = (
+    r"(?i)\b(asked|missed|met|allowed|private (script|loop|code)|(an)?other job|busy machine|"
+    r"\w+ other processes|beside \w+ trainings|not measured yet|so far)\b"
+)
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
 
 

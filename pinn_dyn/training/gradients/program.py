@@ -56,7 +56,7 @@ class LossProgram:
         """Loss and gradient of each batch at the values ``(P,)`` that go with it."""
         names = _ROWS[self._loss.model.state]
         arguments = [
-            (some, [getattr(batch, name) for name in names], _samples(batch))
+            (some, *(getattr(batch, name) for name in names), *_samples(batch))
             for some, batch in zip(values, batches, strict=True)
         ]
         # A program is compiled here, before the threads call it.
@@ -77,11 +77,10 @@ class LossProgram:
     def _traced(self, windows: Windows) -> Program:
         state = self._loss.model.state
 
-        def loss_and_gradient(
-            vector: Tensor, rows: list[Tensor], samples: list[Tensor]
-        ) -> list[Tensor]:
-            given: dict[str, Any] = dict(zip(_ROWS[state], rows, strict=True))
-            batch = replace(windows, **given, input=windows.input.with_samples(*samples))
+        def loss_and_gradient(vector: Tensor, *rows: Tensor) -> list[Tensor]:
+            names = _ROWS[state]
+            given: dict[str, Any] = dict(zip(names, rows, strict=False))
+            batch = replace(windows, **given, input=windows.input.with_samples(*rows[len(names) :]))
             batch = StateWindows.of(batch, state)
             with torch.enable_grad():
                 values = [value.detach().requires_grad_() for value in self._vector.split(vector)]
