@@ -182,6 +182,13 @@ def test_names_and_units_of_all_constants():
     [
         ({"start": "truth"}, "start is 'truth'"),
         ({"drive_gain": -1.0}, "drive_gain is"),
+        ({"drive_gain": [1.0, 2.0]}, r"drive_gain is \[1.0, 2.0\], expected one number or 4"),
+        ({"drive_gain": math.inf}, "drive_gain is inf"),
+        ({"spread": -1.0}, r"spread is -1.0, expected a positive number: 0.3 for"),
+        ({"spread": 0.0}, r"spread is 0.0, expected a positive number"),
+        ({"spread": math.nan}, r"spread is nan, expected a positive number"),
+        ({"gain_spread": -1.0}, "gain_spread is -1.0, expected 0, which fixes the drive gains"),
+        ({"gain_spread": math.inf}, "gain_spread is inf, expected 0"),
         ({"locked_joints": ()}, "the data have 4 coordinates"),
     ],
 )
