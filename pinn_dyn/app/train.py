@@ -30,6 +30,7 @@ from pinn_dyn.app.build import (
 from pinn_dyn.app.config import ConfigError, check, checked
 from pinn_dyn.app.data_record import check_data, write_data
 from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.known_data import check_known
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -206,6 +207,7 @@ def train_in(
         validator.check(stack_until(data.splits.validation))
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
+    check_known(config, data.source)
     model = build_predictor(config, statistics)
     if model.state == "qp" and data.windows.p.shape[-1] == 0:
         raise ConfigError(

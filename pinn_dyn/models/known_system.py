@@ -76,8 +76,8 @@ class KnownSystem(LearnedConstants):
             )
         if not 0 < spread < math.inf:
             raise ValueError(
-                f"spread is {spread}, expected a positive number: 1.5 for guesses that may be off by "
-                "a factor of ten, 0.3 for a data sheet"
+                f"spread is {spread}, expected a positive number: 1.5 for guesses that may be "
+                "off by a factor of ten, 0.3 for a data sheet"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()

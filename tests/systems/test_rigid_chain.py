@@ -168,6 +168,12 @@ def test_generic_bodies_come_from_the_kinematics_alone():
     assert torch.linalg.eigvalsh(chain.generic_inertia()).min() > 0
 
 
+MIMICKING = TREE.replace(
+    '<joint name="bend" type="continuous">',
+    '<joint name="bend" type="continuous"><mimic joint="turn"/>',
+)
+
+
 @pytest.mark.parametrize(
     ("text", "settings", "message"),
     [
@@ -179,6 +185,7 @@ def test_generic_bodies_come_from_the_kinematics_alone():
         ("<robot name='x'/>", {}, "at least one: is it a URDF"),
         ("<robot", {}, "not valid XML"),
         (TREE.replace('type="continuous"', 'type="floating"'), {}, "'bend' is 'floating'"),
+        (MIMICKING, {}, r"joint 'bend' is a mimic joint, expected .* add it to locked_joints"),
         (TREE.replace('xyz="1 2 2"', 'xyz="0 0 0"'), {}, "'slide' has the axis"),
         (TREE.replace('xyz="0.2 0 0.1"', 'xyz="0.2 0"'), {}, "three numbers"),
     ],
@@ -186,6 +193,13 @@ def test_generic_bodies_come_from_the_kinematics_alone():
 def test_a_wrong_description_is_refused_by_name(text, settings, message):
     with pytest.raises(ValueError, match=message):
         RigidChain(text, **settings)
+
+
+def test_a_locked_mimic_joint_is_a_weld():
+    locked = ["wrist", "bend"]
+    chain, other = (RigidChain(text, locked_joints=locked) for text in (MIMICKING, TREE))
+    assert chain.joint_names == other.joint_names == ["turn", "slide", "fork"]
+    assert torch.equal(chain.inertia, other.inertia)
 
 
 def test_a_missing_file_is_named():
