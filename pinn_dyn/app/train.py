@@ -243,6 +243,11 @@ def train_in(
         if isinstance(learner, LeastSquaresLearner):  # settings that only the data can refuse
             raise ConfigError(f"optimizer: {problem}") from problem
         raise
+    except SystemExit:  # Lightning's end of an interrupted training
+        if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
+            trainer.save_checkpoint(folder / CHECKPOINTS / "last.ckpt")
+            _write_constants(model, learner.result, folder)
+        raise
     if last is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, batches, verbose=False)
     seconds = time.perf_counter() - start
@@ -315,8 +320,18 @@ def _cpu_seconds() -> float:
 
 
 def _write_constants(model: Predictor, result: Fit, folder: Path) -> None:
-    """Write the constants with their 95 % intervals, and what the data leave to the prior."""
+    """Write the constants with their 95 % intervals, and what the data leave to the prior.
+
+    Those of a fit that was stopped are in a file of another name.
+    """
     assert isinstance(model, LearnedConstants)
+    unfinished = folder / "constants_unfinished.csv"
+    if result.stopped_in is not None:
+        with whole(unfinished) as partial:
+            constants_table(model, result).to_csv(partial, index=False)
+        log.warning("the best constants so far are in %s, the fit is not finished", unfinished)
+        return
+    unfinished.unlink(missing_ok=True)
     with whole(folder / "constants.csv") as partial:
         constants_table(model, result).to_csv(partial, index=False)
     left = undetermined(model, result) or ["nothing: the data determine every parameter"]

@@ -9,7 +9,7 @@ from torch.nn.utils import vector_to_parameters
 
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.learned_constants import LearnedConstants
-from pinn_dyn.training.least_squares import Fit, posterior_covariance
+from pinn_dyn.training.constants_fit import Fit, posterior_covariance
 
 _SHARE = 0.5
 """Variance of a direction, as a part of that of the prior, from which the data leave it open."""

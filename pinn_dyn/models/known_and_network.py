@@ -39,8 +39,8 @@ class KnownAndNetwork(Sum):
         integrator: the method of integration.
 
     Raises:
-        ValueError: on a weight that is negative or not finite, or a network with an input matrix, a residual force or a
-            learned start.
+        ValueError: on a weight that is negative or not finite, or a network with an input matrix, a
+            residual force or a learned start.
     """
 
     def __init__(

@@ -5,7 +5,7 @@ import torch
 
 from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.training import Fit
-from pinn_dyn.training.least_squares import Prior
+from pinn_dyn.training.constants_fit import Prior
 from tests.support.known import known_model
 
 
