@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia, rod
 from tests.contracts.mechanical_system import MechanicalSystemContract
@@ -14,6 +15,7 @@ from tests.support.rigid_chains import TREE, joint, link, robot
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 STATES = 100
+NEEDS_COMPILER = pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
 
 
 def urdf_file(name):
@@ -166,6 +168,44 @@ def test_generic_bodies_come_from_the_kinematics_alone():
     )
     assert torch.equal(chain.generic_inertia(), other.generic_inertia())
     assert torch.linalg.eigvalsh(chain.generic_inertia()).min() > 0
+
+
+def dynamics_of(chain, q, v, u):
+    """Acceleration, and the gradient of its square in the inertias of the bodies."""
+    inertia = chain.inertia.clone().requires_grad_()
+    mass, bias = chain.mass_and_bias(q, v, inertia)
+    a = torch.linalg.solve(mass, u - bias)
+    return a.detach(), torch.autograd.grad(a.square().mean(), inertia)[0]
+
+
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "aot_eager",
+        pytest.param("inductor", marks=[pytest.mark.slow, NEEDS_COMPILER]),
+    ],
+)
+def test_compiled_it_is_the_same_chain(backend):
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(2)).double()
+    torch._dynamo.reset()
+    # One graph: anything that is done in Python between two would be an error.
+    compiled = torch.compile(chain.mass_and_bias, fullgraph=True, backend=backend)
+    expected = dynamics_of(chain, q, v, u)
+    chain.mass_and_bias = compiled
+    for found, value in zip(dynamics_of(chain, q, v, u), expected, strict=True):
+        assert torch.allclose(found, value, rtol=1e-9, atol=1e-11 * float(value.abs().max()))
+
+
+def test_single_precision_is_the_same_chain_to_its_digits():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(2)).double()
+    expected = dynamics_of(chain, q, v, u)
+    found = dynamics_of(chain.float(), q.float(), v.float(), u.float())
+    for single, double in zip(found, expected, strict=True):
+        assert single.dtype == torch.float32
+        assert (single - double).norm() < 1e-4 * double.norm()
+        assert (single - double).abs().max() > 0  # it was not computed in double
 
 
 MIMICKING = TREE.replace(
