@@ -47,7 +47,8 @@ def scales() -> Statistics:
 def step_of(name: str, compiled: str, batch: int) -> Callable[[], float]:
     """Loss and gradient of the model of an experiment on one batch."""
     torch.manual_seed(0)
-    model = build_model(composed("train", [f"experiment=panda/{name}"]), scales()).train()
+    words = [f"experiment=panda/{name}", "name=benchmark", f"model_name={name}"]
+    model = build_model(composed("train", words), scales()).train()
     loss, vector = IncrementLoss(scales(), model), ParameterVector(model.parameters())
     windows = make_windows(SIZE, batch, torch.float32)
     if compiled == "eager":

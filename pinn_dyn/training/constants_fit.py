@@ -12,7 +12,10 @@ from torch import Tensor
 _FAR = 3.0
 """Standard deviations a priori: of a thousand constants three are farther from their start."""
 _MOST_NAMED = 5
-_CHECKS = {"drive gain": "units and sign of its input", "torque offset": "sign of its input"}
+_CHECKS = {
+    "drive gain": "units and sign of its input",
+    **dict.fromkeys(("torque offset", "force offset"), "sign of its input"),
+}
 """What to look at first; else the units of the columns."""
 
 
