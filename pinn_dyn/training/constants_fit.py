@@ -68,7 +68,9 @@ class Fit:
             or not all(isinstance(state[key], kind) for key, kind in numbers.items())
             or not all(isinstance(state[key], Tensor) for key in shapes)
             or not all(list(state[key].shape) == shape for key, shape in shapes.items())
+            or not all(state[key].dtype == torch.float64 for key in shapes)
             or not all(bool(state[key].isfinite().all()) for key in shapes)
+            or bool(torch.linalg.inv_ex(state["root"]).info)
         ):
             raise ValueError(
                 f"the checkpoint has no fit of the model's {count} constants: it is damaged or of "

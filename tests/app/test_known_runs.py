@@ -1,5 +1,6 @@
 """Runs of known mechanics that others start from: a network on top, or the robot with a load."""
 
+import os
 import re
 import shutil
 import signal
@@ -130,7 +131,12 @@ def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, setting
     assert re.search(message, refused_text(capsys, "train.py", KNOWN, *SMALL, setting, place))
 
 
-def test_a_terminated_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("stop", "status"),
+    [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, 1)],
+    ids=["SIGTERM", "Ctrl-C"],
+)
+def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, stop, status):
     folder, begun, log = tmp_path / "run", tmp_path / "begun", tmp_path / "log.txt"
 
     def endless(*_):
@@ -144,12 +150,12 @@ def test_a_terminated_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
         try:
             while not begun.exists() and process.is_alive():
                 time.sleep(0.05)
-            process.terminate()
+            os.kill(process.pid, stop)
             process.join(60)
         finally:
             process.kill()
     text = log.read_text()
-    assert process.exitcode == 128 + signal.SIGTERM, text
+    assert process.exitcode == status, text
     assert f"train.py resume={folder}" in text
     stopped = pd.read_csv(folder / "constants_unfinished.csv")
     assert not (folder / "constants.csv").exists()
@@ -186,3 +192,12 @@ def test_currents_without_gains_end_in_a_sentence(tmp_path, capsys):
     currents = "dataset.u.unit=A"
     text = refused_text(capsys, "train.py", KNOWN, *SMALL, currents, f"hydra.run.dir={tmp_path}")
     assert "tau_cmd1 in A, tau_cmd2 in A, and model.drive_gain is 1" in text
+
+
+def test_a_damaged_fit_ends_in_a_sentence(tmp_path, fitted, capsys):
+    folder = shutil.copytree(fitted, tmp_path / "run")
+    (folder / "metrics.json").unlink()
+    path = folder / "checkpoints" / "last.ckpt"
+    torch.save({**torch.load(path, weights_only=True), "fit": {}}, path)
+    text = refused_text(capsys, "train.py", f"resume={folder}")
+    assert "the checkpoint has no fit of the model's 36 constants" in text

@@ -237,13 +237,15 @@ def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
         lambda state: None,
         lambda state: {**state, "root": state["root"][:3]},
         lambda state: {**state, "mean": state["mean"] * torch.nan},
+        lambda state: {**state, "root": 0 * state["root"]},
+        lambda state: {**state, "covariance": state["covariance"].int()},
         lambda state: {**state, "stopped_in": "here"},
         lambda state: {key: value for key, value in state.items() if key != "information"},
     ],
 )
 def test_a_damaged_fit_is_refused(change):
-    one = torch.eye(4)
-    state = Fit(one, one, Prior(torch.zeros(4), one), 0.1, 3, stopped_in=1).state()
+    one = torch.eye(4).double()
+    state = Fit(one, one, Prior(torch.zeros(4).double(), one), 0.1, 3, stopped_in=1).state()
     assert Fit.from_state(state, 4).stopped_in == 1
     with pytest.raises(ValueError, match="the checkpoint has no fit of the model's 4 constants"):
         Fit.from_state(change(state), 4)
