@@ -40,6 +40,5 @@ model = pinn_dyn.fit(source, model="lnn", steps=steps, overrides=[*own, *sys.arg
 
 learned, true = model.terms([1.0]), source.system.double().terms(torch.ones(1).double())
 for name in ("M", "D", "G"):
-    print(
-        f"{name} learned {getattr(learned, name).item():.3f}, true {getattr(true, name).item():.3f}"
-    )
+    found, value = getattr(learned, name).item(), getattr(true, name).item()
+    print(f"{name} learned {found:.3f}, true {value:.3f}")

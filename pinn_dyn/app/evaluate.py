@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.data_record import check_data
 from pinn_dyn.app.evaluation_results import (
     SPLITS,
@@ -191,6 +192,9 @@ def evaluate(cfg: DictConfig) -> float:
         input_labels=source.input_labels,
         comparisons=comparisons,
         joints=joints,
+        constants=read_constants(
+            {label: run.folder for label, run in zip(labels, runs, strict=True)}
+        ),
         parts=parts,
         intervals=intervals,
         origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),

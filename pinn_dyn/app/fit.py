@@ -17,17 +17,19 @@ from lightning.pytorch.utilities.seed import isolate_rng
 
 from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError, composed
-from pinn_dyn.app.frame import Signals, frame_dataset
+from pinn_dyn.app.frame import Signals, frame_dataset, in_frame
 from pinn_dyn.app.keys import KEYS, Count
 from pinn_dyn.app.learned_model import LearnedModel, load
 from pinn_dyn.app.run_folder import CONFIG, claimed
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.train import train_in
 from pinn_dyn.app.words import OVERRIDE
-from pinn_dyn.data import DataSource
+from pinn_dyn.data import DataSource, store
 
 STEPS = 1000
 """Of the optimizer, on a data frame: a minute or two."""
+TRAJECTORIES = "trajectories.npz"
+"""In a run folder, the data of a source that Python made."""
 _VALIDATIONS = 10  # at most, in such a training
 
 
@@ -117,15 +119,18 @@ def fit(
             config["callbacks"].pop("figures", None)  # which nobody could see
         source = data if isinstance(data, DataSource) else None
         if source is not None:
-            # An object has no configuration: what the run folder can say of it.
-            labels = {"labels": list(source.labels), "input_labels": list(source.input_labels)}
-            config["dataset"] = {"name": source.name, **labels}
+            # An object has no configuration: its trajectories stay in the run folder.
+            config["dataset"] = store(source, place / TRAJECTORIES)
         threads = torch.get_num_threads()
         stack.callback(torch.set_num_threads, threads)
         try:
             with isolate_rng(), warnings.catch_warnings(), claimed(place, config):
                 hush()
                 train_in(place, config, source=source)
+        except ConfigError as error:
+            if not isinstance(data, pd.DataFrame):
+                raise
+            raise ConfigError(in_frame(str(error), data, place)) from error
         except SystemExit as stop:  # Lightning's end of an interrupted training
             raise KeyboardInterrupt from stop
         return load(place)

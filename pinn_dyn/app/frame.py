@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pandas as pd
 import yaml
 
 from pinn_dyn.data.logs import Columns, LogError
-from pinn_dyn.data.logs.reader import column, numbers
+from pinn_dyn.data.logs.reader import THE_FRAME, column, numbers
 from pinn_dyn.data.whole import whole, write_whole
 
 Signals = str | Sequence[str] | Mapping[str, Any]
@@ -45,7 +46,7 @@ def frame_dataset(
         raise LogError(f"run is {run!r}, expected the name of a column, or None")
     described = {name: _described(name, given) for name, given in signals.items()}
     columns = {name: Columns.from_config(name, given) for name, given in described.items()}
-    path = Path("the frame")
+    path = THE_FRAME
     values = {name: numbers(frame, path, x.columns, name) for name, x in columns.items()}
     if not len(frame):
         raise LogError("the frame has no rows, expected a log")
@@ -81,6 +82,16 @@ def frame_dataset(
         "data=multi_step",
         *(f"{key}={value}" for key, value in settings.items()),
     ]
+
+
+def in_frame(said: str, frame: pd.DataFrame, folder: Path) -> str:
+    """What an error says of a line in the written file, as of a row by the index of the frame."""
+    said = re.sub(
+        rf"{re.escape(str(folder / FRAME))}, line (\d+)",
+        lambda line: f"the frame, row {frame.index[int(line[1]) - 2]}",
+        said,
+    )
+    return said.replace("otherwise repair the file", "otherwise repair the frame")
 
 
 def _described(name: str, given: Signals) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from pinn_dyn.app.build import (
     epochs,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.data_record import check_data, write_data
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.known_data import check_known
@@ -47,14 +48,13 @@ from pinn_dyn.app.run_folder import (
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import check_name, packages
 from pinn_dyn.data import DataSource, LogSource
-from pinn_dyn.data.whole import whole, write_whole
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
-from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor, stack_until
-from pinn_dyn.models import KnownAndNetwork, KnownMechanics, LearnedConstants
-from pinn_dyn.training import COVARIANCE, Fit, LeastSquaresLearner
+from pinn_dyn.models import KnownAndNetwork, KnownMechanics
+from pinn_dyn.training import COVARIANCE, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
 
@@ -246,13 +246,13 @@ def train_in(
     except SystemExit:  # Lightning's end of an interrupted training
         if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
             trainer.save_checkpoint(folder / CHECKPOINTS / "last.ckpt")
-            _write_constants(model, learner.result, folder)
+            write_constants(model, learner.result, data.source, folder)
         raise
     if last is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, batches, verbose=False)
     seconds = time.perf_counter() - start
     if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
-        _write_constants(model, learner.result, folder)
+        write_constants(model, learner.result, data.source, folder)
 
     metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
     error = metrics.get(VALIDATION_ERROR, float("nan"))
@@ -317,26 +317,6 @@ def _saved_steps(folder: Path) -> int:
 def _cpu_seconds() -> float:
     """Processor time of this process and of those that it has waited for."""
     return sum(os.times()[:4])
-
-
-def _write_constants(model: Predictor, result: Fit, folder: Path) -> None:
-    """Write the constants with their 95 % intervals, and what the data leave to the prior.
-
-    Those of a fit that was stopped are in a file of another name.
-    """
-    assert isinstance(model, LearnedConstants)
-    unfinished = folder / "constants_unfinished.csv"
-    if result.stopped_in is not None:
-        with whole(unfinished) as partial:
-            constants_table(model, result).to_csv(partial, index=False)
-        log.warning("the best constants so far are in %s, the fit is not finished", unfinished)
-        return
-    unfinished.unlink(missing_ok=True)
-    with whole(folder / "constants.csv") as partial:
-        constants_table(model, result).to_csv(partial, index=False)
-    left = undetermined(model, result) or ["nothing: the data determine every parameter"]
-    write_whole(folder / "undetermined.md", "".join(f"- {line}\n" for line in left))
-    log.info("constants and their intervals are in %s", folder / "constants.csv")
 
 
 def _write_report(source: LogSource, folder: Path) -> None:

@@ -131,8 +131,9 @@ class DisturbanceObserver(Controller):
         model = self.law.model
         with torch.no_grad():
             momentum, A = model.momentum(q, v), model.input_matrix(q)
-            force = model._kinetic_gradient(q, v) - model.potential_force(q)
-            force = force - model.dissipative_force(q, v)
+            # What moves p beside the input: C^T v - G - D v.
+            state = torch.cat([q, momentum], dim=-1)
+            force = model.momentum_derivative(state, torch.zeros_like(u))[..., q.shape[-1] :]
             if last is None or self.residual is None or last.momentum.shape != q.shape:
                 self._forget()
                 self.residual = torch.zeros_like(q)

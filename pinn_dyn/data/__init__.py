@@ -15,6 +15,7 @@ from pinn_dyn.data.robot_excitation import (
 from pinn_dyn.data.simulated import SimulatedSource
 from pinn_dyn.data.simulation import SimulationError, simulate
 from pinn_dyn.data.source import DataSource, Splits
+from pinn_dyn.data.stored import StoredSource, store
 from pinn_dyn.data.windows import Windows, draw_windows
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "SimulationError",
     "Splits",
     "Steps",
+    "StoredSource",
     "TorqueMultiSine",
     "TrackedMultiSine",
     "Windows",
@@ -43,4 +45,5 @@ __all__ = [
     "moments",
     "same_moments",
     "simulate",
+    "store",
 ]

@@ -9,7 +9,13 @@ from pinn_dyn.models.cholesky import (
 )
 from pinn_dyn.models.delay import Delay, LearnedDelay, NoDelay
 from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
-from pinn_dyn.models.friction_ladder import AsymmetricCoulomb, DriveCoulomb, LoadDependent, Stribeck
+from pinn_dyn.models.friction_ladder import (
+    AsymmetricCoulomb,
+    DriveCoulomb,
+    LoadDependent,
+    LoadDependentStribeck,
+    Stribeck,
+)
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
 from pinn_dyn.models.initial_velocity import InitialVelocity, LearnedVelocity, MeasuredVelocity
 from pinn_dyn.models.input_matrix import (
@@ -59,6 +65,7 @@ __all__ = [
     "LearnedDelay",
     "LearnedVelocity",
     "LoadDependent",
+    "LoadDependentStribeck",
     "MeasuredVelocity",
     "NetworkCholesky",
     "NetworkInput",

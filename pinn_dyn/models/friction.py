@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pinn_dyn.models.known_constants import Named
 from pinn_dyn.models.scales import Scales
 
 
@@ -27,6 +28,10 @@ class Friction(nn.Module, abc.ABC):
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
         """What of the force of a drive arrives at the joint, ``(*batch, N)``; here all of it."""
         return force
+
+    def physical_constants(self) -> list[Named]:
+        """The constants as they act, of a law whose parameters are such; here none."""
+        return []
 
     @abc.abstractmethod
     def slope(self, v: Tensor) -> Tensor:

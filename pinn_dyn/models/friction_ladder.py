@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.models.friction import Friction
-from pinn_dyn.models.known_constants import PositiveConstants
+from pinn_dyn.models.known_constants import Named, PositiveConstants
 from pinn_dyn.models.scales import Scales
 
 _SLOWEST = 0.01
@@ -37,17 +37,27 @@ class DriveCoulomb(Friction):
         super().__init__()
         force, v_std = scales.value, scales.statistics.v_std.double()
         self.slowest = _SLOWEST * float(v_std.mean())
-        joints = [str(k + 1) for k in range(scales.size)]
+        names = [joint.name for joint in scales.joints]
+        self.forces = [joint.force for joint in scales.joints]
+        self.speeds = [joint.speed for joint in scales.joints]
         self.level = PositiveConstants(
-            level * force, spread, [f"Coulomb friction of joint {k}" for k in joints]
+            level * force, spread, [f"Coulomb friction of {name}" for name in names], self.forces
         )
         self.width = PositiveConstants(
-            width * v_std, spread, [f"width of the friction of joint {k}" for k in joints]
+            width * v_std, spread, [f"friction width of {name}" for name in names], self.speeds
         )
-        self._add_constants(scales, joints)
+        self._add_constants(scales, names)
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
         """What a law of a higher rung has besides level and width."""
+
+    def physical_constants(self) -> list[Named]:
+        """The level or levels, and the width that acts: with the least one in it."""
+        width = self.width.named()
+        return [*self._levels(), width._replace(values=self._width(), lower=self.slowest)]
+
+    def _levels(self) -> list[Named]:
+        return [self.level.named()]
 
     def forward(self, v: Tensor) -> Tensor:
         return self._level(v)[0] * torch.tanh(v / self._width())
@@ -71,10 +81,19 @@ class AsymmetricCoulomb(DriveCoulomb):
     A level for each direction, as worn and preloaded gears have. Arguments as of the rung below.
     """
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
-        # c+ and c- are the level times e^r and e^-r.
-        names = [f"asymmetry of the friction of joint {k}" for k in joints]
-        self.ratio = PositiveConstants(torch.ones(scales.size), 0.5, names)
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        # c+ and c- are the level times the asymmetry, and divided by it.
+        asymmetries = [f"friction asymmetry of {name}" for name in names]
+        ones = torch.ones(scales.size)
+        self.ratio = PositiveConstants(ones, 0.5, asymmetries, ["1"] * scales.size)
+
+    def _levels(self) -> list[Named]:
+        level, ratio = self.level(), self.ratio()
+        found = []
+        for sign, values in ((">", level * ratio), ("<", level / ratio)):
+            names = [name.replace(" of ", f" (v {sign} 0) of ", 1) for name in self.level.names]
+            found.append(Named(names, self.forces, values, lower=0.0))
+        return found
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
         level, ratio = self.level(), self.ratio()
@@ -89,12 +108,15 @@ class Stribeck(AsymmetricCoulomb):
     the rungs below.
     """
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
-        super()._add_constants(scales, joints)
-        rises = [f"Stribeck rise of joint {k}" for k in joints]
-        speeds = [f"Stribeck speed of joint {k}" for k in joints]
-        self.rise = PositiveConstants(0.03 * scales.value, 1.0, rises)
-        self.speed = PositiveConstants(0.3 * scales.statistics.v_std, 1.0, speeds)
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        super()._add_constants(scales, names)
+        rises = [f"Stribeck rise of {name}" for name in names]
+        speeds = [f"Stribeck speed of {name}" for name in names]
+        self.rise = PositiveConstants(0.03 * scales.value, 1.0, rises, self.forces)
+        self.speed = PositiveConstants(0.3 * scales.statistics.v_std, 1.0, speeds, self.speeds)
+
+    def physical_constants(self) -> list[Named]:
+        return [*super().physical_constants(), self.rise.named(), self.speed.named()]
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
         level, _ = super()._level(v)
@@ -110,19 +132,56 @@ class LoadDependent(Stribeck):
 
     Teeth that transmit more press harder on each other: l_i, between 0 and 1, is the part of the
     force that gets lost while the drive moves; driven backwards the gear takes as much more. Since
-    v_i l_i |f_i| tanh(v_i / w_i) >= 0 it only takes energy. Models M3 to M6 of Duclusaud et al.
-    2025, "Extended friction models for the physics simulation of servo actuators" (BAM). Arguments
-    as of the rungs below.
+    v_i l_i |f_i| tanh(v_i / w_i) >= 0 it only takes energy. Model M3 of Duclusaud et al. 2025,
+    "Extended friction models for the physics simulation of servo actuators" (BAM), with the rise
+    of M2; their load is the force of the drive less that of the arm, here that of the drive.
+    Arguments as of the rungs below.
     """
 
     by_load = True
 
-    def _add_constants(self, scales: Scales, joints: list[str]) -> None:
-        super()._add_constants(scales, joints)
-        names = [f"loss by load of joint {k}" for k in joints]
-        self.odds = PositiveConstants(torch.full((scales.size,), 0.05), 1.0, names)
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        super()._add_constants(scales, names)
+        self.odds = self._odds_of("loss by load", 0.05, names)
+
+    def _odds_of(self, what: str, start: float, names: list[str]) -> PositiveConstants:
+        full = torch.full((len(names),), start)
+        return PositiveConstants(full, 1.0, [f"{what} of {n}" for n in names], ["1"] * len(names))
+
+    def physical_constants(self) -> list[Named]:
+        loss = self.odds.named()
+        return [*super().physical_constants(), loss._replace(values=_part(self.odds()))]
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """f - l |f| tanh(v / w), with l = odds / (1 + odds)."""
-        odds = self.odds()
-        return force - odds / (1 + odds) * force.abs() * torch.tanh(v / self._width())
+        """f - l |f| tanh(v / w)."""
+        return force - self._loss(v) * force.abs() * torch.tanh(v / self._width())
+
+    def _loss(self, v: Tensor) -> Tensor:
+        """l at v, from its odds."""
+        return _part(self.odds())
+
+
+class LoadDependentStribeck(LoadDependent):
+    """As the rung below, with a loss that is larger near rest, as the friction is::
+
+        l_i(v) = o_i / (1 + o_i),     o_i = odds_i + rise_i exp(-(v_i / b_i)^2)
+
+    b_i is the Stribeck speed. 0 < l_i < 1 at every v, so it only takes energy. Model M4 of the same
+    source. Arguments as of the rungs below.
+    """
+
+    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+        super()._add_constants(scales, names)
+        self.odds_rise = self._odds_of("loss by load near rest", 0.02, names)
+
+    def physical_constants(self) -> list[Named]:
+        rest = self.odds_rise.named()._replace(values=_part(self.odds() + self.odds_rise()))
+        return [*super().physical_constants(), rest]
+
+    def _loss(self, v: Tensor) -> Tensor:
+        return _part(self.odds() + self.odds_rise() * torch.exp(-((v / self.speed()) ** 2)))
+
+
+def _part(odds: Tensor) -> Tensor:
+    """Of the whole, between 0 and 1."""
+    return odds / (1 + odds)

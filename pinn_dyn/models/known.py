@@ -11,10 +11,10 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
+from pinn_dyn.models.known_constants import Named, PhysicalBodies, PositiveConstants, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
-from pinn_dyn.models.learned_constants import LearnedConstants, Named
-from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.learned_constants import LearnedConstants
+from pinn_dyn.models.scales import Joint, Scales
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import FrictionHead
 
@@ -26,11 +26,13 @@ Start = Literal["generic", "prior"]
 class Structure(Protocol):
     """Rigid bodies with known kinematics: what :class:`KnownMechanics` needs of an analytic system.
 
-    ``inertia`` are pseudo-inertias ``(n, 4, 4)`` of the n bodies, in which all terms are linear.
+    ``turning`` says of each joint whether it turns, else it slides; ``inertia`` are
+    pseudo-inertias ``(n, 4, 4)`` of the n bodies, in which all terms are linear.
     """
 
     num_coordinates: int
     joint_names: list[str]
+    turning: list[bool]
     body_names: list[str]
     inertia: Tensor
 
@@ -130,20 +132,37 @@ class KnownMechanics(LearnedConstants):
         gain = gain.expand(size)
         force = gain * statistics.u_rms.double()
         acceleration = statistics.acceleration.double()
-        names = structure.joint_names
+        joints = tuple(map(Joint, structure.joint_names, structure.turning))
         bodies = structure.generic_inertia() if start == "generic" else structure.inertia
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
-        self.armature = PositiveConstants(
-            0.03 * force / acceleration, 1.5, [f"armature of {name}" for name in names]
-        )
         damping = 0.1 * force / statistics.v_std.double()
-        self.viscous = PositiveConstants(damping, 1.5, [f"viscous friction of {n}" for n in names])
-        self.offset = RealConstants(0.3 * force, [f"torque offset of {name}" for name in names])
-        self.friction = friction(Scales(statistics, force))
+        self.armature = PositiveConstants(
+            0.03 * force / acceleration,
+            1.5,
+            [f"armature of {joint.name}" for joint in joints],
+            [joint.inertia for joint in joints],
+        )
+        self.viscous = PositiveConstants(
+            damping,
+            1.5,
+            [f"viscous friction of {joint.name}" for joint in joints],
+            [joint.damping for joint in joints],
+        )
+        self.offset = RealConstants(
+            0.3 * force,
+            [f"{'torque' if joint.turns else 'force'} offset of {joint.name}" for joint in joints],
+            [joint.force for joint in joints],
+        )
+        self.friction = friction(Scales(statistics, force, named=joints))
         self.input_affine = not self.friction.by_load
         self.gain: PositiveConstants | None = None
         if gain_spread > 0:
-            self.gain = PositiveConstants(gain, gain_spread, [f"drive gain of {n}" for n in names])
+            self.gain = PositiveConstants(
+                gain,
+                gain_spread,
+                [f"drive gain of {joint.name}" for joint in joints],
+                [f"{joint.force}/u" for joint in joints],
+            )
         self.register_buffer("fixed_gain", gain.clone())
         self.fixed_gain: Tensor
         self.float()
@@ -155,16 +174,18 @@ class KnownMechanics(LearnedConstants):
         return self.fixed_gain if self.gain is None else self.gain()
 
     def physical_constants(self) -> list[Named]:
-        """All constants in SI units: masses, m c, moments of inertia, armature, friction, gains."""
+        """All constants in SI units: masses, m c, moments of inertia, drives, friction, gains."""
         table = self.body_parameters()
         found = []
         labels = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
         for column, label in enumerate(labels):
             unit = "kg" if column == 0 else "kg m" if column < 4 else "kg m^2"
             names = [f"{label} of {body}" for body in self.structure.body_names]
-            found.append(Named(names, [unit] * len(names), table[:, column]))
-        others = [part for part in self._constants() if part is not self.bodies]
-        return found + [Named(part.names, part.units, part()) for part in others]
+            lower = 0.0 if label in ("mass", "Ixx", "Iyy", "Izz") else -float("inf")
+            found.append(Named(names, [unit] * len(names), table[:, column], lower))
+        drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
+        gains = [] if self.gain is None else [self.gain.named()]
+        return [*found, *drives, *self.friction.physical_constants(), *gains]
 
     def body_parameters(self) -> Tensor:
         """pi ``(n, 10)``: the inertial parameters, with M a + C v + G = Y(q, v, a) pi."""

@@ -9,9 +9,22 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+
+class Named(NamedTuple):
+    """Constants in physical units: n names, their units, values ``(n,)``, and what none is below.
+
+    A drive gain has the unit of its force by u, such as ``Nm/u``: no model knows that of its input.
+    """
+
+    names: list[str]
+    units: list[str]
+    values: Tensor
+    lower: float = -float("inf")
 
 
 class Constants(nn.Module, abc.ABC):
@@ -21,19 +34,24 @@ class Constants(nn.Module, abc.ABC):
         z: the parameters, zero at the start.
         names: of the entries of z, flattened: what a direction in them means.
         units: of what these names stand for.
+        lower: no constant is below it.
     """
 
-    def __init__(
-        self, shape: Sequence[int], names: Sequence[str], units: Sequence[str] | None = None
-    ):
+    lower = -float("inf")
+
+    def __init__(self, shape: Sequence[int], names: Sequence[str], units: Sequence[str]):
         super().__init__()
         self.z = nn.Parameter(torch.zeros(tuple(shape)))
         self.names = list(names)
-        self.units = ["SI"] * len(self.names) if units is None else list(units)
+        self.units = list(units)
 
     @abc.abstractmethod
     def forward(self) -> Tensor:
         """The constants in SI units."""
+
+    def named(self) -> Named:
+        """The constants with their names and units."""
+        return Named(self.names, self.units, self().flatten(), self.lower)
 
 
 class PositiveConstants(Constants):
@@ -43,21 +61,16 @@ class PositiveConstants(Constants):
         start: the median a priori, ``(n,)``.
         spread: standard deviation of the logarithm; 0.7 is a factor of two.
         names: n names.
-        units: n units; SI by default.
+        units: n units.
 
     Raises:
         ValueError: unless start and spread are positive.
     """
 
     start: Tensor
+    lower = 0.0
 
-    def __init__(
-        self,
-        start: Tensor,
-        spread: float,
-        names: Sequence[str],
-        units: Sequence[str] | None = None,
-    ):
+    def __init__(self, start: Tensor, spread: float, names: Sequence[str], units: Sequence[str]):
         if not bool(((start > 0) & start.isfinite()).all()) or not 0 < spread < math.inf:
             raise ValueError(
                 f"{names[0]} ...: start is {start.tolist()} and spread {spread}, expected positive"
@@ -76,12 +89,13 @@ class RealConstants(Constants):
     Args:
         spread: standard deviation a priori, ``(n,)``.
         names: n names.
+        units: n units.
     """
 
     spread: Tensor
 
-    def __init__(self, spread: Tensor, names: Sequence[str]):
-        super().__init__(spread.shape, names)
+    def __init__(self, spread: Tensor, names: Sequence[str], units: Sequence[str]):
+        super().__init__(spread.shape, names, units)
         self.register_buffer("spread", spread.float().clone())
 
     def forward(self) -> Tensor:
@@ -133,7 +147,7 @@ class PhysicalBodies(Constants):
         parts = ["mass", "x extent", "y extent", "z extent", "xy shear", "xz shear", "yz shear"]
         parts += ["x centre", "y centre", "z centre"]
         names = [f"{part} of {body}" for body in bodies for part in parts]
-        super().__init__((len(start), 10), names)
+        super().__init__((len(start), 10), names, ["1"] * len(names))
         mass = start[:, 3, 3, None, None]
         centre = start[:, :3, 3:] / mass
         root = torch.zeros_like(start)

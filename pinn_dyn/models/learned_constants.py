@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,15 +12,7 @@ from torch.nn.utils import parameters_to_vector
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.models.known_constants import Constants
-
-
-class Named(NamedTuple):
-    """Constants in physical units: n names, their units and values ``(n,)``."""
-
-    names: list[str]
-    units: list[str]
-    values: Tensor
+from pinn_dyn.models.known_constants import Constants, Named
 
 
 class LearnedConstants(MechanicalSystem):
@@ -40,7 +32,7 @@ class LearnedConstants(MechanicalSystem):
 
     def physical_constants(self) -> list[Named]:
         """All constants in their units."""
-        return [Named(part.names, part.units, part().flatten()) for part in self._constants()]
+        return [part.named() for part in self._constants()]
 
     def drive_gain(self) -> Tensor:
         """k ``(N,)``, a factor of the force of each input: one, unless gains are learned.

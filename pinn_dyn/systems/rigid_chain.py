@@ -66,6 +66,7 @@ class RigidChain(MechanicalSystem):
 
     Attributes:
         joint_names, body_names: N names each; a body is a link with all that is fixed to it.
+        turning: of each joint whether it turns, else it slides.
         inertia: pseudo-inertias, ``(N, 4, 4)``, in the frames of the joints; the URDF's.
 
     Raises:
@@ -107,6 +108,7 @@ class RigidChain(MechanicalSystem):
         if not 0 <= payload < float("inf"):
             raise ValueError(f"payload is {payload}, expected a finite number of at least 0 in kg")
         self.joint_names, self.body_names = tree.joints, tree.bodies
+        self.turning = tree.turning
         self.parents = tuple(tree.parents)
         # The pose of a joint is F0 + s F1 + c F2, with s = sin q and c = 1 - cos q (Rodrigues'
         # formula), or s = q and c = 0 where it slides.

@@ -2,7 +2,6 @@
 
 from pinn_dyn.training.checkpoints import WholeCheckpoints
 from pinn_dyn.training.constants_fit import Fit, StoppedFit
-from pinn_dyn.training.fit import fit
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
@@ -27,6 +26,5 @@ __all__ = [
     "StoppedFit",
     "WholeCheckpoints",
     "WindowLoss",
-    "fit",
     "one_cycle",
 ]

@@ -154,7 +154,7 @@ def test_a_lacking_argument_is_named(model):
     ("change", "expected"),
     [
         (lambda x: x.rename(columns={"bend_x": "bendx"}), "no column 'bend_x'.*mean 'bendx'"),
-        (lambda x: x.assign(force=np.nan), "the frame, line 251, column 'force' .*empty or NaN"),
+        (lambda x: x.assign(force=np.nan), "the frame, row 251, column 'force' .*empty or NaN"),
         (lambda x: x.assign(t=x.t * 1000), "unit of the time wrong"),
         (lambda x: x[:0], "the frame has no rows"),
         (lambda x: x[:5], "5 samples are too few for SavitzkyGolayVelocity"),
@@ -247,16 +247,17 @@ def test_the_same_training_by_train_has_the_same_weights(model, folder, tmp_path
         assert torch.equal(value.float(), expected[name].float()), name
 
 
+class Still(pinn_dyn.DataSource):
+    name, labels, input_labels = "still", ["q [m]"], ["u [N]"]
+
+    def load(self):
+        t = torch.arange(21, dtype=torch.float64) * 0.01
+        q, u = (t**2 / 2).unsqueeze(1), torch.ones(21, 1).double()
+        one = pinn_dyn.Trajectory(q, t.unsqueeze(1), pinn_dyn.Signal(t, u))
+        return pinn_dyn.Splits([one], [one], [one])
+
+
 def test_fit_leaves_the_random_numbers_and_the_threads_alone(black_box, folder):
-    class Still(pinn_dyn.DataSource):
-        name, labels, input_labels = "still", ["q [m]"], ["u [N]"]
-
-        def load(self):
-            t = torch.arange(21, dtype=torch.float64) * 0.01
-            q, u = (t**2 / 2).unsqueeze(1), torch.ones(21, 1).double()
-            one = pinn_dyn.Trajectory(q, t.unsqueeze(1), pinn_dyn.Signal(t, u))
-            return pinn_dyn.Splits([one], [one], [one])
-
     torch.manual_seed(5)
     expected = torch.rand(2)
     torch.manual_seed(5)
@@ -268,6 +269,18 @@ def test_fit_leaves_the_random_numbers_and_the_threads_alone(black_box, folder):
     assert not fitted.folder.exists()
     assert fitted.labels == ["q [m]"]
     assert fitted.predict([0.0, 0.0], np.ones((3, 1)), [0, 0.01, 0.02]).shape == (3, 2)
+
+
+def test_a_source_made_in_python_can_be_evaluated_and_controlled_from_its_folder(tmp_path):
+    short = ["data.pairs=8", "data.batch_size=8", "data.stride=1", "validator.horizon=0.1"]
+    run = tmp_path / "run"
+    pinn_dyn.fit(Still(), model="lnn", steps=1, overrides=short, folder=run)
+    run_script("evaluate.py", f"runs=[{run}]", f"hydra.run.dir={tmp_path / 'evaluation'}")
+    rows = pd.read_csv(tmp_path / "evaluation" / "summary.csv")
+    assert {"lnn", "stands still", "keeps its velocity"} <= set(rows["model"])
+    wanted = ["reference.q=[0.1]", f"hydra.run.dir={tmp_path / 'control'}"]
+    run_script("control.py", f"run={run}", *wanted)
+    assert (tmp_path / "control" / "report.html").is_file()
 
 
 @pytest.mark.parametrize(
@@ -287,6 +300,16 @@ def test_what_cannot_be_fitted_is_refused_by_name(changes, expected):
     arguments = {"q": Q, "u": U, "run": "run", "steps": 1, "overrides": SHORT, **changes}
     with pytest.raises(ValueError, match=expected):
         pinn_dyn.fit(log(), **arguments)
+
+
+def test_a_row_of_a_frame_is_named_by_its_number_not_by_a_line_of_a_file_that_is_gone():
+    frame = log()
+    frame.loc[260, "t"] = 0.0
+    with pytest.raises(ValueError, match=r"data: the frame, row 260, column 't': the time goes"):
+        pinn_dyn.fit(frame, q=Q, u=U, run="run", steps=1, overrides=SHORT)
+    frame.loc[260, "t"] = np.nan
+    with pytest.raises(ValueError, match=r"the frame, row 260, column 't' .*empty or NaN"):
+        pinn_dyn.fit(frame, q=Q, u=U, run="run", steps=1, overrides=SHORT)
 
 
 def test_columns_belong_to_a_frame(folder, model):

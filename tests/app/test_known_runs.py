@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import pinn_dyn
+from pinn_dyn.app.constants import read_constants
 from tests.app.entry import NO_FIGURES, fork_script, refused_text, run_script
 from tests.support.recorded_logs import LOGS, needs_logs
 
@@ -34,6 +35,50 @@ def fitted(tmp_path_factory, quick):
     folder = tmp_path_factory.mktemp("runs") / "known"
     run_script("train.py", KNOWN, *SMALL, f"hydra.run.dir={folder}")
     return folder
+
+
+def test_what_the_data_leave_open_is_announced_and_listed(fitted):
+    """With how many there are, some of them, and where all of them are."""
+    lines = (fitted / "undetermined.md").read_text().splitlines()
+    count = int(re.match(r"(\d+) of 36 directions of the constants are held by", lines[0])[1])
+    listed = [line for line in lines if line.startswith("- ")]
+    assert sum("held by the prior" in line for line in listed) == count > 10
+    (warned,) = re.findall(r"WARNING.*held by the prior, not by the data.*", _log(fitted))
+    assert f"{count} of 36" in warned
+    shown = [line for line in listed if line.removeprefix("- ") in warned]
+    assert 2 <= len(shown) <= 4
+    assert f"and {len(listed) - len(shown)} more lines in {fitted / 'undetermined.md'}" in warned
+
+
+def _log(folder):
+    return (folder / "train.log").read_text()
+
+
+def test_constants_have_units_and_the_names_of_joints(fitted):
+    table = pd.read_csv(fitted / "constants.csv").set_index("name")
+    assert table.unit["armature of shoulder"] == "kg m^2"
+    assert table.unit["Coulomb friction (v > 0) of elbow"] == "Nm"
+    assert table.unit["friction width of elbow"] == "rad/s"
+    assert not table.unit.isin(["SI"]).any()
+    assert not table.index.str.contains("joint ").any()
+    positive = ~table.index.str.match("m c|I(xy|xz|yz)|torque offset")
+    assert (table.low[positive] >= 0).all()
+
+
+def test_constants_of_runs_are_read_where_there_are_any(tmp_path, fitted, caplog):
+    damaged, older = tmp_path / "damaged", tmp_path / "older"
+    for folder in (damaged, older):
+        folder.mkdir()
+    (damaged / "constants.csv").write_bytes(b"\xff\xfe name")
+    pd.read_csv(fitted / "constants.csv")[["name", "value", "known"]].to_csv(
+        older / "constants.csv"
+    )
+    runs = {"fit": fitted, "network": tmp_path, "damaged": damaged, "older": older}
+    found = read_constants(runs)
+    assert list(found) == ["fit", "older"]
+    assert found["older"].value.equals(found["fit"].value)
+    assert found["older"].start.isna().all()
+    assert f"passed over: {damaged / 'constants.csv'} cannot be read" in caplog.text
 
 
 def constants(folder):
@@ -164,7 +209,7 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, stop, sta
     assert max(float(value.abs().max()) for value in kept.values()) > 0.1
     run_script("train.py", f"resume={folder}")
     found = pd.read_csv(folder / "constants.csv")
-    assert list(found.name) == list(stopped.name)
+    assert list(found.name)[: len(stopped)] == list(stopped.name)
     assert not (folder / "constants_unfinished.csv").exists()
     assert (folder / "metrics.json").exists()
     assert (folder / "undetermined.md").exists()

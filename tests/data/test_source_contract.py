@@ -11,7 +11,9 @@ from pinn_dyn.data import (
     RobotSource,
     SimulatedSource,
     Splits,
+    StoredSource,
     TorqueMultiSine,
+    store,
 )
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
@@ -149,3 +151,40 @@ class TestOwnSource(DataSourceContract):
     @pytest.fixture
     def changed(self):
         return Swings(rate=np.pi)
+
+
+class TestStoredSource(DataSourceContract):
+    """It stands for the source whose trajectories it keeps."""
+
+    def make(self, source, folder):
+        arguments = store(source, folder / f"{source.rate}.npz")
+        assert arguments.pop("_target_") == "pinn_dyn.data.StoredSource"
+        return StoredSource(**arguments)
+
+    @pytest.fixture
+    def source(self, tmp_path):
+        return self.make(Swings(), tmp_path)
+
+    @pytest.fixture
+    def again(self, tmp_path):
+        return self.make(Swings(), tmp_path)
+
+    @pytest.fixture
+    def changed(self, tmp_path):
+        return self.make(Swings(rate=np.pi), tmp_path)
+
+    def test_the_numbers_are_those_of_the_other_source(self, source):
+        for split in ("train", "validation", "test"):
+            pairs = zip(getattr(source.load(), split), getattr(Swings().load(), split), strict=True)
+            for one, other in pairs:
+                for name in ("t", "q", "v", "u"):
+                    assert torch.equal(getattr(one, name), getattr(other, name))
+        assert source.fingerprint() == Swings().fingerprint()
+
+    def test_a_file_that_is_cut_short_or_gone_is_named(self, source):
+        content = source.path.read_bytes()
+        source.path.write_bytes(content[: len(content) // 2])
+        with pytest.raises(ValueError, match=r"2\.0\.npz cannot be read, it may be damaged"):
+            source.load()
+        with pytest.raises(ValueError, match=r"gone\.npz does not exist.*dataset\.path"):
+            StoredSource(str(source.path.with_name("gone.npz")), "swings", ["q"], ["u"])

@@ -140,6 +140,7 @@ def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
         "input_labels": INPUTS,
         "comparisons": comparisons_of(names[:1]),
         "joints": pd.DataFrame(),
+        "constants": {},
         "parts": pd.DataFrame(),
         "intervals": {},
         "origin": origin(names),

@@ -3,14 +3,22 @@
 import pytest
 import torch
 
-from pinn_dyn.evaluation.identification import constants_table, undetermined
+from pinn_dyn.evaluation.identification import (
+    constants_table,
+    determined_together,
+    undetermined,
+)
+from pinn_dyn.models import AsymmetricCoulomb
 from pinn_dyn.training import Fit
 from pinn_dyn.training.constants_fit import Prior
 from tests.support.known import known_model
 
 
 def fit_with(model, variances):
-    covariance = torch.diag(torch.as_tensor(variances, dtype=torch.float64))
+    return fit_of(torch.diag(torch.as_tensor(variances, dtype=torch.float64)))
+
+
+def fit_of(covariance):
     information = torch.linalg.inv(covariance) - torch.eye(len(covariance)).double()
     prior = Prior(torch.zeros(len(covariance)).double(), torch.eye(len(covariance)).double())
     return Fit(covariance, information, prior, 0.0, 1)
@@ -38,10 +46,27 @@ def test_intervals_follow_from_the_covariance(model):
 
 def test_open_directions_are_named(model):
     names = model.parameter_names()
-    open_ones = {"mass of slider": 0.95, "armature of bend": 0.7}
+    open_ones = {"armature of bend": 0.7, "mass of slider": 0.95}
     words = undetermined(model, fit_with(model, [open_ones.get(name, 0.01) for name in names]))
     assert [text.split(":")[0] for text in words] == list(open_ones)
-    assert "95%" in words[0]
+    assert "95%" in words[1]
+
+
+def test_open_directions_are_named_one_by_one_where_they_are_open_one_by_one(model):
+    """The eigenvectors mix three parameters, none of which has anything to do with the others."""
+    names = model.parameter_names()
+    open_ones = ["mass of slider", "x extent of slider", "armature of bend"]
+    places = [names.index(name) for name in open_ones]
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
+    block = turn.double() @ torch.diag(torch.tensor([0.7, 0.8, 0.9]).double()) @ turn.double().T
+    covariance = 0.01 * torch.eye(len(names)).double()
+    covariance[torch.tensor(places)[:, None], torch.tensor(places)] = block
+    words = undetermined(model, fit_of(covariance))
+    assert {text.split(":")[0] for text in words} == set(open_ones)
+
+
+def test_nothing_open_is_nothing_said(model):
+    assert not undetermined(model, fit_with(model, [0.01] * len(model.parameter_names())))
 
 
 def test_what_no_data_determine_keeps_the_width_of_the_prior(model):
@@ -52,7 +77,95 @@ def test_what_no_data_determine_keeps_the_width_of_the_prior(model):
     with torch.no_grad():
         model.bodies.z[1, 0] -= 2  # the slider's mass, to a fiftieth
     after = constants_table(model, fit).set_index("name")
-    width = after.high - after.low
-    assert width["mass of slider"] == pytest.approx((before.high - before.low)["mass of slider"])
+    width = after.high - after.value
+    assert width["mass of slider"] == pytest.approx((before.high - before.value)["mass of slider"])
     assert after.known["mass of slider"] == pytest.approx(0, abs=1e-9)
     assert after.value["mass of slider"] < 0.1 * before.value["mass of slider"]
+
+
+def test_no_interval_goes_below_what_a_constant_can_be():
+    model = known_model(friction=AsymmetricCoulomb)
+    table = constants_table(model, fit_with(model, [1.0] * len(model.parameter_names())))
+    table = table.set_index("name")
+    for name in ("mass of slider", "Izz of slider", "armature of slide"):
+        assert table.low[name] == 0
+    assert table.low["friction width of slide"] == pytest.approx(model.friction.slowest)
+    assert table.low["m cx of slider"] < 0
+    assert table.low["force offset of slide"] < 0
+
+
+def test_constants_have_the_units_of_their_joint_and_of_the_input(model):
+    fit = fit_with(model, [0.5] * len(model.parameter_names()))
+    units = constants_table(model, fit, ["A", "A", "V", "A"]).set_index("name").unit
+    assert units["armature of turn"] == "kg m^2"
+    assert units["armature of slide"] == "kg"
+    assert units["viscous friction of turn"] == "Nms/rad"
+    assert units["viscous friction of slide"] == "Ns/m"
+    assert units["torque offset of turn"] == "Nm"
+    assert units["force offset of slide"] == "N"
+    assert units[[f"drive gain of {name}" for name in model.structure.joint_names]].tolist() == [
+        "Nm/A",
+        "N/A",
+        "Nm/V",
+        "Nm/A",
+    ]
+    assert constants_table(model, fit).set_index("name").unit["drive gain of turn"] == "Nm/u"
+
+
+def slopes_of(model, *names):
+    """dc/dz of these constants, by differences."""
+    z = torch.nn.utils.parameters_to_vector(model.parameters()).detach()
+
+    def values(at):
+        torch.nn.utils.vector_to_parameters(at, model.parameters())
+        found = {
+            n: x for c in model.physical_constants() for n, x in zip(c.names, c.values, strict=True)
+        }
+        return torch.stack([found[name] for name in names]).detach()
+
+    steps = 1e-5 * torch.eye(len(z)).double()
+    columns = [(values(z + step) - values(z - step)) / 2e-5 for step in steps]
+    middle = values(z)
+    return middle, torch.stack(columns, dim=1)
+
+
+def told(slope, sigma):
+    """A fit to data that tell of one combination of z alone, with the standard deviation sigma."""
+    information = torch.outer(slope, slope) / sigma**2
+    prior = Prior(0 * slope, torch.eye(len(slope)).double())
+    return Fit(torch.linalg.inv(information + prior.root), information, prior, 0.0, 1)
+
+
+def test_a_sum_that_is_known_where_its_parts_are_not_is_named(model):
+    names = ["mass of slider", "armature of slide"]
+    model.armature.start[1] = 3.0
+    (mass, armature), slopes = slopes_of(model, *names)
+    fit = told(slopes.sum(0), sigma := 0.001 * float(mass + armature))
+    (row,) = determined_together(model, fit).to_dict("records")
+    assert row["name"] == "mass of slider + armature of slide"
+    assert row["unit"] == "kg"
+    assert row["value"] == pytest.approx(float(mass + armature))
+    assert row["high"] - row["value"] == pytest.approx(1.96 * sigma, rel=1e-3)
+    assert row["value"] - row["low"] == pytest.approx(1.96 * sigma, rel=1e-3)
+    assert row["known"] > 0.999
+    alone = constants_table(model, fit).set_index("name")
+    assert (alone.low[names] == 0).all()
+
+
+def test_friction_that_is_known_by_the_gain_alone_is_named(model):
+    names = ["viscous friction of turn", "drive gain of turn"]
+    (viscous, gain), slopes = slopes_of(model, *names)
+    ratio = viscous / gain
+    fit = told(slopes[0] / gain - viscous / gain**2 * slopes[1], sigma := 0.01 * float(ratio))
+    (row,) = determined_together(model, fit, ["A"] * 4).to_dict("records")
+    assert row["name"] == "viscous friction of turn / drive gain of turn"
+    assert row["unit"] == "Nms/rad/(Nm/A)"
+    assert row["value"] == pytest.approx(float(ratio))
+    assert row["high"] - row["value"] == pytest.approx(1.96 * sigma, rel=1e-3)
+
+
+def test_what_is_known_alone_is_not_named_with_others(model):
+    fit = fit_with(model, [1e-6] * len(model.parameter_names()))
+    assert determined_together(model, fit).empty
+    open_fit = fit_with(model, [1.0] * len(model.parameter_names()))
+    assert determined_together(model, open_fit).empty

@@ -12,6 +12,7 @@ from PIL import Image
 
 from pinn_dyn.evaluation import write_table
 from pinn_dyn.evaluation.drawing import Line, Panel, error_panel, units
+from pinn_dyn.evaluation.identification import COLUMNS
 from pinn_dyn.evaluation.report import measured_model_report
 from pinn_dyn.evaluation.report.error_curves import error_figure
 from pinn_dyn.evaluation.report.motion import motion_figure, shown_motions
@@ -356,3 +357,24 @@ def test_a_run_without_any_finite_sample_is_drawn_as_nothing():
 def test_one_run_of_one_trajectory_is_enough():
     text, _ = prediction_page(names=("hnn",))
     assert [row["run"][0] for row in Page(text).table("mean error ± std")] == ["hnn"]
+
+
+def test_fitted_constants_have_a_section_that_says_what_is_not_determined(prediction):
+    rows = [
+        ["mass of link", 91.0548, 79.3, 102.8, "kg", 50.0, 0.999],
+        ["armature of screw", 4.0, 0.0, 15.7, "kg", 4.0, 0.0004],
+        ["mass of link + armature of screw", 95.0415, 93.7, 96.4, "kg", 54.0, 0.99999],
+        [ODD, 1.0, 0.5, 1.5, "Nm/A", np.nan, np.nan],
+    ]
+    constants = {"known": pd.DataFrame(rows, columns=COLUMNS)}
+    page = Page(prediction_page(constants=constants)[0])
+    mass, armature, both, odd = page.table("95 % from")
+    assert mass["value"] == ["91.1", "91.0548"]
+    assert (mass["unit"][0], mass["start"][0], mass[""][0]) == ("kg", "50", "")
+    assert armature[""][0] == "not determined"
+    assert both["constant"][0] == "mass of link + armature of screw"
+    assert both[""][0] == ""
+    assert odd["constant"][0] == ODD
+    assert odd["start"][0] == "-"
+    assert "1 not determined" in page.text
+    assert "95 % from" not in prediction[0]

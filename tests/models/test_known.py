@@ -5,7 +5,14 @@ import math
 import pytest
 import torch
 
-from pinn_dyn.models import AsymmetricCoulomb, DriveCoulomb, KnownMechanics, LoadDependent, Stribeck
+from pinn_dyn.models import (
+    AsymmetricCoulomb,
+    DriveCoulomb,
+    KnownMechanics,
+    LoadDependent,
+    LoadDependentStribeck,
+    Stribeck,
+)
 from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters
@@ -13,7 +20,8 @@ from tests.contracts.mechanical_system import MechanicalSystemContract
 from tests.support.known import known_model, statistics, unit_scales
 from tests.support.rigid_chains import TREE
 
-LADDER = [DriveCoulomb, AsymmetricCoulomb, Stribeck, LoadDependent]
+BY_LOAD = [LoadDependent, LoadDependentStribeck]
+LADDER = [DriveCoulomb, AsymmetricCoulomb, Stribeck, *BY_LOAD]
 
 
 def anywhere(module, std=1.0, seed=0):
@@ -100,8 +108,8 @@ def test_a_body_that_cannot_be_is_named():
 
 
 def test_standardized_constants():
-    positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"])
-    real = RealConstants(torch.tensor([4.0]), ["c"])
+    positive = PositiveConstants(torch.tensor([2.0, 3.0]), 0.5, ["a", "b"], ["kg", "kg"])
+    real = RealConstants(torch.tensor([4.0]), ["c"], ["N"])
     assert positive().tolist() == [2.0, 3.0]
     assert real().tolist() == [0.0]
     with torch.no_grad():
@@ -110,7 +118,7 @@ def test_standardized_constants():
     assert positive().tolist() == pytest.approx([2 * 1.6487213, 3 * 1.6487213])
     assert real().tolist() == [-8.0]
     with pytest.raises(ValueError, match=r"start is .* expected positive"):
-        PositiveConstants(torch.tensor([0.0]), 0.5, ["a"])
+        PositiveConstants(torch.tensor([0.0]), 0.5, ["a"], ["kg"])
 
 
 @pytest.mark.parametrize("law", LADDER)
@@ -148,9 +156,10 @@ def test_a_loaded_gear_transmits_less_forwards_and_takes_more_backwards():
     assert driven.flatten().tolist() == pytest.approx([1 - share, 1 + share, 1.0])
 
 
+@pytest.mark.parametrize("law", BY_LOAD)
 @pytest.mark.parametrize("seed", range(5))
-def test_load_only_takes_energy(seed):
-    model = anywhere(known_model(friction=LoadDependent, gain_spread=0.5), std=0.7, seed=seed)
+def test_load_only_takes_energy(law, seed):
+    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.7, seed=seed)
     q, v, u = (5 * torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(seed))).double()
     entering = (v * model.drive_gain() * u).sum(-1)
     lost = (v * model.dissipative_force(q, v)).sum(-1)
@@ -158,13 +167,39 @@ def test_load_only_takes_energy(seed):
     assert not model.input_affine
 
 
-def test_the_motion_obeys_the_equation_with_load():
-    model = anywhere(known_model(friction=LoadDependent, gain_spread=0.5), std=0.3)
+@pytest.mark.parametrize("law", BY_LOAD)
+def test_the_motion_obeys_the_equation_with_load(law):
+    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.3)
     q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(1)).double()
     a = model.forward_dynamics(q, v, u)
     bodies = model.structure.regressor(q, v, a) @ model.body_parameters().flatten()
     left = bodies + model.drive_force(v, a, u)
     assert float(left.abs().max()) < 1e-9 * float(bodies.abs().max())
+
+
+def test_reported_friction_is_what_acts():
+    """Level of each direction, width and loss, against forces of the law itself."""
+    model = anywhere(known_model(friction=LoadDependentStribeck), std=0.4)
+    found = {n: x for c in model.physical_constants() for n, x in zip(*c[::2], strict=True)}
+    law, slide = model.friction, model.structure.joint_names.index("slide")
+    fast = torch.full((4,), 1e3).double()
+    assert float(law(fast)[slide]) == pytest.approx(
+        float(found["Coulomb friction (v > 0) of slide"])
+    )
+    assert float(law(-fast)[slide]) == pytest.approx(
+        -float(found["Coulomb friction (v < 0) of slide"])
+    )
+    lost = 1 - law.transmitted(fast, torch.ones(4).double())
+    assert float(lost[slide]) == pytest.approx(float(found["loss by load of slide"]))
+    # Near rest F = (c + s) v / w, with c of the direction, and a unit of force loses l v / w.
+    slow = torch.full((4,), 1e-9).double()
+    slope = law.slope(slow)[slide]
+    level = found["Coulomb friction (v > 0) of slide"] + found["Stribeck rise of slide"]
+    width = float(found["friction width of slide"])
+    assert width == pytest.approx(float(level / slope), rel=1e-6)
+    assert width > law.slowest
+    lost = (1 - law.transmitted(slow, torch.ones(4).double()))[slide] / 1e-9 * width
+    assert float(lost) == pytest.approx(float(found["loss by load near rest of slide"]), rel=1e-4)
 
 
 def test_names_and_units_of_all_constants():
@@ -173,7 +208,7 @@ def test_names_and_units_of_all_constants():
     assert len(model.parameter_names()) == count == len(set(model.parameter_names()))
     constants = model.physical_constants()
     for item in constants:
-        assert len(item.names) == len(item.values)
+        assert len(item.names) == len(item.units) == len(item.values)
     assert "drive gain of turn" in [name for item in constants for name in item.names]
 
 

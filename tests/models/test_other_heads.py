@@ -68,23 +68,6 @@ def test_the_quadratic_part_is_an_elastic_well(q):
 # The input matrix.
 
 
-@pytest.mark.parametrize("inputs", [1, 3, 4])
-@pytest.mark.parametrize(
-    "builder",
-    [
-        partial(NetworkInput, hidden=[4]),
-        ConstantInput,
-    ],
-    ids=["network", "constant"],
-)
-def test_input_matrix_has_one_column_per_input(builder, inputs, q):
-    head = make_input(builder, inputs)
-    assert head(q).shape == (40, SIZE, inputs)
-    assert head(q[0]).shape == (SIZE, inputs)
-    assert_near(head(q.reshape(4, 10, SIZE)), head(q).reshape(4, 10, SIZE, inputs), 1e-12)
-    assert_near(head(q[0]), head(q)[0], 1e-12)
-
-
 @pytest.mark.parametrize("quadratic", [True, False])
 def test_a_potential_is_bounded_from_below(quadratic, q):
     """Its network falls along some direction: far out only the well goes on."""

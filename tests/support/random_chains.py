@@ -108,7 +108,7 @@ def fit_of_a_random_chain(seed: int) -> Outcome:
     windows = draw_windows(runs, count=100, steps=10, stride=4, seed=seed)
     table = constants_table(model, LeastSquares(cutoff=10.0).fit(model, runs, windows))
     true = torch.cat([item.values for item in truth.physical_constants()]).detach().numpy()
-    error = (table.value - true) / ((table.high - table.low) / (2 * 1.96))
+    error = (table.value - true) / ((table.high - table.value) / 1.96)
     error = error[table.known > 0.99]
     unseen = random_motion(truth, generator)
     with torch.no_grad():

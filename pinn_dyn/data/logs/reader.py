@@ -24,6 +24,8 @@ from pinn_dyn.data.logs.parquet import read_parquet
 # A run of a table: its name, and which rows are its own.
 Group = tuple[str, slice | np.ndarray]
 
+THE_FRAME = Path("the frame")
+"""In the place of a file: a data frame, whose rows are named by its index."""
 _PART = 200_000  # rows of a CSV file that are parsed together
 _LONGEST_HEADER = 130_000
 _MOST_COLUMNS = 10_000
@@ -155,6 +157,7 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
     bad = ~np.isfinite(values)
     if bad.any():
         k = int(bad.argmax())
+        line = "row" if path == THE_FRAME else "line"
         empty = np.ndim(raw.iloc[k]) == 0 and pd.isna(raw.iloc[k])
         what = "is empty or NaN" if empty else f"is {shown(str(raw.iloc[k]))}"
         if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", str(raw.iloc[k])):
@@ -167,7 +170,7 @@ def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarr
                 "t = pandas.to_datetime(table[...])"
             )
         raise LogError(
-            f"{path}, line {table.index[k]}, column {name!r} ({signal}): the value {what}, "
+            f"{path}, {line} {table.index[k]}, column {name!r} ({signal}): the value {what}, "
             f"expected a number ({int(bad.sum())} such rows in this column): {cure}"
         )
     return values

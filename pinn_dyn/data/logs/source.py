@@ -38,6 +38,7 @@ from pinn_dyn.data.logs.pieces import (
     trajectory,
 )
 from pinn_dyn.data.logs.reader import (
+    THE_FRAME,
     Group,
     column,
     find_files,
@@ -214,7 +215,7 @@ class LogSource(DataSource):
                     f"steps.{name}: {step} takes something from the training runs, which a frame "
                     "does not have: give it in the configuration, and train again"
                 )
-        path = Path("the frame")
+        path = THE_FRAME
         groups: list[Group] = [("the frame", slice(None))]
         if self.trajectory is not None and self.trajectory in frame.columns:
             groups = runs_of(frame, path, self.trajectory)

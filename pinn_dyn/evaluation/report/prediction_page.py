@@ -10,6 +10,7 @@ from markupsafe import Markup
 from pinn_dyn.evaluation.calibration import Calibration, calibration_figure
 from pinn_dyn.evaluation.drawing import units, with_unit
 from pinn_dyn.evaluation.figures import ERROR, prediction_errors, terms_figure, trajectory_panels
+from pinn_dyn.evaluation.identification import OPEN
 from pinn_dyn.evaluation.learned_terms import TermComparison
 from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.prediction import Prediction
@@ -66,6 +67,7 @@ def prediction_report(
     input_labels: Sequence[str],
     comparisons: Mapping[str, TermComparison],
     joints: pd.DataFrame,
+    constants: Mapping[str, pd.DataFrame],
     parts: pd.DataFrame,
     intervals: Mapping[str, Mapping[float, Calibration]],
     origin: Origin,
@@ -84,6 +86,8 @@ def prediction_report(
         comparisons: names of the runs that have terms, and these beside the true ones; empty
             where the truth is not known.
         joints: torque errors, one row per run and joint; empty without any.
+        constants: names of the runs whose constants were fitted, and these, as
+            :func:`pinn_dyn.evaluation.identification.constants_table` makes them.
         parts: what the parts of sums contribute, one row per run, part and term; empty without any.
         intervals: names of the runs that have members, and the calibration for each window in s.
         origin: where the numbers come from.
@@ -114,6 +118,8 @@ def prediction_report(
         sections.insert(3, Section("Parts", _parts(parts)))
     if len(joints):
         sections.insert(3, Section("Torque", _torques(joints)))
+    if constants:
+        sections.insert(3, Section("Constants", _constants(constants)))
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
@@ -180,6 +186,31 @@ def _trajectories(
     if lost:
         text += f" Diverged: {'; '.join(lost)}. A line is not drawn far outside its panel."
     return [figure(drawn, "figure-trajectory"), paragraph(text)]
+
+
+def _constants(constants: Mapping[str, pd.DataFrame]) -> list[Markup]:
+    headers = {
+        "name": "constant",
+        "value": "value",
+        "low": "95 % from",
+        "high": "to",
+        "unit": "unit",
+        "start": "start",
+        "note": "",
+    }
+    text = (
+        "Fitted constants with their 95 % intervals, and the value that each started from, the "
+        "middle of its prior. What is not determined keeps the width of the prior, as the data say "
+        "next to nothing of it. Sums and ratios at the end are determined where their parts are "
+        "not."
+    )
+    parts = [paragraph(text)]
+    for run, frame in constants.items():
+        left = frame["known"] < 1 - OPEN
+        rows = frame.assign(note=left.map({True: "not determined", False: ""}))
+        title = f"{run}: {len(rows)} rows, {int(left.sum())} not determined (constants.csv)"
+        parts.append(details(title, table(rows, headers=headers)))
+    return parts
 
 
 def _torques(joints: pd.DataFrame) -> list[Markup]:
