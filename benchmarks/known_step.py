@@ -1,12 +1,12 @@
 """Time of a training step of known mechanics, beside that of the Lagrangian network for one robot.
 
 A step is: one RK4 step of a batch, the increment loss, its gradient; no optimizer. The models are
-those of experiment=panda/known, panda/known_and_network and panda/lnn, N = 7, compiled as
-compile=true does it in a training of 5,000 steps (the state derivative) and of 20,000 (all of it).
+those of experiment=panda/known, panda/known_and_network and panda/lnn, N = 7, eager and compiled as
+compile=true does it in a training of 5,000 steps (the state derivative), or of 20,000 (the whole).
 They take turns, round by round; the clock is the processor time of this process, on one thread.
 
     python benchmarks/known_step.py                       # the table of README.md
-    python benchmarks/known_step.py --rounds 3 --eager    # without compiling, no file
+    python benchmarks/known_step.py --ways eager --rounds 2 --output /dev/null   # a smoke run
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from pinn_dyn.training.gradients import Compiled, Eager
 SIZE = 7
 RESULT = Path(__file__).parent / "results" / "known_step.csv"
 MODELS = ("lnn", "known", "known_and_network")
-STEPS = {"derivative": 0, "whole": STEPS_FOR_PROGRAM}
+WAYS = {"eager": None, "derivative": 0, "whole": STEPS_FOR_PROGRAM}
+"""How it is compiled, and the steps of a training that does so."""
 
 
 def scales() -> Statistics:
@@ -51,10 +52,8 @@ def step_of(name: str, compiled: str, batch: int) -> Callable[[], float]:
     model = build_model(composed("train", words), scales()).train()
     loss, vector = IncrementLoss(scales(), model), ParameterVector(model.parameters())
     windows = make_windows(SIZE, batch, torch.float32)
-    if compiled == "eager":
-        engine: Compiled | Eager = Eager(loss, model, vector)
-    else:
-        engine = Compiled(loss, model, vector, STEPS[compiled])
+    steps = WAYS[compiled]
+    engine = Eager(loss, model, vector) if steps is None else Compiled(loss, model, vector, steps)
     return lambda: float(engine(windows)[0])
 
 
@@ -72,11 +71,15 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--count", type=int, default=10, help="steps in a round")
-    parser.add_argument("--eager", action="store_true", help="smoke run without a compiler")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=["eager", "derivative"])
+    parser.add_argument("--output", type=Path, default=RESULT)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    ways = ["eager"] if arguments.eager else ["eager", *STEPS]
-    steps = {(name, way): step_of(name, way, arguments.batch) for way in ways for name in MODELS}
+    steps = {
+        (name, way): step_of(name, way, arguments.batch)
+        for way in arguments.ways
+        for name in MODELS
+    }
     for (name, way), step in steps.items():
         start = time.perf_counter()
         step()
@@ -95,12 +98,11 @@ def main() -> None:
         row |= {"smallest": round(min(beside), 2), "largest": round(max(beside), 2)}
         rows.append(row | record)
         print(f"| {way} | {name} | {row['cpu_ms']} | {row['x_lnn']} |", flush=True)
-    if not arguments.eager:
-        with RESULT.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-        print(f"wrote {RESULT}")
+    with arguments.output.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"wrote {arguments.output}")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.parts import build_part
@@ -26,8 +26,8 @@ def check_known(config: dict[str, Any], source: DataSource) -> None:
     Where the columns do not name the joints, their order counts: it is logged.
 
     Raises:
-        ConfigError: if there are more or fewer columns than joints, their names show another order,
-            or inputs such as currents have no drive gains.
+        ConfigError: if there are more or fewer columns than joints, their names or units show
+            another order, or inputs such as currents have no drive gains.
     """
     model = config["model"]
     for place, part in (("model", model), ("model.known", model.get("known"))):
@@ -36,6 +36,7 @@ def check_known(config: dict[str, Any], source: DataSource) -> None:
             if isinstance(structure, Structure):
                 locked = list(part["structure"].get("locked_joints", ()))
                 _check_joints(f"{place}.structure", structure.joint_names, locked, source)
+                _check_units(f"{place}.structure", structure, source)
                 _check_gains(place, part, structure.num_coordinates, source)
 
 
@@ -116,6 +117,20 @@ def _plain(name: str) -> str:
     return re.sub(r"[\W_]", "", name.split(" [")[0].lower())
 
 
+def _check_units(place: str, structure: Structure, source: DataSource) -> None:
+    """Refuse a joint that turns by metres, or slides by radians."""
+    for (name, unit), joint, turns in zip(
+        _units(source, "q"), structure.joint_names, structure.turning, strict=True
+    ):
+        expected = "rad" if turns else "m"
+        if unit not in (None, expected):
+            raise ConfigError(
+                f"{name} is in {unit}, and joint {joint} of {place} "
+                f"{'turns' if turns else 'slides'}: expected {expected}; is it the column of another joint, or the unit wrong "
+                "(dataset.q.unit)?"
+            )
+
+
 def _check_gains(place: str, part: dict[str, Any], size: int, source: DataSource) -> None:
     if part.get("gain_spread", 0) != 0:
         return
@@ -123,8 +138,8 @@ def _check_gains(place: str, part: dict[str, Any], size: int, source: DataSource
     gains = gain if isinstance(gain, list) else [gain] * size
     other = [
         f"{name} in {unit}"
-        for (name, unit), own in zip(_input_units(source), gains, strict=False)
-        if unit not in _FORCES and own == 1
+        for (name, unit), own in zip(_units(source, "u"), gains, strict=False)
+        if unit not in (None, *_FORCES) and own == 1
     ]
     if other:
         raise ConfigError(
@@ -135,14 +150,13 @@ def _check_gains(place: str, part: dict[str, Any], size: int, source: DataSource
         )
 
 
-def _input_units(source: DataSource) -> Iterator[tuple[str, str]]:
-    """Names and units of the inputs; those without a unit count as forces."""
+def _units(source: DataSource, signal: Literal["q", "u"]) -> Iterator[tuple[str, str | None]]:
+    """Names and units of the coordinates or the inputs; None where nobody said the unit."""
     if isinstance(source, LogSource):
-        for name, unit, in_file in zip(
-            source.u.columns, source.u.units, source.u.file_units, strict=True
-        ):
-            yield name, "Nm" if in_file == "1" else "%" if unit == "1" else unit
+        given = source.q if signal == "q" else source.u
+        for name, unit, in_file in zip(given.columns, given.units, given.file_units, strict=True):
+            yield name, None if in_file == "1" else in_file if unit == "1" else unit
         return
-    for label in source.input_labels:
+    for label in source.labels if signal == "q" else source.input_labels:
         name, _, unit = label.rstrip("]").partition(" [")
-        yield name, unit or "Nm"
+        yield name, unit or None

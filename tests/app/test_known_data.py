@@ -20,13 +20,13 @@ def urdf(names=NAMES):
     return robot(*links, *(joint(name, "continuous", a, b) for name, a, b in ends))
 
 
-def log_of(q, u=None, v=None, unit="Nm"):
+def log_of(q, u=None, v=None, unit="Nm", q_unit="rad"):
     return LogSource(
         name="arm",
         root=".",
         files="*.csv",
         time=dict(columns="t", unit="s"),
-        q=dict(columns=q, unit="rad"),
+        q=dict(columns=q, unit=q_unit),
         v=None if v is None else dict(columns=v, unit="rad/s"),
         u=dict(columns=u or [f"u{k}" for k in range(len(q))], unit=unit),
         validation=PART,
@@ -118,6 +118,21 @@ def test_inputs_that_are_no_forces_need_gains(unit):
         check_known(config(drive_gain=[1, 1, 2]), source)
     for gains in ({"drive_gain": 8.0}, {"drive_gain": [1, 8, 1]}, {"gain_spread": 0.5}):
         check_known(config(**gains), source)
+
+
+def test_a_joint_that_turns_is_not_measured_in_metres():
+    one = config(["slider", "elbow"])
+    structure = one["model"]["structure"]
+    structure["urdf"] = structure["urdf"].replace(
+        '"slider" type="continuous"', '"slider" type="prismatic"'
+    )
+    check_known(one, log_of(["q1", "q2"], q_unit=["mm", "deg"]))
+    check_known(one, log_of(["q1", "q2"], q_unit="1"))
+    message = (
+        r"q1 is in rad, and joint slider of model.structure slides: expected m;.*dataset.q.unit"
+    )
+    with pytest.raises(ConfigError, match=message):
+        check_known(one, log_of(["q1", "q2"], q_unit=["deg", "mm"]))
 
 
 def test_units_that_nobody_said_pass_and_so_do_other_models():
