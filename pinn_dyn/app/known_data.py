@@ -126,8 +126,8 @@ def _check_units(place: str, structure: Structure, source: DataSource) -> None:
         if unit not in (None, expected):
             raise ConfigError(
                 f"{name} is in {unit}, and joint {joint} of {place} "
-                f"{'turns' if turns else 'slides'}: expected {expected}; is it the column of another joint, or the unit wrong "
-                "(dataset.q.unit)?"
+                f"{'turns' if turns else 'slides'}: expected {expected}; is it the column "
+                "of another joint, or the unit wrong (dataset.q.unit)?"
             )
 
 
