@@ -202,6 +202,14 @@ def test_reported_friction_is_what_acts():
     assert float(lost) == pytest.approx(float(found["loss by load near rest of slide"]), rel=1e-4)
 
 
+@pytest.mark.parametrize("law", LADDER)
+@pytest.mark.parametrize("setting", ["level", "width", "spread"])
+def test_settings_of_friction_are_refused_by_name(law, setting):
+    for value in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match=rf"friction: {setting} is {value}, expected a pos"):
+            law(unit_scales(1), **{setting: value})
+
+
 def test_names_and_units_of_all_constants():
     model = known_model(gain_spread=0.5)
     count = sum(p.numel() for p in model.parameters())
