@@ -123,7 +123,7 @@ def logs() -> str:
                 mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
                 best = mean == means[column].min() and mean < floor[column]
                 spread = f" ({_precise(low)}–{_precise(high)})" if len(runs) > 1 else ""
-                cells.append(f"{bold(_precise(mean), best)}{spread}")
+                cells.append(f"{bold(_error(mean), best)}{spread}{_lost(runs, column, mean)}")
             label = model if model in _LINEAR else f"`{model}`"
             rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells])
         rows.append(["", "keeps its velocity", *(_floor(floor[c], means[c]) for c in WINDOWS)])
@@ -132,7 +132,7 @@ def logs() -> str:
 
 _RIGID_ROWS = (
     *("identification", "known", "known_and_network", "lnn", "acceleration", "mlp"),
-    *("keeps its velocity", "ARX"),
+    *("stands still", "keeps its velocity", *_LINEAR),
 )
 
 
@@ -141,12 +141,13 @@ def rigid() -> str:
     rows = []
     for name, unit in RIGID.items():
         data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
-        data = data.groupby("model")[["floor", *WINDOWS, "torque_share"]].mean()
-        data = data.loc[[model for model in _RIGID_ROWS if model in data.index]]
-        for index, (model, row) in enumerate(data.iterrows()):
+        means = data.groupby("model")[["floor", *WINDOWS, "torque_share"]].mean()
+        means = means.loc[[model for model in _RIGID_ROWS if model in means.index]]
+        for index, (model, row) in enumerate(means.iterrows()):
             label = model if row["floor"] else f"`{model}`"
+            runs = data[data["model"] == model]
             cells = [
-                bold(_precise(row[c]), row[c] == data[c].min()) if row[c] < 100 else "diverged"
+                f"{bold(_error(row[c]), row[c] == means[c].min())}{_lost(runs, c, row[c])}"
                 for c in WINDOWS
             ]
             torque = "–" if pd.isna(row["torque_share"]) else number(row["torque_share"])
@@ -215,6 +216,23 @@ def _of_log(name: str) -> pd.DataFrame:
 def _precise(value: float) -> str:
     """Three digits, as the models of a log are close to each other."""
     return f"{value:#.3g}"
+
+
+_DIVERGED = 100.0
+"""A mean error above it is that of motions that broke down."""
+
+
+def _error(value: float) -> str:
+    return _precise(value) if value < _DIVERGED else "diverged"
+
+
+def _lost(runs: pd.DataFrame, column: str, mean: float) -> str:
+    """How many motions diverged and are in no mean, if any did."""
+    name = column.replace("error_mean", "diverged")
+    count = int(runs[name].sum()) if name in runs else 0
+    if not count or mean >= _DIVERGED:
+        return ""
+    return f", {count} of {int(runs['trajectories'].sum())} diverged"
 
 
 def _floor(value: float, models: pd.Series) -> str:

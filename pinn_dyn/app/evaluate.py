@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.data_record import check_data
@@ -27,16 +26,19 @@ from pinn_dyn.app.evaluation_results import (
     torque_errors,
     write_intervals,
 )
+from pinn_dyn.app.identification import identified
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
 from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, write_json
+from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
-from pinn_dyn.data import Splits
+from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
     Prediction,
     RunResult,
     beaten_by_floors,
+    best_floor,
     build_floors,
     calibration,
     common_stride,
@@ -93,26 +95,20 @@ def evaluate(cfg: DictConfig) -> float:
     torch.set_num_threads(config["threads"])
     trust = packages(config.get("trust"))
     runs, damaged = _load_all(find_runs(config["runs"]), config["checkpoint"], trust)
-    trained_on = build_source(_shared_dataset(runs))
-    source = build_source(config) if config.get("dataset") else trained_on
-    sizes = [len(source.labels), len(source.input_labels)]
-    if sizes != [len(trained_on.labels), len(trained_on.input_labels)]:
-        raise ConfigError(
-            f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, the runs "
-            f"were trained on {len(trained_on.labels)} and {len(trained_on.input_labels)}"
-        )
     try:
-        training = trained_on.load()
-        trajectories = getattr(source.load(), split)
-        truth = stack_until(trajectories)
-        config["horizon"] = config["horizon"] or default_horizon(truth.duration)
-        truth = stack_until(trajectories, config["horizon"])
+        data = shared_data(runs, config)
+        plain = next(k for k, one in enumerate(data) if not one.preparation)
+        source, motions = data[plain].source, data[plain].trajectories
+        shortest = stack_until(motions).duration
+        config["horizon"] = config["horizon"] or default_horizon(shortest)
+        truths = [stack_until(one.trajectories, config["horizon"]) for one in data]
+        truth = truths[plain]
         steps = [run.model.fixed_step or config["step"] or run.statistics.step for run in runs]
         stride = common_stride(steps, truth.t)
     except ValueError as error:
-        raise ConfigError(f"{source.name}: {error}") from error
-    for run in runs:
-        check_data(run.folder, trained_on)
+        raise ConfigError(f"{runs[0].config['dataset'].get('name', 'dataset')}: {error}") from error
+    for run, one in zip(runs, data, strict=True):
+        check_data(run.folder, one.trained_on)
     grid = stride * truth.duration / (len(truth.t) - 1)
     if config["windows"] is None:
         config["windows"] = default_windows(config["horizon"], grid)
@@ -121,31 +117,46 @@ def evaluate(cfg: DictConfig) -> float:
             f"trajectory is {config['trajectory']}, expected 0 to {len(truth.q) - 1}, one of the "
             f"{len(truth.q)} {SPLITS[split]}"
         )
-    if (dropped := len(trajectories) - len(truth.q)) > 0:
+    if (dropped := len(motions) - len(truth.q)) > 0:
         log.warning(
             "%d of %d %s of %s are shorter than horizon=%g and left out",
-            *(dropped, len(trajectories), SPLITS[split], source.name, config["horizon"]),
+            *(dropped, len(motions), SPLITS[split], source.name, config["horizon"]),
         )
     log.info("%d runs on %d %s of %s", len(runs), truth.q.shape[0], SPLITS[split], source.name)
 
-    labels = _labels(runs)
-    rows = [_row(run, label, step) for run, label, step in zip(runs, labels, steps, strict=True)]
-    models = [run.model for run in runs]
-    members = [run.members() for run in runs]
-    for label, floor in build_floors(training.train, training.validation, step=grid).items():
-        rows.append(RunResult(label, label, None, {}, {"step": grid}, floor=True))
-        models.append(floor)
-        members.append(None)
+    names = _model_names(runs, data)
+    labels = _labels(runs, names)
+    entrants = [
+        _Entrant(_row(run, label, name, step), run.model, truth, one.training, run.members())
+        for run, label, name, step, truth, one in zip(
+            runs, labels, names, steps, truths, data, strict=True
+        )
+    ]
+    notes = _notes(data, source)
+    training = data[plain].training
+    floors = build_floors(training.train, training.validation, step=grid)
+    entrants += [
+        _Entrant(_floor(label, grid), floor, truth, training) for label, floor in floors.items()
+    ]
+    fits = identified(runs, data)
+    for k, model in fits.items():
+        label = "identification"
+        if len(fits) > 1 or label in labels:
+            label = f"identification of {labels[k]}"
+        entrants.append(_Entrant(_floor(label, steps[k]), model, truths[k], data[k].training))
+        notes.append(
+            f"{label}: the constants of {labels[k]} by its inverse dynamics alone, as "
+            "optimizer.rollouts=false trains them"
+        )
     evaluations = []
-    progress = tqdm(models, desc="evaluating", disable=None)
-    for model, drawn, row in zip(progress, members, rows, strict=True):
+    for entrant in tqdm(entrants, desc="evaluating", disable=None):
         try:
-            evaluations.append(_evaluate(model, drawn, row, truth, training, stride, config))
+            evaluations.append(_evaluate(entrant, stride, config))
         except ValueError as error:
-            raise ConfigError(f"run '{row.run}': {error}") from error
+            raise ConfigError(f"run '{entrant.row.run}': {error}") from error
     trained = evaluations[: len(runs)]
-    joints = torque_errors(trained, truth, source)
-    parts = shares(trained, truth)
+    joints = torque_errors(evaluations, source)
+    parts = shares(evaluations)
     summary = summary_table([item.result for item in evaluations])
     write_table(summary, folder, "summary")
     grouped = grouped_table(summary)
@@ -155,9 +166,9 @@ def evaluate(cfg: DictConfig) -> float:
     if len(parts):
         write_table(parts, folder, "parts")
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    made = {"config": config, "dataset": runs[0].config["dataset"], **record}
+    made = {"config": config, "dataset": runs[plain].config["dataset"], **record}
     write_json(folder / "provenance.json", made)
-    draw(evaluations, truth, source, config, folder)
+    draw(evaluations, best_floor(summary), truth, source, config, folder)
     intervals = write_intervals(trained, source, split, folder)
     comparisons = compare_with_truth(trained, source, folder)
 
@@ -175,8 +186,8 @@ def evaluate(cfg: DictConfig) -> float:
     headers |= {"input_delay_seconds": "delay"}
     print(format_table(summary[[name for name in shown if name in summary]], headers))
     verdict = beaten_by_floors(summary)
-    notes = ["* best; only a model that beats all in brackets; valid_time, after and delay in s"]
-    print("\n".join([*notes, *verdict, *interval_lines(intervals)]))
+    star = "* best; only a model that beats all in brackets; valid_time, after and delay in s"
+    print("\n".join([star, *notes, *verdict, *interval_lines(intervals)]))
     if len(grouped) < len(summary):
         figures = [c for c in grouped if c.endswith(("_error_mean", "_error_worst"))]
         print(f"\nover seeds:\n{format_table(grouped[['model', 'seeds', 'floor', *figures]])}")
@@ -185,6 +196,7 @@ def evaluate(cfg: DictConfig) -> float:
         trajectories=trajectories,
         summary=summary,
         grouped=grouped,
+        notes=notes,
         truth=truth,
         predictions={item.result.run: item.prediction for item in evaluations},
         trajectory=config["trajectory"],
@@ -242,25 +254,16 @@ def _load_all(
     return runs, damaged
 
 
-def _shared_dataset(runs: list[Run]) -> dict[str, Any]:
-    """The part of the configuration that says which data all runs were trained on."""
-    first = runs[0]
-    for run in runs[1:]:
-        if _without_cache(run.config) != _without_cache(first.config):
-            raise ConfigError(
-                f"runs: {run.folder} was trained on another data set than {first.folder} "
-                "(compare 'dataset' in their config.yaml): evaluate them separately"
-            )
-    return first.config
+def _model_names(runs: list[Run], data: list[RunData]) -> list[str]:
+    """The model of each run, and how its inputs were prepared where that is not as in the truth."""
+    return [
+        f"{run.config['model_name']} {one.preparation}".rstrip()
+        for run, one in zip(runs, data, strict=True)
+    ]
 
 
-def _without_cache(config: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in config["dataset"].items() if key != "cache"}
-
-
-def _labels(runs: list[Run]) -> list[str]:
+def _labels(runs: list[Run], models: list[str]) -> list[str]:
     """Short names of runs: the model, with its seed and folder only where they tell apart."""
-    models = [run.config["model_name"] for run in runs]
     seeds = [f"{m} seed {run.config['seed']}" for m, run in zip(models, runs, strict=True)]
     for names in (models, seeds):
         if len(set(names)) == len(names):
@@ -268,24 +271,46 @@ def _labels(runs: list[Run]) -> list[str]:
     return [f"{name} {run.folder.name}" for name, run in zip(seeds, runs, strict=True)]
 
 
-def _row(run: Run, label: str, step: float) -> RunResult:
+def _row(run: Run, label: str, model: str, step: float) -> RunResult:
     """The row of a trained model, without its figures."""
     recorded = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
     extra = {name: run.metrics[name] for name in recorded if name in run.metrics}
     extra |= {"step": step, **run.model.learned_figures()}
-    return RunResult(label, run.config["model_name"], run.config["seed"], {}, extra)
+    return RunResult(label, model, run.config["seed"], {}, extra)
 
 
-def _evaluate(
-    model: Predictor,
-    members: Ensemble | None,
-    row: RunResult,
-    truth: Trajectory,
-    training: Splits,
-    stride: int,
-    config: dict[str, Any],
-) -> Evaluation:
+def _floor(label: str, step: float) -> RunResult:
+    """The row of what a model has to beat, without its figures."""
+    return RunResult(label, label, None, {}, {"step": step}, floor=True)
+
+
+def _notes(data: list[RunData], source: DataSource) -> list[str]:
+    """What to know of the rows whose inputs were prepared otherwise."""
+    names = [name for name in dict.fromkeys(one.preparation for one in data) if name]
+    if not names:
+        return []
+    listed = "; ".join(names)
+    return [
+        f"{listed}: trained and predicting on inputs as their own data sets prepare them. Motions, "
+        f"starts and times are those of the rows without such a word ({source.name})"
+    ]
+
+
+@dataclass(frozen=True)
+class _Entrant:
+    """A row of the table before its roll-outs: what predicts, and on which motions."""
+
+    row: RunResult
+    model: Predictor
+    truth: Trajectory
+    training: Splits
+    members: Ensemble | None = None
+
+
+def _evaluate(entrant: _Entrant, stride: int, config: dict[str, Any]) -> Evaluation:
     """Roll out over the horizon and window by window; compared at every ``stride``-th sample."""
+    row, model, truth = entrant.row, entrant.model, entrant.truth
+    training, members = entrant.training, entrant.members
     step = row.extra["step"]
     every = stride // samples_of("step", step, truth.t)
 
@@ -318,4 +343,4 @@ def _evaluate(
             if found.within_corrected is not None and found.factor is not None:
                 metrics[f"window_{window:g}s_within_corrected"] = found.within_corrected
                 metrics[f"window_{window:g}s_factor"] = found.factor
-    return Evaluation(model, prediction, replace(row, metrics=metrics), intervals)
+    return Evaluation(model, truth, prediction, replace(row, metrics=metrics), intervals)

@@ -44,24 +44,24 @@ SPLITS = {"test": "unseen test trajectories", "validation": "validation trajecto
 class Evaluation:
     """The roll-outs of one run, or of a floor, and the row of the table.
 
-    ``intervals`` are those of its windowed predictions, by window in s; none of a single network.
+    ``truth`` has the inputs as the run knows them; ``intervals`` are those of its windowed
+    predictions, by window in s; none of a single network.
     """
 
     model: Predictor
+    truth: Trajectory
     prediction: Prediction
     result: RunResult
     intervals: dict[float, Calibration]
 
 
-def torque_errors(
-    evaluations: list[Evaluation], truth: Trajectory, source: DataSource
-) -> pd.DataFrame:
+def torque_errors(evaluations: list[Evaluation], source: DataSource) -> pd.DataFrame:
     """Give mechanical models their torque error; returns it joint by joint."""
     tables = []
     for item in evaluations:
         if isinstance(item.model, MechanicalSystem):
             try:
-                found = torque_error(item.model, truth, system=source.system)
+                found = torque_error(item.model, item.truth, system=source.system)
             except ValueError as error:
                 log.warning("no torque error: %s", error)
                 break
@@ -70,25 +70,29 @@ def torque_errors(
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
-def shares(evaluations: list[Evaluation], truth: Trajectory) -> pd.DataFrame:
+def shares(evaluations: list[Evaluation]) -> pd.DataFrame:
     """Give models with a residual force its share; returns what the parts of sums contribute."""
     tables = []
     for item in evaluations:
         if isinstance(item.model, MechanicalSystem) and item.model.has_residual:
-            item.result.metrics["residual_share"] = residual_share(item.model, truth)
+            item.result.metrics["residual_share"] = residual_share(item.model, item.truth)
         if isinstance(item.model, Sum):
-            tables.append(part_shares(item.model, truth).assign(run=item.result.run))
+            tables.append(part_shares(item.model, item.truth).assign(run=item.result.run))
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def draw(
     evaluations: list[Evaluation],
+    lowest: str | None,
     truth: Trajectory,
     source: DataSource,
     config: dict[str, Any],
     folder: Path,
 ) -> None:
-    """Write the figures of one trajectory, of errors over time, and of the spread of members."""
+    """Write the figures of one trajectory, of errors over time, and of the spread of members.
+
+    Of all floors the figure of a trajectory has the ``lowest``, and that of the errors each.
+    """
     floors, predictions = (
         {x.result.run: x.prediction for x in evaluations if x.result.floor == floor}
         for floor in (True, False)
@@ -102,6 +106,7 @@ def draw(
         title=f"{source.name}, {split} trajectory {config['trajectory']}, open loop",
         labels=source.labels,
         input_labels=source.input_labels,
+        floors={name: item for name, item in floors.items() if name == lowest},
     )
     save(figure, folder / "trajectory.png")
     label = with_unit(ERROR, source.labels)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import glob
 import logging
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from pinn_dyn.app.build import BEST_BY
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.jobs import Job, derived_keys, filter_jobs, find_jobs
 from pinn_dyn.evaluation import save, write_table
@@ -31,6 +34,8 @@ log = logging.getLogger(__name__)
 _LATEST_EVALUATIONS = "runs/evaluation/*"
 _FEW = 6  # parameters beside the folder of a lost job
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")
+_DRAW = "search.draw"
+_OVERRIDES = Path(".hydra") / "overrides.yaml"
 _ERRORS = ("error_mean", "error_median", "error_worst", "diverged")
 
 
@@ -89,6 +94,9 @@ def _report(jobs: list[Job], config: dict[str, Any], folder: Path) -> None:
         notes.append(f"the model or the data set decides, only in the files: {hidden}")
     if notes:
         print("\n" + "\n".join(notes))
+    if draws := best_draws(jobs):
+        lines = "\n".join(f"  {line}" for line in draws)
+        print(f"\nbest draw of each model by {BEST_BY}, mean over seeds:\n{lines}")
     if config["plot"] is not None:
         others = [name for name in shown if name != config["plot"]]
         try:
@@ -98,10 +106,44 @@ def _report(jobs: list[Job], config: dict[str, Any], folder: Path) -> None:
         save(figure, folder / "sweep.png")
 
 
+def best_draws(jobs: list[Job]) -> list[str]:
+    """Of each model of a search the best draw, its validation error, and the command behind it.
+
+    Draws that diverged for one seed, and runs of no search, are none. Of equal draws the first is
+    the best.
+    """
+    found: dict[str, dict[int, list[Job]]] = {}
+    for job in jobs:
+        if _DRAW in job.config:
+            draws = found.setdefault(str(job.config["name"]), {})
+            draws.setdefault(int(job.config[_DRAW]), []).append(job)
+    lines = []
+    for name, draws in found.items():
+        errors = {
+            draw: np.mean([_figures(job).get(BEST_BY, np.nan) for job in draws[draw]])
+            for draw in sorted(draws)
+        }
+        finite = {draw: error for draw, error in errors.items() if np.isfinite(error)}
+        if finite:
+            best = min(finite, key=finite.__getitem__)
+            folder = draws[best][0].folder
+            lines.append(f"{name}: draw {best} has {finite[best]:.4g}: {_command(folder)}")
+    return lines
+
+
+def _command(folder: Path) -> str:
+    """What trained a run; its folder where it does not say."""
+    try:
+        words = yaml.safe_load((folder / _OVERRIDES).read_text())
+        return shlex.join(["python", "train.py", *words])
+    except (OSError, ValueError, TypeError, yaml.YAMLError):  # it may come from anyone
+        return str(folder)
+
+
 def _figures(job: Job) -> dict[str, float]:
     """What the training itself recorded."""
     record = job.record or {}
-    names = [f"val/{name}" for name in _ERRORS]
+    names = [*(f"val/{name}" for name in _ERRORS), BEST_BY]
     validation = record.get("validation", {})
     return {name: validation[name] for name in names if name in validation} | {
         name: record[name] for name in _RECORDED if name in record

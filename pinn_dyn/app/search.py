@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
@@ -10,6 +11,8 @@ from scipy.stats import qmc
 
 from pinn_dyn.app.keys import Count, Index, Range
 from pinn_dyn.app.schema import ConfigError
+
+log = logging.getLogger(__name__)
 
 PositiveNumber = Annotated[float, Range(0, above=True)]
 T = TypeVar("T")
@@ -60,16 +63,15 @@ class EqualSearch:
     def applied(self, config: dict[str, Any]) -> dict[str, Any]:
         """The configuration with the settings of the draw, and of the search its number alone.
 
-        Raises:
-            ConfigError: on an optimizer without a learning rate.
+        A fit by least squares has none of these settings: it is the same at every draw.
         """
-        if "lr" not in config["optimizer"]:
-            raise ConfigError(
-                "search: the optimizer has no learning rate to draw, as a least-squares fit has "
-                "none: leave search out"
-            )
         config = {**config, "search": {"draw": self.draw}}
         if self.draw == 0:
+            return config
+        if "lr" not in config["optimizer"]:
+            log.info(
+                "search: draw %d changes nothing, as the optimizer has no learning rate", self.draw
+            )
             return config
         point = iter(qmc.Sobol(d=7, seed=0).random_base2(self.draw.bit_length())[self.draw])
         optimizer = dict(config["optimizer"])

@@ -49,6 +49,7 @@ from pinn_dyn.evaluation.shares import part_shares, residual_share
 from pinn_dyn.evaluation.tables import (
     RunResult,
     beaten_by_floors,
+    best_floor,
     format_table,
     grouped_table,
     summary_table,
@@ -73,6 +74,7 @@ __all__ = [
     "ValidationHistory",
     "animate",
     "beaten_by_floors",
+    "best_floor",
     "build_floors",
     "calibration",
     "calibration_figure",

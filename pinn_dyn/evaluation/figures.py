@@ -12,6 +12,7 @@ from pinn_dyn.evaluation.drawing import (
     COLOURS,
     DARK,
     DASHES,
+    GREY,
     TRUTH,
     Line,
     Panel,
@@ -42,6 +43,7 @@ def trajectory_panels(
     labels: Sequence[str],
     input_labels: Sequence[str],
     error: str = ERROR,
+    floors: Mapping[str, Prediction] | None = None,
 ) -> tuple[list[Panel], list[Panel]]:
     """A panel per coordinate, truth and models, with the error below; and a panel per input.
 
@@ -53,14 +55,22 @@ def trajectory_panels(
             names fixes their colours and dashes.
         labels, input_labels: name and unit of each coordinate and input.
         error: name and unit of the error.
+        floors: what the models have to beat, in thin grey lines.
     """
-    styled = [(name, item, *look(k)) for k, (name, item) in enumerate(predictions.items())]
+    styled = [(name, item, *look(k), 1.3) for k, (name, item) in enumerate(predictions.items())]
+    styled += [(name, item, GREY, "dash", 1.0) for name, item in (floors or {}).items()]
     states = []
     for k, label in enumerate(labels):
         real = Line("truth", truth.t, truth.q[..., k], TRUTH, width=4, always=True)
-        guesses = [Line(name, item.t, item.q_hat[..., k], c, d, 1.3) for name, item, c, d in styled]
+        guesses = [
+            Line(name, item.t, item.q_hat[..., k], colour, dash, width)
+            for name, item, colour, dash, width in styled
+        ]
         states.append(Panel(label, [real, *guesses], leading=real))
-    distances = [Line(name, item.t, item.error(), c, d, 1.3) for name, item, c, d in styled]
+    distances = [
+        Line(name, item.t, item.error(), colour, dash, width)
+        for name, item, colour, dash, width in styled
+    ]
     states.append(Panel(error, distances, log=True))
     held = truth.input.interpolation == "hold"
     inputs = [
@@ -81,6 +91,7 @@ def trajectory_figure(
     title: str,
     labels: Sequence[str] | None = None,
     input_labels: Sequence[str] | None = None,
+    floors: Mapping[str, Prediction] | None = None,
 ) -> Figure:
     """One test trajectory, see :func:`trajectory_panels`; a note says when a model leaves a panel.
 
@@ -90,13 +101,15 @@ def trajectory_figure(
         title: data set and horizon.
         labels: name and unit of each coordinate; None takes q1 ... qN.
         input_labels: name and unit of each input; None takes u1 ... uM.
+        floors: what the models have to beat, in thin grey lines.
 
     Raises:
         ValueError: on labels that do not fit.
     """
     labels = names(labels, "q", truth.q.shape[-1], "labels")
     inputs = names(input_labels, "u", truth.u.shape[-1], "input_labels")
-    columns = trajectory_panels(truth, predictions, labels, inputs, with_unit(ERROR, labels))
+    error = with_unit(ERROR, labels)
+    columns = trajectory_panels(truth, predictions, labels, inputs, error, floors)
     return motion_png(columns, trajectory, title=title)
 
 

@@ -237,6 +237,16 @@ def beaten_by_floors(frame: pd.DataFrame) -> list[str]:
     return sentences
 
 
+def best_floor(summary: pd.DataFrame) -> str | None:
+    """The floor that errs least of those with the fewest diverged trajectories; None without any.
+
+    Args:
+        summary: what :func:`summary_table` returns.
+    """
+    floors = summary[summary["floor"].astype(bool)]
+    return None if floors.empty else floors.sort_values(["diverged", "error_mean"])["run"].iloc[0]
+
+
 def _competes(frame: pd.DataFrame, name: str) -> pd.Series:
     """Rows whose figure compares: of roll-out errors those with the fewest that diverged."""
     everyone = pd.Series(True, index=frame.index)

@@ -25,6 +25,11 @@ from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
 _WORST = 10.0
+_APART = 1.5  # last above best: beyond the usual ups and downs
+_REMEDIES = (
+    "See last.ckpt too (evaluate.py checkpoint=last), at longer windows (data.steps), or at "
+    "whether the validation motions are like the training ones"
+)
 
 
 class RolloutValidator:
@@ -183,18 +188,25 @@ class ValidationHistory(L.Callback):
         )
 
     def warning(self) -> str | None:
-        """What to be wary of: a best at the first validation while the loss went on to fall."""
-        if len(self.rows) < 2 or self._best() is not self.rows[0]:
+        """What to be wary of: a best that the last has left far behind, or the first validation."""
+        if len(self.rows) < 2:
             return None
-        first, last = self.rows[0]["train/loss"], self.rows[-1]["train/loss"]
-        if not last < first:
-            return None
-        return (
-            f"best.ckpt is of the first validation, while the training loss fell from {first:.3g} "
-            f"to {last:.3g} after it: the model fits its windows better and predicts worse. See "
-            "last.ckpt too (evaluate.py checkpoint=last), at longer windows (data.steps), or at "
-            "whether the validation motions are like the training ones"
-        )
+        best, last = self._best(), self.rows[-1]
+        if best is self.rows[0] and last["train/loss"] < best["train/loss"]:
+            return (
+                "best.ckpt is of the first validation, while the training loss fell from "
+                f"{best['train/loss']:.3g} to {last['train/loss']:.3g} after it: the model fits "
+                f"its windows better and predicts worse. {_REMEDIES}"
+            )
+        errors = [row["val/error_windowed"] for row in (best, last)]
+        # Not <=: an error that is no number is far away too.
+        if not errors[1] <= _APART * errors[0]:
+            return (
+                f"last.ckpt errs by {errors[1]:.3g} (windowed), best.ckpt (epoch "
+                f"{best['epoch']:.0f}) by {errors[0]:.3g}: what the best one is worth may be luck. "
+                f"{_REMEDIES}"
+            )
+        return None
 
     def _best(self) -> dict[str, float]:
         return min(self.rows, key=lambda row: row["val/error_windowed"])

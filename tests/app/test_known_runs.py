@@ -141,6 +141,27 @@ def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
     assert (middle[1:] < high[1:]).all()
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path, fitted, capsys):
+    """It is what a run without roll-outs finds, which is not shown twice."""
+    rolled = tmp_path / "rolled"
+    run_script("train.py", KNOWN, *WINDOWS, f"hydra.run.dir={rolled}")
+    rows = {}
+    for name, runs in {"rolled": [rolled], "both": [rolled, fitted]}.items():
+        words = ["windows=[0.1]", "horizon=0.5", f"hydra.run.dir={tmp_path / name}"]
+        run_script("evaluate.py", f"runs=[{','.join(map(str, runs))}]", *words)
+        rows[name] = pd.read_csv(tmp_path / name / "summary.csv").set_index("run")
+    assert "identification: the constants of known by its inverse" in capsys.readouterr().out
+    found, trained = rows["rolled"].loc["identification"], rows["both"].loc["known seed 0 known"]
+    figures = ["error_mean", "error_worst", "window_0.1s_error_mean", "torque_share"]
+    np.testing.assert_allclose(
+        found[figures].astype(float), trained[figures].astype(float), rtol=1e-5
+    )
+    assert found["floor"]
+    assert found["error_mean"] != rows["rolled"].loc["known", "error_mean"]
+    assert "identification" not in rows["both"].index
+
+
 FORGED = {
     "none": (lambda c: None, "has no covariance of its constants.*or leave start_from out"),
     "in words": (lambda c: "certain", "has no covariance of its constants"),

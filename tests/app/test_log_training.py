@@ -177,7 +177,7 @@ def test_presets_of_hardware_have_the_structure_of_the_paper():
     neck, fit, panda = (
         compose(f"experiment={name}") for name in ("neck/lnn", "neck/polynomial", "panda_real/lnn")
     )
-    assert neck.dataset.steps.smooth.window == 50
+    assert neck.dataset.steps.smooth.window == "5 s"  # 50 samples of 10 Hz
     assert "fit" not in neck.dataset.steps
     assert fit.dataset.steps.smooth is None
     assert fit.dataset.steps.fit.degree == 7

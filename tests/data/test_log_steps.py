@@ -224,6 +224,20 @@ def test_subtract_start_starts_at_zero():
     np.testing.assert_array_equal(done.q[:, 0], [-1.0, 1.0, 6.0])
 
 
+@pytest.mark.parametrize("rate", [50.0, RATE])
+def test_a_time_at_rest_and_of_stale_values_is_one_at_every_rate(rate):
+    """0.04 s are 2 samples at 50 Hz, and 4 at 100 Hz."""
+    count = round(0.04 * rate)
+    q = np.arange(30.0) ** 2
+    done, _ = only(SubtractStart(samples="0.04 s"), recording(q, rate=rate))
+    assert done.q[0, 0] == -np.mean(q[:count])
+    u = np.r_[0.0, np.repeat([10.0, 20.0], [count + 1, count + 2]), 30.0]
+    held = recording(np.zeros(len(u)), u=u[:, None], rate=rate)
+    done, _ = only(InterpolateHeld(longest="40 ms"), held)
+    np.testing.assert_allclose(done.u[1 : count + 3, 0], np.linspace(10, 20, count + 2))
+    np.testing.assert_array_equal(done.u[count + 2 :, 0], u[count + 2 :])  # one repeat too many
+
+
 def test_given_delay_shifts_by_whole_samples():
     done, text = only(InputDelay(delay=0.021).fit([]), recording(np.arange(10), u=np.arange(10)))
     np.testing.assert_array_equal(done.q - done.u, 2)
@@ -290,7 +304,9 @@ def test_windows_in_time_are_those_of_so_many_samples(in_time, in_samples):
         lambda: RemoveJumps(threshold=0.1, window=4),
         lambda: RemoveJumps(threshold=[0.1] * 3).apply(recording(NOISE)),
         lambda: InterpolateHeld(longest=0),
+        lambda: InterpolateHeld(longest="8"),
         lambda: SubtractStart(samples=0),
+        lambda: SubtractStart(samples="soon"),
         lambda: MovingAverage(window="5 samples"),
         lambda: SavitzkyGolayVelocity(window="-5 ms"),
         lambda: RemoveJumps(0.1, window="five"),

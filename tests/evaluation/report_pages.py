@@ -133,6 +133,7 @@ def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
         "trajectories": f"{real.q.shape[0]} unseen test trajectories",
         "summary": summary,
         "grouped": grouped_table(summary),
+        "notes": [],
         "truth": real,
         "predictions": found,
         "trajectory": 0,

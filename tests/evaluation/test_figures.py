@@ -102,6 +102,19 @@ def test_floors_are_thin_grey_lines_without_a_band(predictions, tmp_path):
     assert len(ax.collections) == 1  # the band of the model
 
 
+def test_one_motion_has_its_floor_as_a_thin_grey_line(truth, predictions):
+    models = {"good": predictions["good"]}
+    floors = {"ARX": predictions["fragile"]}
+    figure = trajectory_figure(truth, models, trajectory=0, title="fake", floors=floors)
+    drawn = [ax.lines for ax in figure.axes if len(ax.lines) > 1]
+    assert len(drawn) == truth.q.shape[-1] + 1  # coordinates and the error
+    for *_, model, floor in drawn:
+        assert [model.get_label(), floor.get_label()] == ["good", "ARX"]
+        assert floor.get_color() == GREY
+        assert floor.get_linewidth() < model.get_linewidth()
+    np.testing.assert_array_equal(drawn[0][-1].get_ydata(), floors["ARX"].q_hat[0, :, 0])
+
+
 def test_colours_follow_the_order_of_the_models(truth, predictions):
     lines = trajectory_figure(truth, predictions, trajectory=0, title="fake").axes[0].lines
     errors = error_figure(predictions, title="fake").axes[0].lines

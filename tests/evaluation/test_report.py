@@ -282,6 +282,12 @@ def test_floors_are_in_brackets_and_a_model_that_loses_to_one_has_no_bold_figure
     assert "No model beats every floor in error_mean: 'hnn' has" in page.text
 
 
+def test_notes_on_rows_stand_below_the_table(prediction):
+    page = Page(prediction_page(notes=["with delay: <its own> inputs"])[0])
+    assert "with delay: <its own> inputs" in page.text
+    assert "with delay" not in prediction[1].text
+
+
 def test_parts_of_sums_have_a_section_where_there_are_any(prediction):
     parts = pd.DataFrame(
         {

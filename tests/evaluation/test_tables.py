@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import pandas as pd
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from pinn_dyn.evaluation import (
     RunResult,
     beaten_by_floors,
+    best_floor,
     format_table,
     grouped_table,
     summary_table,
@@ -192,3 +194,14 @@ def test_columns_of_what_went_wrong_appear_where_something_did():
 
 def test_no_floor_needs_no_sentence(results):
     assert beaten_by_floors(summary_table(results)) == []
+
+
+def test_the_best_floor_is_the_lowest_of_those_that_lost_fewest():
+    floors = [
+        replace(result("still", None, 0.5), floor=True),
+        replace(result("arx", None, 0.25), floor=True),
+        replace(result("edmdc", None, 0.1, diverged=3), floor=True),
+    ]
+    models = [result("lnn", 0, 0.01)]
+    assert best_floor(summary_table([*models, *floors])) == "arx-None"
+    assert best_floor(summary_table(models)) is None

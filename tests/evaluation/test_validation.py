@@ -106,7 +106,7 @@ def test_best_stands_beside_last():
     ("rows", "warned"),
     [
         ([(4, 0.9, 0.4, 0.1), (9, 0.5, 0.2, 0.2)], True),  # the loss falls, the error does not
-        ([(4, 0.9, 0.4, 0.1), (9, 0.9, 0.2, 0.2)], False),  # nothing is learned any more
+        ([(4, 0.9, 0.4, 0.1), (9, 0.9, 0.2, 0.14)], False),  # nothing is learned any more
         ([(4, 0.9, 0.4, 0.2), (9, 0.5, 0.2, 0.1)], False),
         ([(4, 0.9, 0.4, 0.2)], False),
     ],
@@ -115,3 +115,18 @@ def test_a_best_at_the_first_validation_while_the_loss_falls_is_a_warning(rows, 
     said = history(rows).warning()
     assert (said is not None) == warned
     assert not warned or "fell from 0.9 to 0.5" in said
+
+
+@pytest.mark.parametrize(
+    ("rows", "warned"),
+    [
+        ([(4, 0.9, 0.4, 0.3), (9, 0.5, 0.2, 0.1), (14, 0.4, 0.3, 0.16)], True),
+        ([(4, 0.9, 0.4, 0.3), (9, 0.5, 0.2, 0.1), (14, 0.4, 0.3, float("nan"))], True),
+        ([(4, 0.9, 0.4, 0.3), (9, 0.5, 0.2, 0.1), (14, 0.4, 0.3, 0.15)], False),
+        ([(4, 0.9, 0.4, 0.3), (9, 0.5, 0.2, 0.0), (14, 0.4, 0.3, 0.0)], False),
+    ],
+)
+def test_a_last_that_is_far_behind_the_best_is_a_warning(rows, warned):
+    said = history(rows).warning()
+    assert (said is not None) == warned
+    assert not warned or "best.ckpt (epoch 9) by 0.1" in said

@@ -13,6 +13,7 @@ from pinn_dyn.models import (
     DriveCoulomb,
     FixedInput,
     LoadDependent,
+    LoadDependentStribeck,
     NetworkInput,
     NetworkPotential,
     NetworkResidual,
@@ -77,6 +78,7 @@ FRICTIONS = {
     "asymmetric": AsymmetricCoulomb,
     "Stribeck": Stribeck,
     "by load": LoadDependent,
+    "by load, Stribeck": LoadDependentStribeck,
 }
 
 

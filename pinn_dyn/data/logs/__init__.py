@@ -2,6 +2,7 @@
 
 from pinn_dyn.data.logs.clock import Deduplicate, Resample, RowClock, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.common import common_motions
 from pinn_dyn.data.logs.delay import DelayCurve, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
@@ -43,5 +44,6 @@ __all__ = [
     "SplitGaps",
     "Step",
     "SubtractStart",
+    "common_motions",
     "input_delays",
 ]

@@ -15,7 +15,7 @@ from pinn_dyn.data.logs.step import sample_time
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
 # Inputs before a piece that are kept for models of a delay, s.
-_PAST = 0.5
+PAST = 0.5
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def pieces_of(
     pieces = [
         replace(
             item.rows(slice(first, first + span + 1)),
-            past=item.u[max(first - round(_PAST / step), 0) : first],
+            past=item.u[max(first - round(PAST / step), 0) : first],
         )
         for item in stretches
         for first in _starts(len(item), span)

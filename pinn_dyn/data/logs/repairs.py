@@ -102,20 +102,21 @@ class InterpolateHeld(Step):
     stand-still is kept as it is. Each column is treated alone.
 
     Args:
-        longest: the most repeats in a row that are taken for stale values.
+        longest: the most repeats in a row that are taken for stale values, or their time, such as
+            ``"80 ms"``.
         signals: which of q, v and u.
     """
 
-    longest: int
+    longest: Length
     signals: Sequence[str] = ("u",)
 
     def __post_init__(self) -> None:
         check_signals(self.signals)
-        if self.longest < 1:
-            raise LogError(f"InterpolateHeld: longest is {self.longest}, expected at least 1")
+        check_window("InterpolateHeld", self.longest, 1, key="longest")
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         shares: list[float] = []
+        longest = window_samples(self.longest, recording, 1)
 
         def draw(x: np.ndarray) -> np.ndarray:
             columns = []
@@ -124,7 +125,7 @@ class InterpolateHeld(Step):
                 edges = np.flatnonzero(np.diff(np.r_[False, held, False])).reshape(-1, 2)
                 for first, end in edges:
                     # At the end of the log no update follows that a line could lead to.
-                    if end - first > self.longest or end == len(column):
+                    if end - first > longest or end == len(column):
                         held[first:end] = False
                 shares.append(float(held.mean()))
                 columns.append(np.interp(recording.t, recording.t[~held], column[~held]))
@@ -145,16 +146,15 @@ class SubtractStart(Step):
     Right only where every run starts at rest in the same pose.
 
     Args:
-        samples: number of samples at rest.
+        samples: number of samples at rest, or their time, such as ``"0.5 s"``.
     """
 
-    samples: int
+    samples: Length
 
     def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise LogError(f"SubtractStart: samples is {self.samples}, expected at least 1")
+        check_window("SubtractStart", self.samples, 1, key="samples")
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        start = recording.q[: self.samples].mean(axis=0)
+        start = recording.q[: window_samples(self.samples, recording, 1)].mean(axis=0)
         shown = ", ".join(f"{value:.4g}" for value in start)
         return [replace(recording, q=recording.q - start)], f"subtracted ({shown}) from q"

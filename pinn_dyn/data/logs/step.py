@@ -90,7 +90,9 @@ def sample_time(recording: Recording, wanted_by: str) -> float:
     return step
 
 
-def check_window(name: str, window: Length, least: int, *, odd: bool = False) -> None:
+def check_window(
+    name: str, window: Length, least: int, *, odd: bool = False, key: str = "window"
+) -> None:
     """Refuse a window that is no number of samples, of at least ``least``, and no time.
 
     Raises:
@@ -98,13 +100,13 @@ def check_window(name: str, window: Length, least: int, *, odd: bool = False) ->
     """
     if isinstance(window, str):
         try:
-            seconds_of(f"{name}: window", window)
+            seconds_of(f"{name}: {key}", window)
         except ValueError as error:
             raise LogError(str(error)) from error
     elif window < least or (odd and window % 2 == 0):
-        kind = "an odd window" if odd else "a window"
+        kind = "an odd number" if odd else "a number"
         raise LogError(
-            f"{name}: window is {window}, expected {kind} of at least {least} samples, or a time, "
+            f"{name}: {key} is {window}, expected {kind} of samples, at least {least}, or a time, "
             "such as '0.1 s'"
         )
 

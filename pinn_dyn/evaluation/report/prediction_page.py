@@ -27,7 +27,7 @@ from pinn_dyn.evaluation.report.page import (
     table,
     turned,
 )
-from pinn_dyn.evaluation.tables import beaten_by_floors, best, bracketed
+from pinn_dyn.evaluation.tables import beaten_by_floors, best, best_floor, bracketed
 from pinn_dyn.mechanics import Trajectory
 
 _HEADERS = {
@@ -60,6 +60,7 @@ def prediction_report(
     trajectories: str,
     summary: pd.DataFrame,
     grouped: pd.DataFrame,
+    notes: Sequence[str],
     truth: Trajectory,
     predictions: Mapping[str, Prediction],
     trajectory: int,
@@ -79,6 +80,7 @@ def prediction_report(
         trajectories: what they are, and how many, for the line below it.
         summary: one row per run, as :func:`pinn_dyn.evaluation.summary_table` makes it.
         grouped: one row per model, as :func:`pinn_dyn.evaluation.grouped_table` makes it.
+        notes: what to know of some of the rows.
         truth: the K trajectories stacked, q ``(K, T, N)``, over the horizon.
         predictions: names of runs and floors, and their roll-outs of the same K trajectories.
         trajectory: which of the K to show first.
@@ -99,7 +101,7 @@ def prediction_report(
     )
     trained = summary[~summary["floor"]]
     sections = [
-        Section("Summary", _summary(summary, grouped, labels)),
+        Section("Summary", _summary(summary, grouped, notes, labels)),
         error_section(
             prediction_errors(models, below, with_unit(ERROR, labels)),
             one="trajectory",
@@ -107,7 +109,15 @@ def prediction_report(
         ),
         Section(
             "Trajectories",
-            _trajectories(trained, truth, models, trajectory, labels, input_labels),
+            _trajectories(
+                trained,
+                truth,
+                models,
+                {name: item for name, item in below.items() if name == best_floor(summary)},
+                trajectory,
+                labels,
+                input_labels,
+            ),
         ),
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
@@ -123,7 +133,9 @@ def prediction_report(
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
-def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]) -> list[Markup]:
+def _summary(
+    summary: pd.DataFrame, grouped: pd.DataFrame, notes: Sequence[str], labels: Sequence[str]
+) -> list[Markup]:
     headers = {name: text for name, text in _HEADERS.items() if name in summary}
     for name in summary:
         if name.startswith("valid_time_"):
@@ -143,7 +155,7 @@ def _summary(summary: pd.DataFrame, grouped: pd.DataFrame, labels: Sequence[str]
             "is bold if it beats them all. A number under the pointer shows all its digits."
         ),
         table(bracketed(summary), headers=headers, best=marks, spread={"error_mean": "error_std"}),
-        *map(paragraph, beaten_by_floors(summary)),
+        *map(paragraph, [*notes, *beaten_by_floors(summary)]),
     ]
     if len(grouped) < len(summary):
         shown = {name: text for name, text in _GROUP_HEADERS.items() if name in grouped}
@@ -157,12 +169,13 @@ def _trajectories(
     summary: pd.DataFrame,
     truth: Trajectory,
     predictions: Mapping[str, Prediction],
+    floors: Mapping[str, Prediction],
     first: int,
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Markup]:
     states, inputs = trajectory_panels(
-        truth, predictions, labels, input_labels, with_unit(ERROR, labels)
+        truth, predictions, labels, input_labels, with_unit(ERROR, labels), floors
     )
     count = len(truth.q)
     worst = {int(row.worst_trajectory): row.run for row in summary.itertuples()}
