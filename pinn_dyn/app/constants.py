@@ -24,16 +24,29 @@ from pinn_dyn.training import Fit
 log = logging.getLogger(__name__)
 
 _CONSTANTS = "constants.csv"
+_UNFINISHED = "constants_unfinished.csv"
 _UNDETERMINED = "undetermined.md"
 _SHOWN = 2  # lines of each kind in the log
 
 
 def write_constants(model: Predictor, result: Fit, source: DataSource, folder: Path) -> None:
-    """Write the constants with their 95 % intervals, and what the data leave to the prior."""
+    """Write the constants with their 95 % intervals, and what the data leave to the prior.
+
+    Those of a fit that was stopped are in a file of another name, alone.
+    """
     assert isinstance(model, LearnedConstants)
     inputs = [units([label]) for label in source.input_labels]
+    table = constants_table(model, result, inputs)
+    if result.stopped_in is not None:
+        with whole(folder / _UNFINISHED) as partial:
+            table.to_csv(partial, index=False)
+        log.warning(
+            "the fit is not finished: its best constants so far are in %s", folder / _UNFINISHED
+        )
+        return
+    (folder / _UNFINISHED).unlink(missing_ok=True)
     together = determined_together(model, result, inputs)
-    table = pd.concat([constants_table(model, result, inputs), together])
+    table = pd.concat([table, together])
     with whole(folder / _CONSTANTS) as partial:
         table.to_csv(partial, index=False)
     log.info("constants and their intervals are in %s", folder / _CONSTANTS)

@@ -31,6 +31,7 @@ from pinn_dyn.app.config import ConfigError, check, checked
 from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.data_record import check_data, write_data
 from pinn_dyn.app.keys import KEYS
+from pinn_dyn.app.known_data import check_known
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -206,6 +207,7 @@ def train_in(
         validator.check(stack_until(data.splits.validation))
     except ValueError as problem:
         raise ConfigError(f"validator: {problem}") from problem
+    check_known(config, data.source)
     model = build_predictor(config, statistics)
     if model.state == "qp" and data.windows.p.shape[-1] == 0:
         raise ConfigError(
@@ -240,6 +242,11 @@ def train_in(
     except ValueError as problem:
         if isinstance(learner, LeastSquaresLearner):  # settings that only the data can refuse
             raise ConfigError(f"optimizer: {problem}") from problem
+        raise
+    except SystemExit:  # Lightning's end of an interrupted training
+        if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
+            trainer.save_checkpoint(folder / CHECKPOINTS / "last.ckpt")
+            write_constants(model, learner.result, data.source, folder)
         raise
     if last is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, batches, verbose=False)

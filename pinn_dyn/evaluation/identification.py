@@ -16,7 +16,7 @@ from torch.nn.utils import vector_to_parameters
 from pinn_dyn.mechanics import double_copy
 from pinn_dyn.models.known_constants import Named
 from pinn_dyn.models.learned_constants import LearnedConstants
-from pinn_dyn.training.least_squares import Fit, posterior_covariance
+from pinn_dyn.training.constants_fit import Fit, posterior_covariance
 
 COLUMNS = ["name", "value", "low", "high", "unit", "start", "known"]
 """Of the table of constants."""

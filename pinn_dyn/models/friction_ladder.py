@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -24,6 +26,9 @@ class DriveCoulomb(Friction):
         level: c starts at this part of the typical forces.
         width: w starts at this part of the typical speeds.
         spread: standard deviation of the logarithms a priori.
+
+    Raises:
+        ValueError: on a level, width or spread that is not positive.
     """
 
     def __init__(
@@ -35,6 +40,9 @@ class DriveCoulomb(Friction):
         spread: float = 1.0,
     ):
         super().__init__()
+        for key, value in (("level", level), ("width", width), ("spread", spread)):
+            if not 0 < value < math.inf:
+                raise ValueError(f"friction: {key} is {value}, expected a positive number")
         force, v_std = scales.value, scales.statistics.v_std.double()
         self.slowest = _SLOWEST * float(v_std.mean())
         names = [joint.name for joint in scales.joints]

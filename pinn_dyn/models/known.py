@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal, Protocol, runtime_checkable
 
@@ -87,7 +88,8 @@ class KnownMechanics(LearnedConstants):
 
     Raises:
         ValueError: if the structure has no rigid bodies, the data have other coordinates than it,
-            on bodies that are not physical, or on gains that are not positive.
+            on bodies that are not physical, a spread or gains that are not positive, or a negative
+            ``gain_spread``.
     """
 
     def __init__(
@@ -120,8 +122,13 @@ class KnownMechanics(LearnedConstants):
         self.structure = structure
         self.integrator = integrator or RK4()
         gain = torch.as_tensor(drive_gain, dtype=torch.float64)
-        if gain.shape not in ((), (size,)) or not bool((gain > 0).all()):
+        if gain.shape not in ((), (size,)) or not bool(((gain > 0) & gain.isfinite()).all()):
             raise ValueError(f"drive_gain is {drive_gain}, expected one number or {size}, positive")
+        if not 0 <= gain_spread < math.inf:
+            raise ValueError(
+                f"gain_spread is {gain_spread}, expected 0, which fixes the drive gains, or a "
+                "positive number, 0.5 for gains known within some 50 %"
+            )
         gain = gain.expand(size)
         force = gain * statistics.u_rms.double()
         acceleration = statistics.acceleration.double()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -38,8 +39,8 @@ class KnownAndNetwork(Sum):
         integrator: the method of integration.
 
     Raises:
-        ValueError: on a negative weight, or a network with an input matrix, a residual force or a
-            learned start.
+        ValueError: on a weight that is negative or not finite, or a network with an input matrix, a
+            residual force or a learned start.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class KnownAndNetwork(Sum):
         weight: float = 0.01,
         integrator: Integrator | None = None,
     ):
-        if not weight >= 0:
+        if not 0 <= weight < math.inf:
             raise ValueError(f"weight is {weight}, expected zero or a positive number")
         first = known(statistics=statistics)
         # The network works on forces: its scales are those of the torques, not of the currents.

@@ -7,6 +7,7 @@ residuals, and a parameter that no data determine stays where it started.
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -70,7 +71,7 @@ class PositiveConstants(Constants):
     lower = 0.0
 
     def __init__(self, start: Tensor, spread: float, names: Sequence[str], units: Sequence[str]):
-        if not bool((start > 0).all()) or not spread > 0:
+        if not bool(((start > 0) & start.isfinite()).all()) or not 0 < spread < math.inf:
             raise ValueError(
                 f"{names[0]} ...: start is {start.tolist()} and spread {spread}, expected positive"
             )
@@ -122,12 +123,18 @@ class PhysicalBodies(Constants):
         bodies: n names.
 
     Raises:
-        ValueError: on a start that is no body of positive density, naming it.
+        ValueError: on a start that is no body of positive density, naming it, or a spread that is
+            not positive.
     """
 
     root: Tensor
 
     def __init__(self, start: Tensor, spread: float, bodies: Sequence[str]):
+        if not 0 < spread < math.inf:
+            raise ValueError(
+                f"spread is {spread}, expected a positive number: 0.3 for bodies of a data sheet, "
+                "3 for generic ones"
+            )
         start = start.double()
         for name, body in zip(bodies, start, strict=True):
             smallest = float(torch.linalg.eigvalsh(body)[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -55,7 +56,8 @@ class KnownSystem(LearnedConstants):
 
     Raises:
         ValueError: if the data have other coordinates or inputs than the structure, the structure
-            names no constants, or those are no buffers, lack units, or are not positive.
+            names no constants, those are no buffers, lack units, or are not positive, or the spread
+            is not positive.
     """
 
     def __init__(
@@ -71,6 +73,11 @@ class KnownSystem(LearnedConstants):
                 f"the data have {statistics.num_coordinates} coordinates and "
                 f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
                 f"{size} and {inputs}: take the structure of this robot"
+            )
+        if not 0 < spread < math.inf:
+            raise ValueError(
+                f"spread is {spread}, expected a positive number: 1.5 for guesses that may be "
+                "off by a factor of ten, 0.3 for a data sheet"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()

@@ -1,8 +1,9 @@
 """Training: the LightningModule, losses, gradients, schedule."""
 
 from pinn_dyn.training.checkpoints import WholeCheckpoints
+from pinn_dyn.training.constants_fit import Fit, StoppedFit
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
-from pinn_dyn.training.least_squares import Fit, LeastSquares
+from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, Penalized, WindowLoss
 from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
@@ -22,6 +23,7 @@ __all__ = [
     "NonFiniteLossError",
     "ParameterVector",
     "Penalized",
+    "StoppedFit",
     "WholeCheckpoints",
     "WindowLoss",
     "one_cycle",

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from scipy.optimize import least_squares
-from scipy.signal import butter, sosfiltfilt
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
+from pinn_dyn.training.constants_fit import (
+    Fit,
+    Prior,
+    StoppedFit,
+    far_from_start,
+    posterior_covariance,
+)
+from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
 from pinn_dyn.training.sensitivity import rollout_slopes
 
 log = logging.getLogger(__name__)
@@ -30,41 +37,6 @@ _CHANGED = 5.0
 """Standard deviation of the parameters of a changed body: a payload may outweigh its link."""
 _BROKEN = 1e4
 """Residual of a roll-out that breaks down."""
-
-
-class Motion(NamedTuple):
-    """Samples of filtered motion, ``(K, N)`` each: what inverse dynamics is compared on."""
-
-    q: Tensor
-    v: Tensor
-    a: Tensor
-    u: Tensor
-
-
-class Prior(NamedTuple):
-    """What is known of the parameters before: their mean ``(P,)``, and a root of P ``(P, P)``."""
-
-    mean: Tensor
-    root: Tensor
-
-
-@dataclass(frozen=True)
-class Fit:
-    """What a least-squares fit found.
-
-    Attributes:
-        covariance: of the standardized parameters z, ``(P, P)``, prior included.
-        information: of z from the data alone, ``(P, P)``.
-        prior: what was known of z before.
-        residual: root mean square of the normalized data residuals.
-        iterations: of Gauss-Newton.
-    """
-
-    covariance: Tensor
-    information: Tensor
-    prior: Prior
-    residual: float
-    iterations: int
 
 
 class LeastSquares:
@@ -138,6 +110,7 @@ class LeastSquares:
         trajectories: Sequence[Trajectory],
         windows: Windows,
         covariance: Tensor | None = None,
+        stopped: Fit | None = None,
     ) -> Fit:
         """Fit the model in place; it comes back in the precision it had.
 
@@ -146,11 +119,14 @@ class LeastSquares:
             trajectories: the training trajectories, for the inverse dynamics.
             windows: the training windows, for the roll-outs.
             covariance: of the z that the model has from an earlier fit, ``(P, P)``, if any.
+            stopped: this very fit, if it was stopped, to go on from the z that the model has.
 
         Raises:
             ValueError: on a model without parameters or with more than 500, trajectories that are
-                too short for the filter, a covariance that is none or of another model, or changed
-                bodies that the model does not have, or without an earlier fit.
+                too short for the filter, fewer residuals than parameters without an earlier fit, a
+                covariance that is none or of another model, or changed bodies that the model does
+                not have, or without an earlier fit.
+            StoppedFit: on an interrupt; the model then has the best z so far.
         """
         count = sum(p.numel() for p in model.parameters())
         if not 0 < count <= _MOST_PARAMETERS:
@@ -160,16 +136,43 @@ class LeastSquares:
             )
         precision = next(model.parameters()).dtype
         model.double()
-        prior = self._prior(model, covariance)
-        motion = filtered_motion(trajectories, self.cutoff, self.samples)
-        found = self._identify(model, prior, motion)
+        prior = stopped.prior if stopped else self._prior(model, covariance)
+        earlier = covariance is not None
+        stages: list[Callable[[], Fit]] = [
+            partial(self._identify, model, prior, trajectories, earlier)
+        ]
         if self.rollouts:
             windows = windows.to(torch.device("cpu"), torch.float64)
-            steps = len(windows.t) - 1
+            steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
+            _require_enough(
+                size * _halves(steps) * steps,
+                count,
+                f"{len(windows)} windows of {steps} steps",
+                "take more windows (data.pairs) or longer ones (data.steps)",
+                earlier,
+            )
             # Short ones first: long ones break down, or end in a poor minimum, from a poor start.
-            for length in sorted({-(-steps // 4), steps}):
-                found = self._roll_out(model, prior, windows.first(length))
-        model.to(precision)
+            short = -(-steps // 4)
+            enough = size * _halves(short) * short >= count
+            for length in [short, steps] if enough and short < steps else [steps]:
+                stages.append(partial(self._roll_out, model, prior, windows.first(length)))
+        found, number = stopped, (stopped.stopped_in or 0) if stopped else 0
+        try:
+            while number < len(stages):
+                found = stages[number]()
+                number += 1
+        except KeyboardInterrupt as interrupt:
+            nothing = torch.zeros_like(prior.root)
+            known = found or Fit(
+                posterior_covariance(nothing, prior.root), nothing, prior, float("nan"), 0
+            )
+            raise StoppedFit(replace(known, stopped_in=number)) from interrupt
+        finally:
+            model.to(precision)
+        assert found is not None
+        z = parameters_to_vector(model.parameters()).detach().to(prior.mean)
+        for line in far_from_start(model.parameter_names(), z, prior):
+            log.warning("least squares: %s", line)
         return found
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
@@ -204,8 +207,14 @@ class LeastSquares:
             )
         return Prior(z, torch.linalg.cholesky(torch.linalg.inv(spread)).mT)
 
-    def _identify(self, model: LearnedConstants, prior: Prior, motion: Motion) -> Fit:
-        q, v, a, u = motion
+    def _identify(
+        self,
+        model: LearnedConstants,
+        prior: Prior,
+        trajectories: Sequence[Trajectory],
+        earlier: bool,
+    ) -> Fit:
+        q, v, a, u = filtered_motion(trajectories, self.cutoff, self.samples)
         with torch.no_grad():
             spread = model.force_scale(q, v, a, u)
         moves = v.abs() > _REST * v.std(0)
@@ -214,7 +223,13 @@ class LeastSquares:
                 "least squares: nothing moves in the training trajectories, expected motions that "
                 "show the constants: excite the robot"
             )
-
+        _require_enough(
+            int(moves.sum()),
+            len(prior.mean),
+            f"{len(q)} samples of filtered motion, without joints at rest,",
+            "record longer motions of all joints, or raise optimizer.samples",
+            earlier,
+        )
         samples = model.samples(q, v, a, u)
 
         def errors() -> Tensor:
@@ -238,8 +253,7 @@ class LeastSquares:
         scale = windows.statistics().qv_increment_std.clone()
         scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
         x0, measured = windows.start("qv"), windows.increments("qv")
-        # Where dq/dt = v holds by construction, q says nothing over a single step.
-        first = model.num_coordinates if measured.shape[1] == 1 else 0
+        first = (2 - _halves(measured.shape[1])) * model.num_coordinates
 
         def residuals(derivative: bool) -> Tensor:
             if derivative:
@@ -274,19 +288,29 @@ class LeastSquares:
             return max(float(np.sqrt(remains)), np.finfo(float).eps)
 
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
+        best = np.inf, z.numpy()
         for _ in range(2):
             weight = 1 / (noise * correlated**0.5)
+            best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
+                nonlocal best
                 data = weight * _evaluate(model, at, residuals, False)
-                return np.concatenate([data, root @ (at - mean)])
+                every = np.concatenate([data, root @ (at - mean)])
+                if (cost := float(every @ every)) < best[0]:
+                    best = cost, at.copy()
+                return every
 
             def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
                 return np.concatenate([data, root])
 
             limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
-            found = least_squares(value, z.numpy(), slope, **limit)
+            try:
+                found = least_squares(value, z.numpy(), slope, **limit)
+            except KeyboardInterrupt:
+                vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
+                raise
             z = torch.from_numpy(found.x)
             noise = spread(found.x)
             steps += int(found.njev)
@@ -309,67 +333,25 @@ def _evaluate(
     return values if derivative else values.clip(-_BROKEN, _BROKEN)
 
 
-def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
-    """(I + R^T R)^-1, ``(P, P)``, from information I and the root R of the prior's precision.
-
-    By the eigenvalues of R^-T I R^-1: of data without noise I + R^T R cannot be inverted as it is.
-    """
-    back = torch.linalg.inv(root)
-    values, vectors = torch.linalg.eigh(back.T @ information @ back)
-    half = back @ vectors / (1 + values.clamp(min=0)).sqrt()
-    return half @ half.T
+def _halves(steps: int) -> int:
+    """Of q and v, how many say something of an increment: where dq/dt = v, q none of one step."""
+    return 1 if steps == 1 else 2
 
 
-def correlation_length(errors: np.ndarray) -> float:
-    """How many successive errors ``(K, N)`` say as much as one that is independent, at least 1.
+def _require_enough(found: int, constants: int, where: str, remedy: str, earlier: bool) -> None:
+    """Refuse fewer residuals than constants, which are met exactly, as if there were no noise.
 
-    1 + 2 sum over k of rho_k, the autocorrelation up to its first sign change; the mean over the N
-    columns, each weighted by its square. Source: Sokal 1997, "Monte Carlo methods in statistical
-    mechanics", the integrated autocorrelation time.
-    """
-    count = len(errors)
-    spectrum = np.fft.rfft(errors, 2 * count, axis=0)
-    correlation = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[:count].sum(-1)
-    if not correlation[0] > 0:
-        return 1.0
-    share = correlation / correlation[0]
-    until = int(np.argmax(share <= 0)) or count
-    return float(1 + 2 * share[1:until].sum())
-
-
-def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
-    """At most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
-
-    A Butterworth filter of fourth order, forwards and backwards, on each trajectory; a is the
-    derivative of the filtered v, by differences. Half a period of the cutoff is left out at both
-    ends. Samples are spread evenly.
+    After an earlier fit it is a warning: only what has changed is free.
 
     Raises:
-        ValueError: if the cutoff is above half the sample rate, or no trajectory is longer than
-            three periods of it.
+        ValueError: with the counts.
     """
-    parts: list[Motion] = []
-    for item in trajectories:
-        rate = 1 / float(item.t[1] - item.t[0])
-        if not cutoff < rate / 2:
-            raise ValueError(
-                f"least squares: cutoff is {cutoff} Hz, expected less than half the sample rate of "
-                f"{rate:g} Hz"
-            )
-        if item.duration < 3 / cutoff:
-            continue
-        low_pass = butter(4, cutoff, fs=rate, output="sos")
-        smooth = [sosfiltfilt(low_pass, getattr(item, name).numpy(), axis=0) for name in "qvu"]
-        q, v, u = (torch.from_numpy(x.copy()).double() for x in smooth)
-        (a,) = torch.gradient(v, spacing=1 / rate, dim=0)
-        edge = max(int(0.5 * rate / cutoff), 1)
-        parts.append(Motion(*(x[edge:-edge] for x in (q, v, a, u))))
-    if not parts:
-        longest = max(item.duration for item in trajectories)
-        raise ValueError(
-            f"least squares: the longest training trajectory has {longest:g} s, expected at least "
-            f"three periods of the cutoff of {cutoff} Hz"
-        )
-    joined = Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-    keep = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
-    return Motion(*(x[keep] for x in joined))
+    if found >= constants:
+        return
+    said = (
+        f"{where} give {found} residuals for {constants} constants, expected at least as many: "
+        f"fewer are met exactly, as if there were no noise; {remedy}"
+    )
+    if not earlier:
+        raise ValueError(f"least squares: {said}")
+    log.warning("least squares: %s", said)

@@ -1,7 +1,10 @@
 """Runs of known mechanics that others start from: a network on top, or the robot with a load."""
 
+import os
 import re
 import shutil
+import signal
+import time
 
 import numpy as np
 import pandas as pd
@@ -10,7 +13,7 @@ import torch
 
 import pinn_dyn
 from pinn_dyn.app.constants import read_constants
-from tests.app.entry import NO_FIGURES, refused_text, run_script
+from tests.app.entry import NO_FIGURES, fork_script, refused_text, run_script
 from tests.support.recorded_logs import LOGS, needs_logs
 
 pytestmark = needs_logs
@@ -105,7 +108,7 @@ def test_a_network_starts_on_the_constants_of_a_fit(tmp_path, fitted):
 
 def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted):
     folder = tmp_path / "again"
-    short = ["optimizer.samples=20", f"start_from={fitted}"]
+    short = ["optimizer.samples=40", f"start_from={fitted}"]
     run_script("train.py", KNOWN, *SMALL, *short, f"hydra.run.dir={folder}")
     before, after = constants(fitted), constants(folder)
     apart = max(float((after[key] - before[key]).abs().max()) for key in before)
@@ -192,3 +195,75 @@ def test_a_covariance_that_is_none_is_no_prior(tmp_path, fitted, capsys):
 def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, setting, message):
     place = f"hydra.run.dir={tmp_path / 'no'}"
     assert re.search(message, refused_text(capsys, "train.py", KNOWN, *SMALL, setting, place))
+
+
+@pytest.mark.parametrize(
+    ("stop", "status"),
+    [(signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, 1)],
+    ids=["SIGTERM", "Ctrl-C"],
+)
+def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, stop, status):
+    folder, begun, log = tmp_path / "run", tmp_path / "begun", tmp_path / "log.txt"
+
+    def endless(*_):
+        begun.touch()
+        time.sleep(600)
+
+    with log.open("w") as output, monkeypatch.context() as patch:
+        patch.setattr("pinn_dyn.training.least_squares.rollout_slopes", endless)
+        words = [KNOWN, *WINDOWS, "optimizer.samples=200", f"hydra.run.dir={folder}"]
+        process = fork_script("train.py", *words, folder=tmp_path, output=output)
+        try:
+            while not begun.exists() and process.is_alive():
+                time.sleep(0.05)
+            os.kill(process.pid, stop)
+            process.join(60)
+        finally:
+            process.kill()
+    text = log.read_text()
+    assert process.exitcode == status, text
+    assert f"train.py resume={folder}" in text
+    stopped = pd.read_csv(folder / "constants_unfinished.csv")
+    assert not (folder / "constants.csv").exists()
+    assert not (folder / "metrics.json").exists()
+    kept = constants(folder)
+    assert max(float(value.abs().max()) for value in kept.values()) > 0.1
+    run_script("train.py", f"resume={folder}")
+    found = pd.read_csv(folder / "constants.csv")
+    assert list(found.name)[: len(stopped)] == list(stopped.name)
+    assert not (folder / "constants_unfinished.csv").exists()
+    assert (folder / "metrics.json").exists()
+    assert (folder / "undetermined.md").exists()
+
+
+def test_a_fit_that_is_finished_is_not_done_again(tmp_path, fitted, monkeypatch):
+    """As where a training was killed after its checkpoint, and before it wrote its record."""
+    folder = shutil.copytree(fitted, tmp_path / "run")
+    for name in ("metrics.json", "constants.csv", "undetermined.md"):
+        (folder / name).unlink()
+    monkeypatch.setattr("pinn_dyn.training.LeastSquares.fit", lambda *_: pytest.fail("fitted"))
+    run_script("train.py", f"resume={folder}")
+    first, again = (pd.read_csv(place / "constants.csv") for place in (fitted, folder))
+    pd.testing.assert_frame_equal(first, again, rtol=1e-6)
+    assert (folder / "metrics.json").exists()
+
+
+def test_fewer_windows_than_constants_end_in_a_sentence(tmp_path, capsys):
+    few = [KNOWN, NO_FIGURES, "data.pairs=1", "data.batch_size=1", "data.steps=2"]
+    text = refused_text(capsys, "train.py", *few, f"hydra.run.dir={tmp_path / 'no'}")
+    assert re.search(r"optimizer: .*1 windows of 2 steps give 8 residuals for \d+ constants", text)
+
+
+def test_currents_without_gains_end_in_a_sentence(tmp_path, capsys):
+    currents = "dataset.u.unit=A"
+    text = refused_text(capsys, "train.py", KNOWN, *SMALL, currents, f"hydra.run.dir={tmp_path}")
+    assert "tau_cmd1 in A, tau_cmd2 in A, and model.drive_gain is 1" in text
+
+
+def test_a_damaged_fit_ends_in_a_sentence(tmp_path, fitted, capsys):
+    folder = shutil.copytree(fitted, tmp_path / "run")
+    (folder / "metrics.json").unlink()
+    path = folder / "checkpoints" / "last.ckpt"
+    torch.save({**torch.load(path, weights_only=True), "fit": {}}, path)
+    text = refused_text(capsys, "train.py", f"resume={folder}")
+    assert "the checkpoint has no fit of the model's 36 constants" in text

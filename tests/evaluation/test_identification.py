@@ -10,7 +10,7 @@ from pinn_dyn.evaluation.identification import (
 )
 from pinn_dyn.models import AsymmetricCoulomb
 from pinn_dyn.training import Fit
-from pinn_dyn.training.least_squares import Prior
+from pinn_dyn.training.constants_fit import Prior
 from tests.support.known import known_model
 
 

@@ -164,5 +164,5 @@ def test_known_mechanics_takes_rigid_bodies():
 
 
 def test_a_spread_is_positive():
-    with pytest.raises(ValueError, match=r"spread 0\.0, expected positive"):
+    with pytest.raises(ValueError, match=r"spread is 0\.0, expected a positive number: 1\.5 for"):
         KnownSystem(statistics(3), SoftArm(), spread=0.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia, rod
 from tests.contracts.mechanical_system import MechanicalSystemContract
@@ -14,6 +15,7 @@ from tests.support.rigid_chains import TREE, joint, link, robot
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 STATES = 100
+NEEDS_COMPILER = pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
 
 
 def urdf_file(name):
@@ -168,6 +170,50 @@ def test_generic_bodies_come_from_the_kinematics_alone():
     assert torch.linalg.eigvalsh(chain.generic_inertia()).min() > 0
 
 
+def dynamics_of(chain, q, v, u):
+    """Acceleration, and the gradient of its square in the inertias of the bodies."""
+    inertia = chain.inertia.clone().requires_grad_()
+    mass, bias = chain.mass_and_bias(q, v, inertia)
+    a = torch.linalg.solve(mass, u - bias)
+    return a.detach(), torch.autograd.grad(a.square().mean(), inertia)[0]
+
+
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "aot_eager",
+        pytest.param("inductor", marks=[pytest.mark.slow, NEEDS_COMPILER]),
+    ],
+)
+def test_compiled_it_is_the_same_chain(backend):
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(2)).double()
+    torch._dynamo.reset()
+    # One graph: anything that is done in Python between two would be an error.
+    compiled = torch.compile(chain.mass_and_bias, fullgraph=True, backend=backend)
+    expected = dynamics_of(chain, q, v, u)
+    chain.mass_and_bias = compiled
+    for found, value in zip(dynamics_of(chain, q, v, u), expected, strict=True):
+        assert torch.allclose(found, value, rtol=1e-9, atol=1e-11 * float(value.abs().max()))
+
+
+def test_single_precision_is_the_same_chain_to_its_digits():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(2)).double()
+    expected = dynamics_of(chain, q, v, u)
+    found = dynamics_of(chain.float(), q.float(), v.float(), u.float())
+    for single, double in zip(found, expected, strict=True):
+        assert single.dtype == torch.float32
+        assert (single - double).norm() < 1e-4 * double.norm()
+        assert (single - double).abs().max() > 0  # it was not computed in double
+
+
+MIMICKING = TREE.replace(
+    '<joint name="bend" type="continuous">',
+    '<joint name="bend" type="continuous"><mimic joint="turn"/>',
+)
+
+
 @pytest.mark.parametrize(
     ("text", "settings", "message"),
     [
@@ -179,6 +225,7 @@ def test_generic_bodies_come_from_the_kinematics_alone():
         ("<robot name='x'/>", {}, "at least one: is it a URDF"),
         ("<robot", {}, "not valid XML"),
         (TREE.replace('type="continuous"', 'type="floating"'), {}, "'bend' is 'floating'"),
+        (MIMICKING, {}, r"joint 'bend' is a mimic joint, expected .* add it to locked_joints"),
         (TREE.replace('xyz="1 2 2"', 'xyz="0 0 0"'), {}, "'slide' has the axis"),
         (TREE.replace('xyz="0.2 0 0.1"', 'xyz="0.2 0"'), {}, "three numbers"),
     ],
@@ -186,6 +233,13 @@ def test_generic_bodies_come_from_the_kinematics_alone():
 def test_a_wrong_description_is_refused_by_name(text, settings, message):
     with pytest.raises(ValueError, match=message):
         RigidChain(text, **settings)
+
+
+def test_a_locked_mimic_joint_is_a_weld():
+    locked = ["wrist", "bend"]
+    chain, other = (RigidChain(text, locked_joints=locked) for text in (MIMICKING, TREE))
+    assert chain.joint_names == other.joint_names == ["turn", "slide", "fork"]
+    assert torch.equal(chain.inertia, other.inertia)
 
 
 def test_a_missing_file_is_named():

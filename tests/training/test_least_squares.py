@@ -1,6 +1,8 @@
 """Least squares finds the constants that made the data, and leaves what no data determine."""
 
 import copy
+import itertools
+import logging
 
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ from scipy.signal import lfilter
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import draw_windows
+from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import DriveCoulomb
-from pinn_dyn.training import LeastSquares
-from pinn_dyn.training.least_squares import correlation_length, filtered_motion
+from pinn_dyn.training import LeastSquares, StoppedFit, least_squares
+from pinn_dyn.training.constants_fit import Fit, Prior, far_from_start
+from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
 from tests.support.known import known_model, motion, motions
 from tests.support.rigid_chains import joint, link, robot
 
@@ -180,3 +184,110 @@ def test_a_model_that_is_too_large_is_refused(runs):
     windows = draw_windows(runs, count=2, steps=1, stride=1, seed=0)
     with pytest.raises(ValueError, match="least squares takes 1 to 500"):
         LeastSquares(cutoff=5.0).fit(model, runs, windows)
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """The minimizations that were begun: two of the identification, then short and long ones."""
+    begun, solve = [], LeastSquares._solve
+
+    def recorded(self, stage, *arguments, **settings):
+        begun.append(stage)
+        return solve(self, stage, *arguments, **settings)
+
+    monkeypatch.setattr(LeastSquares, "_solve", recorded)
+    return begun
+
+
+@pytest.mark.parametrize(("minimization", "evaluation"), [(1, 2), (1, 8), (4, 4)])
+def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
+    truth, runs, solved, monkeypatch, minimization, evaluation
+):
+    windows = draw_windows(runs, count=40, steps=4, stride=2, seed=0)
+    solver, model = LeastSquares(cutoff=20.0), robot_model("generic")
+    before = held_out_error(model, truth)
+    evaluate, calls = least_squares._evaluate, itertools.count(1)
+
+    def interrupted(model, z, *others):
+        found = evaluate(model, z, *others)
+        if len(solved) == minimization and next(calls) == evaluation:
+            vector_to_parameters(torch.from_numpy(z + 3), model.parameters())  # a step too far
+            raise KeyboardInterrupt
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(least_squares, "_evaluate", interrupted)
+        with pytest.raises(StoppedFit) as stopped:
+            solver.fit(model, runs, windows)
+    count = sum(p.numel() for p in model.parameters())
+    fit = Fit.from_state(stopped.value.fit.state(), count)
+    assert fit.stopped_in == (0 if minimization == 1 else 2)
+    assert held_out_error(model, truth) < (1.001 if evaluation == 2 else 0.9) * before
+    solved.clear()
+    found = solver.fit(model, runs, windows, stopped=fit)
+    assert found.stopped_in is None
+    assert len(solved) == (4 if minimization == 1 else 1)  # what was finished is not done again
+    assert held_out_error(model, truth) < 0.01
+    assert not found.prior.mean.any()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state: None,
+        lambda state: {**state, "root": state["root"][:3]},
+        lambda state: {**state, "mean": state["mean"] * torch.nan},
+        lambda state: {**state, "root": 0 * state["root"]},
+        lambda state: {**state, "covariance": state["covariance"].int()},
+        lambda state: {**state, "stopped_in": "here"},
+        lambda state: {key: value for key, value in state.items() if key != "information"},
+    ],
+)
+def test_a_damaged_fit_is_refused(change):
+    one = torch.eye(4).double()
+    state = Fit(one, one, Prior(torch.zeros(4).double(), one), 0.1, 3, stopped_in=1).state()
+    assert Fit.from_state(state, 4).stopped_in == 1
+    with pytest.raises(ValueError, match="the checkpoint has no fit of the model's 4 constants"):
+        Fit.from_state(change(state), 4)
+
+
+def test_fewer_residuals_than_constants_are_refused(runs, caplog):
+    few, enough = (draw_windows(runs, count=k, steps=2, stride=2, seed=0) for k in (2, 40))
+    count = sum(p.numel() for p in robot_model("generic").parameters())
+    message = f"2 windows of 2 steps give 16 residuals for {count} constants.*data.pairs"
+    with pytest.raises(ValueError, match=message):
+        LeastSquares(cutoff=20.0).fit(robot_model("generic"), runs, few)
+    message = f"8 samples of .* give 16 residuals for {count} constants.* optimizer.samples"
+    with pytest.raises(ValueError, match=message):
+        LeastSquares(cutoff=20.0, samples=8).fit(robot_model("generic"), runs, enough)
+    known = 1e-4 * torch.eye(count).double()
+    LeastSquares(cutoff=20.0, samples=8, rollouts=False).fit(
+        robot_model("generic"), runs, few, known
+    )
+    assert f"give 16 residuals for {count} constants" in caplog.text
+
+
+def test_a_constant_far_from_its_start_is_named():
+    names = ["mass of tip", "drive gain of wrist", "torque offset of wrist", "armature of wrist"]
+    root = torch.diag(torch.tensor([1.0, 1.0, 2.0, 0.1]).double())
+    mean = torch.tensor([0.0, 0.0, 1.0, 0.0]).double()
+    z = torch.tensor([-3.5, 6.0, 2.0, 25.0]).double()
+    assert far_from_start(names, z, Prior(mean, root)) == [
+        "drive gain of wrist is 6.0 prior deviations from its start: check units and sign of its "
+        "input",
+        "mass of tip is 3.5 prior deviations from its start: check the units of the columns",
+    ]
+    many = far_from_start(
+        [f"mass of {k}" for k in range(8)], 5 * torch.ones(8), Prior(torch.zeros(8), torch.eye(8))
+    )
+    assert len(many) == 6
+    assert many[-1] == "and 3 more"
+
+
+def test_gains_of_the_wrong_unit_are_warned_of(runs, caplog):
+    """Inputs in mNm taken for Nm, whose gains are known within some 10 %."""
+    wrong = [Trajectory(run.q, run.v, Signal(run.t, 1000 * run.u)) for run in runs]
+    model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, gain_spread=0.1)
+    with caplog.at_level(logging.WARNING):
+        LeastSquares(cutoff=20.0, rollouts=False).fit(model, wrong, None)
+    assert "prior deviations from its start" in caplog.text

@@ -1,0 +1,109 @@
+"""Time of a training step of known mechanics, beside that of the Lagrangian network for one robot.
+
+A step is: one RK4 step of a batch, the increment loss, its gradient; no optimizer. The models are
+those of experiment=panda/known, panda/known_and_network and panda/lnn, N = 7, eager and compiled as
+compile=true does it in a training of 5,000 steps (the state derivative), or of 20,000 (the whole).
+They take turns, round by round; the clock is the processor time of this process, on one thread.
+
+    python benchmarks/known_step.py                       # the table of README.md
+    python benchmarks/known_step.py --ways eager --rounds 2 --output /dev/null   # a smoke run
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from training_step import STEP, make_windows
+
+from pinn_dyn.app.build import build_model
+from pinn_dyn.app.config import composed
+from pinn_dyn.app.provenance import provenance
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.models import Statistics
+from pinn_dyn.training import IncrementLoss, ParameterVector
+from pinn_dyn.training.gradients import Compiled, Eager
+
+SIZE = 7
+RESULT = Path(__file__).parent / "results" / "known_step.csv"
+MODELS = ("lnn", "known", "known_and_network")
+WAYS = {"eager": None, "derivative": 0, "whole": STEPS_FOR_PROGRAM}
+"""How it is compiled, and the steps of a training that does so."""
+
+
+def scales() -> Statistics:
+    """Of standard normal data."""
+    one = torch.ones(SIZE, dtype=torch.float64)
+    increment = torch.cat([STEP * one, STEP * one])[None]
+    return Statistics(
+        0 * one, one, -5 * one, 5 * one, one, one, 0 * one, one, increment, increment, STEP
+    )
+
+
+def step_of(name: str, compiled: str, batch: int) -> Callable[[], float]:
+    """Loss and gradient of the model of an experiment on one batch."""
+    torch.manual_seed(0)
+    words = [f"experiment=panda/{name}", "name=benchmark", f"model_name={name}"]
+    model = build_model(composed("train", words), scales()).train()
+    loss, vector = IncrementLoss(scales(), model), ParameterVector(model.parameters())
+    windows = make_windows(SIZE, batch, torch.float32)
+    steps = WAYS[compiled]
+    engine = Eager(loss, model, vector) if steps is None else Compiled(loss, model, vector, steps)
+    return lambda: float(engine(windows)[0])
+
+
+def seconds_of(step: Callable[[], float], count: int) -> float:
+    """Processor time of a step among its like."""
+    step()
+    start = time.process_time()
+    for _ in range(count):
+        step()
+    return (time.process_time() - start) / count
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--count", type=int, default=10, help="steps in a round")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=["eager", "derivative"])
+    parser.add_argument("--output", type=Path, default=RESULT)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    steps = {
+        (name, way): step_of(name, way, arguments.batch)
+        for way in arguments.ways
+        for name in MODELS
+    }
+    for (name, way), step in steps.items():
+        start = time.perf_counter()
+        step()
+        print(f"{name}, {way}: first step {time.perf_counter() - start:.0f} s", flush=True)
+    times: dict[tuple[str, str], list[float]] = {key: [] for key in steps}
+    for _ in range(arguments.rounds):
+        for key, step in steps.items():
+            times[key].append(seconds_of(step, arguments.count))
+    record = {key: provenance()[key] for key in ("hardware", "torch", "commit")}
+    rows = []
+    for (name, way), values in times.items():
+        beside = [own / lnn for own, lnn in zip(values, times["lnn", way], strict=True)]
+        row = {"coordinates": SIZE, "batch": arguments.batch, "model": name, "compiled": way}
+        row |= {"rounds": len(values), "cpu_ms": round(1e3 * statistics.median(values), 2)}
+        row |= {"x_lnn": round(statistics.median(beside), 2)}
+        row |= {"smallest": round(min(beside), 2), "largest": round(max(beside), 2)}
+        rows.append(row | record)
+        print(f"| {way} | {name} | {row['cpu_ms']} | {row['x_lnn']} |", flush=True)
+    with arguments.output.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"wrote {arguments.output}")
+
+
+if __name__ == "__main__":
+    main()

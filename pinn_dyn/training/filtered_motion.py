@@ -1,0 +1,77 @@
+"""Motion without noise: what an identification by inverse dynamics works on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.signal import butter, sosfiltfilt
+from torch import Tensor
+
+from pinn_dyn.mechanics import Trajectory
+
+
+class Motion(NamedTuple):
+    """Samples of filtered motion, ``(K, N)`` each: what inverse dynamics is compared on."""
+
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    u: Tensor
+
+
+def correlation_length(errors: np.ndarray) -> float:
+    """How many successive errors ``(K, N)`` say as much as one that is independent, at least 1.
+
+    1 + 2 sum over k of rho_k, the autocorrelation up to its first sign change; the mean over the N
+    columns, each weighted by its square. Source: Sokal 1997, "Monte Carlo methods in statistical
+    mechanics", the integrated autocorrelation time.
+    """
+    count = len(errors)
+    spectrum = np.fft.rfft(errors, 2 * count, axis=0)
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[:count].sum(-1)
+    if not correlation[0] > 0:
+        return 1.0
+    share = correlation / correlation[0]
+    until = int(np.argmax(share <= 0)) or count
+    return float(1 + 2 * share[1:until].sum())
+
+
+def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
+    """At most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
+
+    A Butterworth filter of fourth order, forwards and backwards, on each trajectory; a is the
+    derivative of the filtered v, by differences. Half a period of the cutoff is left out at both
+    ends. Samples are spread evenly.
+
+    Raises:
+        ValueError: if the cutoff is above half the sample rate, or no trajectory is longer than
+            three periods of it.
+    """
+    parts: list[Motion] = []
+    for item in trajectories:
+        rate = 1 / float(item.t[1] - item.t[0])
+        if not cutoff < rate / 2:
+            raise ValueError(
+                f"least squares: cutoff is {cutoff} Hz, expected less than half the sample rate of "
+                f"{rate:g} Hz"
+            )
+        if item.duration < 3 / cutoff:
+            continue
+        low_pass = butter(4, cutoff, fs=rate, output="sos")
+        smooth = [sosfiltfilt(low_pass, getattr(item, name).numpy(), axis=0) for name in "qvu"]
+        q, v, u = (torch.from_numpy(x.copy()).double() for x in smooth)
+        (a,) = torch.gradient(v, spacing=1 / rate, dim=0)
+        edge = max(int(0.5 * rate / cutoff), 1)
+        parts.append(Motion(*(x[edge:-edge] for x in (q, v, a, u))))
+    if not parts:
+        longest = max(item.duration for item in trajectories)
+        raise ValueError(
+            f"least squares: the longest training trajectory has {longest:g} s, expected at least "
+            f"three periods of the cutoff of {cutoff} Hz"
+        )
+    joined = Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    keep = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
+    return Motion(*(x[keep] for x in joined))
