@@ -53,6 +53,7 @@ from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, LearnedConstants
+from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.training import COVARIANCE, Fit, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
@@ -286,6 +287,7 @@ def _take_weights(model: Predictor, folder: Path, trust: tuple[str, ...]) -> Non
         trained = load_run(folder, "best", trust).model
     except ConfigError as error:
         raise ConfigError(f"start_from: {error}") from error
+    set_output_limits(trained, {})
     if isinstance(model, KnownAndNetwork) and isinstance(trained, KnownMechanics):
         model = model.known
     here, there = ({k: tuple(x.shape) for k, x in m.state_dict().items()} for m in (model, trained))

@@ -9,6 +9,7 @@ from torch.optim import AdamW
 
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models.output_limits import output_limits, set_output_limits
 from pinn_dyn.training.learner import DynamicsLearner
 from pinn_dyn.training.losses import IncrementLoss, WindowLoss
 from pinn_dyn.training.schedule import one_cycle
@@ -74,6 +75,7 @@ def fit(
         enable_progress_bar=progress,
         use_distributed_sampler=False,
     ).fit(learner, data)
+    set_output_limits(model, output_limits(model, data.windows.q.to(next(model.parameters()))))
     model.eval()
     return losses.values
 
