@@ -30,6 +30,7 @@ from pinn_dyn.app.provenance import build_origin, command_line, data_hash, prove
 from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, write_json
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import Splits
+from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
@@ -110,6 +111,8 @@ def evaluate(cfg: DictConfig) -> float:
         stride = common_stride(steps, truth.t)
     except ValueError as error:
         raise ConfigError(f"{source.name}: {error}") from error
+    if long := too_long_for(trajectories, max(steps), source.labels):
+        log.warning("%s: %s", source.name, long)
     for run in runs:
         check_data(run.folder, trained_on)
     grid = stride * truth.duration / (len(truth.t) - 1)

@@ -46,6 +46,7 @@ from pinn_dyn.app.run_folder import (
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import check_name, packages
 from pinn_dyn.data import DataSource, LogSource
+from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
@@ -193,6 +194,8 @@ def train_in(
     data = build_data(config, source)
     log.info("%s: loading data", config["name"])
     try:
+        if long := too_long_for(data.splits.train, data.step, data.source.labels):
+            log.warning("%s: %s", data.source.name, long)
         statistics = data.statistics
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem

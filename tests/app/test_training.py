@@ -187,3 +187,10 @@ def test_a_sweep_writes_a_folder_per_combination(tmp_path):
         found.add((config["model_name"], config["seed"]))
     assert found == {(model, seed) for model in ("lnn", "hnn") for seed in (0, 1)}
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 4
+
+
+def test_a_step_too_long_for_the_fastest_motion_is_named_before_its_few_pairs(tmp_path, capsys):
+    words = [*TINY, "dataset.step=0.05", "data.stride=1", f"hydra.run.dir={tmp_path}"]
+    text = refused_text(capsys, "train.py", *words)
+    assert "a step of 0.05 s is too long for the fastest motion in the data, that of" in text
+    assert "training trajectories have only" in text

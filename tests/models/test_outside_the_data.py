@@ -68,9 +68,7 @@ def limited(model, seen):
 def ranges_of(data, state="qv"):
     """Smallest and largest of (q, v) or (q, p)."""
     second = data.v_std if state == "qv" else data.p_std
-    return torch.stack(
-        [torch.cat([data.q_low, -3 * second]), torch.cat([data.q_high, 3 * second])]
-    )
+    return torch.stack([torch.cat([data.q_low, -3 * second]), torch.cat([data.q_high, 3 * second])])
 
 
 def along_a_line(data, count=200):
@@ -107,7 +105,7 @@ class TestOutsideTheData(MechanicalNetwork):
 
 
 class TestWithAnAngle(MechanicalNetwork):
-    duration = 5.0  # it turns several times a second
+    duration = 2.0  # it turns several times a second
 
     @pytest.fixture
     def system(self, seen):
@@ -226,7 +224,8 @@ class TestATrainedNetwork(OutsideTheDataContract):
 
 def test_a_potential_of_a_chain_stays_bounded():
     """Linear in the sine and cosine of each joint, so periodic: nothing to limit."""
-    model = make_structured("lnn", 3, 1, potential=partial(ChainPotential, rank=4), angles=[0, 1, 2])
+    potential = partial(ChainPotential, rank=4)
+    model = make_structured("lnn", 3, 1, potential=potential, angles=[0, 1, 2])
     q = along_a_line(make_statistics(3, 1))
     turn = 2 * torch.pi * torch.tensor([1.0, -2.0, 30.0], dtype=torch.float64)
     with torch.no_grad():
