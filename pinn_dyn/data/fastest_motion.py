@@ -10,19 +10,23 @@ from torch import Tensor
 from pinn_dyn.mechanics import Trajectory
 
 _SAMPLES = 8  # of a period, at least
+_MOST = 30  # trajectories that are looked at
 
 
 def periods(trajectories: Sequence[Trajectory]) -> Tensor:
-    """The period of each velocity, ``(N,)``, s: half of its power has a shorter one.
+    """The typical period of each coordinate, ``(N,)``, s: the median of its spectrum.
 
-    Half of the power, as measured velocities are noisy, and noise has any period down to two
-    samples. The mean velocity of a trajectory is no oscillation; infinite where nothing moves.
+    The spectrum is that of q v, the power of the velocity over the frequency. That of v itself is
+    mostly noise where v is derived from a measured q, and that of q mostly drift. The mean
+    velocity of a trajectory is no oscillation; infinite where nothing moves.
     """
     frequencies, powers = [], []
-    for item in trajectories:
+    for item in trajectories[:: -(-len(trajectories) // _MOST)]:
         v, sample = item.v.double(), float(item.t[1] - item.t[0])
-        powers.append(torch.fft.rfft(v - v.mean(0), dim=0).abs().square()[1:])
-        frequencies.append(torch.fft.rfftfreq(len(v), sample, dtype=v.dtype)[1:])
+        frequency = torch.fft.rfftfreq(len(v), sample, dtype=v.dtype)[1:]
+        power = torch.fft.rfft(v - v.mean(0), dim=0).abs().square()[1:]
+        frequencies.append(frequency)
+        powers.append(power / frequency[:, None])
     frequency, order = torch.cat(frequencies).sort()
     below = torch.cat(powers)[order].cumsum(0)
     half = torch.searchsorted(below.T.contiguous(), below[-1, :, None] / 2)[:, 0]
@@ -43,9 +47,9 @@ def too_long_for(
     k = int(found.argmin())
     if not found[k] < _SAMPLES * step:
         return None
+    period = float(found[k])
     return (
         f"a step of {step:g} s is too long for the fastest motion in the data, that of "
-        f"{labels[k]}: half of the power of its velocity has periods below {float(found[k]):.3g} s,"
-        f" expected at least {_SAMPLES} steps a period: take one of at most "
-        f"{float(found[k]) / _SAMPLES:.2g} s"
+        f"{labels[k]}, which has a period of about {period:.2g} s: expected at least {_SAMPLES} "
+        f"steps in it, of {period / _SAMPLES:.2g} s or less"
     )
