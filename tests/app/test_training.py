@@ -11,6 +11,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.models.output_limits import free_weights
 from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
 
 PLAIN = (str, int, float, bool, type(None))
@@ -97,7 +98,7 @@ def test_a_training_starts_from_the_best_weights_of_another_run(tmp_path, hnn_ru
         NO_FIGURES,
     )
     before, after = (load_run(folder, "best").model.state_dict() for folder in (hnn_run, run))
-    for name, value in before.items():
+    for name, value in free_weights(before).items():  # limits are of other windows
         torch.testing.assert_close(after[name], value, rtol=1e-4, atol=1e-6)
 
 
