@@ -179,7 +179,7 @@ class TestATrainedNetwork(OutsideTheDataContract):
     """Of the one-segment arm over the paper's range: 2,500 steps, heads of 24 units.
 
     Its checkpoint as the training left it, with scales, 500 of the training configurations and the
-    largest speeds. Without limits its smallest eigenvalue falls to a millionth.
+    largest speeds. Without limits its smallest eigenvalue falls to less than a thousandth.
     """
 
     duration = 5.0  # a fast motion: its frequency is a hundred times that of the data
