@@ -283,10 +283,10 @@ def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, 
     assert "open report.html" in text
 
 
-def test_a_step_too_long_for_the_fastest_motion_is_named_with_its_coordinate(tmp_path, mlp_run):
+def test_a_step_too_long_for_the_fastest_motion_is_named_with_its_coordinate(tmp_path, lnn_run):
     run_script(
         "evaluate.py",
-        f"runs=[{mlp_run}]",
+        f"runs=[{lnn_run}]",
         "dataset=soft_arm_1",
         *TINY_DATA,
         "horizon=0.2",
