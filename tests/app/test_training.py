@@ -149,6 +149,17 @@ def test_a_run_loads_back_with_the_weights_of_its_checkpoint(hnn_run):
         assert torch.equal(value, saved[f"model.{key}"])
     assert not run.model.training
     assert run.config["model_name"] == "hnn"
+    assert "inverse_mass.output_limits" in weights
+
+
+def test_a_checkpoint_of_before_there_were_limits_loads_without_them(tmp_path, hnn_run):
+    earlier = Path(shutil.copytree(hnn_run, tmp_path / "earlier"))
+    saved = load(earlier)
+    saved["state_dict"] = free_weights(saved["state_dict"])
+    torch.save(saved, earlier / "checkpoints" / "best.ckpt")
+    old, new = (load_run(folder, "best").model for folder in (earlier, hnn_run))
+    assert old.inverse_mass.output_limits is None
+    assert free_weights(new.state_dict()).keys() == old.state_dict().keys()
 
 
 def test_a_seed_gives_the_same_weights_again_and_another_seed_gives_others(tmp_path, lnn_run):
