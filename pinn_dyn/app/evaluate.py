@@ -32,6 +32,7 @@ from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, w
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource, Splits
+from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
@@ -107,6 +108,8 @@ def evaluate(cfg: DictConfig) -> float:
         stride = common_stride(steps, truth.t)
     except ValueError as error:
         raise ConfigError(f"{runs[0].config['dataset'].get('name', 'dataset')}: {error}") from error
+    if long := too_long_for(motions, max(steps), source.labels):
+        log.warning("%s: %s", source.name, long)
     for run, one in zip(runs, data, strict=True):
         check_data(run.folder, one.trained_on)
     grid = stride * truth.duration / (len(truth.t) - 1)

@@ -29,6 +29,7 @@ from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.sweep_table import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
+from pinn_dyn.models.output_limits import expect_output_limits
 from pinn_dyn.training import COVARIANCE
 
 CONFIG = "config.yaml"
@@ -228,6 +229,7 @@ def _take_weights(
         ConfigError: if they are those of another model, or not finite.
     """
     weights = {k.removeprefix("model."): x for k, x in state.items() if k.startswith("model.")}
+    expect_output_limits(model, weights)
     for key, own in model.state_dict().items():
         found = weights.get(key)
         if found is not None and (found.shape != own.shape or not _alike(found, own)):

@@ -48,12 +48,14 @@ from pinn_dyn.app.run_folder import (
 from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import check_name, packages
 from pinn_dyn.data import DataSource, LogSource
+from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
+from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.training import COVARIANCE, LeastSquaresLearner
 
 log = logging.getLogger(__name__)
@@ -193,6 +195,8 @@ def train_in(
     data = build_data(config, source)
     log.info("%s: loading data", config["name"])
     try:
+        if long := too_long_for(data.splits.train, data.step, data.source.labels):
+            log.warning("%s: %s", data.source.name, long)
         statistics = data.statistics
     except ValueError as problem:
         raise ConfigError(f"data: {problem}") from problem
@@ -293,6 +297,7 @@ def _take_weights(model: Predictor, folder: Path, trust: tuple[str, ...]) -> Non
         trained = load_run(folder, "best", trust).model
     except ConfigError as error:
         raise ConfigError(f"start_from: {error}") from error
+    set_output_limits(trained, {})
     if isinstance(model, KnownAndNetwork) and isinstance(trained, KnownMechanics):
         model = model.known
     here, there = ({k: tuple(x.shape) for k, x in m.state_dict().items()} for m in (model, trained))

@@ -88,18 +88,27 @@ class DynamicsData(L.LightningDataModule):
         return self._splits
 
     @property
+    def step(self) -> float:
+        """Step of a window, s."""
+        t = self.splits.train[0].t
+        return self._samples() * float(t[1] - t[0])
+
+    def _samples(self) -> int:
+        """Samples in a step."""
+        if isinstance(self.stride, str):
+            length = seconds_of("stride", self.stride)
+            return samples_of("stride", length, self.splits.train[0].t)
+        return self.stride
+
+    @property
     def windows(self) -> Windows:
         """The training windows."""
         if self._windows is None:
-            train = self.splits.train
-            stride = self.stride
-            if isinstance(stride, str):
-                stride = samples_of("stride", seconds_of("stride", stride), train[0].t)
             self._windows = draw_windows(
-                train,
+                self.splits.train,
                 count=None if self.pairs == "all" else self.pairs,
                 steps=self.steps,
-                stride=stride,
+                stride=self._samples(),
                 seed=self.seed,
                 coverage=self.coverage,
                 history=self.history,

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Sampler
 
 from pinn_dyn.data import DynamicsData
-from pinn_dyn.data.windows import BatchSampler, WindowLoader
+from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
 from pinn_dyn.mechanics import Trajectory
 
 
@@ -26,6 +26,11 @@ class EnsembleData(L.LightningDataModule):
         super().__init__()
         self.data = data
         self.members = members
+
+    @property
+    def windows(self) -> Windows:
+        """The training windows, the same for all members."""
+        return self.data.windows
 
     def prepare_data(self) -> None:
         """Simulate or convert the data once, before other processes read them."""

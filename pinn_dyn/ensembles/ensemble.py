@@ -9,6 +9,12 @@ from torch import Tensor
 
 from pinn_dyn.ensembles.stack import ContinuousStack, DiscreteStack
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Signal
+from pinn_dyn.models.output_limits import (
+    free_weights,
+    given_limits,
+    joint_limits,
+    set_output_limits,
+)
 
 
 class Ensemble(Predictor):
@@ -28,7 +34,10 @@ class Ensemble(Predictor):
     Attributes:
         size: E.
         stack: the members as one model with a leading dimension E, as training uses it.
+        prefix: of the names in a member, in the ensemble's own.
     """
+
+    prefix = "stack.template.model."
 
     def __init__(self, members: Sequence[Predictor]):
         if len(members) < 2:
@@ -40,6 +49,8 @@ class Ensemble(Predictor):
         continuous = [item for item in members if isinstance(item, ContinuousPredictor)]
         self.stack = ContinuousStack(continuous) if continuous else DiscreteStack(members)
         self.penalized = first.penalized
+        limits = joint_limits([given_limits(item) for item in members])
+        set_output_limits(self.stack.template.model, limits)
 
     @property
     def fixed_step(self) -> float | None:  # type: ignore[override]
@@ -74,13 +85,14 @@ class Ensemble(Predictor):
     def _check(members: Sequence[Predictor]) -> None:
         first = members[0]
         shapes = {name: value.shape for name, value in first.named_parameters()}
-        scales = dict(first.named_buffers())
+        scales = free_weights(dict(first.named_buffers()))
         for k, other in enumerate(members):
             if {name: value.shape for name, value in other.named_parameters()} != shapes:
                 raise ValueError(
                     f"member {k} has other parameters than member 0: expected one kind of model"
                 )
-            if any(not torch.equal(value, scales[name]) for name, value in other.named_buffers()):
+            own = free_weights(dict(other.named_buffers()))
+            if any(not torch.equal(value, scales[name]) for name, value in own.items()):
                 raise ValueError(
                     f"member {k} has other scales (buffers) than member 0: build all members from "
                     "the same statistics"

@@ -8,6 +8,8 @@ from torch.optim import Optimizer
 from pinn_dyn.ensembles.ensemble import Ensemble
 from pinn_dyn.ensembles.gradients import CompiledMembers
 from pinn_dyn.ensembles.stack import ContinuousStack
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models.output_limits import joint_limits, output_limits
 from pinn_dyn.training import ELEMENTWISE, SOAP, DynamicsLearner, ParameterVector
 from pinn_dyn.training.gradients import Eager, Engine
 
@@ -28,6 +30,12 @@ class EnsembleLearner(DynamicsLearner):
     """
 
     model: Ensemble
+
+    def output_limits(self, model: Predictor, q: Tensor) -> dict[str, Tensor]:
+        """Those that hold for all members."""
+        assert isinstance(model, Ensemble)
+        each = [output_limits(model.member(k), q) for k in range(model.size)]
+        return {f"{model.prefix}{name}": x for name, x in joint_limits(each).items()}
 
     def parameter_vector(self) -> ParameterVector:
         return ParameterVector(self.model.parameters(), self.model.size)

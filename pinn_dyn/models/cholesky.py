@@ -14,6 +14,10 @@ from pinn_dyn.models.positivity import Positive, Positivity
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.triangular import UNROLLED, square
 
+# Beyond the outputs on the data: a softplus far below zero is an exponential, exp(-0.2) = 0.82.
+_DIAGONAL_MARGIN = 0.2
+_MARGIN = 0.1
+
 
 class CholeskyFactor(nn.Module, abc.ABC):
     """A lower triangular L(q) ``(*batch, N, N)``, for a matrix L L^T that is never indefinite.
@@ -67,8 +71,11 @@ class NetworkCholesky(CholeskyFactor):
 
     The network has N (N + 1)/2 outputs, the first N for the diagonal (paper, section Sub-Network
     Structures); ``positivity`` makes the entries of them. What the network sees of q saturates
-    outside the data, so that the matrix is nowhere larger, and nowhere nearer to singular, than in
-    a box around the data.
+    outside the data. Once trained, its outputs y saturate too, beyond what they were on the data,
+    as in the corners of a box around the data no motion may ever have been: with c = y clipped to
+    its smallest and largest value on the data and a margin m of 0.2 (diagonal) or a tenth of that
+    range (others), y becomes c + m tanh((y - c)/m). So by construction every entry of L is nearly
+    within what the data showed, and the eigenvalues of the matrix are bounded on either side.
 
     In a chain of bodies row i of L in M = L^T L (``transposed``) describes the bodies from joint i
     to the tip, so that most entries are simpler functions than those of L in M = L L^T
@@ -94,6 +101,7 @@ class NetworkCholesky(CholeskyFactor):
 
     placement: Tensor
     order: Tensor
+    output_limits: Tensor | None
 
     def __init__(
         self,
@@ -127,6 +135,7 @@ class NetworkCholesky(CholeskyFactor):
         ]
         self.register_buffer("placement", placement)
         self.register_buffer("order", order.unsqueeze(1), persistent=False)
+        self.register_buffer("output_limits", None)  # while it learns
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
         y, tape = self.network.linearize(q)
@@ -148,8 +157,26 @@ class NetworkCholesky(CholeskyFactor):
         dy = self._take(columns(cotangent.flatten(-2))) * tape[-1]
         return self.network.pullback(tape[:-1], rows(dy, cotangent[..., 0]))
 
+    def limits_at(self, q: Tensor) -> Tensor:
+        """Smallest and largest outputs at q ``(B, N)``, and the margin beyond, ``(3, K)``."""
+        with torch.no_grad():
+            y = self.network(q)
+        low, high = y.amin(0), y.amax(0)
+        margin = (_MARGIN * (high - low)).clamp(min=1e-3)  # of an output that is constant
+        margin[: self.size] = _DIAGONAL_MARGIN
+        return torch.stack([low, high, margin])
+
     def _entries(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Entries of L in units of its scale, the diagonal first, and their slopes in y."""
+        if self.output_limits is None:
+            return self._free_entries(y)
+        low, high, margin = self.output_limits.reshape(3, -1, *[1] * (y.ndim - 1)).unbind()
+        clipped = y.clamp(low, high)
+        beyond = torch.tanh((y - clipped) / margin)
+        values, slopes = self._free_entries(clipped + margin * beyond)
+        return values, slopes * (1 - beyond * beyond)
+
+    def _free_entries(self, y: Tensor) -> tuple[Tensor, Tensor]:
         diagonal, diagonal_slope = self.positivity.diagonal(y[: self.size])
         lower, lower_slope = self.positivity.lower(y[self.size :])
         return torch.cat([diagonal, lower]), torch.cat([diagonal_slope, lower_slope])

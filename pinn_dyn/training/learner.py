@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 import warnings
@@ -18,6 +19,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
+from pinn_dyn.models.output_limits import free_weights, output_limits, set_output_limits
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.losses import Penalized, WindowLoss
@@ -86,6 +88,7 @@ class DynamicsLearner(L.LightningModule):
         # For the checkpoint; what the loggers compare is chosen elsewhere.
         hyperparameters = {"config": config, "statistics": statistics.to_dict()}
         self.save_hyperparameters(hyperparameters, logger=False)
+        set_output_limits(model, {})  # those of an earlier training
         self.model = model
         self.loss = Penalized(loss) if model.penalized else loss
         self.validator = validator
@@ -195,6 +198,23 @@ class DynamicsLearner(L.LightningModule):
 
     def on_validation_model_zero_grad(self) -> None:
         """Keep the gradients, which are views of one vector."""
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add how far the heads may go beyond what these weights give on the training windows."""
+        weights = checkpoint["state_dict"]  # those of a callback that averages them, maybe
+        model = copy.deepcopy(self.model)
+        model.load_state_dict({name.removeprefix("model."): x for name, x in weights.items()})
+        q = self.trainer.datamodule.windows.q  # type: ignore[attr-defined]
+        limits = self.output_limits(model, q.to(next(model.parameters())))
+        weights.update({f"model.{name}": limit for name, limit in limits.items()})
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on learning without limits."""
+        checkpoint["state_dict"] = free_weights(checkpoint["state_dict"])
+
+    def output_limits(self, model: Predictor, q: Tensor) -> dict[str, Tensor]:
+        """How far the heads of a model may go beyond what they give at q ``(K, N)``."""
+        return output_limits(model, q)
 
     def parameter_vector(self) -> ParameterVector:
         """The parameters of the model as one vector."""

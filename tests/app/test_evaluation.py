@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.run_folder import read_config
-from tests.app.entry import NO_FIGURES, refused_text, run_script, train
+from tests.app.entry import NO_FIGURES, TINY_DATA, refused_text, run_script, train
 
 SHORT = ["horizon=0.1", "windows=[0.02,0.05]"]
 
@@ -281,3 +281,18 @@ def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, 
     assert summary["run"].tolist()[0] == "mlp"
     assert (~summary["floor"]).sum() == 1
     assert "open report.html" in text
+
+
+def test_a_step_too_long_for_the_fastest_motion_is_named_with_its_coordinate(tmp_path, lnn_run):
+    run_script(
+        "evaluate.py",
+        f"runs=[{lnn_run}]",
+        "dataset=soft_arm_1",
+        *TINY_DATA,
+        "horizon=0.2",
+        "windows=[0.1]",
+        "step=0.1",
+        f"hydra.run.dir={tmp_path / 'out'}",
+    )
+    said = (tmp_path / "out" / "evaluate.log").read_text()
+    assert "a step of 0.1 s is too long for the fastest motion in the data, that of" in said

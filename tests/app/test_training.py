@@ -11,6 +11,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.models.output_limits import free_weights
 from tests.app.entry import NO_FIGURES, TINY, refused_text, run_script, train
 
 PLAIN = (str, int, float, bool, type(None))
@@ -97,7 +98,7 @@ def test_a_training_starts_from_the_best_weights_of_another_run(tmp_path, hnn_ru
         NO_FIGURES,
     )
     before, after = (load_run(folder, "best").model.state_dict() for folder in (hnn_run, run))
-    for name, value in before.items():
+    for name, value in free_weights(before).items():  # limits are of other windows
         torch.testing.assert_close(after[name], value, rtol=1e-4, atol=1e-6)
 
 
@@ -148,6 +149,17 @@ def test_a_run_loads_back_with_the_weights_of_its_checkpoint(hnn_run):
         assert torch.equal(value, saved[f"model.{key}"])
     assert not run.model.training
     assert run.config["model_name"] == "hnn"
+    assert "inverse_mass.output_limits" in weights
+
+
+def test_a_checkpoint_of_before_there_were_limits_loads_without_them(tmp_path, hnn_run):
+    earlier = Path(shutil.copytree(hnn_run, tmp_path / "earlier"))
+    saved = load(earlier)
+    saved["state_dict"] = free_weights(saved["state_dict"])
+    torch.save(saved, earlier / "checkpoints" / "best.ckpt")
+    old, new = (load_run(folder, "best").model for folder in (earlier, hnn_run))
+    assert old.inverse_mass.output_limits is None
+    assert free_weights(new.state_dict()).keys() == old.state_dict().keys()
 
 
 def test_a_seed_gives_the_same_weights_again_and_another_seed_gives_others(tmp_path, lnn_run):
@@ -187,3 +199,10 @@ def test_a_sweep_writes_a_folder_per_combination(tmp_path):
         found.add((config["model_name"], config["seed"]))
     assert found == {(model, seed) for model in ("lnn", "hnn") for seed in (0, 1)}
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 4
+
+
+def test_a_step_too_long_for_the_fastest_motion_is_named_before_its_few_pairs(tmp_path, capsys):
+    words = [*TINY, "dataset.step=0.05", "data.stride=1", f"hydra.run.dir={tmp_path}"]
+    text = refused_text(capsys, "train.py", *words)
+    assert "a step of 0.05 s is too long for the fastest motion in the data, that of" in text
+    assert "training trajectories have only" in text

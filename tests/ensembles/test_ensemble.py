@@ -8,6 +8,7 @@ import torch
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, ContinuousPredictor, Signal, double_copy
 from pinn_dyn.models import LearnedVelocity
+from pinn_dyn.models.output_limits import output_limits, set_output_limits
 from tests.models.builders import make_model, make_structured, perturb
 
 KINDS = ("lnn", "hnn", "acceleration", "next_state")
@@ -118,3 +119,14 @@ def test_members_that_do_not_belong_together_are_refused():
         Ensemble([first, second])
     with pytest.raises(ValueError, match="member is 3, expected one of the 3 members, 0 to 2"):
         Ensemble(members("lnn")).member(3)
+
+
+def test_members_share_the_widest_of_their_limits():
+    alone, q = members("lnn", 2), motion("lnn")[0][:, :2]
+    for item in alone:
+        set_output_limits(item, output_limits(item, q))
+    first, second = (item.mass.output_limits for item in alone)
+    assert not torch.equal(first, second)
+    found = Ensemble(alone).member(1).mass.output_limits
+    assert torch.equal(found[0], torch.minimum(first[0], second[0]))
+    assert torch.equal(found[1:], torch.maximum(first[1:], second[1:]))
