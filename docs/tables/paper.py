@@ -50,14 +50,12 @@ def entries_of(group: str) -> dict[str, Entry]:
 def prediction_table(group: str) -> str:
     """Prediction errors, a row for each entry: means over the seeds."""
     entries = {name: (entry, recorded(entry)) for name, entry in entries_of(group).items()}
-    # Older results have no velocities.
-    with_v = all("state_squared_error_mean" in data for _, data in entries.values())
-    square, of = ("state_squared_error", " of (q, v)") if with_v else ("squared_error", "")
-    head = ["model", "paper", "ours: mean norm ± std", f"squared norm{of}, mean ± variance"]
+    head = ["model", "paper", "ours: mean norm ± std", "squared norm of (q, v), mean ± variance"]
     head += ["each seed", "pairs (paper)", "training, s"]
     rows = []
     for name, (entry, data) in entries.items():
         mean = data.mean(numeric_only=True)
+        square, variance, of = squared_norm(data)
         took = training_seconds(data)
         pairs = f" ({entry['pairs']:,})" if "pairs" in entry else ""
         rows.append(
@@ -65,13 +63,21 @@ def prediction_table(group: str) -> str:
                 name,
                 entry.get("paper", "–"),
                 f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
-                f"{mean[f'{square}_mean']:.1e} ± {mean[f'{square}_variance']:.1e}",
+                f"{square:.1e} ± {variance:.1e}{of}",
                 " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
                 f"{int(data['pairs'].iloc[0]) * entry.get('steps', 1):,}{pairs}",
                 f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
             ]
         )
     return table(head, rows)
+
+
+def squared_norm(data: pd.DataFrame) -> tuple[float, float, str]:
+    """Mean and variance of the squared norm, of (q, v), or, said in words, of q alone."""
+    whole = "state_squared_error_mean" in data and data["state_squared_error_mean"].notna().all()
+    name = "state_squared_error" if whole else "squared_error"
+    mean, variance = (data[f"{name}_{figure}"].mean() for figure in ("mean", "variance"))
+    return mean, variance, "" if whole else " of q"
 
 
 def generalization_table() -> str:
@@ -107,7 +113,13 @@ def lost(data: pd.DataFrame) -> str:
 
 def train_commands(group: str) -> str:
     """What trains the rows of a table, in their order."""
-    lines = [" ".join(["python train.py -m", *e["train"]]) for e in entries_of(group).values()]
+    entries, lines = read_entries(), []
+    for entry in entries_of(group).values():
+        starts = [
+            f"start_from=runs/sweep/<date>/0_{entries[one]['select']['model']}-seed0"
+            for one in entry.get("runs", ())
+        ]
+        lines.append(" ".join(["python train.py -m", *entry["train"], *map(repr, starts)]))
     return commands(lines)
 
 
