@@ -203,11 +203,11 @@ def run(name: str, entry: Entry, folder: Path) -> None:
         return
     if "train" in entry:
         starts = [
-            (f"seed={read_yaml(path / METRICS)['seed']}", f"start_from={_quoted(path)}")
+            [f"seed={read_yaml(path / METRICS)['seed']}", f"start_from={_quoted(path)}"]
             for path in runs
         ]
         # train.py itself passes over what is finished, and goes on with what is not.
-        for start in starts or [()]:
+        for start in starts or [[]]:
             sweep = f"hydra.sweep.dir={_quoted(folder / name)}"
             call("train.py", "-m", *entry["train"], *start, sweep)
         runs = trained(folder / name)

@@ -105,7 +105,7 @@ def panda() -> str:
         cells = [bold(number(row[c]), row[c] == means[c].min()) for c in columns]
         lost, every = counts.loc[(model, windows)]
         diverged = f"{lost} of {every}"
-        pairs = windows * _PANDA_STEPS.get(model, 1)
+        pairs = int(windows) * _PANDA_STEPS.get(model, 1)
         rows.append([f"`{model}`", f"{pairs:,}", *cells, diverged])
     for label, name in (("keeps its velocity", FLOOR), ("true equation, the same RK4", GROUND)):
         figures = floors(name).loc["panda"]
