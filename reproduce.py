@@ -25,6 +25,7 @@ from typing import Any
 import pandas as pd
 
 from pinn_dyn.app.keys import Positive, Section
+from pinn_dyn.app.run_folder import METRICS
 from pinn_dyn.app.schema import ConfigError, check_value
 from pinn_dyn.app.trust import read_yaml
 
@@ -42,7 +43,7 @@ class _Keys(Section):
     train: Sequence[str] = ()
     evaluate: Sequence[str] = ()
     control: Sequence[str] = ()
-    run: str = ""
+    runs: Sequence[str] = ()
     results: str = ""
     select: Mapping[str, Any] | None = None
     metric: str = ""
@@ -54,7 +55,12 @@ class _Keys(Section):
     missing: str = ""
 
 
-_WHOLE = ({"train", "evaluate"}, {"control", "run", "minutes"}, {"missing"})
+_WHOLE = (
+    {"train", "evaluate"},
+    {"evaluate", "runs", "minutes"},
+    {"control", "runs", "minutes"},
+    {"missing"},
+)
 """Keys that an entry needs, of one kind or another."""
 
 
@@ -86,10 +92,14 @@ def _check_entry(name: str, entry: Entry, entries: dict[str, Entry]) -> None:
     if not any(keys <= entry.keys() for keys in _WHOLE):
         raise ConfigError(
             f"entries.{name} has {', '.join(entry) or 'nothing'}, expected train and evaluate, or "
-            "control, run and minutes, or missing"
+            "evaluate or control with runs and minutes, or missing"
         )
-    if "run" in entry and "train" not in entries.get(entry["run"], {}):
-        raise ConfigError(f"entries.{name}.run is {entry['run']!r}, expected an entry that trains")
+    before = list(entries)[: list(entries).index(name)]
+    for one in entry.get("runs", ()):
+        if one not in before or "train" not in entries[one]:
+            raise ConfigError(
+                f"entries.{name}.runs has {one!r}, expected entries above it that train"
+            )
     if Path(entry.get("results", "")).is_absolute():
         raise ConfigError(
             f"entries.{name}.results is {entry['results']!r}, expected files below {ROOT}"
@@ -120,7 +130,7 @@ def selected(entry: Entry, files: list[Path]) -> pd.DataFrame:
                     f"{path} has no column {column!r}, by which its entry selects rows: "
                     f"there are {', '.join(rows)}"
                 )
-            rows = rows[rows[column] == value]
+            rows = rows[rows[column].isin(value if isinstance(value, list) else [value])]
         found.append(rows)
     return pd.concat(found) if found else pd.DataFrame()
 
@@ -151,13 +161,18 @@ def tables(name: str, entry: Entry, folder: Path) -> list[Path]:
     """The tables that an entry leaves, one for each run that controls, else one of them all."""
     if "control" not in entry:
         return [folder / name / "evaluation" / SUMMARY]
-    runs = trained(folder / entry["run"])
+    runs = trained_of(entry, folder)
     return [folder / name / run.name / SUMMARY for run in runs]
 
 
 def trained(folder: Path) -> list[Path]:
     """The finished trainings of an entry."""
-    return sorted(path.parent for path in folder.glob("*/metrics.json"))
+    return sorted(path.parent for path in folder.glob(f"*/{METRICS}"))
+
+
+def trained_of(entry: Entry, folder: Path) -> list[Path]:
+    """The finished trainings that an entry starts from."""
+    return [path for one in entry.get("runs", ()) for path in trained(folder / one)]
 
 
 def state(name: str, entry: Entry, folder: Path) -> str:
@@ -176,22 +191,30 @@ def run(name: str, entry: Entry, folder: Path) -> None:
     Raises:
         EntryError: if one fails.
     """
+    for one in entry.get("runs", ()):
+        if not trained(folder / one):
+            raise EntryError(f"needs {one}, which has no finished training")
+    runs = trained_of(entry, folder)
     if "control" in entry:
-        runs = trained(folder / entry["run"])
-        if not runs:
-            raise EntryError(f"needs {entry['run']}, which has no finished training")
         for path in runs:
             if not (folder / name / path.name / SUMMARY).is_file():
                 out = f"hydra.run.dir={_quoted(folder / name / path.name)}"
                 call("control.py", *entry["control"], f"run={_quoted(path)}", out)
         return
-    # train.py itself passes over what is finished, and goes on with what is not.
-    call("train.py", "-m", *entry["train"], f"hydra.sweep.dir={_quoted(folder / name)}")
+    if "train" in entry:
+        starts = [
+            [f"seed={read_yaml(path / METRICS)['seed']}", f"start_from={_quoted(path)}"]
+            for path in runs
+        ]
+        # train.py itself passes over what is finished, and goes on with what is not.
+        for start in starts or [[]]:
+            sweep = f"hydra.sweep.dir={_quoted(folder / name)}"
+            call("train.py", "-m", *entry["train"], *start, sweep)
+        runs = trained(folder / name)
+        if not runs:
+            raise EntryError("train.py left no finished training")
     (table,) = tables(name, entry, folder)
-    runs = trained(folder / name)
-    if not runs:
-        raise EntryError("train.py left no finished training")
-    newest = max((path / "metrics.json").stat().st_mtime for path in runs)
+    newest = max((path / METRICS).stat().st_mtime for path in runs)
     if not table.is_file() or table.stat().st_mtime < newest:
         found = ",".join(_quoted(path) for path in runs)
         out = f"hydra.run.dir={_quoted(table.parent)}"
@@ -220,18 +243,22 @@ def call(program: str, *words: str) -> None:
 
 def comparison(entries: dict[str, Entry], names: list[str], folder: Path) -> str:
     """What was remade, beside what is recorded and what the paper says."""
-    lines = [f"{'entry':<30}{'remade':>12}{'recorded':>12}   paper"]
+    lines = [f"{'entry':<42}{'remade':>12}{'recorded':>12}   paper"]
     for name in names:
         entry = entries[name]
-        if "select" not in entry:  # a study: no single figure
-            continue
         metric = entry.get("metric", "error_mean")
         files = [path for path in tables(name, entry, folder) if path.is_file()]
-        means = [
-            f"{rows[metric].mean():.3g}" if len(rows) and metric in rows else "-"
-            for rows in (selected(entry, files), recorded(entry))
-        ]
-        lines.append(f"{name:<30}{means[0]:>12}{means[1]:>12}   {entry.get('paper', '-')}")
+        both = [selected(entry, files), recorded(entry)]
+        models = both[1]["model"].unique() if "model" in both[1] else []
+        # A line for each of several models, with the mean over its runs.
+        for model in models if len(models) > 1 else [None]:
+            means = []
+            for data in both:
+                rows = data[data["model"] == model] if model and len(data) else data
+                found = len(rows) and metric in rows
+                means.append(f"{rows[metric].mean():.3g}" if found else "-")
+            label = f"{name} {model}" if model else name
+            lines.append(f"{label:<42}{means[0]:>12}{means[1]:>12}   {entry.get('paper', '-')}")
     return "\n".join(lines)
 
 
@@ -244,8 +271,11 @@ def chosen(entries: dict[str, Entry], only: list[str] | None) -> list[str]:
     wanted = only or [name for name, entry in entries.items() if "missing" not in entry]
     if lacking := [name for name in wanted if "missing" in entries[name]]:
         raise SystemExit(f"{', '.join(lacking)}: the paper's log is not published")
-    needed = {entries[name]["run"] for name in wanted if "run" in entries[name]}
-    return [name for name in entries if name in needed or name in wanted]
+    needed = set(wanted)
+    for name in reversed(entries):  # what an entry needs stands above it
+        if name in needed:
+            needed.update(entries[name].get("runs", ()))
+    return [name for name in entries if name in needed]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -270,7 +300,7 @@ def _remake(
     if listed:
         for name, entry in entries.items():
             took = "" if "missing" in entry else f"{minutes(entry):.0f} min"
-            print(f"{name:<30}{took:>8}   {state(name, entry, folder)}")
+            print(f"{name:<42}{took:>8}   {state(name, entry, folder)}")
     names = chosen(entries, only)
     left = [name for name in names if state(name, entries[name], folder) != "done"]
     print(f"{sum(minutes(entries[name]) for name in left):.0f} min to go, on one core")

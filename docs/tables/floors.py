@@ -37,8 +37,11 @@ _ONE = ("dataset.train_initial_states=1", "dataset.train_inputs=1", "dataset.val
 SETS = {
     "soft_arm_1": (5.0, 0.002, (0.1, 1.0), _ONE),
     "soft_arm_1_wide": (5.0, 0.002, (0.1, 1.0), _ONE),
+    "soft_arm_1_wide_beyond": (5.0, 0.002, (), ()),
     "soft_arm_2": (10.0, 0.005, (0.1, 1.0), _ONE),
+    "soft_arm_2_beyond": (10.0, 0.01, (), ()),
     "panda": (2.0, 0.01, (0.05, 0.5), ("dataset.train=1", "dataset.validation=1")),
+    "panda_beyond": (2.0, 0.01, (), ()),
     "double_pendulum": (2.0, 0.01, (0.1, 1.0), ()),
     "panda_gaz": (3.0, 0.02, (0.1, 1.0), ()),
     "soft_neck": (11.0, 0.1, (0.1, 1.0), ()),

@@ -7,8 +7,9 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
+from docs.tables.floors import FILE, GROUND
 from docs.tables.text import bold, commands, number, table
-from reproduce import ENTRIES, ROOT, Entry, read_entries, recorded, training_seconds
+from reproduce import ENTRIES, ROOT, SUMMARY, Entry, read_entries, recorded, training_seconds
 
 _PREDICTED = ("soft_arm_1_wide", "soft_arm_1", "soft_arm_2", "panda")
 # Columns of the table of generalization: evaluations of the models of the wide range.
@@ -18,6 +19,11 @@ _ELSEWHERE = {
     "beyond, 1.3 times": "beyond/summary.csv",
     "steps of 5 ms": "steps/summary.csv",
     "trained on 500 pairs": "few_pairs/summary.csv",
+}
+# Data set and task, and the folder of their evaluations, with those beyond the range in it.
+_BEYOND = {
+    ("soft_arm_2", "two-segment soft arm at 100 Hz, 10 s"): "soft_arm_2/100hz_wide",
+    ("panda", "Panda in PyBullet, 2 s"): "panda",
 }
 _GEOMETRY_KNOWN = "known_system"
 """Knows the arm, so that it says nothing of networks elsewhere."""
@@ -30,6 +36,7 @@ def tables() -> dict[str, str]:
         **{name: prediction_table(name) for name in _PREDICTED},
         **{f"{name}_commands": train_commands(name) for name in _PREDICTED},
         "generalization": generalization_table(),
+        "beyond": beyond_table(),
         "hardware": hardware_table(),
         "control": control_table(),
         "terms": terms_table(),
@@ -50,14 +57,12 @@ def entries_of(group: str) -> dict[str, Entry]:
 def prediction_table(group: str) -> str:
     """Prediction errors, a row for each entry: means over the seeds."""
     entries = {name: (entry, recorded(entry)) for name, entry in entries_of(group).items()}
-    # Older results have no velocities.
-    with_v = all("state_squared_error_mean" in data for _, data in entries.values())
-    square, of = ("state_squared_error", " of (q, v)") if with_v else ("squared_error", "")
-    head = ["model", "paper", "ours: mean norm ± std", f"squared norm{of}, mean ± variance"]
+    head = ["model", "paper", "ours: mean norm ± std", "squared norm of (q, v), mean ± variance"]
     head += ["each seed", "pairs (paper)", "training, s"]
     rows = []
     for name, (entry, data) in entries.items():
         mean = data.mean(numeric_only=True)
+        square, variance, of = squared_norm(data)
         took = training_seconds(data)
         pairs = f" ({entry['pairs']:,})" if "pairs" in entry else ""
         rows.append(
@@ -65,7 +70,7 @@ def prediction_table(group: str) -> str:
                 name,
                 entry.get("paper", "–"),
                 f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
-                f"{mean[f'{square}_mean']:.1e} ± {mean[f'{square}_variance']:.1e}",
+                f"{square:.1e} ± {variance:.1e}{of}",
                 " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
                 f"{int(data['pairs'].iloc[0]) * entry.get('steps', 1):,}{pairs}",
                 f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
@@ -74,29 +79,78 @@ def prediction_table(group: str) -> str:
     return table(head, rows)
 
 
+def squared_norm(data: pd.DataFrame) -> tuple[float, float, str]:
+    """Mean and variance of the squared norm, of (q, v), or, said in words, of q alone."""
+    whole = "state_squared_error_mean" in data and data["state_squared_error_mean"].notna().all()
+    name = "state_squared_error" if whole else "squared_error"
+    mean, variance = (data[f"{name}_{figure}"].mean() for figure in ("mean", "variance"))
+    return mean, variance, "" if whole else " of q"
+
+
 def generalization_table() -> str:
     """The models of the wide range where they were not trained: means over the seeds."""
     tables = {head: pd.read_csv(_WIDE / file) for head, file in _ELSEWHERE.items()}
+    tables = {head: data[data["model"] != _GEOMETRY_KNOWN] for head, data in tables.items()}
+    beyond = tables["beyond, 1.3 times"]
     rows = []
     for model in tables["in range"]["model"].unique():
-        if model == _GEOMETRY_KNOWN:
-            continue
-        cells = []
-        for data in tables.values():
-            runs, trained = data[data["model"] == model], data[~data["floor"]]
-            trained = trained[trained["model"] != _GEOMETRY_KNOWN]
-            if runs.empty:
-                cells.append("–")
-                continue
-            figures = []
-            for column in ("error_mean", "error_median"):
-                error = runs[column].mean()
-                best = error == trained.groupby("model")[column].mean().min()
-                figures.append(bold(number(error), best))
-            cells.append(f"{', '.join(figures)}{lost(runs)}")
-        floor = bool(tables["in range"].set_index("model").loc[[model], "floor"].iloc[0])
-        rows.append([model if floor else f"`{model}`", *cells])
-    return table(["model", *tables], rows)
+        cells = [_mean_and_median(data, model) for data in tables.values()]
+        rows.append(
+            [_label(tables["in range"], model), *cells[:2], _left(beyond, model), *cells[2:]]
+        )
+    truth = [_truth(name) for name in ("soft_arm_1_wide", "soft_arm_1_wide_beyond")]
+    rows.append(["true equation", *truth, *["–"] * (len(tables) - 1)])
+    head = list(tables)
+    return table(["model", *head[:2], "left the data beyond", *head[2:]], rows)
+
+
+def beyond_table() -> str:
+    """The other simulated robots within their range and beyond it."""
+    rows = []
+    for (dataset, task), folder in _BEYOND.items():
+        files = [ROOT / "results" / folder / rest for rest in (SUMMARY, f"beyond/{SUMMARY}")]
+        inside, beyond = (pd.read_csv(path) for path in files)
+        # Without models that were not tested beyond.
+        inside = inside.merge(beyond[["model", "pairs"]].drop_duplicates())
+        for index, model in enumerate(beyond["model"].unique()):
+            cells = [_mean_and_median(data, model) for data in (inside, beyond)]
+            label = _label(beyond, model)
+            rows.append(["" if index else task, label, *cells, _left(beyond, model)])
+        truth = (_truth(name) for name in (dataset, f"{dataset}_beyond"))
+        rows.append(["", "true equation", *truth, "–"])
+    return table(["task", "model", "in range", "beyond, 1.3 times", "left the data beyond"], rows)
+
+
+def _label(data: pd.DataFrame, model: str) -> str:
+    return model if data.set_index("model")["floor"][[model]].iloc[0] else f"`{model}`"
+
+
+def _mean_and_median(data: pd.DataFrame, model: str) -> str:
+    """Errors of a model, bold where they are the smallest of what was trained."""
+    runs, trained = data[data["model"] == model], data[data["pairs"].notna()]
+    if runs.empty:
+        return "–"
+    figures = []
+    for column in ("error_mean", "error_median"):
+        error = runs[column].mean()
+        figures.append(bold(number(error), error == trained.groupby("model")[column].mean().min()))
+    return f"{', '.join(figures)}{lost(runs)}"
+
+
+def _left(data: pd.DataFrame, model: str) -> str:
+    """How many predictions left the range of the training data, and when the first did."""
+    runs = data[data["model"] == model]
+    if not (left := int(runs["left_data"].sum())):
+        return "none"
+    return f"{left} of {int(runs['trajectories'].sum())}, {runs['left_data_after'].min():.1f} s"
+
+
+def _truth(dataset: str) -> str:
+    """Errors of the true equation in the same steps."""
+    data = pd.read_csv(FILE)
+    row = data[(data["dataset"] == dataset) & (data["model"] == GROUND)]
+    figures = (f"{row[column].iloc[0]:.1e}" for column in ("error_mean", "error_median"))
+    return f"{', '.join(figures)}{lost(row)}"
 
 
 def lost(data: pd.DataFrame) -> str:
@@ -107,7 +161,13 @@ def lost(data: pd.DataFrame) -> str:
 
 def train_commands(group: str) -> str:
     """What trains the rows of a table, in their order."""
-    lines = [" ".join(["python train.py -m", *e["train"]]) for e in entries_of(group).values()]
+    entries, lines = read_entries(), []
+    for entry in entries_of(group).values():
+        starts = [
+            f"start_from=runs/sweep/<date>/0_{entries[one]['select']['model']}-seed0"
+            for one in entry.get("runs", ())
+        ]
+        lines.append(" ".join(["python train.py -m", *entry["train"], *map(repr, starts)]))
     return commands(lines)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pandas as pd
 
 from docs.tables.floors import FLOOR, GROUND
-from docs.tables.paper import lost
+from docs.tables.paper import lost, squared_norm
 from docs.tables.text import bold, number, table
-from reproduce import ROOT, read_entries, recorded
+from reproduce import ROOT, read_entries, recorded, training_seconds
 
 RESULTS = ROOT / "results"
 NAMES = {
@@ -22,7 +22,7 @@ NAMES = {
 # reproduction.yaml, or a log and its model.
 SUMMARY = [
     ("one-segment soft arm, 5 s", "hnn", "soft_arm_1_wide/hnn", "soft_arm_1_wide/mlp"),
-    ("", "lnn", "soft_arm_1_wide/lnn", "soft_arm_1_wide/mlp"),
+    ("", "lnn", "soft_arm_1_wide/lnn_wide", "soft_arm_1_wide/mlp"),
     (
         "two-segment soft arm at 100 Hz, 10 s",
         "lnn",
@@ -66,6 +66,7 @@ def summary() -> str:
     for task, model, ours, rival in SUMMARY:
         data, other = rows_of(ours), rows_of(rival)
         mean, best = data["error_mean"].mean(), other["error_mean"].mean()
+        square, _, of = squared_norm(data)
         paper = entries.get(ours, {}).get("paper", "–")
         experiment = entries[ours]["train"][0] if ours in entries else f"experiment=logs/{ours}"
         cells = [
@@ -73,11 +74,20 @@ def summary() -> str:
             f"`{model}`",
             paper,
             f"{bold(number(mean), mean < best and not lost(data))}{lost(data)}",
+            f"{square:.1e}{of}",
         ]
-        cells += [bold(number(best), best < mean), number(floor[ours.split("/")[0]])]
-        rows.append([*cells, f"`{experiment}`"])
-    head = ["task", "model", "paper", "ours", "best black box", "keeps its velocity"]
+        steps = entries.get(ours, {}).get("steps", 1)
+        cells += [_effort(data, steps), bold(number(best), best < mean), _effort(other)]
+        rows.append([*cells, number(floor[ours.split("/")[0]]), f"`{experiment}`"])
+    head = ["task", "model", "paper", "ours: mean norm", "squared norm of (q, v)"]
+    head += ["pairs, training", "best black box", "pairs, training", "keeps its velocity"]
     return table([*head, "trained by"], rows)
+
+
+def _effort(data: pd.DataFrame, steps: int = 1) -> str:
+    """Pairs, and minutes of the processor in the mean over the seeds."""
+    minutes = training_seconds(data).mean() / 60
+    return f"{int(data['pairs'].iloc[0]) * steps:,}, {number(minutes)} min"
 
 
 _PANDA_STEPS = {"known": 20, "known_and_network": 10}
@@ -95,7 +105,7 @@ def panda() -> str:
         cells = [bold(number(row[c]), row[c] == means[c].min()) for c in columns]
         lost, every = counts.loc[(model, windows)]
         diverged = f"{lost} of {every}"
-        pairs = windows * _PANDA_STEPS.get(model, 1)
+        pairs = int(windows) * _PANDA_STEPS.get(model, 1)
         rows.append([f"`{model}`", f"{pairs:,}", *cells, diverged])
     for label, name in (("keeps its velocity", FLOOR), ("true equation, the same RK4", GROUND)):
         figures = floors(name).loc["panda"]

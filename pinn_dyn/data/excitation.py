@@ -12,6 +12,56 @@ Signal = Callable[[np.ndarray], np.ndarray]
 """Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """Signals drawn together, a function of time and of arrays with a row for each of them."""
+
+    function: Callable[..., np.ndarray]
+    arrays: Sequence[np.ndarray]
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        return self.function(t, *self.arrays)
+
+    def rows(self, index: np.ndarray) -> Signal:
+        """Some of them; the others are not computed."""
+        return Drawn(self.function, [array[index] for array in self.arrays])
+
+
+class Joined:
+    """Signals of several draws as one: the k-th is the ``row[k]``-th of ``signals[which[k]]``.
+
+    Args:
+        signals: drawn, of one number of inputs; of a :class:`Drawn` only the rows are computed.
+        which: numbers of the draws, ``(count,)``.
+        row: numbers within them, ``(count,)``.
+    """
+
+    def __init__(self, signals: Sequence[Signal], which: np.ndarray, row: np.ndarray):
+        self._given = signals, which, row
+        self._parts: list[Signal] = []
+        self._pick = np.empty(len(which), dtype=int)
+        count = 0
+        for k in np.unique(which):
+            needed, place = np.unique(row[which == k], return_inverse=True)
+            self._parts.append(_rows(signals[k], needed))
+            self._pick[which == k] = count + place
+            count += len(needed)
+
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        return np.concatenate([part(t) for part in self._parts])[self._pick]
+
+    def rows(self, index: np.ndarray) -> Signal:
+        """Some of them; the others are not computed."""
+        signals, which, row = self._given
+        return Joined(signals, which[index], row[index])
+
+
+def _rows(signal: Signal, index: np.ndarray) -> Signal:
+    if isinstance(signal, (Drawn, Joined)):
+        return signal.rows(index)
+    return lambda t: signal(t)[index]
+
+
 def _check_positive(owner: object, **values: float) -> None:
     for name, value in values.items():
         if not value > 0:
@@ -100,11 +150,18 @@ class MultiSine(_Bounded):
         phase = rng.uniform(0, 2 * np.pi, shape)
         weight = rng.dirichlet(np.ones(self.harmonics), peak.shape)
 
-        def signal(t: np.ndarray) -> np.ndarray:
-            angle = 2 * np.pi * frequency[:, None] * t[:, None, None] + phase[:, None]
-            return self._scaled((weight[:, None] * np.sin(angle)).sum(-1), peak)
+        return Drawn(self._signal, (peak, frequency, phase, weight))
 
-        return signal
+    def _signal(
+        self,
+        t: np.ndarray,
+        peak: np.ndarray,
+        frequency: np.ndarray,
+        phase: np.ndarray,
+        weight: np.ndarray,
+    ) -> np.ndarray:
+        angle = 2 * np.pi * frequency[:, None] * t[:, None, None] + phase[:, None]
+        return self._scaled((weight[:, None] * np.sin(angle)).sum(-1), peak)
 
 
 @dataclass(frozen=True)
@@ -131,12 +188,19 @@ class Chirp(_Bounded):
         start = np.where(down, self.frequency[1], self.frequency[0])
         rate = np.where(down, -1, 1) * (self.frequency[1] - self.frequency[0]) / duration
 
-        def signal(t: np.ndarray) -> np.ndarray:
-            time = t[:, None]
-            cycles = start[:, None] * time + 0.5 * rate[:, None] * time**2
-            return self._scaled(np.sin(phase[:, None] + 2 * np.pi * cycles), peak)
+        return Drawn(self._signal, (peak, phase, start, rate))
 
-        return signal
+    def _signal(
+        self,
+        t: np.ndarray,
+        peak: np.ndarray,
+        phase: np.ndarray,
+        start: np.ndarray,
+        rate: np.ndarray,
+    ) -> np.ndarray:
+        time = t[:, None]
+        cycles = start[:, None] * time + 0.5 * rate[:, None] * time**2
+        return self._scaled(np.sin(phase[:, None] + 2 * np.pi * cycles), peak)
 
 
 @dataclass(frozen=True)
@@ -170,18 +234,19 @@ class Steps(_Bounded):
         shape = (*peak.shape, number)
         level = rng.uniform(-1, 1, shape)
         start = np.cumsum(rng.uniform(self.hold[0], self.hold[1], shape), axis=-1)
-        jump = np.diff(level, axis=-1)
-        rows, _, columns = np.ix_(range(count), range(1), range(peak.shape[1]))
+        return Drawn(self._signal, (peak, level, start))
 
-        def signal(t: np.ndarray) -> np.ndarray:
-            # A ramp ends before the next begins: only the last one begun is under way.
-            begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)
-            last = (rows, columns, np.maximum(begun - 1, 0))
-            ramp = np.clip((t[:, None] - start[last]) / self.rise_time, 0.0, 1.0)
-            smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
-            return self._scaled(level[last] + jump[last] * smooth, peak)
-
-        return signal
+    def _signal(
+        self, t: np.ndarray, peak: np.ndarray, level: np.ndarray, start: np.ndarray
+    ) -> np.ndarray:
+        rows, _, columns = np.ix_(range(len(peak)), range(1), range(peak.shape[1]))
+        # A ramp ends before the next begins: only the last one begun is under way.
+        begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)
+        last = np.maximum(begun - 1, 0)
+        before = level[rows, columns, last]
+        ramp = np.clip((t[:, None] - start[rows, columns, last]) / self.rise_time, 0.0, 1.0)
+        smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
+        return self._scaled(before + (level[rows, columns, last + 1] - before) * smooth, peak)
 
 
 @dataclass(frozen=True)
@@ -201,9 +266,5 @@ class Mixture(Excitation):
         signals = [
             part.draw(size, duration, rng) for part, size in zip(self.parts, sizes, strict=True)
         ]
-        order = np.argsort(np.concatenate([np.arange(k, count, kinds) for k in range(kinds)]))
-
-        def signal(t: np.ndarray) -> np.ndarray:
-            return np.concatenate([part(t) for part in signals])[order]
-
-        return signal
+        every = np.arange(count)
+        return Joined(signals, every % kinds, every // kinds)

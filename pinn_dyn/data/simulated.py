@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
-from pinn_dyn.data.excitation import Excitation
+from pinn_dyn.data.excitation import Excitation, Joined
 from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
@@ -277,24 +277,19 @@ class SimulatedSource(DataSource):
             else:
                 pick.append(np.array([(a, a) for a in range(states)]))
 
-        def signal(time: np.ndarray) -> np.ndarray:
-            drawn = [part(time) for part in signals]
-            return np.concatenate([d[p[:, 1]] for d, p in zip(drawn, pick, strict=True)])
-
         q0, v0 = (
             np.concatenate([s[k][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
             for k in range(2)
         )
-        return _Draw(q0, v0, signal)
+        which = np.repeat(np.arange(len(pick)), [len(p) for p in pick])
+        return _Draw(q0, v0, Joined(signals, which, np.concatenate(pick)[:, 1]))
 
     def _move(
         self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """q, v and u of some motions: ``rows`` of the draws one after another."""
-
-        def signal(time: np.ndarray) -> np.ndarray:
-            return np.concatenate([draw.signal(time) for draw in draws])[rows]
-
+        size = len(draws[0].q0)
+        signal = Joined([draw.signal for draw in draws], rows // size, rows % size)
         q, v = simulate(
             self.system,
             np.concatenate([draw.q0 for draw in draws])[rows],

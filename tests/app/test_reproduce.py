@@ -22,7 +22,9 @@ ENTRIES = {
         "minutes": 7,
         "paper": "0.171 ± 0.272",
     },
-    "control/lnn": {"run": "arm/lnn", "control": ["experiment=x"], "minutes": 5},
+    "control/lnn": {"runs": ["arm/lnn"], "control": ["experiment=x"], "minutes": 5},
+    "arm/rk4": {"runs": ["arm/lnn"], "train": ["loss=x"], "evaluate": [], "minutes": 2},
+    "arm/beyond": {"runs": ["arm/lnn"], "evaluate": ["dataset=x"], "minutes": 1},
     "real/lnn": {"missing": "no log", "paper": "2.4"},
 }
 
@@ -39,12 +41,17 @@ def calls(tmp_path, monkeypatch):
         if "bad" in words:
             return subprocess.CompletedProcess(command, 1)
         if names[-1] == "train.py":
-            assert words["seed"] == "0,1"
-            for seed in (0, 1):  # a finished training is passed over
+            seeds = map(int, words["seed"].split(","))
+            if "loss" in words:
+                start = Path(words["start_from"])
+                assert yaml.safe_load((start / "metrics.json").read_text()) == {
+                    "seed": int(words["seed"])
+                }
+            for seed in seeds:  # a finished training is passed over
                 path = Path(words["hydra.sweep.dir"]) / f"{seed}_lnn-seed{seed}" / "metrics.json"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if not path.exists():
-                    path.write_text("{}")
+                    path.write_text(f'{{"seed": {seed}}}')
         else:
             runs = words.get("runs", words.get("run")).strip("[]").split(",")
             assert all((Path(run) / "metrics.json").is_file() for run in runs)
@@ -56,7 +63,7 @@ def calls(tmp_path, monkeypatch):
 
     monkeypatch.setattr(reproduce, "subprocess", types.SimpleNamespace(run=call))
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "entries.yaml").write_text(yaml.safe_dump({"entries": ENTRIES}))
+    (tmp_path / "entries.yaml").write_text(yaml.safe_dump({"entries": ENTRIES}, sort_keys=False))
     return names
 
 
@@ -75,11 +82,16 @@ def test_an_entry_that_fails_is_listed_and_does_not_stop_the_others(calls, capsy
         "1 failed:",
         "  arm/bad: train.py ended with status 1, its output says why",
     ]
-    assert calls == ["train.py", "train.py", "evaluate.py", "control.py", "control.py"]
+    assert calls == [
+        *("train.py", "train.py", "evaluate.py", "control.py", "control.py"),
+        *("train.py", "train.py", "evaluate.py", "evaluate.py"),  # arm/rk4, arm/beyond
+    ]
     said = capsys.readouterr().out
-    assert said.startswith("13 min to go")
-    assert "[2/3] arm/lnn: 7 min" in said
-    assert "arm/lnn                                0.2           -   0.171 ± 0.272" in said
+    assert said.startswith("16 min to go")
+    assert "[2/5] arm/lnn: 7 min" in said
+    assert (
+        "arm/lnn                                            0.2           -   0.171 ± 0.272" in said
+    )
 
 
 def test_what_is_done_is_passed_over_and_what_is_not_goes_on(calls, tmp_path):
@@ -104,8 +116,44 @@ def test_the_list_says_how_long_each_takes_and_how_far_it_is(calls, tmp_path, ca
         ["arm/bad", "1", "min", "to", "do"],
         ["arm/lnn", "7", "min", "done"],
         ["control/lnn", "5", "min", "to", "do"],
+        ["arm/rk4", "2", "min", "done"],
+        ["arm/beyond", "1", "min", "done"],
         ["real/lnn", "no", "data"],
         ["6", "min", "to", "go,", "on", "one", "core"],
+    ]
+
+
+def test_an_entry_starts_from_runs_of_others_with_their_seeds(calls, tmp_path):
+    call("--only", "arm/rk4", "arm/beyond")
+    assert calls == [
+        "train.py",
+        "evaluate.py",
+        "train.py",
+        "train.py",
+        "evaluate.py",
+        "evaluate.py",
+    ]
+    folder = tmp_path / "runs" / "reproduce" / "arm"
+    assert len(reproduce.trained(folder / "rk4")) == 2
+    assert not reproduce.trained(folder / "beyond")
+    assert (folder / "beyond" / "evaluation" / "summary.csv").is_file()
+
+
+def test_the_entries_that_an_entry_needs_are_run_first():
+    a, b, c = ({"train": [], "evaluate": []} for _ in range(3))
+    entries = {"a": a, "other": {**a}, "b": {**b, "runs": ["a"]}, "c": {**c, "runs": ["b"]}}
+    assert reproduce.chosen(entries, ["c"]) == ["a", "b", "c"]
+
+
+def test_models_of_one_entry_are_compared_each_with_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce, "ROOT", tmp_path)
+    rows = {"model": ["hnn", "lnn", "lnn", "mlp"], "error_mean": [0.1, 0.2, 0.4, 0.7]}
+    pd.DataFrame(rows).to_csv(tmp_path / "a.csv", index=False)
+    entry = {"results": "a.csv", "select": {"model": ["hnn", "lnn"]}}
+    said = reproduce.comparison({"a": entry}, ["a"], tmp_path / "out").split("\n")[1:]
+    assert [line.split()[:4] for line in said] == [
+        ["a", "hnn", "-", "0.1"],
+        ["a", "lnn", "-", "0.3"],
     ]
 
 

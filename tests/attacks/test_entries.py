@@ -10,7 +10,7 @@ from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.words import parsed
 
 TRAINS = {"train": ["seed=0"], "evaluate": [], "minutes": 1}
-GOOD = {"a/lnn": TRAINS, "control/a": {"control": [], "run": "a/lnn", "minutes": 1}}
+GOOD = {"a/lnn": TRAINS, "control/a": {"control": [], "runs": ["a/lnn"], "minutes": 1}}
 
 
 def with_key(key, value, name="a/lnn"):
@@ -26,8 +26,15 @@ BROKEN = {
     "a tag": (b"!!python/object/apply:os.system [touch was_here]", "cannot be read"),
     "no entries": ({}, "entries is None, expected a mapping"),
     "a number": ({"a": 3}, "entries.a is 3, expected a mapping with train, evaluate"),
-    "an empty entry": ({"a": {}}, "entries.a has nothing, expected train and evaluate, or control"),
+    "an empty entry": (
+        {"a": {}},
+        "entries.a has nothing, expected train and evaluate, or evaluate",
+    ),
     "half an entry": ({"a": {"train": []}}, "entries.a has train, expected train and evaluate"),
+    "its own run": (
+        with_key("runs", ["a/lnn"]),
+        r"lnn.runs has 'a/lnn', expected entries above it",
+    ),
     "a way out": ({"../x": TRAINS}, "entries has '../x', expected the name of a folder"),
     "another place": ({"/tmp/x": TRAINS}, "entries has '/tmp/x', expected the name of a folder"),
     "a number for a name": ({3: TRAINS}, "entries has 3"),
@@ -39,7 +46,10 @@ BROKEN = {
     "no time": (with_key("minutes", float("nan")), "lnn.minutes is nan, expected a number above 0"),
     "results elsewhere": (with_key("results", "/etc/*"), "results is '/etc/\\*', expected files"),
     "an unknown key": (with_key("metrik", "x"), "takes no 'metrik': did you mean metric"),
-    "no such run": (with_key("run", "b", "control/a"), "run is 'b', expected an entry that trains"),
+    "no such run": (
+        with_key("runs", ["b"], "control/a"),
+        "runs has 'b', expected entries above it",
+    ),
 }
 
 
