@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pinn_dyn.data.logs import LogError, messages
+from pinn_dyn.data.logs import LogError, Resample, messages
 from pinn_dyn.data.logs.bags import read_bag
 from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
@@ -131,7 +131,12 @@ def bag_with(**changes):
         (["/joint_state/position/elbow"] * 1, "no topic .* /joint_states .sensor_msgs/msg/Joint"),
         (["/joint_states/position/wrist"], "'position/wrist': its joints are elbow, shoulder"),
         (["/joint_states/angle/elbow"], "no 'angle/elbow': their fields are header, name"),
-        (["/joint_states/effort/elbow"], "no message has a value of 'effort/elbow'"),
+        (["/joint_states/effort/elbow"], "value of 'effort/elbow': 'effort' is empty"),
+        (["/joint_states/header/stamp"], "'header/stamp' is builtin_inter.*the column '<topic>/t'"),
+        (["/joint_states/header/seq"], "no 'header/seq': their fields are header, name"),
+        (["/joint_states/name/0"], "'name/0' is a text, expected a number"),
+        (["/joint_states/position"], "'position' is an array of 2.*'position/0', or by the name"),
+        (["/commands/data/7"], "value of 'data/7': 'data' has 2 entries at most"),
     ],
 )
 def test_what_a_bag_does_not_have_is_named_beside_what_it_has(tmp_path, columns, said):
@@ -139,6 +144,18 @@ def test_what_a_bag_does_not_have_is_named_beside_what_it_has(tmp_path, columns,
     q = dict(columns=columns, unit="rad")
     with pytest.raises(LogError, match=f"run.*{said}"):
         source(tmp_path, files="run", **bag_with(q=q, v=None)).load()
+
+
+def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path, expected):
+    late = TABLE.assign(t=TABLE["t"] + 1_764_000_000.25)
+    formats.write_bag(tmp_path / "run", late)
+    log = source(tmp_path, files="run", **formats.BAG)
+    np.testing.assert_allclose(log.load().train[0].q[:200], expected[0].q[:200], atol=1e-6)
+    assert "t from the stamp 1764000000.250000 s" in log.report
+    assert log.fingerprint()["splits"]["train"][0].startswith("run (0 to ")
+    steps = {"resample": Resample(rate=100.0, max_gap=0.005)}
+    with pytest.raises(LogError, match=r"run \(0 to .* s\): Resample .* after t = 0 s"):
+        source(tmp_path, files="run", steps=steps, **formats.BAG).load()
 
 
 def test_clocks_that_never_overlap_are_told(tmp_path):
