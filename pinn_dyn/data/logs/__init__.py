@@ -2,7 +2,7 @@
 
 from pinn_dyn.data.logs.clock import Deduplicate, Resample, RowClock, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay import DelayCurve, input_delays
+from pinn_dyn.data.logs.delay import DelayCurve, agreed_delays, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
     Butterworth,
@@ -15,6 +15,7 @@ from pinn_dyn.data.logs.input_delay import InputDelay
 from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.repairs import InterpolateHeld, RemoveJumps, SubtractStart
+from pinn_dyn.data.logs.repeats import repeat_floor
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.step import Step
@@ -43,5 +44,7 @@ __all__ = [
     "SplitGaps",
     "Step",
     "SubtractStart",
+    "agreed_delays",
     "input_delays",
+    "repeat_floor",
 ]

@@ -36,6 +36,7 @@ _CANDIDATES = 60  # at most: a parabola finds what is between them
 _DEPTH = 0.97
 _SPREAD = 0.6
 _UNEXPLAINED = 0.5
+_AS_WELL = 1.1  # times what delays of their own leave unexplained: a common one explains as well
 _ONE_LINE = 0.995  # of the power of a signal
 
 
@@ -113,6 +114,39 @@ def input_delays(
             for curve, line in zip(found, lines, strict=True)
         ]
     return found
+
+
+def agreed_delays(
+    recordings: Sequence[Recording], *, longest: float = 0.3
+) -> tuple[list[DelayCurve], bool]:
+    """The delay of each input; one for all where they have no good answers of their own.
+
+    Delays are mostly of a bus or a filter that all inputs share, and searched for together they
+    have the data of all. So where an input has no answer, or where two lie more than a sample
+    apart, a common one is tried. It counts if it has an answer, and if it explains the motion
+    about as well as those of their own where all of these exist.
+
+    Args:
+        recordings: stretches of one sample time, q and u in them.
+        longest: longest delay that is tried, s.
+
+    Returns:
+        A curve per input, and whether they are one.
+
+    Raises:
+        LogError: if a clock is not uniform.
+    """
+    own = input_delays(recordings, longest=longest)
+    found = [curve.delay for curve in own if curve.delay is not None]
+    whole = len(found) == len(own)
+    step = sample_time(recordings[0], "a delay")
+    if len(own) == 1 or not found or (whole and max(found) - min(found) <= step):
+        return own, False
+    common = input_delays(recordings, longest=longest, common=True)
+    left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (own, common))
+    if common[0].delay is None or (whole and left_in_common > _AS_WELL * left):
+        return own, False
+    return common, True
 
 
 def _rank(curve: DelayCurve) -> tuple[bool, float]:
