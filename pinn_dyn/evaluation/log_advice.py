@@ -37,7 +37,7 @@ class Measured:
         rest: share of the training at rest.
         outside: share of the test that is outside the training, or far from it.
         condition: number of the regressor (1, q, v, a).
-        follows: share of v that q and the inputs explain without an acceleration.
+        follows: share of q that the inputs of the moment explain.
     """
 
     source: LogSource
@@ -76,7 +76,7 @@ class Measured:
     @property
     def overdamped(self) -> bool:
         """Whether the robot follows the positions of its motors all but without inertia."""
-        return self.follows > 0.8 and set(self.source.u.units) <= {*_POSITIONS, "1"}
+        return self.follows > 0.5 and set(self.source.u.units) <= set(_POSITIONS)
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,11 @@ def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> 
     for k in range(training[0].q.shape[1]):
         powers = [welch(item.q[:, k], 1 / step, nperseg=size)[1] for item in training]
         f = np.fft.rfftfreq(size, step)
-        power = np.mean(powers, axis=0) * f**2
-        # White noise has the power 2 s² h per Hz; four times that is no noise.
-        power[np.mean(powers, axis=0) < 8 * noise[k] ** 2 * step] = 0.0
+        density = np.mean(powers, axis=0)
+        # White noise has 2 s² h per Hz, single bad samples what is left at the highest frequencies;
+        # four times that is no noise.
+        level = max(2 * noise[k] ** 2 * step, float(np.median(density[len(f) // 2 :])))
+        power = np.where(density > 4 * level, density, 0.0) * f**2
         if power.any():
             share = np.cumsum(power) / power.sum()
             best = max(best, float(f[int(np.searchsorted(share, 0.99))]))
@@ -205,8 +207,8 @@ def _model(found: Measured) -> Advice | None:
             "model",
             "model=lnn model/mass=constant model.mass.positivity.initial=0.3 "
             "model/input=nonlinear model/integrator=rosenbrock",
-            f"q and the positions of the motors explain {100 * found.follows:.0f} % of v, without "
-            "inertia: damping outweighs it",
+            f"the positions of the motors explain {100 * found.follows:.0f} % of q at once: "
+            "damping outweighs inertia; see whether model=acceleration is as good",
         )
     if found.joints and set(u) <= set(_FORCES):
         return Advice(

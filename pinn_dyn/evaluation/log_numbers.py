@@ -52,7 +52,7 @@ def explained_shares(
 ) -> tuple[float, float]:
     """The largest share that delayed inputs add to the explanation of v and of a by (1, q, v).
 
-    Also the share of v that q and the inputs explain. Corrected for the number of terms; 1 and 0
+    Also the share of q that the inputs explain. Corrected for the number of terms; 1 and 0
     where the rows are too few to tell.
     """
     width = max(_SMOOTH / step, 1.5)
@@ -82,7 +82,7 @@ def explained_shares(
     ]
     # A controlled robot's acceleration may follow from q and v; its torque then does too.
     gains.append(1 - _rest_of(inputs, np.hstack([known, speed, acceleration])))
-    return max(gains), 1 - _rest_of(speed, np.hstack([known, inputs]))
+    return max(gains), 1 - _rest_of(position, np.hstack([known[:, :1], inputs]))
 
 
 def _rest_of(y: np.ndarray, x: np.ndarray) -> float:

@@ -68,7 +68,10 @@ def measured(q=1, u=1, units=("rad", "Nm"), *, hertz=1.0, noise=0.0, v=True, **c
         (measured(2, 2), "model=lnn model/input=fixed: 2 inputs in Nm"),
         (measured(2, 2, ("rad", "A")), "model=lnn model/input=constant: 2 inputs in A"),
         (measured(2, 3, ("rad", "N")), "model=lnn: 3 inputs for 2 coordinates"),
-        (measured(2, 3, ("rad", "rad"), follows=0.9), "rosenbrock: q and the positions of the"),
+        (
+            measured(2, 3, ("rad", "rad"), follows=0.9),
+            "rosenbrock: the positions of .* 90 %",
+        ),
         (measured(2, 2, condition=2e3), "model=known .*condition 2e"),
         (measured(9, 9), "model=known .*40 s for 9 joints"),
         (measured(hertz=0.5), "data.stride=8 data.steps=10: 80 ms a step.* of 0.62 Hz"),

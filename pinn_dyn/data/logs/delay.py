@@ -37,6 +37,7 @@ _DEPTH = 0.97
 _SPREAD = 0.6
 _UNEXPLAINED = 0.5
 _AS_WELL = 1.1  # times what delays of their own leave unexplained: a common one explains as well
+_AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _ONE_LINE = 0.995  # of the power of a signal
 
 
@@ -123,24 +124,20 @@ def agreed_delays(
 
     Delays are mostly of a bus or a filter that all inputs share, and searched for together they
     have the data of all. So where an input has no answer, or where two lie more than a sample
-    apart, a common one is tried. It counts if it has an answer, and if it explains the motion
-    about as well as those of their own where all of these exist.
+    apart, a common one is tried, but not where one is logged after the motion. It counts if it
+    explains the motion about as well as those of their own where all of these exist.
 
-    Args:
-        recordings: stretches of one sample time, q and u in them.
-        longest: longest delay that is tried, s.
+    Arguments and errors are those of :func:`input_delays`.
 
     Returns:
         A curve per input, and whether they are one.
-
-    Raises:
-        LogError: if a clock is not uniform.
     """
     own = input_delays(recordings, longest=longest)
     found = [curve.delay for curve in own if curve.delay is not None]
     whole = len(found) == len(own)
     step = sample_time(recordings[0], "a delay")
-    if len(own) == 1 or not found or (whole and max(found) - min(found) <= step):
+    after = any(curve.reason == _AFTER for curve in own)
+    if len(own) == 1 or not found or after or (whole and max(found) - min(found) <= step):
         return own, False
     common = input_delays(recordings, longest=longest, common=True)
     left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (own, common))
@@ -385,7 +382,7 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
     elif best >= len(candidates) - 2:
         reason = f"the residual still falls at the longest delay, {candidates[-1]:.3g} s"
     elif best == 0:
-        reason = "the input is logged after the motion: a filtered measurement, or another clock"
+        reason = _AFTER
     delay = max(_minimum(candidates, whole), 0.0)
     return DelayCurve(candidates, whole, None if reason else delay, spread, form, reason)
 
