@@ -1,17 +1,21 @@
 """Bags, HDF5, MATLAB 7.3, NPZ and Parquet give the trajectories that the same CSV gives."""
 
 import contextlib
+import re
 import sqlite3
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from hydra.utils import instantiate
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pinn_dyn.data.logs import LogError, Resample, messages
+from pinn_dyn.data.logs import LogError, LogSource, Resample, messages
 from pinn_dyn.data.logs.bags import read_bag
 from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
@@ -254,15 +258,7 @@ def test_hdf5_paths_that_are_no_columns(tmp_path, column, said):
 
 
 def test_matlab_73_is_read_too(tmp_path, expected):
-    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
-        for name in "tqvu":
-            columns = ["t"] if name == "t" else [f"{name}1", f"{name}2"]
-            data = file.create_dataset(f"log/{name}", data=TABLE[columns].to_numpy().T)
-            data.attrs["MATLAB_class"] = np.bytes_("double")
-        file["log"].attrs["MATLAB_class"] = np.bytes_("struct")
-    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
-    content = (tmp_path / "run.mat").read_bytes()
-    (tmp_path / "run.mat").write_bytes(head + content[len(head) :])
+    write_mat73(tmp_path / "run.mat", TABLE)
     assert_same(trajectories(source(tmp_path, files="*.mat", **renamed("log."))), expected)
 
 
@@ -305,3 +301,39 @@ def test_a_damaged_file_is_named(tmp_path, name):
     (tmp_path / name).write_bytes(b"PAR1 not a file")
     with pytest.raises(LogError, match=f"{name}: cannot be read as"):
         source(tmp_path, files=name).load()
+
+
+def write_mat73(path, table):
+    """As MATLAB does: HDF5 behind a header of its own, matrices transposed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name in "tqvu":
+            columns = ["t"] if name == "t" else [f"{name}1", f"{name}2"]
+            data = file.create_dataset(f"log/{name}", data=table[columns].to_numpy().T)
+            data.attrs["MATLAB_class"] = np.bytes_("double")
+        file["log"].attrs["MATLAB_class"] = np.bytes_("struct")
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    content = path.read_bytes()
+    path.write_bytes(head + content[len(head) :])
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "bags_and_other_logs.md").read_text()
+BLOCKS = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
+
+
+def test_the_configurations_of_the_documentation_read_such_files(tmp_path):
+    table = motion(30.0)
+    formats.write_bag(tmp_path / "bag", table)
+    formats.write_hdf5(tmp_path / "run.h5", table)
+    write_mat73(tmp_path / "run.mat", table)
+    formats.write_npz(tmp_path / "run.npz", table)
+    formats.write_lerobot(tmp_path, table)
+    (tmp_path / "bag" / "bag.mcap").rename(tmp_path / "bag.mcap")
+    assert [x["files"] for x in BLOCKS] == [
+        *("*.mcap", "*.h5", "*.mat", "*.npz"),
+        "data/*/*.parquet",
+    ]
+    for block in BLOCKS:
+        given = {key: value for key, value in block.items() if key != "defaults"}
+        given["steps"] = {key: instantiate(x) for key, x in given.get("steps", {}).items()}
+        train = LogSource(root=str(tmp_path), **given).load().train[0]
+        np.testing.assert_allclose(train.q[:300], table[["q1", "q2"]][:300], atol=1e-6)
