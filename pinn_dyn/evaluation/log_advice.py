@@ -185,9 +185,12 @@ def _split(found: Measured) -> Advice | None:
     part = found.source.test
     if found.outside <= 0.05 or part.seconds is None or part.blocks:
         return None
+    # As many seconds in all as now, in blocks that hold a piece.
+    pieces = 4 if isinstance(part.piece, str) else int(part.seconds / part.piece + 1e-9)
+    blocks = min(4, pieces)
     return Advice(
         "dataset",
-        f"test: {{seconds: {part.seconds:g}, blocks: 4, piece: {part.piece}}}",
+        f"test: {{seconds: {part.seconds / blocks:g}, blocks: {blocks}, piece: {part.piece}}}",
         f"{100 * found.outside:.0f} % of the test is not like the training, at the ends of the "
         "runs: blocks along them are; keep the ends if new motions are the question",
     )

@@ -51,7 +51,7 @@ def measured(q=1, u=1, units=("rad", "Nm"), *, hertz=1.0, noise=0.0, v=True, **c
         files="*",
         time=dict(columns="t", unit="s"),
         validation=dict(seconds=3.0, piece=3.0),
-        test=dict(seconds=3.0, piece=3.0),
+        test=dict(seconds=9.0, piece=3.0),
         **named,
     )
     training = [recording(sine(hertz, q), sine(hertz, u), noise)]
@@ -62,7 +62,7 @@ def measured(q=1, u=1, units=("rad", "Nm"), *, hertz=1.0, noise=0.0, v=True, **c
 @pytest.mark.parametrize(
     ("found", "line"),
     [
-        (measured(outside=0.4), "test: {seconds: 3, blocks: 4, piece: 3.0} # 40 % of the test"),
+        (measured(outside=0.4), "test: {seconds: 3, blocks: 3, piece: 3.0} # 40 % of the test"),
         (measured(noise=0.005), "Butterworth, cutoff: 4.5} # noise is .* ends at 1.1 Hz"),
         (measured(u=3, units=("rad", "rad"), follows=0.9), "InputRates} # the inputs are"),
         (measured(2, 2), "model=lnn model/input=fixed: 2 inputs in Nm"),

@@ -125,7 +125,8 @@ def agreed_delays(
     Delays are mostly of a bus or a filter that all inputs share, and searched for together they
     have the data of all. So where an input has no answer, or where two lie more than a sample
     apart, a common one is tried, but not where one is logged after the motion. It counts if it
-    explains the motion about as well as those of their own where all of these exist.
+    is among those that were found, within a sample, and explains the motion about as well as all of
+    them do.
 
     Arguments and errors are those of :func:`input_delays`.
 
@@ -141,7 +142,10 @@ def agreed_delays(
         return own, False
     common = input_delays(recordings, longest=longest, common=True)
     left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (own, common))
-    if common[0].delay is None or (whole and left_in_common > _AS_WELL * left):
+    among = common[0].delay is not None and (
+        min(found) - step <= common[0].delay <= max(found) + step
+    )
+    if not among or (whole and left_in_common > _AS_WELL * left):
         return own, False
     return common, True
 
