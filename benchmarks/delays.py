@@ -1,34 +1,48 @@
-"""Delays found in simulated logs of known delay: python -m benchmarks.delays [draws]."""
+"""Delays found in simulated logs of known delay: python -m benchmarks.delays [draws] [first].
+
+Each input by itself (``input_delays``), one for all, and as check.py does (``agreed_delays``).
+The thresholds were set on the draws 0 to 5.
+"""
 
 import sys
+from collections.abc import Sequence
 
 import numpy as np
 
-from pinn_dyn.data.logs import input_delays
+from pinn_dyn.data.logs import DelayCurve, agreed_delays, input_delays
 from tests.support.delayed_robots import log
 
 SAMPLE = 0.01
 
 
-def main(draws: int) -> None:
+def main(draws: int, first: int) -> None:
     """Print, per robot, in how many draws every input's delay is within a sample of the truth."""
     for kind in ("pendulum", "arm", "tendons"):
-        delays = [float(np.random.default_rng(1000 + k).uniform(0, 0.1)) for k in range(draws)]
-        found = [input_delays([log(kind, k, d)]) for k, d in enumerate(delays)]
-        errors = np.array(
-            [
-                [np.inf if c.delay is None else abs(c.delay - d) for c in curves]
-                for curves, d in zip(found, delays, strict=True)
-            ]
-        )
-        within = int((errors <= SAMPLE).all(axis=1).sum())
-        print(
-            f"{kind}: {within} of {draws} within a sample, {int(np.isinf(errors).sum())} of "
-            f"{errors.size} without an answer, median error "
-            f"{1e3 * np.median(errors):.1f} ms",
-            flush=True,
-        )
+        numbers = range(first, first + draws)
+        delays = [float(np.random.default_rng(1000 + k).uniform(0, 0.1)) for k in numbers]
+        logs = [log(kind, k, d) for k, d in zip(numbers, delays, strict=True)]
+        ways = {"its own": [input_delays([one]) for one in logs]}
+        if kind != "pendulum":
+            ways["common"] = [input_delays([one], common=True) for one in logs]
+            ways["agreed"] = [agreed_delays([one])[0] for one in logs]
+        for way, found in ways.items():
+            print(f"{kind}, {way}: {_words(found, delays)}", flush=True)
+
+
+def _words(found: Sequence[Sequence[DelayCurve]], delays: Sequence[float]) -> str:
+    errors = np.array(
+        [
+            [np.inf if c.delay is None else abs(c.delay - d) for c in curves]
+            for curves, d in zip(found, delays, strict=True)
+        ]
+    )
+    within = int((errors <= SAMPLE).all(axis=1).sum())
+    return (
+        f"{within} of {len(errors)} within a sample, {int(np.isinf(errors).sum())} of "
+        f"{errors.size} without an answer, median error {1e3 * np.median(errors):.1f} ms"
+    )
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 50)
+    numbers = [int(word) for word in sys.argv[1:]]
+    main(*[*numbers, *(50, 0)[len(numbers) :]])

@@ -60,7 +60,8 @@ def check_words(command: str, folder: Path, overrides: list[Override]) -> None:
 
     Raises:
         ConfigError: on a top-level key that is taken away, a group that is given something else
-            than the name of an option, or a sweep over nothing or without end.
+            than the name of an option, a sweep over nothing or without end, or an option that is
+            given to the key of its group.
     """
     for override in overrides:
         word, key = str(override.input_line), override.key_or_group
@@ -75,6 +76,14 @@ def check_words(command: str, folder: Path, overrides: list[Override]) -> None:
             raise ConfigError(
                 f"'{word}' is a sweep over {count:.6g} values, expected 1 to {MOST_JOBS - 1}"
             )
+        group = key.replace(".", "/")
+        if group != key and (folder / group).is_dir():
+            for value in _values(override):
+                if isinstance(value, str) and value in _options(folder, group):
+                    raise ConfigError(
+                        f"{word!r} gives {key} a text, where it is an object: to choose the option "
+                        f"write {group}={value}"
+                    )
         if key == "hydra" or is_group(folder, word):
             for value in _values(override):
                 items = value if isinstance(value, list) else [value]

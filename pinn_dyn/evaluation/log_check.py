@@ -7,15 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
 
-from pinn_dyn.data.logs import Cleaned, DelayCurve, LogSource, Recording, input_delays
+from pinn_dyn.data.logs import (
+    Cleaned,
+    DelayCurve,
+    LogSource,
+    Recording,
+    agreed_delays,
+    repeat_floor,
+)
+from pinn_dyn.evaluation.log_advice import Measured, advice
+from pinn_dyn.evaluation.log_numbers import (
+    distance_from,
+    explained_shares,
+    own_share,
+    regressor_columns,
+    share_at_rest,
+    white_noise,
+)
 from pinn_dyn.mechanics import Trajectory
 
-_SMOOTH = 0.03  # width of the kernel before a derivative, s
-_POINTS = 4000  # of a figure or a search among neighbours
-_STILL = 0.01  # of the fastest, a speed below which the robot rests
 # What a training cannot do without.
 _LEAST_SAMPLES = 200
 _LEAST_EXPLAINED = 0.1
@@ -25,8 +36,9 @@ _NOISE = 0.02
 _CONDITION = 1e3
 _OWN = 0.01
 _FAR = 3.0
-_NEAR = 0.05  # of the spread
 _OUTSIDE = 0.05
+_MOST_REPEATS = 20  # stretches of the training that are looked for in the others
+_LINEAR = "condition number of the linear regressor (1, q, v, a), not of rigid bodies"
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,8 @@ class LogCheck:
             tenth of the training is from the rest, ``(S,)``.
         problems: why a training makes no sense; empty where it does.
         warnings: what to look at before a training.
-        suggestion: lines of YAML to copy, or "".
+        unidentified: the coordinates whose inertia the motion does not tell.
+        suggestion: lines of YAML and commands to copy, each with its reason.
     """
 
     name: str
@@ -56,6 +69,7 @@ class LogCheck:
     distance: np.ndarray
     problems: list[str]
     warnings: list[str]
+    unidentified: list[str]
     suggestion: str
 
     def __str__(self) -> str:
@@ -70,9 +84,9 @@ class LogCheck:
         if len(self.runs) > 20:
             lines.append(f"... {len(self.runs) - 20} more in the page")
         lines += ["", *(f"{name}: {value:.3g}" for name, value in self.figures.items())]
+        lines.append(f"inertia not identified: {', '.join(self.unidentified) or 'none'}")
         lines += ["", "Warnings", *(f"- {text}" for text in self.warnings or ["none"])]
-        if self.suggestion:
-            lines += ["", "To copy into the configuration", self.suggestion]
+        lines += ["", "To copy into the configuration, and to run", self.suggestion]
         verdict = "a training makes sense" if not self.problems else "a training makes no sense:"
         return "\n".join([*lines, "", f"Verdict: {verdict}", *(f"- {x}" for x in self.problems)])
 
@@ -96,18 +110,20 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
         for item in part.clean
     ]
     test = splits.test
-    delays = input_delays(training, longest=longest_delay)
+    delays, common = agreed_delays(training, longest=longest_delay)
     step = float(np.median(np.diff(training[0].t)))
     coordinates, condition = _coordinates(source, training, test, step)
-    explained = _explained(training, delays, step)
-    distance = _distance(training, test)
+    repeats = _add_repeats(coordinates, source, training)
+    explained, follows = explained_shares(training, delays, step)
+    distance = distance_from(training, test)
     samples = sum(len(item) for item in training)
     figures = {
         "training samples": float(samples),
         "training time [s]": sum(item.duration for item in training),
         "sample time [s]": step,
-        "share of the training at rest": _rest(training),
-        "condition number of the linear regressor (1, q, v, a)": condition,
+        "share of the training at rest": share_at_rest(training),
+        _LINEAR: condition,
+        "motions that repeat one of the training": float(repeats),
         "share of the motion that the inputs add to what (1, q, v) explains": explained,
         "median distance of the test from the training [of a tenth of it from the rest]": float(
             np.median(distance)
@@ -123,10 +139,21 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
             "spread [ms]": [
                 np.nan if c.delay is None else 1e3 * min(c.spread, 9.999) for c in delays
             ],
-            "how": [c.reason or c.form for c in delays],
+            "how": [c.reason or f"{c.form}{', common' * common}" for c in delays],
         }
     )
     warnings = [*source.warnings, *_warnings(coordinates, figures, delays, distance, step)]
+    measured = Measured(
+        source,
+        training,
+        step,
+        delays,
+        noise=coordinates["noise of q"].to_numpy(),
+        rest=figures["share of the training at rest"],
+        outside=max(float((distance > _FAR).mean()), float(coordinates["test outside"].max())),
+        condition=condition,
+        follows=follows,
+    )
     return LogCheck(
         source.name,
         pd.DataFrame([_run(part) for part in source.cleaned]),
@@ -137,7 +164,8 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
         distance,
         problems,
         warnings,
-        _suggestion(delays, figures, step),
+        _unidentified(coordinates),
+        advice(measured),
     )
 
 
@@ -160,10 +188,30 @@ def _run(part: Cleaned) -> dict[str, object]:
     }
 
 
-def _noise(x: np.ndarray) -> np.ndarray:
-    """Standard deviation of white noise: third differences leave nothing of a smooth motion."""
-    third = np.diff(x, n=3, axis=0)
-    return 1.4826 * np.median(np.abs(third), axis=0) / np.sqrt(20)
+def _noise_of_v(raw: list[Recording]) -> dict[str, np.ndarray]:
+    """A column where the log has v; of a derived one the noise is not white any more."""
+    long = [item.v for item in raw if item.v is not None and len(item) > 10]
+    return {"noise of v": np.median([white_noise(v) for v in long], axis=0)} if long else {}
+
+
+def _add_repeats(frame: pd.DataFrame, source: LogSource, training: list[Recording]) -> int:
+    """The floors of q and v that repeated motions tell, as columns; returns their number."""
+    splits = source.load()
+    held = [
+        Recording("", x.t.numpy(), x.q.numpy(), x.v.numpy(), x.u.numpy())
+        for x in (*splits.validation, *splits.test)
+    ]
+    some = training[:: max(1, len(training) // _MOST_REPEATS)]
+    middles = [item.rows(slice(len(item) // 4, 3 * len(item) // 4)) for item in some]
+    repeats, q, v = repeat_floor([*held, *(x for x in middles if len(x) > 10)], training)
+    if repeats:
+        frame["floor of q"], frame["floor of v"] = q, v
+    return repeats
+
+
+def _unidentified(coordinates: pd.DataFrame) -> list[str]:
+    """The coordinates whose acceleration follows from q, v and other accelerations."""
+    return coordinates.loc[coordinates["own share of a"] < _OWN, "coordinate"].tolist()
 
 
 def _coordinates(
@@ -172,13 +220,13 @@ def _coordinates(
     """One row per coordinate, and the condition number of (1, q, v, a)."""
     q = np.vstack([item.q for item in training])
     raw = [part.raw for part in source.cleaned if part.split == "train"]
-    noise = np.median([_noise(item.q) for item in raw if len(item) > 10], axis=0)
+    noise = np.median([white_noise(item.q) for item in raw if len(item) > 10], axis=0)
     v = np.vstack([item.v for item in training if item.v is not None])
     seen = np.vstack([item.q.numpy() for item in test])
     low, high = q.min(axis=0), q.max(axis=0)
-    regressor = _regressor(training, step)
+    regressor = regressor_columns(training, step)
     size = q.shape[1]
-    own = [_own_share(regressor, k, size) for k in range(size)]
+    own = [own_share(regressor, k, size) for k in range(size)]
     scaled = regressor / np.linalg.norm(regressor, axis=0).clip(min=1e-300)
     frame = pd.DataFrame(
         {
@@ -188,105 +236,12 @@ def _coordinates(
             "fastest [/s]": np.abs(v).max(axis=0),
             "noise of q": noise,
             "noise / range": noise / np.ptp(q, axis=0).clip(min=1e-300),
+            **_noise_of_v(raw),
             "test outside": ((seen < low) | (seen > high)).mean(axis=0),
             "own share of a": own,
         }
     )
     return frame, float(np.linalg.cond(scaled))
-
-
-def _regressor(training: list[Recording], step: float) -> np.ndarray:
-    """Columns 1, q, v, a of averages by a Gaussian kernel, of unit spread."""
-    width = max(_SMOOTH / step, 1.5)
-    thin = max(1, int(width / 2))
-    parts = []
-    for item in training:
-        if len(item) > 10 * width:
-            smooth = [gaussian_filter1d(item.q, width, axis=0, order=k) for k in range(3)]
-            inner = slice(int(4 * width), -int(4 * width), thin)
-            parts.append(np.hstack([x[inner] for x in smooth]))
-    x = np.vstack(parts) if parts else np.zeros((1, 3 * training[0].q.shape[1]))
-    x = (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
-    return np.hstack([np.ones((len(x), 1)), x])
-
-
-def _own_share(x: np.ndarray, k: int, size: int) -> float:
-    """Share of a_k that 1, q_k, v_k and the other accelerations do not explain."""
-    accelerations = np.arange(1 + 2 * size, 1 + 3 * size)
-    own = accelerations[k]
-    others = x[:, [0, 1 + k, 1 + size + k, *accelerations[accelerations != own]]]
-    rest = x[:, own] - others @ np.linalg.lstsq(others, x[:, own], rcond=None)[0]
-    return float(rest.var() / max(x[:, own].var(), 1e-300))
-
-
-def _explained(training: list[Recording], delays: list[DelayCurve], step: float) -> float:
-    """The largest share that delayed inputs add to the explanation of v and of a by (1, q, v).
-
-    Corrected for the number of terms; 1 where the rows are too few to tell.
-    """
-    width = max(_SMOOTH / step, 1.5)
-    edge = int(4 * width) + 1
-    lags = [round((curve.delay or 0.0) / step) for curve in delays]
-    q: list[np.ndarray] = []
-    v: list[np.ndarray] = []
-    a: list[np.ndarray] = []
-    u: list[np.ndarray] = []
-    for item in training:
-        first = edge + max(lags)
-        # So far apart that their averages are independent.
-        rows = np.arange(first, len(item) - edge, max(1, int(3.5 * width)))
-        if not len(rows):
-            continue
-        for parts, order in ((q, 0), (v, 1), (a, 2)):
-            parts.append(gaussian_filter1d(item.q, width, axis=0, order=order)[rows])
-        smooth = gaussian_filter1d(item.u, width, axis=0)
-        u.append(np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)]))
-    if not q or sum(len(x) for x in q) < 6 * (3 * q[0].shape[1] + len(delays)):
-        return 1.0
-    position, speed, acceleration, inputs = (np.vstack(x) for x in (q, v, a, u))
-    known = np.hstack([np.ones((len(position), 1)), position, np.sin(position), np.cos(position)])
-    gains = [
-        _rest_of(y, x) - _rest_of(y, np.hstack([x, inputs]))
-        for y, x in ((speed, known), (acceleration, np.hstack([known, speed])))
-    ]
-    # A controlled robot's acceleration may follow from q and v; its torque then does too.
-    gains.append(1 - _rest_of(inputs, np.hstack([known, speed, acceleration])))
-    return max(gains)
-
-
-def _rest_of(y: np.ndarray, x: np.ndarray) -> float:
-    """Share of the variance of y that x leaves, per degree of freedom."""
-    moving = y.std(axis=0) > 0
-    if not moving.any():
-        return 1.0
-    left = len(x) - x.shape[1]
-    y = (y[:, moving] - y[:, moving].mean(axis=0)) / y[:, moving].std(axis=0)
-    x = x / np.abs(x).max(axis=0).clip(min=1e-300)
-    rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-    return float((rest**2).mean()) * len(x) / left
-
-
-def _rest(training: list[Recording]) -> float:
-    speeds = np.vstack([np.abs(np.diff(item.q, axis=0)) for item in training])
-    return float((speeds < _STILL * speeds.max(axis=0).clip(min=1e-300)).all(axis=1).mean())
-
-
-def _distance(training: list[Recording], test: Sequence[Trajectory]) -> np.ndarray:
-    """Of the test's (q, v) from the nearest of the training.
-
-    The unit is the distance that a tenth of the training keeps from the nine others, so that it
-    does not depend on the number of coordinates; at least a twentieth of the spread in each of
-    them, which is near also where the training repeats one motion.
-    """
-    known = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
-    asked = np.vstack([np.hstack([item.q.numpy(), item.v.numpy()]) for item in test])
-    spread = known.std(axis=0).clip(min=1e-300)
-    known = known[:: max(1, len(known) // _POINTS)] / spread
-    asked = asked[:: max(1, len(asked) // _POINTS)] / spread
-    tenth = np.arange(len(known)) * 10 // len(known)
-    own = [cKDTree(known[tenth != k]).query(known[tenth == k])[0] for k in range(10)]
-    unit = max(float(np.median(np.concatenate(own))), _NEAR * known.shape[1] ** 0.5)
-    return cKDTree(known).query(asked)[0] / unit
 
 
 def _problems(
@@ -331,7 +286,7 @@ def _warnings(
                 f"{name}: {100 * row['test outside']:.0f} % of the test is outside the range of "
                 "the training"
             )
-    if figures["condition number of the linear regressor (1, q, v, a)"] > _CONDITION:
+    if figures[_LINEAR] > _CONDITION:
         found.append(
             "the regressor (1, q, v, a) of all joints is ill-conditioned: their motions share few "
             "frequencies, so take a model of few parameters (known mechanics), or excite more"
@@ -349,23 +304,3 @@ def _warnings(
             "below, or learn the delay with the model"
         )
     return found
-
-
-def _suggestion(delays: list[DelayCurve], figures: dict[str, float], step: float) -> str:
-    lines = []
-    shifts = [round(round((c.delay or 0.0) / step) * step, 6) for c in delays]
-    if any(shifts):
-        shown = shifts[0] if len(set(shifts)) == 1 else shifts
-        lines += [
-            "steps:",
-            f"  delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {shown}}}",
-        ]
-        if len(set(shifts)) == 1:
-            longest = max(0.1, 2 * shifts[0])
-            lines.append(
-                "# or, learned with the model, on the command line: model/delay=learned "
-                f"model.delay.initial={shifts[0]:g} model.delay.longest={longest:g}"
-            )
-    if figures["share of the training at rest"] > 0.5:
-        lines.append("# on the command line: data.coverage=0.5, as the robot often rests")
-    return "\n".join(lines)

@@ -89,6 +89,11 @@ def test_a_wrong_option_of_a_group_lists_the_right_ones(elsewhere, capsys, choic
     assert not list(elsewhere.iterdir())
 
 
+def test_an_option_given_to_the_key_of_its_group_is_told_how_to_be_chosen(elsewhere, capsys):
+    text = said(fails("train.py", "model.delay=learned"), capsys)
+    assert "to choose the option write model/delay=learned" in text
+
+
 def test_a_missing_value_is_asked_for_by_name(elsewhere, capsys):
     text = said(fails("train.py", *TINY, "model=lnn", "model/damping=fixed"), capsys)
     assert "no value for model.damping.value" in text

@@ -93,7 +93,7 @@ def write_npz(path, table, **more):
 
 def write_lerobot(folder, table, episodes=3):
     """A LeRobot folder of episodes in one Parquet file, with named entries."""
-    rows = [table] * episodes
+    rows = [table.assign(q1=table["q1"] + 0.01 * k) for k in range(episodes)]
     data = {
         "timestamp": np.concatenate([x["t"] for x in rows]),
         "episode_index": np.repeat(np.arange(episodes), len(table)),

@@ -102,6 +102,34 @@ def test_an_empty_pattern_names_itself_and_the_folder(tmp_path):
         source(tmp_path / "absent").load()
 
 
+def test_a_folder_that_is_no_bag_names_what_is_in_it(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run_0.mcap").touch()
+    with pytest.raises(LogError, match=r"folder without metadata.yaml.* as 'run/\*.mcap'"):
+        source(tmp_path, files="run").load()
+    (tmp_path / "csv").mkdir()
+    write(tmp_path / "csv", motion())
+    with pytest.raises(LogError, match=r"nothing matches 'c\*' .*, but a folder: .* 'csv/\*.csv'"):
+        source(tmp_path, files="c*").load()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("run.ulg", r"\.ulg is not read, but CSV .*bags of ROS.*ulog2csv"),
+        ("run.pickle", r"read_pickle.*if you trust"),
+        ("run.tdms", r"nptdms"),
+        ("run.json", r"read_json"),
+        ("run.XLSX", r"read_excel"),
+        ("run.foo", r"cannot be read as CSV.*What is read is CSV .*NPZ, Parquet, .*to_parquet"),
+    ],
+)
+def test_files_of_other_formats_are_told_how_to_convert(tmp_path, name, message):
+    (tmp_path / name).write_bytes(b"ULog\x01\x12\xff\x00" * 50)
+    with pytest.raises(LogError, match=rf"{name}: .*{message}"):
+        source(tmp_path, files="run.*").load()
+
+
 def test_runs_that_do_not_exist_or_do_not_suffice(tmp_path):
     write(tmp_path, motion())
     piece = dict(piece=1.0)

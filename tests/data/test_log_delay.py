@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, input_delays
+from pinn_dyn.data.logs import InputDelay, agreed_delays, input_delays
+from pinn_dyn.data.logs import delay as finding
 from tests.support.delayed_robots import log
 
 
@@ -67,3 +68,29 @@ def test_given_delays_shift_each_input():
     (shifted,), _ = InputDelay(delay=[0.02, 0.05]).apply(item)
     np.testing.assert_array_equal(shifted.u[:, 0], item.u[3:-2, 0])
     np.testing.assert_array_equal(shifted.u[:, 1], item.u[:-5, 1])
+
+
+def both(first, second):
+    """The arm with the torque of each joint late by its own time."""
+    one, other = log("arm", 3, first), log("arm", 3, second)
+    return replace(one, u=np.column_stack([one.u[:, 0], other.u[:, 1]]))
+
+
+def test_inputs_with_delays_of_their_own_keep_them():
+    found, common = agreed_delays([both(0.02, 0.06)])
+    assert not common
+    assert [curve.delay for curve in found] == pytest.approx([0.02, 0.06], abs=0.005)
+
+
+def test_an_input_without_an_answer_takes_that_of_all(monkeypatch):
+    item = log("arm", 3, 0.03)
+    own = input_delays([item])
+    lost = [own[0], replace(own[1], delay=None, reason="the residual is all but the same")]
+    every = input_delays([item], common=True)
+    answers = {False: lost, True: every}
+    monkeypatch.setattr(finding, "input_delays", lambda *_, common=False, **__: answers[common])
+    found, common = agreed_delays([item])
+    assert common
+    assert [curve.delay for curve in found] == pytest.approx([0.03, 0.03], abs=0.005)
+    lost[1] = replace(lost[1], reason=finding._AFTER)
+    assert agreed_delays([item])[0] == lost

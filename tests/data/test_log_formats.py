@@ -1,17 +1,21 @@
 """Bags, HDF5, MATLAB 7.3, NPZ and Parquet give the trajectories that the same CSV gives."""
 
 import contextlib
+import re
 import sqlite3
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from hydra.utils import instantiate
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pinn_dyn.data.logs import LogError, messages
+from pinn_dyn.data.logs import LogError, LogSource, Resample, messages
 from pinn_dyn.data.logs.bags import read_bag
 from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
@@ -131,7 +135,12 @@ def bag_with(**changes):
         (["/joint_state/position/elbow"] * 1, "no topic .* /joint_states .sensor_msgs/msg/Joint"),
         (["/joint_states/position/wrist"], "'position/wrist': its joints are elbow, shoulder"),
         (["/joint_states/angle/elbow"], "no 'angle/elbow': their fields are header, name"),
-        (["/joint_states/effort/elbow"], "no message has a value of 'effort/elbow'"),
+        (["/joint_states/effort/elbow"], "value of 'effort/elbow': 'effort' is empty"),
+        (["/joint_states/header/stamp"], "'header/stamp' is builtin_inter.*the column '<topic>/t'"),
+        (["/joint_states/header/seq"], "no 'header/seq': their fields are header, name"),
+        (["/joint_states/name/0"], "'name/0' is a text, expected a number"),
+        (["/joint_states/position"], "'position' is an array of 2.*'position/0', or by the name"),
+        (["/commands/data/7"], "value of 'data/7': 'data' has 2 entries at most"),
     ],
 )
 def test_what_a_bag_does_not_have_is_named_beside_what_it_has(tmp_path, columns, said):
@@ -139,6 +148,18 @@ def test_what_a_bag_does_not_have_is_named_beside_what_it_has(tmp_path, columns,
     q = dict(columns=columns, unit="rad")
     with pytest.raises(LogError, match=f"run.*{said}"):
         source(tmp_path, files="run", **bag_with(q=q, v=None)).load()
+
+
+def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path, expected):
+    late = TABLE.assign(t=TABLE["t"] + 1_764_000_000.25)
+    formats.write_bag(tmp_path / "run", late)
+    log = source(tmp_path, files="run", **formats.BAG)
+    np.testing.assert_allclose(log.load().train[0].q[:200], expected[0].q[:200], atol=1e-6)
+    assert "t from the stamp 1764000000.250000 s" in log.report
+    assert log.fingerprint()["splits"]["train"][0].startswith("run (0 to ")
+    steps = {"resample": Resample(rate=100.0, max_gap=0.005)}
+    with pytest.raises(LogError, match=r"run \(0 to .* s\): Resample .* after t = 0 s"):
+        source(tmp_path, files="run", steps=steps, **formats.BAG).load()
 
 
 def test_clocks_that_never_overlap_are_told(tmp_path):
@@ -237,15 +258,7 @@ def test_hdf5_paths_that_are_no_columns(tmp_path, column, said):
 
 
 def test_matlab_73_is_read_too(tmp_path, expected):
-    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
-        for name in "tqvu":
-            columns = ["t"] if name == "t" else [f"{name}1", f"{name}2"]
-            data = file.create_dataset(f"log/{name}", data=TABLE[columns].to_numpy().T)
-            data.attrs["MATLAB_class"] = np.bytes_("double")
-        file["log"].attrs["MATLAB_class"] = np.bytes_("struct")
-    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
-    content = (tmp_path / "run.mat").read_bytes()
-    (tmp_path / "run.mat").write_bytes(head + content[len(head) :])
+    write_mat73(tmp_path / "run.mat", TABLE)
     assert_same(trajectories(source(tmp_path, files="*.mat", **renamed("log."))), expected)
 
 
@@ -288,3 +301,41 @@ def test_a_damaged_file_is_named(tmp_path, name):
     (tmp_path / name).write_bytes(b"PAR1 not a file")
     with pytest.raises(LogError, match=f"{name}: cannot be read as"):
         source(tmp_path, files=name).load()
+
+
+def write_mat73(path, table):
+    """As MATLAB does: HDF5 behind a header of its own, matrices transposed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name in "tqvu":
+            columns = ["t"] if name == "t" else [f"{name}1", f"{name}2"]
+            data = file.create_dataset(f"log/{name}", data=table[columns].to_numpy().T)
+            data.attrs["MATLAB_class"] = np.bytes_("double")
+        file["log"].attrs["MATLAB_class"] = np.bytes_("struct")
+    head = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    content = path.read_bytes()
+    path.write_bytes(head + content[len(head) :])
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "bags_and_other_logs.md").read_text()
+BLOCKS = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
+
+
+def test_the_configurations_of_the_documentation_read_such_files(tmp_path):
+    table = motion(30.0)
+    formats.write_bag(tmp_path / "bag", table)
+    formats.write_hdf5(tmp_path / "run.h5", table)
+    write_mat73(tmp_path / "run.mat", table)
+    formats.write_npz(tmp_path / "run.npz", table)
+    formats.write_lerobot(tmp_path, table)
+    (tmp_path / "bag" / "bag.mcap").rename(tmp_path / "bag.mcap")
+    assert [x["files"] for x in BLOCKS] == [
+        *("*.mcap", "*.h5", "*.mat", "*.npz"),
+        "data/*/*.parquet",
+    ]
+    for block in BLOCKS:
+        given = {key: value for key, value in block.items() if key != "defaults"}
+        given["steps"] = {key: instantiate(x) for key, x in given.get("steps", {}).items()}
+        train = LogSource(root=str(tmp_path), **given).load().train[0]
+        for name in ("q2", "u1", "u2"):  # q1 differs from episode to episode
+            found = (train.q if name[0] == "q" else train.u)[:300, int(name[1]) - 1]
+            np.testing.assert_allclose(found, table[name][:300], atol=1e-6)

@@ -138,6 +138,7 @@ def test_commands_exist(block, files):
         "python train.py data.pairs",
         "python train.py trainer.max_epochs=3",
         "python train.py model.integrator=rosenbrock",
+        "python check.py longest_dely=0.1",
         "python nothing.py",
         "python benchmarks/training_step.py --none",
         "pinn-dyn-learn model=lnn",

@@ -7,9 +7,11 @@ import runpy
 import sys
 
 import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from pinn_dyn.data.simulation import has_cpp_compiler
-from tests.app.entry import NO_FIGURES, ROOT, own_logging
+from tests.app.entry import NO_FIGURES, ROOT, compose, own_logging
 
 EXAMPLES = ROOT / "examples"
 TINY = [NO_FIGURES, "data.pairs=64", "data.batch_size=32", "trainer.enable_progress_bar=false"]
@@ -103,8 +105,19 @@ def test_ensemble_with_spread(capsys):
     assert float(first[2]) < float(last[2])  # they start together
 
 
+def test_write_example_bag(home):
+    """The bag that conf/dataset/example_bag.yaml reads, its joints by their names."""
+    run("write_example_bag.py", "example_bag")
+    config = compose("dataset=example_bag", f"dataset.root='{home}'").dataset
+    source = instantiate(OmegaConf.to_container(config, resolve=True), _convert_="all")
+    (train,) = source.load().train
+    assert len(train.t) == 3898
+    assert train.q[:, 0].std() > 1.2 * train.q[:, 1].std() > 0.1  # shoulder and elbow
+
+
 def test_every_example_is_short_says_what_it_does_and_is_run_here():
-    helpers = ("write_example_log.py", "demo_summary.py")  # of the tests and of make demo
+    # Of the tests, of the documentation and of make demo.
+    helpers = ("write_example_log.py", "write_example_bag.py", "demo_summary.py")
     tests = (ROOT / "tests" / "examples" / "test_examples.py").read_text()
     names = [path for path in EXAMPLES.glob("*.py") if path.name not in helpers]
     assert len(names) == 8

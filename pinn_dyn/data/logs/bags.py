@@ -118,10 +118,13 @@ def _read(reader: Any, path: Path, columns: Sequence[str]) -> dict[str, Topic]:
             raise LogError(f"{path}, topic {topic}: has no messages")
         for field, column in zip(fields[topic].values(), found.values, strict=True):
             if np.isnan(column).all():
-                names = f"its joints are {listed(sorted(found.names))}" if found.names else ""
+                array, most = found.arrays.get(field, (field, 0))
+                there = f"{array!r} has {most} entries at most, which count from 0"
+                if found.names and most:
+                    there = f"its joints are {listed(sorted(found.names))}"
                 raise LogError(
                     f"{path}, topic {topic}: no message has a value of {field!r}: "
-                    f"{names or 'the array is empty or shorter in all of them'}"
+                    f"{there if most else f'{array!r} is empty in all of them'}"
                 )
     return taken
 

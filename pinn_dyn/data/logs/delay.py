@@ -36,6 +36,8 @@ _CANDIDATES = 60  # at most: a parabola finds what is between them
 _DEPTH = 0.97
 _SPREAD = 0.6
 _UNEXPLAINED = 0.5
+_AS_WELL = 1.1  # times what delays of their own leave unexplained: a common one explains as well
+_AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _ONE_LINE = 0.995  # of the power of a signal
 
 
@@ -113,6 +115,39 @@ def input_delays(
             for curve, line in zip(found, lines, strict=True)
         ]
     return found
+
+
+def agreed_delays(
+    recordings: Sequence[Recording], *, longest: float = 0.3
+) -> tuple[list[DelayCurve], bool]:
+    """The delay of each input; one for all where they have no good answers of their own.
+
+    Delays are mostly of a bus or a filter that all inputs share, and searched for together they
+    have the data of all. So where an input has no answer, or where two lie more than a sample
+    apart, a common one is tried, but not where one is logged after the motion. It counts if it
+    is among those that were found, within a sample, and explains the motion about as well as all of
+    them do.
+
+    Arguments and errors are those of :func:`input_delays`.
+
+    Returns:
+        A curve per input, and whether they are one.
+    """
+    own = input_delays(recordings, longest=longest)
+    found = [curve.delay for curve in own if curve.delay is not None]
+    whole = len(found) == len(own)
+    step = sample_time(recordings[0], "a delay")
+    after = any(curve.reason == _AFTER for curve in own)
+    if len(own) == 1 or not found or after or (whole and max(found) - min(found) <= step):
+        return own, False
+    common = input_delays(recordings, longest=longest, common=True)
+    left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (own, common))
+    among = common[0].delay is not None and (
+        min(found) - step <= common[0].delay <= max(found) + step
+    )
+    if not among or (whole and left_in_common > _AS_WELL * left):
+        return own, False
+    return common, True
 
 
 def _rank(curve: DelayCurve) -> tuple[bool, float]:
@@ -351,7 +386,7 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
     elif best >= len(candidates) - 2:
         reason = f"the residual still falls at the longest delay, {candidates[-1]:.3g} s"
     elif best == 0:
-        reason = "the input is logged after the motion: a filtered measurement, or another clock"
+        reason = _AFTER
     delay = max(_minimum(candidates, whole), 0.0)
     return DelayCurve(candidates, whole, None if reason else delay, spread, form, reason)
 

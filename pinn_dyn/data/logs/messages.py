@@ -164,12 +164,14 @@ class Topic:
     Attributes:
         rows: messages so far.
         names: of the entries of arrays in all of them.
+        arrays: of a path that leads into an array, the path of the array and its most entries.
     """
 
     def __init__(self, place: str, fields: dict[str, str], count: int):
         self.place, self.fields = place, fields
         self.rows = 0
         self.names: set[str] = set()
+        self.arrays: dict[str, tuple[str, int]] = {}
         self._data = np.empty((1 + len(fields), count))  # the time, then the columns
         self._getters: list[Get] = []
         self._layouts: list[Layout] = []
@@ -193,7 +195,9 @@ class Topic:
         if not self._getters:
             first = reader.deserialize(raws[0], kind)
             self._getters = [
-                _getter(first, path, self.place) for path in self.fields.values() if path != "t"
+                _getter(first, path, self.place, self.arrays)
+                for path in self.fields.values()
+                if path != "t"
             ]
         begin, self.rows = self.rows, self.rows + len(raws)
         if self.rows > self._data.shape[1]:  # the bag's own count was wrong
@@ -276,8 +280,11 @@ def _time(message: Any, stamp: int) -> float:
     return 1e-9 * stamp
 
 
-def _getter(message: Any, field: str, place: str) -> Callable[[Any], float]:
-    """What takes the number at a path such as ``position/joint1`` out of a message, or NaN."""
+def _getter(message: Any, field: str, place: str, arrays: dict[str, tuple[str, int]]) -> Get:
+    """What takes the number at a path such as ``position/joint1`` out of a message, or NaN.
+
+    It notes in ``arrays`` how long the arrays were.
+    """
     *inner, last = field.split("/")
     names = next((name for name in _NAMES if hasattr(message, name)), None)
     at = message
@@ -291,32 +298,60 @@ def _getter(message: Any, field: str, place: str) -> Callable[[Any], float]:
                 f"{place}: its messages have no {field!r}: their fields are "
                 f"{', '.join(_fields(message))}"
             )
-    if not inner and not hasattr(message, last):
+    if not hasattr(at, "__len__") and not hasattr(at, last):
         raise LogError(
             f"{place}: its messages have no {field!r}: their fields are "
             f"{', '.join(_fields(message))}"
         )
 
+    def missing(at: int, length: int) -> float:
+        _, most = arrays.get(field, ("", 0))
+        arrays[field] = "/".join(inner[:at]), max(most, length)
+        return _NAN
+
     def get(one: Any) -> float:
         x = one
-        for step in inner:
+        for at, step in enumerate(inner):
             if step.isdigit():
                 if int(step) >= len(x):
-                    return _NAN
+                    return missing(at, len(x))
                 x = x[int(step)]
             else:
                 x = getattr(x, step)
-        if hasattr(x, "__len__"):
-            if last.isdigit():
-                k = int(last)
-            else:
-                every = getattr(one, names) if names else ()
-                k = every.index(last) if last in every else len(x)
-            return float(x[k]) if k < len(x) else _NAN
-        x = getattr(x, last)
-        return _NAN if hasattr(x, "__len__") else float(x)
+        if not hasattr(x, "__len__"):
+            return _number(getattr(x, last), field, place)
+        if last.isdigit():
+            k = int(last)
+        else:
+            every = getattr(one, names) if names else ()
+            k = every.index(last) if last in every else len(x)
+        return _number(x[k], field, place) if k < len(x) else missing(len(inner), len(x))
 
     return get
+
+
+def _number(x: Any, field: str, place: str) -> float:
+    """A field as a number.
+
+    Raises:
+        LogError: on one that is none, as a stamp, a text or an array.
+    """
+    if isinstance(x, (int, float, np.number, np.bool_)):
+        return float(x)
+    if isinstance(x, str):
+        what = "a text"
+    elif hasattr(x, "__len__"):
+        what = f"an array of {len(x)}"
+        cure = f"name an entry of it, as {field + '/0'!r}, or by the name of a joint"
+    else:
+        what = str(getattr(x, "__msgtype__", type(x).__name__))
+        cure = f"name one of its fields, {', '.join(_fields(x))}"
+        if what.endswith("/Time"):
+            cure = "the time of a message, in seconds, is the column '<topic>/t'"
+    raise LogError(
+        f"{place}: {field!r} is {what}, expected a number"
+        + ("" if isinstance(x, str) else f": {cure}")
+    )
 
 
 def _fields(message: Any) -> list[str]:

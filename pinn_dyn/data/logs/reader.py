@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
-from pinn_dyn.data.logs.bags import is_bag, read_bag
+from pinn_dyn.data.logs.bags import BAG_SUFFIXES, is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes, shown
 from pinn_dyn.data.logs.parquet import read_parquet
 
@@ -38,6 +38,25 @@ _NO_TEXT = {
     b"(\xb5/\xfd": "it is packed by zstd: unpack it",
     b"\x00\x05\x16\x07": "macOS writes such files beside others: delete it",
 }
+# Files of others, by their suffix, and what makes a table of them that can be read.
+_CONVERTED = {
+    ".ulg": "by 'ulog2csv' of the package pyulog, a CSV file for each topic",
+    ".pkl": "pandas.read_pickle(...).to_parquet('run.parquet'), if you trust its author",
+    ".tdms": "nptdms.TdmsFile.read(...).as_dataframe().to_parquet('run.parquet')",
+    ".json": "pandas.read_json(...).to_parquet('run.parquet')",
+    ".xlsx": "pandas.read_excel(...).to_csv('run.csv', index=False)",
+    ".feather": "pandas.read_feather(...).to_parquet('run.parquet')",
+    ".npy": "numpy.savez('run.npz', t=..., q=..., u=...)",
+}
+_CONVERTED |= {
+    alike: _CONVERTED[one]
+    for alike, one in ((".pickle", ".pkl"), (".jsonl", ".json"), (".xls", ".xlsx"))
+}
+_TEXT = ("", ".csv", ".gz", ".txt", ".tsv", ".dat", ".log")
+FORMATS = (
+    "CSV (also as .csv.gz), MATLAB (.mat), HDF5 (.h5, .hdf5), NPZ, Parquet, and bags of ROS (.bag, "
+    ".mcap, .db3, or the folder of a bag with its metadata.yaml)"
+)
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
@@ -68,9 +87,24 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
         if not matches:
             raise LogError(
                 f"files: nothing matches {shown(pattern)} in the folder {folder.absolute()}"
+                f"{_inside(folder, pattern)}"
             )
         found.update(matches)
     return sorted(found)
+
+
+def _inside(folder: Path, pattern: str) -> str:
+    """What to write instead of a folder that is no bag."""
+    for path in folder.glob(pattern) if folder.is_dir() else ():
+        suffixes = [file.suffix for file in sorted(path.glob("*")) if file.is_file()]
+        if path.is_dir() and suffixes:
+            inner = next((x for x in suffixes if x in BAG_SUFFIXES), suffixes[0])
+            bag = " without metadata.yaml, which a bag has" if inner in BAG_SUFFIXES else ""
+            return (
+                f", but a folder{bag}: name the files in it, as "
+                f"'{path.relative_to(folder).as_posix()}/*{inner}'"
+            )
+    return ""
 
 
 def run_name(path: Path, root: str) -> str:
@@ -103,7 +137,17 @@ def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) ->
         return read_npz(path, time)
     if path.suffix == ".parquet":
         return read_parquet(path)
-    return _read_csv(path)
+    if (how := _CONVERTED.get(path.suffix.lower())) is not None:
+        raise LogError(f"{path}: {path.suffix} is not read, but {FORMATS}: convert it, {how}")
+    try:
+        return _read_csv(path)
+    except LogError as error:
+        if path.suffix.lower() in _TEXT:
+            raise
+        raise LogError(
+            f"{error}. What is read is {FORMATS}: convert other files, as by pandas, whose tables "
+            "have to_csv and to_parquet"
+        ) from error
 
 
 def numbers(table: pd.DataFrame, path: Path, columns: Sequence[str], signal: str) -> np.ndarray:

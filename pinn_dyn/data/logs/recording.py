@@ -10,6 +10,8 @@ import numpy as np
 
 log = logging.getLogger(__name__)
 
+_SINCE_1970 = 1e8  # s, three years: what is later counts from 1970
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -17,7 +19,7 @@ class Recording:
 
     Attributes:
         run: name of the run: its file without suffix, its trajectory id, or both.
-        t: the log's own times, ``(T,)``, s.
+        t: the log's own times, ``(T,)``, s; of stamps since 1970, from the first of the run.
         q: configuration, ``(T, N)``.
         v: velocity, ``(T, N)``, or None while there is none.
         u: input, ``(T, M)``.
@@ -52,6 +54,19 @@ class Recording:
     def values(self) -> np.ndarray:
         """All signals side by side, ``(T, 2N + M)`` or ``(T, N + M)``."""
         return np.hstack([x for x in (self.q, self.v, self.u) if x is not None])
+
+
+def since_start(times: np.ndarray) -> tuple[np.ndarray, str]:
+    """The clocks of a run, ``(T, C)`` in s, from its start where they are stamps since 1970.
+
+    Messages could not tell two stamps apart by six digits.
+
+    Returns:
+        The times, and from when they count, for the report; "" where they are as they were.
+    """
+    stamps = times[0] > _SINCE_1970
+    since = f"; t from the stamp {times[0, 0]:.6f} s" if stamps[0] else ""
+    return times - np.where(stamps, times[0], 0.0), since
 
 
 @dataclass

@@ -62,7 +62,7 @@ def check_repeats(
         if spread == 0:
             continue
         for item in training:
-            if len(item) >= len(piece) and _distance(q, item.q, thin) < _SAME**2 * spread:
+            if len(item) >= len(piece) and _nearest(q, item.q, thin)[0] < _SAME**2 * spread:
                 found[piece.run, item.run] = found.get((piece.run, item.run), 0) + 1
     for (run, other), pieces in found.items():
         report.warn(
@@ -71,9 +71,59 @@ def check_repeats(
         )
 
 
-def _distance(q: np.ndarray, track: np.ndarray, thin: int) -> float:
-    """Smallest mean square distance of q ``(T, N)`` from every ``thin``-th sample of a track."""
-    best = np.inf
+def repeat_floor(
+    pieces: list[Recording], training: list[Recording]
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """What motions that come twice differ by: noise, and all that is not the same in both.
+
+    The difference of a piece and of the stretch of the training that it repeats, at the nearest
+    shift, freed of the rest of a sample's shift (the part of it along v), is √2 times the floor.
+
+    Args:
+        pieces: motions that may repeat one of the training, with q and v.
+        training: stretches, with q and v; a piece is not compared with the stretch it is from.
+
+    Returns:
+        The number of repeats, and the floors of q and of v, ``(N,)`` each, NaN without a repeat.
+    """
+    squares = []
+    for piece in pieces:
+        thin = max(1, len(piece) // _SAMPLES)
+        spread = float(piece.q[::thin].var(axis=0).sum())
+        for item in training:
+            if spread == 0 or len(item) < len(piece) or _shares(piece, item):
+                continue
+            distance, near = _nearest(piece.q[::thin], item.q, thin)
+            if distance >= _SAME**2 * spread:
+                continue
+            firsts = range(max(near - thin, 0), min(near + thin, len(item) - len(piece)) + 1)
+            parts = [item.rows(slice(first, first + len(piece))) for first in firsts]
+            other = min(parts, key=lambda part: float(((part.q - piece.q) ** 2).sum()))
+            assert piece.v is not None
+            assert other.v is not None
+            dq, dv = piece.q - other.q, piece.v - other.v
+            shift = float((dq * other.v).sum() / max((other.v**2).sum(), 1e-300))
+            dq = dq - shift * other.v
+            if dq.any():  # a copy of a file tells nothing
+                squares.append([(x**2).mean(axis=0) for x in (dq, dv)])
+    if not squares:
+        none = np.full(training[0].q.shape[1], np.nan)
+        return 0, none, none
+    q, v = np.sqrt(np.mean(squares, axis=0) / 2)
+    return len(squares), q, v
+
+
+def _shares(piece: Recording, item: Recording) -> bool:
+    """Whether a piece is cut out of a stretch."""
+    return piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
+
+
+def _nearest(q: np.ndarray, track: np.ndarray, thin: int) -> tuple[float, int]:
+    """Smallest mean square distance of q ``(T, N)`` from every ``thin``-th sample of a track.
+
+    Also the sample of the track where the nearest stretch begins.
+    """
+    best, where = np.inf, 0
     centre = q.mean(axis=0)
     q = q - centre
     for start in range(0, thin, max(1, thin // 4)):
@@ -84,6 +134,8 @@ def _distance(q: np.ndarray, track: np.ndarray, thin: int) -> float:
             products = (
                 fftconvolve(a, b[::-1], mode="valid") for a, b in zip(other.T, q.T, strict=True)
             )
-            least = (energy - 2 * sum(products) + (q**2).sum()).min()
-            best = min(best, float(least) / len(q))
-    return best
+            distances = (energy - 2 * sum(products) + (q**2).sum()) / len(q)
+            k = int(distances.argmin())
+            if distances[k] < best:
+                best, where = float(distances[k]), start + k * thin
+    return best, where

@@ -47,7 +47,7 @@ from pinn_dyn.data.logs.reader import (
     run_name,
     runs_of,
 )
-from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.recording import Recording, Report, since_start
 from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import Part, split
@@ -338,11 +338,7 @@ class LogSource(DataSource):
         return recordings
 
     def _recordings(
-        self,
-        table: pd.DataFrame,
-        path: Path,
-        groups: list[Group],
-        report: Report,
+        self, table: pd.DataFrame, path: Path, groups: list[Group], report: Report
     ) -> list[Recording]:
         """The runs of a table in SI units, checked; the table loses what it gives."""
         lines = table.index.to_numpy()
@@ -359,7 +355,8 @@ class LogSource(DataSource):
         clock, *clocks = self.time.columns
         recordings = []
         for run, rows in groups:
-            t, *others = values["time"][rows].T
+            times, since = since_start(values["time"][rows])
+            t, *others = times.T
             check_clock(t, lines[rows], path, clock, steps)
             for name, other in zip(clocks, others, strict=True):
                 check_second_clock(t, other, lines[rows], path, (clock, name))
@@ -369,7 +366,8 @@ class LogSource(DataSource):
                     check_rows(Rows(path, *found), t, report, jumps_are_removed=signal in removed)
             v = values["v"][rows] if "v" in values else None
             recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
-            report.add("Read", run, f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}")
+            read = f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}{since}"
+            report.add("Read", run, read)
         return recordings
 
     def _clean(self, parts: dict[str, list[Recording]], report: Report) -> list[Cleaned]:

@@ -85,7 +85,9 @@ def sample_time(recording: Recording, wanted_by: str) -> float:
         k = int(off.argmax())
         raise LogError(
             f"{recording.place}: {wanted_by} needs a uniform clock, but near t = {t[k]:.6g} s the "
-            f"time is {off[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it"
+            f"time is {off[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it, "
+            f"as {{_target_: pinn_dyn.data.logs.Resample, rate: {float(f'{1 / step:.3g}')}, "
+            f"max_gap: {max(float(np.diff(t).max()), step):.2g}}}"
         )
     return step
 

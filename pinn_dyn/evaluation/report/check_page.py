@@ -35,8 +35,10 @@ def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
     parts = [paragraph(text) for text in verdict]
     parts += [paragraph(f"Warning: {text}") for text in check.warnings]
     parts.append(table(facts, headers={"what": "", "value": ""}))
-    if check.suggestion:
-        parts += [paragraph("To copy into the configuration:"), preformatted(check.suggestion)]
+    parts += [
+        paragraph("To copy into the configuration, and to run; each line with its reason:"),
+        preformatted(check.suggestion),
+    ]
     sections = [
         Section("Verdict", parts),
         Section("Clock", [table(check.runs), drawing(_clock(source), "time between rows")]),
@@ -44,9 +46,17 @@ def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
             "Coordinates",
             [
                 paragraph(
-                    "Noise is what third differences leave. The own share of an acceleration is "
-                    "what 1, its own q and v, and the other accelerations do not explain of it: "
-                    "below a hundredth its inertia cannot be identified."
+                    "Noise is what third differences leave; of v, where the log has one. The "
+                    "floors of q and v, where motions come twice, are what both differ by, over "
+                    "√2: noise, and all that is not the same in both. No model errs less."
+                ),
+                paragraph(
+                    "The own share of an acceleration is what 1, its own q and v, and the other "
+                    "accelerations do not explain of it: below a hundredth its inertia cannot be "
+                    "identified. Not identified: "
+                    f"{', '.join(check.unidentified) or 'none'}. This and the condition number "
+                    "are of the linear regressor (1, q, v, a), as a log has no bodies; which of a "
+                    "rigid arm's constants the data leave open, model=known says after its fit."
                 ),
                 table(check.coordinates),
                 drawing(_coverage(check, source), "coverage of the test by the training"),
