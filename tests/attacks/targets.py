@@ -70,7 +70,7 @@ def calls(mark):
         ("pinn_dyn.evaluation.write_table", {"table": 1, "folder": mark, "name": "x"}),
         ("pinn_dyn.control.export_law", {"law": 1, "path": mark}),
         ("pinn_dyn.control.load_law", {"path": mark}),
-        ("pinn_dyn.training.one_cycle", {"optimizer": 1, "total_steps": 1}),
+        ("pinn_dyn.fit", {"data": 1}),
         ("pinn_dyn.systems.SoftArm.__init__.__globals__", {}),
         ("pinn_dyn.models.LagrangianNetwork.load_state_dict", {}),
         ("pinn_dyn.models.torch.save", {"obj": 1, "f": mark}),

@@ -81,21 +81,22 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
         if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
             raise LogError(f"files has {pattern!r}, expected paths from the folder root")
         try:
-            matches = [path for path in folder.glob(pattern) if path.is_file() or is_bag(path)]
+            named = list(folder.glob(pattern))
         except OSError:  # as of a name that no file can have
-            matches = []
+            named = []
+        matches = [path for path in named if path.is_file() or is_bag(path)]
         if not matches:
             raise LogError(
                 f"files: nothing matches {shown(pattern)} in the folder {folder.absolute()}"
-                f"{_inside(folder, pattern)}"
+                f"{_inside(folder, named)}"
             )
         found.update(matches)
     return sorted(found)
 
 
-def _inside(folder: Path, pattern: str) -> str:
+def _inside(folder: Path, named: Sequence[Path]) -> str:
     """What to write instead of a folder that is no bag."""
-    for path in folder.glob(pattern) if folder.is_dir() else ():
+    for path in named:
         suffixes = [file.suffix for file in sorted(path.glob("*")) if file.is_file()]
         if path.is_dir() and suffixes:
             inner = next((x for x in suffixes if x in BAG_SUFFIXES), suffixes[0])
