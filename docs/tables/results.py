@@ -166,6 +166,17 @@ def rigid() -> str:
     return table(head, rows)
 
 
+def torque() -> str:
+    """Torque errors of known mechanics joint by joint, in parts of the spread of each torque."""
+    rows = []
+    for name in RIGID:
+        data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "torque.csv")
+        for index, (model, joints) in enumerate(data.groupby("run", sort=False)):
+            shares = ", ".join(f"{share:.2f}" for share in joints["torque_share"])
+            rows.append([f"`{name}`" if index == 0 else "", f"`{model}`", shares])
+    return table(["log", "model", "joint 1, 2, ..."], rows)
+
+
 def intervals() -> str:
     """What the 95 % intervals of predictions hold on the logs of rigid robots."""
     rows = []
@@ -336,6 +347,7 @@ TABLES = {
         "panda": panda(),
         "logs": logs(),
         "rigid": rigid(),
+        "torque": torque(),
         "intervals": intervals(),
         "verdict": verdict(),
         "neck": neck(),
