@@ -107,7 +107,8 @@ def evaluate(cfg: DictConfig) -> float:
         steps = [run.model.fixed_step or config["step"] or run.statistics.step for run in runs]
         stride = common_stride(steps, truth.t)
     except ValueError as error:
-        raise ConfigError(f"{runs[0].config['dataset'].get('name', 'dataset')}: {error}") from error
+        named = config.get("dataset") or runs[0].config["dataset"]
+        raise ConfigError(f"{named.get('name', 'dataset')}: {error}") from error
     if long := too_long_for(motions, max(steps), source.labels):
         log.warning("%s: %s", source.name, long)
     for run, one in zip(runs, data, strict=True):

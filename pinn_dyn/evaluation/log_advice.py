@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.signal import welch
@@ -54,6 +55,11 @@ class Measured:
     def seconds(self) -> float:
         """Length of the training, s."""
         return sum(item.duration for item in self.training)
+
+    @cached_property
+    def highest(self) -> float:
+        """Where the motion ends, Hz."""
+        return bandwidth(self.training, self.step, self.noise)
 
     @property
     def joints(self) -> bool:
@@ -158,15 +164,14 @@ def _filter(found: Measured) -> Advice | None:
         return None
     v = np.vstack([np.diff(item.q, axis=0) / found.step for item in found.training])
     share = float((2**0.5 * found.noise / found.step / v.std(axis=0).clip(min=1e-300)).max())
-    highest = bandwidth(found.training, found.step, found.noise)
-    cutoff = float(f"{max(4 * highest, 1.0):.2g}")
+    cutoff = float(f"{max(4 * found.highest, 1.0):.2g}")
     if share < 0.02 or not 0 < cutoff < 0.4 / found.step:
         return None
     return Advice(
         "steps",
         f"filter: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}}",
         f"noise is {100 * share:.2g} % of the steps of q from sample to sample, and the motion "
-        f"ends at {highest:.2g} Hz",
+        f"ends at {found.highest:.2g} Hz",
     )
 
 
@@ -240,9 +245,9 @@ def _friction(found: Measured) -> Advice | None:
     if found.little:  # known mechanics has a friction of its own
         return None
     rest, moved = [], []
+    fastest = np.max([np.abs(x.v).max(axis=0) for x in found.training if x.v is not None], 0)
     for item in found.training:
         assert item.v is not None
-        fastest = np.max([np.abs(x.v).max(axis=0) for x in found.training if x.v is not None], 0)
         rate = np.abs(np.gradient(item.u[:, : len(found.delays)], found.step, axis=0))
         usual = np.sqrt((rate**2).mean(axis=0)).clip(min=1e-300)
         moved.append((rate > 0.3 * usual).any(axis=1))
@@ -274,17 +279,17 @@ def _turns(found: Measured) -> Advice | None:
 
 
 def _windows(found: Measured) -> Advice | None:
-    highest = bandwidth(found.training, found.step, found.noise)
-    if not highest:
+    if not found.highest:
         return None
-    stride = max(1, round(1 / (20 * highest) / found.step))
+    stride = max(1, round(1 / (20 * found.highest) / found.step))
     shortest = min(len(item) for item in found.training)
     steps = max(2, min(10, (shortest - 1) // (2 * stride)))
     return Advice(
         "training",
         f"data=multi_step data.stride={stride} data.steps={steps}",
         f"{1e3 * stride * found.step:.3g} ms a step, some twentieth of the period of "
-        f"{highest:.2g} Hz, below which 99 % of the motion is; noise averages out over several",
+        f"{found.highest:.2g} Hz, below which 99 % of the motion is; noise averages out over "
+        "several",
     )
 
 

@@ -98,6 +98,9 @@ def test_a_run_of_another_sample_time_is_named(tmp_path, rate):
 def test_an_empty_pattern_names_itself_and_the_folder(tmp_path):
     with pytest.raises(LogError, match=rf"nothing matches '\*.txt' in the folder {tmp_path}"):
         source(tmp_path, files="*.txt").load()
+    write(tmp_path, motion(), "b.csv")
+    with pytest.raises(LogError, match=r"which has b\.csv: mend dataset\.files or dataset\.root"):
+        source(tmp_path, files="*.txt").load()
     with pytest.raises(LogError, match="absent', which is no folder"):
         source(tmp_path / "absent").load()
 

@@ -88,10 +88,17 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
         if not matches:
             raise LogError(
                 f"files: nothing matches {shown(pattern)} in the folder {folder.absolute()}"
-                f"{_inside(folder, named)}"
+                f"{_inside(folder, named) or _there(folder)}"
             )
         found.update(matches)
     return sorted(found)
+
+
+def _there(folder: Path) -> str:
+    """What the folder has instead."""
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    has = f"has {listed(names)}" if names else "is empty"
+    return f", which {has}: mend dataset.files or dataset.root"
 
 
 def _inside(folder: Path, named: Sequence[Path]) -> str:
