@@ -282,6 +282,13 @@ def test_floors_are_in_brackets_and_a_model_that_loses_to_one_has_no_bold_figure
     assert "No model beats every floor in error_mean: 'hnn' has" in page.text
 
 
+def test_a_value_that_is_not_there_is_a_dash():
+    """Of whole numbers too, such as the seed of a floor."""
+    frame = pd.DataFrame({"seed": pd.array([0, None], dtype="Int64"), "x": [0.5, float("nan")]})
+    shown = re.findall(r"<td[^>]*>([^<]*)</td>", str(table(frame)))
+    assert shown == ["0", "0.5", "-", "-"]
+
+
 def test_notes_on_rows_stand_below_the_table(prediction):
     page = Page(prediction_page(notes=["with delay: <its own> inputs"])[0])
     assert "with delay: <its own> inputs" in page.text

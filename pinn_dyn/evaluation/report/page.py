@@ -189,4 +189,6 @@ def _is_fraction(value: object) -> bool:
 
 
 def _cell(value: object) -> str:
+    if value is pd.NA:
+        return "-"
     return number(float(value)) if isinstance(value, float) else str(value)
