@@ -46,9 +46,7 @@ def check(cfg: DictConfig) -> None:
             )
         check_structure("model.structure", part, structure, source)
     try:
-        found = check_log(
-            source, longest_delay=config["longest_delay"], structure=structure
-        )
+        found = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     except LogError as error:
         raise ConfigError(f"{source.name}: {error}") from error
     write_config(folder, config)

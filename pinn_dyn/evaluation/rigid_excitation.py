@@ -75,7 +75,8 @@ def base_parameters(regressor: np.ndarray) -> BaseParameters:
     parameters of robots".
     """
     norms = np.linalg.norm(regressor, axis=0)
-    scale = np.where(norms > 0, norms, 1.0)
+    # The rounded angles of a URDF leave next to nothing of a column that would be zero.
+    scale = np.where(norms > _DEPENDENT * norms.max(), norms, 1.0)
     triangle = np.linalg.qr(regressor / scale, mode="r")
     basis, kept = np.zeros((len(triangle), 0)), []
     for k, column in enumerate(triangle.T):
@@ -106,10 +107,10 @@ def rigid_excitation(
     and offsets o. Base parameters are those of its columns that are independent at random states;
     the condition number is that of these columns, each of unit norm, at samples of the filtered
     motion. A joint at rest has no row, as dry friction may then have any value up to its level.
-    Directions whose singular value is less than a hundredth of the largest are not determined. Drive
-    gains, where they are unknown, are not among the constants. Sources: Gautier and Khalil 1992,
-    "Exciting trajectories for the identification of base inertial parameters of robots"; Swevers
-    et al. 1997, "Optimal robot excitation and identification".
+    Directions whose singular value is less than a hundredth of the largest are not determined.
+    Drive gains, where they are unknown, are not among the constants. Sources: Gautier and Khalil
+    1992, "Exciting trajectories for the identification of base inertial parameters of robots";
+    Swevers et al. 1997, "Optimal robot excitation and identification".
 
     Args:
         structure: the kinematics.

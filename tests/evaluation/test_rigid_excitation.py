@@ -119,8 +119,8 @@ def source(tmp_path):
         item = log("arm", 0, 0.0)
         q = np.stack([item.q[:, 0], np.full(len(item), 0.3)], 1) if follows else item.q
         columns = [item.t, *q.T, *item.u.T]
-        text = "t,q1,q2,u1,u2\n" + "\n".join(",".join(f"{x:.9g}" for x in r) for r in zip(*columns))
-        (tmp_path / "run.csv").write_text(text)
+        rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True)]
+        (tmp_path / "run.csv").write_text("\n".join(["t,q1,q2,u1,u2", *rows]))
         return LogSource(
             name="arm",
             root=str(tmp_path),
