@@ -10,12 +10,15 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.known_data import check_structure
+from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.provenance import command_line
 from pinn_dyn.app.run_folder import write_config
 from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.log_check import check_log
 from pinn_dyn.evaluation.report import check_report
+from pinn_dyn.models.known import Structure
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +36,17 @@ def check(cfg: DictConfig) -> None:
         raise ConfigError(
             f"dataset {source.name} is simulated, expected a log, such as dataset=example_log"
         )
+    structure = None
+    if (part := config["model"]["structure"]) is not None:
+        structure = build_part("model.structure", part)
+        if not isinstance(structure, Structure):
+            raise ConfigError(
+                f"model.structure is a {type(structure).__name__}, expected rigid bodies: "
+                "model/structure=urdf model.structure.urdf=my_robot.urdf, or leave it out"
+            )
+        check_structure("model.structure", part, structure, source)
     try:
-        found = check_log(source, longest_delay=config["longest_delay"])
+        found = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     except LogError as error:
         raise ConfigError(f"{source.name}: {error}") from error
     write_config(folder, config)

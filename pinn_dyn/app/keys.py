@@ -94,6 +94,13 @@ class Stability(Section):
     samples: Annotated[int, Range(1, 100_000)]
 
 
+@dataclass
+class Kinematics(Section):
+    """Of a log that is looked at: what is known before a model is chosen."""
+
+    structure: Part | None = None
+
+
 # Arguments of the trainer that may be set; the program decides on the others.
 TRAINER: dict[str, Any] = {
     "steps": Annotated[int, Range(1, 10**9)],
@@ -182,7 +189,11 @@ KEYS: dict[str, dict[str, Any]] = {
         "reference": Annotated[Part, Kind("pinn_dyn.control.Reference")],
         "plant": Annotated[Part, Kind("pinn_dyn.control.Plant")],
     },
-    "check": {"dataset": _Source, "longest_delay": Annotated[float, Range(0, 100, above=True)]},
+    "check": {
+        "dataset": _Source,
+        "model": Kinematics,
+        "longest_delay": Annotated[float, Range(0, 100, above=True)],
+    },
     "gather": {
         "runs": Names,
         "evaluations": Names | None,

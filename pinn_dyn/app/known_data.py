@@ -34,10 +34,27 @@ def check_known(config: dict[str, Any], source: DataSource) -> None:
         if isinstance(part, dict) and part.get("_target_") == _KNOWN:
             structure = build_part(f"{place}.structure", part["structure"])
             if isinstance(structure, Structure):
-                locked = list(part["structure"].get("locked_joints", ()))
-                _check_joints(f"{place}.structure", structure.joint_names, locked, source)
-                _check_units(f"{place}.structure", structure, source)
+                check_structure(f"{place}.structure", part["structure"], structure, source)
                 _check_gains(place, part, structure.num_coordinates, source)
+
+
+def check_structure(
+    place: str, part: dict[str, Any], structure: Structure, source: DataSource
+) -> None:
+    """Refuse a structure whose joints are not the data's.
+
+    Args:
+        place: where it stands in the configuration.
+        part: what stands there.
+        structure: what was built of it.
+        source: the data.
+
+    Raises:
+        ConfigError: if there are more or fewer columns than joints, or their names or units show
+            another order.
+    """
+    _check_joints(place, structure.joint_names, list(part.get("locked_joints", ())), source)
+    _check_units(place, structure, source)
 
 
 def _signals(source: DataSource) -> Iterator[tuple[str, list[str]]]:

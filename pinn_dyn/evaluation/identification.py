@@ -44,6 +44,14 @@ class _Posterior(NamedTuple):
     prior: np.ndarray
 
 
+class Direction(NamedTuple):
+    """A direction of P parameters: the number of its own one, its entries ``(P,)``, in words."""
+
+    own: int
+    direction: np.ndarray
+    text: str
+
+
 def constants_table(
     model: LearnedConstants, fit: Fit, input_units: Sequence[str] = ()
 ) -> pd.DataFrame:
@@ -174,31 +182,39 @@ def _constant_slopes(model: LearnedConstants) -> Tensor:
 def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
     """In words, directions of the parameters that the prior decides and not the data.
 
-    They span the eigenvectors of the covariance whose variance is more than half of the prior's.
-    Of all bases of that space this one has a parameter of its own in each direction, so that what
-    is open by itself is named by itself. Those of drives come first, then bodies; each is named by
-    the parameters that make up most of it.
+    They span the eigenvectors of the covariance whose variance is more than half of the prior's
+    (:func:`named_directions`); those of drives come first, then bodies.
     """
     variances, vectors = torch.linalg.eigh(fit.covariance)
     space = vectors[:, variances > OPEN].T.numpy()
+    found = []
+    for one in reversed(named_directions(space, model.parameter_names())):
+        variance = one.direction @ fit.covariance.numpy() @ one.direction
+        found.append(f"{one.text}: held by the prior ({variance:.0%} of its variance is left)")
+    return found
+
+
+def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]:
+    """Directions that span the rows of ``space`` ``(D, P)``, orthonormal, in words.
+
+    Of all bases of that space this one has a parameter of its own in each direction, so that what
+    is open by itself is named by itself. Each is named by the parameters that make up most of it;
+    they come in the order of their own parameters.
+    """
     if not len(space):
         return []
-    names = model.parameter_names()
     _, _, order = qr(space, mode="economic", pivoting=True)
-    own = order[: len(space)]
-    basis = np.linalg.solve(space[:, own], space)
-    found: list[str] = []
-    for k in np.argsort(own)[::-1]:
-        direction = basis[k] / np.linalg.norm(basis[k])
-        variance = direction @ fit.covariance.numpy() @ direction
-        order = np.argsort(-np.abs(direction))
-        direction = direction * np.sign(direction[order[0]])  # the first is named without a sign
+    own = np.sort(order[: len(space)])
+    found = []
+    for k, row in zip(own, np.linalg.solve(space[:, own], space), strict=True):
+        direction = row / np.linalg.norm(row)
+        largest = np.argsort(-np.abs(direction))
+        direction = direction * np.sign(direction[largest[0]])  # the first has no sign
         share, chosen = 0.0, []
-        for j in order[:4]:
+        for j in largest[:4]:
             if share > 0.8:
                 break
             share += float(direction[j] ** 2)
             chosen.append(f"{'+' if direction[j] > 0 else '-'} {names[j]}")
-        text = " ".join(chosen).removeprefix("+ ")
-        found.append(f"{text}: held by the prior ({variance:.0%} of its variance is left)")
+        found.append(Direction(int(k), direction, " ".join(chosen).removeprefix("+ ")))
     return found

@@ -11,6 +11,7 @@ import pandas as pd
 from pinn_dyn.data.logs import (
     Cleaned,
     DelayCurve,
+    LogError,
     LogSource,
     Recording,
     agreed_delays,
@@ -25,7 +26,9 @@ from pinn_dyn.evaluation.log_numbers import (
     share_at_rest,
     white_noise,
 )
+from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_excitation
 from pinn_dyn.mechanics import Trajectory
+from pinn_dyn.models.known import Structure
 
 # What a training cannot do without.
 _LEAST_SAMPLES = 200
@@ -37,7 +40,9 @@ _CONDITION = 1e3
 _OWN = 0.01
 _FAR = 3.0
 _OUTSIDE = 0.05
+_STILL = 0.25  # noise of q, of the range, above which a coordinate does not move
 _MOST_REPEATS = 20  # stretches of the training that are looked for in the others
+_SHOWN = 20  # lines of a table in the terminal
 _LINEAR = "condition number of the linear regressor (1, q, v, a), not of rigid bodies"
 
 
@@ -57,6 +62,7 @@ class LogCheck:
         problems: why a training makes no sense; empty where it does.
         warnings: what to look at before a training.
         unidentified: the coordinates whose inertia the motion does not tell.
+        rigid: what the motion tells of the constants of a rigid robot; None without a structure.
         suggestion: lines of YAML and commands to copy, each with its reason.
     """
 
@@ -70,33 +76,41 @@ class LogCheck:
     problems: list[str]
     warnings: list[str]
     unidentified: list[str]
+    rigid: RigidExcitation | None
     suggestion: str
 
     def __str__(self) -> str:
         tables = {
-            "Runs": self.runs.head(20),
+            "Runs": self.runs.head(_SHOWN),
             "Coordinates": self.coordinates,
             "Inputs": self.inputs,
         }
+        if self.rigid is not None:
+            tables["Rigid bodies"] = self.rigid.joints
         lines = [f"{self.name}: what is in the log, and whether it suffices"]
         for title, frame in tables.items():
             lines += ["", title, frame.to_string(index=False, float_format=lambda x: f"{x:.3g}")]
-        if len(self.runs) > 20:
-            lines.append(f"... {len(self.runs) - 20} more in the page")
+        if len(self.runs) > _SHOWN:
+            lines.append(f"... {len(self.runs) - _SHOWN} more runs in the page")
         lines += ["", *(f"{name}: {value:.3g}" for name, value in self.figures.items())]
         lines.append(f"inertia not identified: {', '.join(self.unidentified) or 'none'}")
+        if self.rigid is not None:
+            lines.append(f"rigid-body constants not determined: {self.rigid.words(_SHOWN)}")
         lines += ["", "Warnings", *(f"- {text}" for text in self.warnings or ["none"])]
         lines += ["", "To copy into the configuration, and to run", self.suggestion]
         verdict = "a training makes sense" if not self.problems else "a training makes no sense:"
         return "\n".join([*lines, "", f"Verdict: {verdict}", *(f"- {x}" for x in self.problems)])
 
 
-def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
+def check_log(
+    source: LogSource, *, longest_delay: float = 0.3, structure: Structure | None = None
+) -> LogCheck:
     """Look at a log as its configuration reads, splits and cleans it.
 
     Args:
         source: the log.
         longest_delay: the longest delay of an input that is tried, s.
+        structure: the kinematics, whose joints are the coordinates of the log, if they are known.
 
     Raises:
         LogError: where the log cannot be used at all.
@@ -130,6 +144,24 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
         ),
     }
     problems = _problems(samples, figures, coordinates, explained)
+    measured = Measured(
+        source,
+        training,
+        step,
+        delays,
+        noise=coordinates["noise of q"].to_numpy(),
+        rest=figures["share of the training at rest"],
+        outside=max(float((distance > _FAR).mean()), float(coordinates["test outside"].max())),
+        condition=condition,
+        follows=follows,
+    )
+    excited = None
+    if structure is not None:
+        excited = _excitation(structure, splits.train, coordinates, measured)
+        figures[
+            f"condition number of the rigid-body regressor ({excited.count} base parameters, "
+            "friction included, columns of unit norm)"
+        ] = excited.condition
     frame = pd.DataFrame(
         {
             "input": source.input_labels[:inputs],
@@ -143,17 +175,12 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
         }
     )
     warnings = [*source.warnings, *_warnings(coordinates, figures, delays, distance, step)]
-    measured = Measured(
-        source,
-        training,
-        step,
-        delays,
-        noise=coordinates["noise of q"].to_numpy(),
-        rest=figures["share of the training at rest"],
-        outside=max(float((distance > _FAR).mean()), float(coordinates["test outside"].max())),
-        condition=condition,
-        follows=follows,
-    )
+    if excited is not None and excited.condition > MOST:
+        warnings.append(
+            f"the rigid-body regressor has the condition number {excited.condition:.3g}, expected "
+            f"less than {MOST:g}: these motions do not determine constants of "
+            f"{', '.join(excited.open_joints)}; excite them by more frequencies, poses and speeds"
+        )
     return LogCheck(
         source.name,
         pd.DataFrame([_run(part) for part in source.cleaned]),
@@ -165,6 +192,7 @@ def check_log(source: LogSource, *, longest_delay: float = 0.3) -> LogCheck:
         problems,
         warnings,
         _unidentified(coordinates),
+        excited,
         advice(measured),
     )
 
@@ -244,6 +272,26 @@ def _coordinates(
     return frame, float(np.linalg.cond(scaled))
 
 
+def _excitation(
+    structure: Structure,
+    trajectories: Sequence[Trajectory],
+    coordinates: pd.DataFrame,
+    measured: Measured,
+) -> RigidExcitation:
+    """What the motions tell of rigid bodies, after a filter between them and their noise."""
+    longest = max(item.duration for item in trajectories)
+    try:
+        return rigid_excitation(
+            structure,
+            trajectories,
+            # At least three of its periods are in the longest motion.
+            cutoff=min(max(4 * measured.highest, 1.0, 3.01 / longest), 0.4 / measured.step),
+            still=(coordinates["noise / range"] > _STILL).tolist(),
+        )
+    except ValueError as error:
+        raise LogError(f"the rigid-body regressor: {error}") from error
+
+
 def _problems(
     samples: int, figures: dict[str, float], coordinates: pd.DataFrame, explained: float
 ) -> list[str]:
@@ -257,7 +305,7 @@ def _problems(
         )
     if figures["share of the training at rest"] > _MOST_REST:
         problems.append("the robot rests for nearly the whole training: cut the rest out")
-    if (coordinates["noise / range"] > 0.25).all():
+    if (coordinates["noise / range"] > _STILL).all():
         problems.append("no coordinate moves by more than its noise")
     return problems
 

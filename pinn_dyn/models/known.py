@@ -18,6 +18,9 @@ from pinn_dyn.models.scales import Joint, Scales
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import FrictionHead
 
+INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+"""Names of the ten inertial parameters of a body, in the order of the regressor's columns."""
+
 Start = Literal["generic", "prior"]
 """Where the bodies start: plausible rods along the links, or those of the description."""
 
@@ -177,8 +180,7 @@ class KnownMechanics(LearnedConstants):
         """All constants in SI units: masses, m c, moments of inertia, drives, friction, gains."""
         table = self.body_parameters()
         found = []
-        labels = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-        for column, label in enumerate(labels):
+        for column, label in enumerate(INERTIAL):
             unit = "kg" if column == 0 else "kg m" if column < 4 else "kg m^2"
             names = [f"{label} of {body}" for body in self.structure.body_names]
             lower = 0.0 if label in ("mass", "Ixx", "Iyy", "Izz") else -float("inf")

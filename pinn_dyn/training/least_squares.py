@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 _MOST_PARAMETERS = 500
 _FIRST_NOISE = 0.1
 """Of the normalized residuals at most, before a fit has shown it."""
-_REST = 0.05
+REST = 0.05
 """Part of a joint's typical speed below which it counts as at rest."""
 _CHANGED = 5.0
 """Standard deviation of the parameters of a changed body: a payload may outweigh its link."""
@@ -217,7 +217,7 @@ class LeastSquares:
         q, v, a, u = filtered_motion(trajectories, self.cutoff, self.samples)
         with torch.no_grad():
             spread = model.force_scale(q, v, a, u)
-        moves = v.abs() > _REST * v.std(0)
+        moves = v.abs() > REST * v.std(0)
         if not moves.any():
             raise ValueError(
                 "least squares: nothing moves in the training trajectories, expected motions that "

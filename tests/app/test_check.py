@@ -47,6 +47,20 @@ def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):
     assert (tmp_path / "out" / "check.html").is_file()
 
 
+def test_a_structure_of_another_robot_is_refused_by_name(tmp_path):
+    error = fails("check.py", *arguments(tmp_path), "model/structure=ur10e")
+    assert "model.structure" in str(error.code)
+    assert "2" in str(error.code)
+
+
+def test_known_kinematics_add_what_the_motion_tells_of_the_bodies(tmp_path, capsys):
+    run_script("check.py", *arguments(tmp_path), "model/structure=double_pendulum")
+    text = capsys.readouterr().out
+    assert "Rigid bodies" in text
+    assert "condition number of the rigid-body regressor (13 base parameters" in text
+    assert "Rigid bodies" in (tmp_path / "out" / "check.html").read_text()
+
+
 def test_names_of_columns_do_nothing_on_the_page(tmp_path):
     given = arguments(tmp_path)
     table = pd.read_csv(tmp_path / "arm.csv")

@@ -20,6 +20,7 @@ from pinn_dyn.evaluation.report.page import (
     preformatted,
     table,
 )
+from pinn_dyn.evaluation.rigid_excitation import MOST
 
 
 def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
@@ -55,13 +56,14 @@ def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
                     "accelerations do not explain of it: below a hundredth its inertia cannot be "
                     "identified. Not identified: "
                     f"{', '.join(check.unidentified) or 'none'}. This and the condition number "
-                    "are of the linear regressor (1, q, v, a), as a log has no bodies; which of a "
-                    "rigid arm's constants the data leave open, model=known says after its fit."
+                    "are of the linear regressor (1, q, v, a), as a log has no bodies; those of a "
+                    "rigid robot are below, where its kinematics is given (model/structure=...)."
                 ),
                 table(check.coordinates),
                 drawing(_coverage(check, source), "coverage of the test by the training"),
             ],
         ),
+        *_rigid(check),
         Section(
             "Inputs and their delays",
             [
@@ -90,6 +92,30 @@ def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
         ),
     ]
     return page(f"{check.name}: check of the log", command, sections)
+
+
+def _rigid(check: LogCheck) -> list[Section]:
+    """What the motions tell of rigid bodies, where their kinematics is known."""
+    if check.rigid is None:
+        return []
+    return [
+        Section(
+            "Rigid bodies",
+            [
+                paragraph(
+                    f"The torques of rigid bodies and their drives are linear in "
+                    f"{check.rigid.count} base parameters. The regressor of the training motions, "
+                    "each column of unit norm, has the condition number "
+                    f"{check.rigid.condition:.3g}; below {MOST:g} a motion is well conditioned. "
+                    "Directions with less than a hundredth of the largest singular value are not "
+                    f"determined: {check.rigid.words(len(check.rigid.undetermined))}. The own "
+                    "share of the weakest parameter is what the other columns do not explain of "
+                    "its own."
+                ),
+                table(check.rigid.joints),
+            ],
+        )
+    ]
 
 
 def _clock(source: LogSource) -> Figure:

@@ -1,0 +1,152 @@
+"""What motions tell of rigid bodies, against closed forms of small robots and printed counts."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.data.logs import LogSource
+from pinn_dyn.evaluation.log_check import check_log
+from pinn_dyn.evaluation.rigid_excitation import base_parameters, rigid_excitation
+from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.systems import RigidChain
+from tests.support.delayed_robots import log, sines
+from tests.support.rigid_chains import TREE, joint, link, robot
+
+PENDULUM = robot(
+    link("base"), link("rod"), joint("hinge", "continuous", "base", "rod", "0 0 0", "0 0 0")
+)
+TWO_RODS = robot(
+    link("base"),
+    link("upper"),
+    link("lower"),
+    joint("shoulder", "continuous", "base", "upper", "0 0 0", "0 0 0"),
+    joint("elbow", "continuous", "upper", "lower", "0 0 -0.5", "0 0 0"),
+)
+
+
+def motion(size, *, seconds=20.0, rate=200.0, still=(), seed=0, highest=1.0):
+    """A sum of sines in each joint, which rests where it is told to."""
+    signal = sines(np.random.default_rng(seed), size, size=0.8, highest=highest)
+    t = torch.arange(round(seconds * rate), dtype=torch.float64) / rate
+    moves = torch.tensor([k not in still for k in range(size)])
+    q, v = (torch.from_numpy(signal(t.numpy(), order)) * moves for order in (0, 1))
+    return Trajectory(q, v, Signal(t, torch.zeros_like(q)))
+
+
+def regressor_at_random(chain):
+    q, v, a = torch.rand(3, 300, chain.num_coordinates, dtype=torch.float64) * 3 - 1.5
+    return chain.regressor(q, v, a).flatten(0, 1).numpy()
+
+
+def test_a_link_carries_the_mass_of_the_next_one_as_a_point_at_its_joint():
+    """Two rods in a plane: l below the shoulder, m2 adds to m cz and Iyy of the first as m2 l."""
+    columns, grouping = base_parameters(regressor_at_random(RigidChain(TWO_RODS)))
+    # Of ten each: m cx, m cz and Iyy of both.
+    assert columns.tolist() == [1, 3, 6, 11, 13, 16]
+    expected = np.zeros((6, 20))
+    expected[np.arange(6), columns] = 1
+    expected[1, 10] = -0.5
+    expected[2, 10] = 0.25
+    np.testing.assert_allclose(grouping, expected, atol=1e-9)
+
+
+def test_the_panda_has_43_base_parameters():
+    """As printed by Gaz et al. 2019, "Dynamic identification of the Franka Emika Panda robot"."""
+    pytest.importorskip("pybullet_data")
+    fingers = ["panda_finger_joint1", "panda_finger_joint2"]
+    chain = RigidChain("franka_panda/panda.urdf", locked_joints=fingers)
+    regressor = regressor_at_random(chain)
+    columns, grouping = base_parameters(regressor)
+    assert len(columns) == 43
+    np.testing.assert_allclose(regressor[:, columns] @ grouping, regressor, atol=1e-6)
+
+
+def test_the_condition_number_of_a_pendulum_is_that_of_its_six_columns():
+    run = motion(1)
+    found = rigid_excitation(RigidChain(PENDULUM), [run], cutoff=20.0)
+    q, v = run.q[:, 0].numpy(), run.v[:, 0].numpy()
+    a, moves = np.gradient(v, run.t.numpy()), np.abs(v) > 0.05 * v.std()
+    columns = [a, np.sin(q), np.cos(q), v, np.sign(v), np.ones_like(q)]
+    columns = np.stack([x[moves] / np.linalg.norm(x[moves]) for x in columns], axis=1)
+    assert found.count == 6
+    assert found.condition == pytest.approx(np.linalg.cond(columns), rel=0.02)
+    shares = 1 / np.diag(np.linalg.inv(columns.T @ columns))
+    assert found.joints["its own share"].item() == pytest.approx(shares.min(), rel=0.05)
+    assert found.undetermined == []
+
+
+def test_motions_of_all_joints_leave_nothing_open():
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    found = rigid_excitation(chain, [motion(4, seconds=60.0)], cutoff=10.0)
+    assert found.condition < 100
+    assert found.open_joints == []
+    assert found.words(5) == "none"
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-5])
+def test_a_joint_that_rests_is_named(noise):
+    chain = RigidChain(TREE, locked_joints=["wrist"])
+    run = motion(4, seconds=60.0, still=[3])
+    generator = torch.Generator().manual_seed(0)
+    q, v = (x + noise * torch.randn(x.shape, generator=generator) for x in (run.q, run.v))
+    still = [False, False, False, noise > 0]
+    found = rigid_excitation(chain, [Trajectory(q, v, run.input)], cutoff=10.0, still=still)
+    name = chain.joint_names[3]
+    assert name in found.open_joints
+    for label in ("viscous friction", "dry friction", "offset"):
+        assert f"{label} of {name}" in found.undetermined
+    assert found.condition > 1e6
+    assert found.joints["not determined"].sum() == len(found.undetermined)
+
+
+def test_one_slow_sine_does_not_tell_the_constants_apart():
+    """A pendulum with one sine of small amplitude: sin q follows a, and cos q follows 1."""
+    t = torch.arange(8000, dtype=torch.float64)[:, None] / 200
+    q, v = 0.02 * torch.sin(2 * t), 0.04 * torch.cos(2 * t)
+    found = rigid_excitation(
+        RigidChain(PENDULUM), [Trajectory(q, v, Signal(t[:, 0], 0 * q))], cutoff=20.0
+    )
+    assert len(found.undetermined) == 2
+    assert found.open_joints == ["hinge"]
+    assert found.condition > 1000
+
+
+@pytest.fixture
+def source(tmp_path):
+    """A log of the two-link arm, whose second joint follows the first if told so."""
+
+    def of(follows):
+        item = log("arm", 0, 0.0)
+        q = np.stack([item.q[:, 0], np.full(len(item), 0.3)], 1) if follows else item.q
+        columns = [item.t, *q.T, *item.u.T]
+        rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True)]
+        (tmp_path / "run.csv").write_text("\n".join(["t,q1,q2,u1,u2", *rows]))
+        return LogSource(
+            name="arm",
+            root=str(tmp_path),
+            files="run.csv",
+            time=dict(columns="t", unit="s"),
+            q=dict(columns=["q1", "q2"], unit="rad"),
+            u=dict(columns=["u1", "u2"], unit="Nm"),
+            validation=dict(seconds=1.0, piece=1.0),
+            test=dict(seconds=2.0, piece=1.0),
+        )
+
+    return of
+
+
+def test_the_check_of_a_log_says_which_joint_is_not_excited(source):
+    found = check_log(source(follows=True), structure=RigidChain(TWO_RODS))
+    assert "elbow" in found.rigid.open_joints
+    assert "dry friction of elbow" in str(found)
+    assert any("do not determine constants of" in text for text in found.warnings)
+
+
+def test_the_check_of_a_log_has_the_number_of_base_parameters(source):
+    found = check_log(source(follows=False), structure=RigidChain(TWO_RODS))
+    # Six of the bodies, the elbow's armature, three frictions and offsets for each joint.
+    (name,) = (text for text in found.figures if "rigid-body regressor" in text)
+    assert "(13 base parameters" in name
+    assert 1 < found.figures[name] < 100
+    assert "rigid-body constants not determined: none" in str(found)
+    assert check_log(source(follows=False)).rigid is None
