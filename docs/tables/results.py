@@ -90,7 +90,7 @@ def _effort(data: pd.DataFrame, steps: int = 1) -> str:
     return f"{int(data['pairs'].iloc[0]) * steps:,}, {number(minutes)} min"
 
 
-_PANDA_STEPS = {"known": 20, "known_and_network": 10}
+_PANDA_STEPS = {"identification": 20, "known": 20, "known_and_network": 10}
 """Pairs in a training window, where it is not one."""
 
 
