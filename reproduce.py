@@ -12,7 +12,6 @@ refused, with the keys that differ. An entry that fails does not stop the others
 from __future__ import annotations
 
 import argparse
-import difflib
 import re
 import shlex
 import subprocess
@@ -28,6 +27,7 @@ from pinn_dyn.app.keys import Positive, Section
 from pinn_dyn.app.run_folder import METRICS
 from pinn_dyn.app.schema import ConfigError, check_value
 from pinn_dyn.app.trust import read_yaml
+from pinn_dyn.spelling import did_you_mean
 
 ROOT = Path(__file__).resolve().parent
 ENTRIES = ROOT / "results" / "reproduction.yaml"
@@ -265,8 +265,7 @@ def comparison(entries: dict[str, Entry], names: list[str], folder: Path) -> str
 def chosen(entries: dict[str, Entry], only: list[str] | None) -> list[str]:
     """The entries to run, those that others need first."""
     if unknown := set(only or []) - set(entries):
-        close = difflib.get_close_matches(min(unknown), entries)
-        hint = f": did you mean {' or '.join(close)}?" if close else "; --list shows them"
+        hint = did_you_mean(min(unknown), entries) or "; --list shows them"
         raise SystemExit(f"no entry {', '.join(sorted(unknown))}{hint}")
     wanted = only or [name for name, entry in entries.items() if "missing" not in entry]
     if lacking := [name for name in wanted if "missing" in entries[name]]:

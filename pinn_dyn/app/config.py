@@ -14,9 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.keys import GIVEN, KEYS
-from pinn_dyn.app.schema import ConfigError, check, did_you_mean, short_form
+from pinn_dyn.app.schema import ConfigError, check, short_form
 from pinn_dyn.app.schema import arguments as arguments_of
 from pinn_dyn.app.words import OVERRIDE, check_words, chooses, parsed, refused, said
+from pinn_dyn.spelling import did_you_mean
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"

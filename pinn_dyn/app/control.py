@@ -14,18 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pinn_dyn.app.build import (
-    build_actuator,
-    build_initial_states,
-    build_law,
-    build_plant,
-    build_reference,
-    build_robot,
-    build_sensor,
-    build_source,
-)
+from pinn_dyn.app.build import build_law, build_reference, build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.control_results import write_results, write_stability
+from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
 from pinn_dyn.app.run_folder import load_run, write_config, write_json
 from pinn_dyn.app.trust import packages
@@ -98,7 +90,7 @@ def control(cfg: DictConfig) -> float:
     if source.system is None:
         return _report_without_truth(learned, source, folder, origin)
 
-    robot = build_robot(run.config["dataset"], config["robot"])
+    robot = build_part("robot", {**run.config["dataset"]["system"], **config["robot"]})
     reference = build_reference(config, robot)
     q0, v0 = _initial_states(config, reference)
     for key, size in (("reference", reference(0.0).q.shape[-1]), ("initial_states", q0.shape[-1])):
@@ -184,7 +176,8 @@ def _initial_states(config: dict[str, Any], reference: Reference) -> tuple[Tenso
         return start.q.double().reshape(shape), start.v.double().reshape(shape)
     # Another stream than the one that set points are drawn from, with the same seed.
     rng = np.random.default_rng([config["seed"], 1])
-    q0, v0 = build_initial_states(config).draw(config["runs"], rng)
+    box = build_part("initial_states", config["initial_states"])
+    q0, v0 = box.draw(config["runs"], rng)
     return torch.from_numpy(q0), torch.from_numpy(v0)
 
 
@@ -281,9 +274,9 @@ def _close_loop(
     config: dict[str, Any],
 ) -> ClosedLoopRecord:
     """One controller on the robot, in continuous time or at a rate."""
-    actuator, sensor = build_actuator(config), build_sensor(config)
+    actuator = build_part("actuator", config["actuator"])
+    sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     progress = f"closing the loop: {name}"
-    law.reset()
     with _errors_of(f"controllers.{name}"):
         if config["rate"] is None:
             if config["delay"] or np.any(sensor.q_noise) or np.any(sensor.v_noise):
@@ -303,7 +296,7 @@ def _close_loop(
                 progress=progress,
             )
         return close_loop(
-            build_plant(config, robot),
+            build_part("plant", config["plant"], robot),
             law,
             reference,
             q0,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import glob
 import logging
 import math
@@ -18,6 +17,7 @@ from pinn_dyn.app.run_folder import CHECKPOINTS, CONFIG, METRICS, read_metrics
 from pinn_dyn.app.sweep import ERROR, first_line
 from pinn_dyn.app.trust import read_yaml
 from pinn_dyn.evaluation.sweep_table import Cell, flatten
+from pinn_dyn.spelling import did_you_mean
 
 MANY_FOLDERS = 2_000
 MOST_FOLDERS = 50_000
@@ -159,8 +159,7 @@ def filter_jobs(jobs: list[Job], conditions: dict[str, Any]) -> list[Job]:
     known = sorted({key for job in jobs for key in job.config})
     for key, value in conditions.items():
         if key not in known:
-            close = difflib.get_close_matches(key, known, n=3)
-            hint = f", did you mean {' or '.join(close)}?" if close else ""
+            hint = did_you_mean(key, known)
             raise ConfigError(f"filter: the runs have no key '{key}'{hint}")
         values = value if isinstance(value, list) else [value]
         if any(isinstance(one, (dict, list)) for one in values):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import collections.abc
 import dataclasses
-import difflib
 import importlib
 import inspect
 import itertools
@@ -30,6 +29,7 @@ from pinn_dyn.app.keys import (
     Range,
     Section,
 )
+from pinn_dyn.spelling import did_you_mean
 
 
 class ConfigError(ValueError):
@@ -46,9 +46,7 @@ def check(command: str, config: Mapping[str, Any]) -> None:
     # Sections last: they take up values of others, as reference.seed=${seed}.
     for key, value in sorted(config.items(), key=lambda item: isinstance(item[1], Mapping)):
         if key not in known:
-            raise ConfigError(
-                f"the configuration has no key {key!r}{did_you_mean(key, list(known))}"
-            )
+            raise ConfigError(f"the configuration has no key {key!r}{did_you_mean(key, known)}")
         check_value(key, value, known[key])
     for key, hint in known.items():
         # Trainings of earlier versions were of single models.
@@ -90,12 +88,6 @@ def _layers(path: str, part: Any) -> Iterator[tuple[str, list[int]]]:
             yield from _layers(f"{path}.{key}", value)
 
 
-def did_you_mean(key: str, known: Sequence[str]) -> str:
-    """The known keys that are like another one, as the end of a sentence."""
-    close = difflib.get_close_matches(key, known, n=3, cutoff=0.6)
-    return f": did you mean {' or '.join(close)}?" if close else ""
-
-
 def check_value(path: str, value: Any, hint: Any) -> None:
     """Refuse a value that is not what an annotation says, and so every part in it.
 
@@ -135,8 +127,7 @@ def _check_section(path: str, value: Mapping[str, Any], section: Any) -> None:
     for key in value:
         if key not in hints:
             raise ConfigError(
-                f"{path} takes no {key!r}{did_you_mean(key, list(hints))}; expected "
-                f"{', '.join(hints)}"
+                f"{path} takes no {key!r}{did_you_mean(key, hints)}; expected {', '.join(hints)}"
             )
     for field in dataclasses.fields(section):
         if field.name in value:
@@ -161,7 +152,7 @@ def _check_part(path: str, part: Mapping[str, Any], hint: Any) -> None:
             if known.get("**") is not None:
                 continue
             raise ConfigError(
-                f"{path}: {name} takes no {key!r}{did_you_mean(key, list(known))}; if an "
+                f"{path}: {name} takes no {key!r}{did_you_mean(key, known)}; if an "
                 f"experiment has it for another class, remove it by '~{path}.{key}'"
             )
         check_value(f"{path}.{key}", value, known[key])

@@ -21,7 +21,6 @@ from pinn_dyn.app.build import (
     build_data,
     build_learner,
     build_predictor,
-    build_search,
     build_trainer,
     build_validator,
     check_processes,
@@ -32,6 +31,7 @@ from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.data_record import check_data, write_data
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.known_data import check_known
+from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -95,7 +95,7 @@ def train(cfg: DictConfig) -> float:
         if "name" in config["dataset"]:
             check_name("dataset.name", config["dataset"]["name"])
         if config.get("search"):
-            config = build_search(config["search"]).applied(config)
+            config = build_part("search", config["search"]).applied(config)
         if config.get("resume_from"):
             raise ConfigError("resume_from says from which checkpoint: give resume=<run> with it")
         trust = packages(config.get("trust"))

@@ -13,7 +13,8 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.keys import KEYS
-from pinn_dyn.app.schema import ConfigError, did_you_mean
+from pinn_dyn.app.schema import ConfigError
+from pinn_dyn.spelling import did_you_mean
 
 OVERRIDE = re.compile(r"~|[^-=].*=", re.DOTALL)
 _RAISED = re.compile(r"\w+ raised while resolving interpolation: ")
@@ -149,7 +150,9 @@ def no_option(folder: Path, error: MissingConfigException) -> str:
     if not group or not options:
         return str(error).splitlines()[0]
     builds = [one for one in options if choice and choice.lower() in _class(folder / group, one)]
-    meant = f": did you mean {' or '.join(builds)}?" if builds else did_you_mean(choice, options)
+    meant = did_you_mean(choice, options)
+    if builds:
+        meant = f": did you mean {' or '.join(builds)}?"
     return (
         f"'{error.missing_cfg_file}' does not exist{meant or '.'} Options of {group}: "
         f"{', '.join(options)}"

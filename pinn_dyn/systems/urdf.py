@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import math
 import xml.etree.ElementTree as ET
@@ -12,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.systems.urdf_checks import end_of, number, parse_urdf
 
 Inertia = Literal["file", "collision"]
@@ -134,8 +134,7 @@ def find_urdf(urdf: str, folder: Path) -> Path:
             return path.resolve()
     near = [str(path) for path in given.parent.glob("*.urdf")]
     near += [str(path.relative_to(folder)) for path in folder.rglob("*.urdf")]
-    guesses = difflib.get_close_matches(urdf, near, n=3, cutoff=0.5)
-    hint = f"; did you mean {' or '.join(guesses)}?" if guesses else "; give the path of a URDF"
+    hint = did_you_mean(urdf, near) or ": give the path of a URDF"
     raise FileNotFoundError(
         f"URDF {urdf!r} not found, neither from {Path.cwd()} nor in {folder}{hint}"
     )

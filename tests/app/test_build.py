@@ -48,12 +48,6 @@ def test_true_without_a_compiler_says_what_to_install(compiler):
         build.compiles(config(True))
 
 
-@pytest.mark.parametrize("choice", ["yes", 1, None])
-def test_another_choice_is_refused(compiler, choice):
-    with pytest.raises(ConfigError, match="expected true, false or auto"):
-        build.compiles(config(choice))
-
-
 @pytest.mark.parametrize("nested", [False, True])
 def test_an_option_of_another_class_says_how_to_remove_it(nested):
     config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "scales": None}

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 import yaml
 
-from pinn_dyn.app.build import build_search
 from pinn_dyn.app.config import composed
 from pinn_dyn.app.gather import best_draws
 from pinn_dyn.app.jobs import Job
+from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.schema import ConfigError
 from pinn_dyn.app.search import EqualSearch
 from tests.app.entry import NO_FIGURES, TINY, run_script
@@ -34,7 +34,7 @@ def drawn(experiment, draw, *words):
         ["search=equal", f"search.draw={draw}", f"experiment={experiment}", "model_name=x", *words],
     )
     before = {**config, "search": {"draw": draw}}
-    return before, build_search(config["search"]).applied(config)
+    return before, build_part("search", config["search"]).applied(config)
 
 
 def values(part, key):

@@ -265,8 +265,8 @@ def test_rates_of_the_inputs_arrive_named_and_drawn(folder):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (dict(q=dict(columns=["q1"], unit="degree")), r"q: unit is 'degree': did you mean 'deg'.*"),
-        (dict(q=dict(columns=["q1"], units="rad")), r"'units'.*did you mean 'unit'"),
+        (dict(q=dict(columns=["q1"], unit="degree")), r"q: unit is 'degree': did you mean deg.*"),
+        (dict(q=dict(columns=["q1"], units="rad")), r"'units'.*did you mean unit"),
         (dict(q=dict(columns=["q1"])), r"q.unit is missing"),
         (dict(q=dict(columns=["q1", "q1"], unit="rad")), r"q1 twice"),
         (dict(q=dict(columns=["q1", "q2"], unit="rad", sign=[1])), r"sign has 1 entries"),
@@ -276,7 +276,7 @@ def test_rates_of_the_inputs_arrive_named_and_drawn(folder):
         (dict(test=dict(piece=1.0)), r"test: runs is None and seconds is None"),
         (dict(test=dict(seconds=1.0, runs=1, piece=1.0)), r"expected one of them"),
         (dict(test=dict(seconds=1.0, piece=2.0)), r"piece is 2.0 s.*at most seconds"),
-        (dict(test=dict(run=1, piece=2.0)), r"'run'.*did you mean 'runs'"),
+        (dict(test=dict(run=1, piece=2.0)), r"'run'.*did you mean runs"),
         (dict(labels=["a"]), r"labels has 1 entries, expected 2"),
         (dict(guard=-1.0), r"guard is -1.0"),
     ],

@@ -7,8 +7,8 @@ An array with as many rows as the time is a column; one with several columns is 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from scipy.io import loadmat
 from pinn_dyn.data.logs.bags import optional
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes
 from pinn_dyn.data.logs.mat_elements import check_elements
+from pinn_dyn.spelling import did_you_mean
 
 _DEEPEST = 30
 _KINDS = {
@@ -29,14 +30,96 @@ _KINDS = {
 }
 
 
+@dataclass(frozen=True)
+class _Found:
+    """The arrays of a file by their names, and why others are none."""
+
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    unusable: dict[str, str] = field(default_factory=dict)
+
+    def add_member(self, file: Any, name: str) -> None:
+        """An array of an NPZ file, or why it is none."""
+        entry = file.zip.getinfo(name if name in file.zip.namelist() else f"{name}.npy")
+        if entry.file_size > most_bytes(entry.compress_size):
+            large = f"has {entry.file_size} bytes in {entry.compress_size} compressed ones"
+            self.unusable[name] = large
+            return
+        try:
+            value = file[name]
+        except MemoryError:
+            self.unusable[name] = "claims to be larger than the memory"
+        except Exception:  # a damaged header raises nearly anything
+            self.unusable[name] = "is damaged or holds Python objects, which are never unpickled"
+        else:
+            if isinstance(value, np.ndarray):
+                self.add(name, value)
+            else:
+                self.unusable[name] = "is no array"
+
+    def flatten(self, name: str, value: Any) -> None:
+        """Matrices of a variable and of the fields of its structs, as ``log.q``; else why not."""
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                self.flatten(f"{name}.{key}", inner)
+            return
+        value = np.asarray(value, dtype=None if not isinstance(value, list) else object)
+        if value.dtype.names:
+            several = f"is a field of an array of {value.size} structs"
+            for key in value.dtype.names:
+                if value.size == 1:
+                    self.flatten(f"{name}.{key}", value.flat[0][key])
+                else:
+                    self.unusable[f"{name}.{key}"] = several
+        else:
+            self.add(name, value)
+
+    def add(self, name: str, value: np.ndarray) -> None:
+        """A real vector or matrix; else why it is none."""
+        if value.dtype.kind not in "fiub":
+            self.unusable[name] = _KINDS.get(value.dtype.kind, f"has the type {value.dtype}")
+        elif value.ndim not in (1, 2):
+            self.unusable[name] = f"has {value.ndim} dimensions"
+        else:
+            self.arrays[name] = value if value.ndim == 2 else value[:, None]
+
+    def table(self, path: Path, time: str) -> pd.DataFrame:
+        """The arrays that have as many rows as the time."""
+        arrays, unusable = self.arrays, self.unusable
+        if time in unusable:
+            said = f"{path}, variable {time!r} (time): {unusable[time]}"
+            raise LogError(f"{said}, expected real numbers")
+        if time not in arrays:
+            names = listed(f"{name} {value.shape}" for name, value in arrays.items())
+            hint = did_you_mean(time, arrays) or "."
+            raise LogError(f"{path}: no variable {time!r} for the time{hint} The file has {names}")
+        samples = arrays[time].size
+        columns: dict[str, np.ndarray] = {}
+        for name, value in arrays.items():
+            rows = value if value.shape[0] == samples else value.T
+            if rows.shape[0] != samples:  # parameters and the like
+                size = " by ".join(map(str, value.shape))
+                unusable[name] = f"is {size}, and the time has {samples} samples"
+                continue
+            single = rows.shape[1] == 1
+            for k in range(rows.shape[1]):
+                column = name if single else f"{name}_{k + 1}"
+                if column in columns:
+                    unusable[column] = "is a column of a matrix and a variable of its own"
+                columns[column] = rows[:, k]
+        for column in unusable.keys() & columns.keys():
+            del columns[column]
+        table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+        table.attrs["unusable"] = unusable
+        return table
+
+
 def read_mat(path: Path, time: str) -> pd.DataFrame:
     """The variables of a MATLAB file, of version 7.3 too.
 
     Raises:
         LogError: if it cannot be read, or has no such time.
     """
-    arrays: dict[str, np.ndarray] = {}
-    unusable: dict[str, str] = {}
+    found = _Found()
     try:
         check_elements(path)
         content = loadmat(path, squeeze_me=False, struct_as_record=True)
@@ -46,8 +129,8 @@ def read_mat(path: Path, time: str) -> pd.DataFrame:
         raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
     for name, value in content.items():
         if not name.startswith("__"):
-            _flatten(name, value, arrays, unusable)
-    return _table(path, time, arrays, unusable)
+            found.flatten(name, value)
+    return found.table(path, time)
 
 
 def _read_mat73(path: Path) -> Mapping[str, Any]:
@@ -66,24 +149,23 @@ def read_hdf5(path: Path, time: str) -> pd.DataFrame:
         LogError: if it cannot be read, or has no such time.
     """
     h5py = optional("h5py", path)
-    arrays: dict[str, np.ndarray] = {}
-    unusable: dict[str, str] = {}
+    found = _Found()
 
     def visit(name: str, item: Any) -> str | None:
         if name.count("/") > _DEEPEST:
             return name
         if isinstance(item, h5py.Group):
-            unusable[name] = f"is a group that holds {listed(item) or 'nothing'}"
+            found.unusable[name] = f"is a group that holds {listed(item) or 'nothing'}"
         elif not isinstance(item, h5py.Dataset):
-            unusable[name] = "is a description of a type"
+            found.unusable[name] = "is a description of a type"
         elif item.external:
-            unusable[name] = "lies in another file, which is not opened"
+            found.unusable[name] = "lies in another file, which is not opened"
         elif item.nbytes > most_bytes(item.id.get_storage_size()):
-            unusable[name] = f"claims {item.nbytes} bytes, far more than the file has of it"
+            found.unusable[name] = f"claims {item.nbytes} bytes, far more than the file has of it"
         elif item.dtype.names or item.dtype.kind not in "fiub":
-            unusable[name] = f"has the type {item.dtype}"
+            found.unusable[name] = f"has the type {item.dtype}"
         else:
-            _add(name, np.asarray(item[()]), arrays, unusable)
+            found.add(name, np.asarray(item[()]))
         return None
 
     try:
@@ -93,7 +175,7 @@ def read_hdf5(path: Path, time: str) -> pd.DataFrame:
         raise LogError(f"{path}: cannot be read as HDF5, it may be cut short: {error}") from error
     if deep is not None:
         raise LogError(f"{path}: has groups more than {_DEEPEST} levels deep, expected a log")
-    return _table(path, time, arrays, unusable)
+    return found.table(path, time)
 
 
 def read_npz(path: Path, time: str) -> pd.DataFrame:
@@ -102,94 +184,11 @@ def read_npz(path: Path, time: str) -> pd.DataFrame:
     Raises:
         LogError: if it cannot be read, or has no such time.
     """
-    arrays: dict[str, np.ndarray] = {}
-    unusable: dict[str, str] = {}
+    found = _Found()
     try:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
-                _add_member(file, name, arrays, unusable)
+                found.add_member(file, name)
     except Exception as error:  # a damaged file raises nearly anything
         raise LogError(f"{path}: cannot be read as NPZ, it may be cut short: {error}") from error
-    return _table(path, time, arrays, unusable)
-
-
-def _add_member(
-    file: Any, name: str, arrays: dict[str, np.ndarray], unusable: dict[str, str]
-) -> None:
-    """An array of an NPZ file, or why it is none."""
-    entry = file.zip.getinfo(name if name in file.zip.namelist() else f"{name}.npy")
-    if entry.file_size > most_bytes(entry.compress_size):
-        unusable[name] = f"has {entry.file_size} bytes in {entry.compress_size} compressed ones"
-        return
-    try:
-        value = file[name]
-    except MemoryError:
-        unusable[name] = "claims to be larger than the memory"
-    except Exception:  # a damaged header raises nearly anything
-        unusable[name] = "is damaged or holds Python objects, which are never unpickled"
-    else:
-        if isinstance(value, np.ndarray):
-            _add(name, value, arrays, unusable)
-        else:
-            unusable[name] = "is no array"
-
-
-def _flatten(
-    name: str, value: Any, arrays: dict[str, np.ndarray], unusable: dict[str, str]
-) -> None:
-    """Real matrices of a variable and of the fields of its structs, as ``log.q``; else why not."""
-    if isinstance(value, Mapping):
-        for field, inner in value.items():
-            _flatten(f"{name}.{field}", inner, arrays, unusable)
-        return
-    value = np.asarray(value, dtype=None if not isinstance(value, list) else object)
-    if value.dtype.names:
-        for field in value.dtype.names:
-            if value.size == 1:
-                _flatten(f"{name}.{field}", value.flat[0][field], arrays, unusable)
-            else:
-                unusable[f"{name}.{field}"] = f"is a field of an array of {value.size} structs"
-    else:
-        _add(name, value, arrays, unusable)
-
-
-def _add(
-    name: str, value: np.ndarray, arrays: dict[str, np.ndarray], unusable: dict[str, str]
-) -> None:
-    if value.dtype.kind not in "fiub":
-        unusable[name] = _KINDS.get(value.dtype.kind, f"has the type {value.dtype}")
-    elif value.ndim not in (1, 2):
-        unusable[name] = f"has {value.ndim} dimensions"
-    else:
-        arrays[name] = value if value.ndim == 2 else value[:, None]
-
-
-def _table(
-    path: Path, time: str, arrays: dict[str, np.ndarray], unusable: dict[str, str]
-) -> pd.DataFrame:
-    if time in unusable:
-        raise LogError(f"{path}, variable {time!r} (time): {unusable[time]}, expected real numbers")
-    if time not in arrays:
-        names = listed(f"{name} {value.shape}" for name, value in arrays.items())
-        close = difflib.get_close_matches(time, arrays, n=1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
-        raise LogError(f"{path}: no variable {time!r} for the time: {hint}the file has {names}")
-    samples = arrays[time].size
-    columns: dict[str, np.ndarray] = {}
-    for name, value in arrays.items():
-        rows = value if value.shape[0] == samples else value.T
-        if rows.shape[0] != samples:  # parameters and the like
-            unusable[name] = f"is {' by '.join(map(str, value.shape))}, and the time has {samples}"
-            unusable[name] += " samples"
-            continue
-        single = rows.shape[1] == 1
-        for k in range(rows.shape[1]):
-            column = name if single else f"{name}_{k + 1}"
-            if column in columns:
-                unusable[column] = "is a column of a matrix and a variable of its own"
-            columns[column] = rows[:, k]
-    for column in unusable.keys() & columns.keys():
-        del columns[column]
-    table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
-    table.attrs["unusable"] = unusable
-    return table
+    return found.table(path, time)

@@ -2,19 +2,60 @@
 
 from __future__ import annotations
 
-import difflib
+import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.units import to_si
+from pinn_dyn.spelling import did_you_mean
 
-_KEYS = ("columns", "unit", "sign", "scale", "offset")
+_Described = TypeVar("_Described", bound="ShortForm")
 
 
-class Columns:
+class ShortForm:
+    """What a config describes by a mapping of its arguments, without a ``_target_``.
+
+    Attributes:
+        form: an example of such a mapping.
+        needed: keys that it must have.
+    """
+
+    form: ClassVar[str]
+    needed: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def from_config(cls: type[_Described], name: str, given: Any) -> _Described:
+        """An object, as it is or from its short form.
+
+        Args:
+            name: where it is given.
+            given: the object or the mapping.
+
+        Raises:
+            LogError: naming the key that is missing or misspelt, or with what the class said.
+        """
+        if isinstance(given, cls):
+            return given
+        if not isinstance(given, Mapping):
+            raise LogError(f"{name} is {given!r}, expected {cls.form}")
+        keys = list(inspect.signature(cls).parameters)
+        for key in given:
+            if key not in keys:
+                hint = did_you_mean(key, keys)
+                raise LogError(f"{name} has the key {key!r}, expected {', '.join(keys)}{hint}")
+        for key in cls.needed:
+            if given.get(key) is None:
+                raise LogError(f"{name}.{key} is missing: expected {cls.form}")
+        try:
+            return cls(**given)
+        except LogError as error:
+            raise LogError(f"{name}: {error}") from error
+
+
+class Columns(ShortForm):
     """The columns of one signal.
 
         x = sign * scale * factor(unit) * (raw - offset)
@@ -31,6 +72,9 @@ class Columns:
     Raises:
         LogError: on an empty or repeated column, an unknown unit, or lengths that differ.
     """
+
+    form = "{columns: [...], unit: ...}"
+    needed = ("columns", "unit")
 
     def __init__(
         self,
@@ -60,30 +104,6 @@ class Columns:
         self.offsets = self._numbers("offset", offset)
         if not np.isfinite(self.offsets).all():
             raise LogError(f"offset is {offset}, expected finite numbers")
-
-    @classmethod
-    def from_config(cls, name: str, given: Columns | Mapping[str, Any]) -> Columns:
-        """Columns from the short form of a config, ``{columns: [q1, q2], unit: rad}``.
-
-        Raises:
-            LogError: naming the signal and the key that is missing or misspelt.
-        """
-        if isinstance(given, Columns):
-            return given
-        if not isinstance(given, Mapping):
-            raise LogError(f"{name} is {given!r}, expected {{columns: [...], unit: ...}}")
-        for key in given:
-            if key not in _KEYS:
-                close = difflib.get_close_matches(str(key), _KEYS, n=1)
-                hint = f": did you mean {close[0]!r}?" if close else ""
-                raise LogError(f"{name} has the key {key!r}, expected {', '.join(_KEYS)}{hint}")
-        for key in ("columns", "unit"):
-            if given.get(key) is None:
-                raise LogError(f"{name}.{key} is missing: expected {{columns: [...], unit: ...}}")
-        try:
-            return cls(**given)
-        except LogError as error:
-            raise LogError(f"{name}: {error}") from error
 
     @property
     def labels(self) -> list[str]:

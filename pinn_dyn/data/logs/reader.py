@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import gzip
 import io
 import re
@@ -20,6 +19,7 @@ from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
 from pinn_dyn.data.logs.bags import BAG_SUFFIXES, is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes, shown
 from pinn_dyn.data.logs.parquet import read_parquet
+from pinn_dyn.spelling import did_you_mean
 
 # A run of a table: its name, and which rows are its own.
 Group = tuple[str, slice | np.ndarray]
@@ -189,11 +189,10 @@ def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series
             )
     if not places:
         names = [str(known) for known in table.columns]
-        close = difflib.get_close_matches(name, names, n=1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
+        hint = did_you_mean(name, names) or "."
         raise LogError(
-            f"{path}: no column {name!r}, which {signal} asks for: {hint}"
-            f"the file has {listed(names)}"
+            f"{path}: no column {name!r}, which {signal} asks for{hint} "
+            f"The file has {listed(names)}"
         )
     return table[name]
 

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.columns import ShortForm
+from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.source import SPLITS
+from pinn_dyn.spelling import did_you_mean
 
-_KEYS = ("runs", "seconds", "blocks", "piece")
 WHOLE: Literal["whole"] = "whole"
 """As a piece: one roll-out of each stretch, as long as it is."""
 
 
-class Part:
+class Part(ShortForm):
     """What is kept from training: whole runs, or seconds at the end of the others or along them.
 
     Args:
@@ -31,6 +31,9 @@ class Part:
     Raises:
         LogError: unless just one of ``runs`` and ``seconds`` is given, and all are above 0.
     """
+
+    form = "{runs: ... or seconds: ..., piece: ...}"
+    needed = ("piece",)
 
     def __init__(
         self,
@@ -63,29 +66,6 @@ class Part:
         elif not piece > 0 or (seconds is not None and piece > seconds):
             raise LogError(f"piece is {piece} s, expected more than 0 and at most seconds")
 
-    @classmethod
-    def from_config(cls, name: str, given: Part | Mapping[str, Any]) -> Part:
-        """A part from the short form of a config, ``{runs: 2, piece: 5.0}``.
-
-        Raises:
-            LogError: naming the part and the key that is missing or misspelt.
-        """
-        if isinstance(given, Part):
-            return given
-        if not isinstance(given, Mapping) or given.get("piece") is None:
-            raise LogError(
-                f"{name} is {given!r}, expected {{runs: ... or seconds: ..., piece: ...}}"
-            )
-        for key in given:
-            if key not in _KEYS:
-                close = difflib.get_close_matches(str(key), _KEYS, n=1)
-                hint = f": did you mean {close[0]!r}?" if close else ""
-                raise LogError(f"{name} has the key {key!r}, expected {', '.join(_KEYS)}{hint}")
-        try:
-            return cls(**given)
-        except LogError as error:
-            raise LogError(f"{name}: {error}") from error
-
 
 def split(
     recordings: list[Recording], validation: Part, test: Part, *, guard: float, seed: int
@@ -104,13 +84,9 @@ def split(
     for name, part in (("validation", validation), ("test", test)):
         for run in part.names or []:
             if run not in by_name:
-                close = difflib.get_close_matches(run, by_name, n=1)
-                hint = f"did you mean {close[0]!r}? " if close else ""
-                known = [*by_name][:20]
-                more = " ..." if len(by_name) > 20 else ""
+                hint = did_you_mean(run, by_name) or "."
                 raise LogError(
-                    f"{name}.runs: there is no run {run!r}: {hint}"
-                    f"the runs are {', '.join(known)}{more}"
+                    f"{name}.runs: there is no run {run!r}{hint} The runs are {listed(by_name)}"
                 )
             if run in taken:
                 raise LogError(f"run {run!r} is in {taken[run]} and in {name}, expected in one")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 
 from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.spelling import did_you_mean
 
 _DEGREE = math.pi / 180
 
@@ -59,7 +59,6 @@ def to_si(unit: str) -> tuple[str, float]:
         LogError: on an unknown unit; lists those that are known.
     """
     if unit not in UNITS:
-        close = difflib.get_close_matches(str(unit), UNITS, n=1)
-        hint = f"did you mean {close[0]!r}? " if close else ""
-        raise LogError(f"unit is {unit!r}: {hint}known units are {', '.join(UNITS)}")
+        hint = did_you_mean(unit, UNITS) or "."
+        raise LogError(f"unit is {unit!r}{hint} Known units are {', '.join(UNITS)}")
     return UNITS[unit]
