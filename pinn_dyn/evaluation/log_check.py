@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+import torch
 
 from pinn_dyn.data.logs import (
     Cleaned,
@@ -124,7 +126,8 @@ def check_log(
         for item in part.clean
     ]
     test = splits.test
-    delays, common = agreed_delays(training, longest=longest_delay)
+    rigid = None if structure is None else functools.partial(_regressor, structure)
+    delays, common = agreed_delays(training, longest=longest_delay, rigid=rigid)
     step = float(np.median(np.diff(training[0].t)))
     coordinates, condition = _coordinates(source, training, test, step)
     repeats = _add_repeats(coordinates, source, training)
@@ -270,6 +273,11 @@ def _coordinates(
         }
     )
     return frame, float(np.linalg.cond(scaled))
+
+
+def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
+    """Y ``(R, N, 10 N)`` of the bodies at q, v, a ``(R, N)``."""
+    return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
 
 def _excitation(

@@ -7,7 +7,7 @@ import pytest
 
 from pinn_dyn.data.logs import InputDelay, agreed_delays, input_delays
 from pinn_dyn.data.logs import delay as finding
-from tests.support.delayed_robots import log
+from tests.support.delayed_robots import log, seven_regressor
 
 
 @pytest.mark.parametrize("kind", ["pendulum", "arm", "tendons"])
@@ -15,6 +15,22 @@ from tests.support.delayed_robots import log
 def test_a_known_delay_is_found_within_a_sample(kind, seed, delay):
     for curve in input_delays([log(kind, seed, delay)]):
         assert curve.delay == pytest.approx(delay, abs=0.01), str(curve)
+
+
+@pytest.mark.parametrize(("seed", "delay"), [(0, 0.0), (1, 0.043), (2, 0.1)])
+def test_seven_joints_whose_kinematics_are_known(seed, delay):
+    curves = input_delays([log("seven joints", seed, delay)], rigid=seven_regressor)
+    for curve in curves:
+        assert curve.delay == pytest.approx(delay, abs=0.01), str(curve)
+    assert sum(curve.form == "rigid bodies" for curve in curves) >= 5
+
+
+@pytest.mark.parametrize("seconds", [12.0, 30.0])
+def test_seven_joints_alone_get_no_wrong_answer(seconds):
+    """30 s are too few for the terms of seven joints: a smooth rest has its minimum anywhere."""
+    for seed in (100, 101, 102):
+        for curve in input_delays([log("seven joints", seed, 0.05, seconds=seconds)]):
+            assert curve.delay is None or curve.delay == pytest.approx(0.05, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", ["pendulum", "arm", "tendons"])

@@ -1,11 +1,14 @@
 """Robots that are driven by an input that acts late, with noise in what is measured."""
 
+import functools
+
 import numpy as np
+import torch
 from scipy.integrate import solve_ivp
 
 from pinn_dyn.data.logs import Recording
-
-SECONDS = 12.0
+from pinn_dyn.systems import RigidChain
+from tests.support.rigid_chains import joint, link, robot
 
 
 def pendulum(q, v, u):
@@ -27,6 +30,32 @@ def arm_torque(q, v, a):
     return np.stack([first, second], axis=1) + 0.3 * v + 0.2 * np.tanh(20 * v)
 
 
+@functools.cache
+def seven_joints():
+    """Seven links of 0.25 m that turn about z and y in turn, each lighter than the one before."""
+    parts = [link("base")]
+    for k in range(1, 8):
+        mass = 3.0 / k
+        moments = f"{0.01 * mass} 0 {0.011 * mass} 0 0 {0.004 * mass}"
+        place = {"xyz": "0 0 0.25", "rpy": "0 0 0", "axis": "0 0 1" if k % 2 else "0 1 0"}
+        parts.append(link(f"link{k}", mass, "0.02 0.01 0.12", moments))
+        parts.append(
+            joint(f"joint{k}", "revolute", f"link{k - 1}" if k > 1 else "base", f"link{k}", **place)
+        )
+    return RigidChain(robot(*parts))
+
+
+def seven_regressor(q, v, a):
+    """Y of the seven joints, ``(T, 7, 70)``."""
+    return seven_joints().regressor(*map(torch.from_numpy, (q, v, a))).numpy()
+
+
+def seven_torques(q, v, a):
+    """Torques of the seven joints, ``(T, 7)``, with friction."""
+    rigid = seven_joints().rigid_force(*map(torch.from_numpy, (q, v, a))).numpy()
+    return rigid + 0.5 * v + 0.3 * np.tanh(20 * v)
+
+
 def tendons(q, u):
     """Two bends that follow three motor angles with time constants of 0.15 and 0.2 s."""
     pull = np.array([[1.0, -0.5, -0.5], [0.0, 0.87, -0.87]]) @ u
@@ -45,18 +74,23 @@ def sines(rng, count, *, size, lowest=0.1, highest=2.0, number=6):
     return value
 
 
-def log(kind, seed, delay, *, rate=100.0, noise=1e-3, highest=2.0, number=6):
+ARMS = {"arm": (2, arm_torque), "seven joints": (7, seven_torques)}
+"""Number of joints, and the torques of a motion."""
+
+
+def log(kind, seed, delay, *, seconds=12.0, rate=100.0, noise=1e-3, highest=2.0, number=6):
     """A recording whose input acts ``delay`` s after it was logged.
 
-    The arm follows sines, and has the torques that they need; the others follow from their input.
+    An arm follows sines, and has the torques that they need; the others follow from their input.
     """
     rng = np.random.default_rng(seed)
-    t = np.arange(round(SECONDS * rate) + 1) / rate
+    t = np.arange(round(seconds * rate) + 1) / rate
     drawn = {"highest": highest, "lowest": min(0.1, highest), "number": number}
-    if kind == "arm":
-        motion = sines(rng, 2, size=0.5, **drawn)
+    if kind in ARMS:
+        size, torque = ARMS[kind]
+        motion = sines(rng, size, size=0.5, **drawn)
         q = motion(t)
-        u = arm_torque(*(motion(t + delay, order) for order in range(3)))
+        u = torque(*(motion(t + delay, order) for order in range(3)))
     else:
         signal = sines(rng, 1 if kind == "pendulum" else 3, size=1.0, **drawn)
         n = 1 if kind == "pendulum" else 2

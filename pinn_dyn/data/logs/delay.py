@@ -1,11 +1,13 @@
 """The delay between an input and the motion that it causes, found from the equation of motion.
 
 Correlating q with u measures the robot, whose own lag is in it. Here a candidate d is judged by
-what the equation of motion leaves unexplained. Three forms of it are tried:
+what the equation of motion leaves unexplained. Three forms of it are tried, four of a rigid robot:
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
     increments          v = f(q) + B(u(t - d)),         overdamped robots
     acceleration        a = f(q, v) + B(u(t - d))
+    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    where the kinematics give Y,
+                                                                      and the others no answer
 
 f and B are linear in their parameters (least squares). All signals are averaged by one Gaussian
 kernel g of width s, whose slopes give the derivatives: g * a = g'' * q. That keeps a linear
@@ -15,29 +17,32 @@ counts whose estimate is the steadiest when tenths of the data are left out in t
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
+from pinn_dyn.data.logs.delay_regression import (
+    BLOCKS,
+    Regressor,
+    Remainder,
+    Smoothed,
+    rigid_shares,
+    terms,
+)
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.step import sample_time
 
 _WIDTHS = (0.005, 0.01, 0.02, 0.04, 0.08)  # of the kernel, s
-_BLOCKS = 10
-_FEW = 3  # inputs, of which products are terms too
-_ROWS = 8_000  # of the regression, at most
-_CUT = 4.0  # the kernel ends at so many widths
 _CANDIDATES = 60  # at most: a parabola finds what is between them
 # The residual must fall to this share of its usual value, and the spread of the estimate stay below
 # this share of a sample, or of 10 ms.
-_DEPTH = 0.97
+_DEPTH = 0.9
 _SPREAD = 0.6
-_UNEXPLAINED = 0.5
+_UNEXPLAINED = 0.4
 _AS_WELL = 1.1  # times what delays of their own leave unexplained: a common one explains as well
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
+_RIGID = "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
 
 
@@ -73,7 +78,11 @@ class DelayCurve:
 
 
 def input_delays(
-    recordings: Sequence[Recording], *, longest: float = 0.3, common: bool = False
+    recordings: Sequence[Recording],
+    *,
+    longest: float = 0.3,
+    common: bool = False,
+    rigid: Regressor | None = None,
 ) -> list[DelayCurve]:
     """The delay of each input, or one for all, from uniformly sampled stretches.
 
@@ -81,6 +90,8 @@ def input_delays(
         recordings: stretches of one sample time, q and u in them.
         longest: longest delay that is tried, s.
         common: whether all inputs share one delay.
+        rigid: Y of a rigid robot with one input for each joint, where its kinematics are known.
+            Without it seven joints have more terms than minutes of data determine.
 
     Returns:
         A curve per input; the same one for all where ``common``.
@@ -95,18 +106,24 @@ def input_delays(
     widths = sorted({max(width, 1.5 * step) for width in _WIDTHS})
     forms: dict[str, list[list[DelayCurve]]] = {}
     for width in widths:
-        data = _Smoothed.of(recordings, step, width, lags)
+        data = Smoothed.of(recordings, step, width, lags)
         if data is not None:
-            for form, curves in _trials(data, lags * step, inputs, common).items():
+            for form, curves in _trials(data, lags * step, inputs, common, rigid).items():
                 forms.setdefault(form, []).append(curves)
     if not forms:
         short = "the stretches are too short"
         return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
-    best = [
-        [min((curves[i] for curves in trials), key=_rank) for i in range(inputs)]
-        for trials in forms.values()
-    ]
-    found = min(best, key=lambda curves: tuple(np.mean([_rank(c) for c in curves], axis=0)))
+    best = {
+        form: [min((curves[i] for curves in trials), key=_rank) for i in range(inputs)]
+        for form, trials in forms.items()
+    }
+    bodies = best.pop(_RIGID, None)
+    found = min(best.values(), key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
+    if bodies is not None:  # its friction is simpler than that of the others, so it comes last
+        found = [
+            of_bodies if of_bodies.delay is not None and _is_open(one) else one
+            for one, of_bodies in zip(found, bodies, strict=True)
+        ]
     lines = [_is_one_line([item.u[:, i] for item in recordings]) for i in range(inputs)]
     if all(lines) or (any(lines) and not common):
         reason = "the input is a single sine, whose delay looks like damping"
@@ -118,7 +135,7 @@ def input_delays(
 
 
 def agreed_delays(
-    recordings: Sequence[Recording], *, longest: float = 0.3
+    recordings: Sequence[Recording], *, longest: float = 0.3, rigid: Regressor | None = None
 ) -> tuple[list[DelayCurve], bool]:
     """The delay of each input; one for all where they have no good answers of their own.
 
@@ -133,14 +150,14 @@ def agreed_delays(
     Returns:
         A curve per input, and whether they are one.
     """
-    own = input_delays(recordings, longest=longest)
+    own = input_delays(recordings, longest=longest, rigid=rigid)
     found = [curve.delay for curve in own if curve.delay is not None]
     whole = len(found) == len(own)
     step = sample_time(recordings[0], "a delay")
     after = any(curve.reason == _AFTER for curve in own)
     if len(own) == 1 or not found or after or (whole and max(found) - min(found) <= step):
         return own, False
-    common = input_delays(recordings, longest=longest, common=True)
+    common = input_delays(recordings, longest=longest, common=True, rigid=rigid)
     left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (own, common))
     among = common[0].delay is not None and (
         min(found) - step <= common[0].delay <= max(found) + step
@@ -154,6 +171,11 @@ def _rank(curve: DelayCurve) -> tuple[bool, float]:
     return curve.delay is None, min(curve.spread, 1.0)
 
 
+def _is_open(curve: DelayCurve) -> bool:
+    """Whether there is no answer, not even that the input comes after the motion."""
+    return curve.delay is None and curve.reason != _AFTER
+
+
 def _is_one_line(signals: Sequence[np.ndarray]) -> bool:
     """Whether nearly all power of every stretch of a signal is in one line of its spectrum."""
     for x in signals:
@@ -164,71 +186,28 @@ def _is_one_line(signals: Sequence[np.ndarray]) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class _Smoothed:
-    """Averages of q, v, a at the rows of the regression, and of u at every lag before them.
-
-    Attributes:
-        q, v, a: ``(R, N)``.
-        u: of the inputs and of the products of them that ``powers`` names, ``(R, D, M)``.
-        powers: of each input in each of these products.
-        block: which tenth of the data a row is in, ``(R,)``.
-    """
-
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    u: np.ndarray
-    powers: list[tuple[int, ...]]
-    block: np.ndarray
-
-    @classmethod
-    def of(
-        cls, recordings: Sequence[Recording], step: float, width: float, lags: np.ndarray
-    ) -> _Smoothed | None:
-        edge = int(np.ceil(_CUT * width / step))
-        samples = width / step
-        first, end = edge + int(lags[-1]), edge - int(lags[0])
-        total = sum(max(len(item) - first - end, 0) for item in recordings)
-        # Averages a quarter of a width apart are all but the same.
-        stride = max(1, int(0.25 * samples), -(-total // _ROWS))
-        rows = [np.arange(first, len(item) - end, stride) for item in recordings]
-        kept = [(item, r) for item, r in zip(recordings, rows, strict=True) if len(r) > 1]
-        count = sum(len(r) for _, r in kept)
-        if count < 20 * _BLOCKS:
-            return None
-
-        def smooth(x: np.ndarray, order: int) -> np.ndarray:
-            return gaussian_filter1d(x, samples, axis=0, order=order, truncate=_CUT) / step**order
-
-        q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in kept]) for order in range(3))
-        powers = _powers(recordings[0].u.shape[1])
-        centre = np.concatenate([item.u for item in recordings])
-        mean, spread = centre.mean(axis=0), centre.std(axis=0).clip(min=1e-300)
-        u = np.concatenate(
-            [
-                smooth(_monomials((item.u - mean) / spread, powers), 0)[r[:, None] - lags]
-                for item, r in kept
-            ]
-        )
-        return cls(q, v, a, u, powers, np.arange(count) * _BLOCKS // count)
-
-
 def _trials(
-    data: _Smoothed, candidates: np.ndarray, inputs: int, common: bool
+    data: Smoothed,
+    candidates: np.ndarray,
+    inputs: int,
+    common: bool,
+    rigid: Regressor | None,
 ) -> dict[str, list[DelayCurve]]:
     """A curve per input for every form of the equation, at one width."""
     found = {}
+    torques = {}
     if inputs <= data.q.shape[1]:
-        known = _terms(data, inverse=True)
-        shares = _Remainder.of(known, data, data.a[:, :0]).of_targets()[..., :inputs]
+        known = terms(data, inverse=True)
+        torques["inverse dynamics"] = Remainder.of(known, data, data.a[:, :0]).of_targets()
+    if rigid is not None and inputs == data.q.shape[1]:
+        torques[_RIGID] = rigid_shares(data, rigid)
+    for form, shares in torques.items():
         if common:
-            shares = np.repeat(shares.mean(axis=-1, keepdims=True), inputs, axis=-1)
-        form = "inverse dynamics"
+            shares = np.repeat(shares[..., :inputs].mean(axis=-1, keepdims=True), inputs, axis=-1)
         found[form] = [_curve(candidates, shares[..., i], form) for i in range(inputs)]
     for form, target in (("increments", data.v), ("acceleration", data.a)):
-        known = _terms(data, inverse=False, first_order=form == "increments")
-        rest = _Remainder.of(known, data, target)
+        known = terms(data, inverse=False, first_order=form == "increments")
+        rest = Remainder.of(known, data, target)
         lag = np.zeros(data.u.shape[2], dtype=int)
         shares = rest.of_inputs(lag, range(len(lag)))
         curves = [_curve(candidates, shares, form)] * inputs
@@ -243,136 +222,12 @@ def _trials(
     return found
 
 
-def _terms(data: _Smoothed, *, inverse: bool, first_order: bool = False) -> np.ndarray:
-    """What a linear combination of explains the motion apart from the input, ``(R, P)``.
-
-    1, q, sin q, cos q, v and friction; v_i v_j and (for inverse dynamics) a, times 1, sin q and
-    cos q as far as the data are enough for so many.
-    """
-    q, v, a = data.q, data.v, data.a
-    size = q.shape[1]
-    ones = np.ones((len(q), 1))
-    trig = np.hstack([ones, np.sin(q), np.cos(q)])
-    speed = v.std(axis=0).clip(min=1e-300)
-    parts = [trig, q, q**2]
-    if not first_order:
-        i, j = np.triu_indices(size)
-        squares = v[:, i] * v[:, j]
-        parts += [v, np.tanh(10 * v / speed)]
-        inertial = [squares, a] if inverse else [squares]
-        several = [_products(trig, x) for x in [*inertial, trig[:, 1:]]]
-        rich = sum(x.shape[1] for x in several)
-        parts += several if 12 * rich < len(q) else inertial
-    return _whitened(np.hstack(parts))
-
-
-def _powers(inputs: int) -> list[tuple[int, ...]]:
-    """Powers of the inputs in B(u): each alone, and products up to the third of few inputs."""
-    alone = [tuple(row) for row in np.eye(inputs, dtype=int)]
-    if inputs > _FEW:
-        return alone
-    every = itertools.product(range(4), repeat=inputs)
-    return alone + [p for p in every if 2 <= sum(p) <= 3]
-
-
-def _monomials(u: np.ndarray, powers: list[tuple[int, ...]]) -> np.ndarray:
-    return np.column_stack([np.prod(u ** np.array(p), axis=1) for p in powers])
-
-
-def _products(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return (x[:, :, None] * y[:, None, :]).reshape(len(x), -1)
-
-
-def _whitened(x: np.ndarray) -> np.ndarray:
-    """Columns of unit size, without those that the others give."""
-    x = x / np.sqrt((x**2).mean(axis=0)).clip(min=1e-300)
-    values, vectors = np.linalg.eigh(x.T @ x / len(x))
-    keep = values > 1e-9 * values[-1]
-    return x @ (vectors[:, keep] / np.sqrt(values[keep]))
-
-
-@dataclass(frozen=True)
-class _Remainder:
-    """What the known terms leave of the inputs at every lag and of the motion, as inner products.
-
-    The first of the B + 1 entries is of all data, each other one leaves a tenth of them out.
-
-    Attributes:
-        inner: of the inputs, ``(B + 1, D M, D M)``.
-        with_motion: of inputs and motion, ``(B + 1, D M, N)``.
-        motion: squares of the motion's remainder, ``(B + 1, N)``.
-        squares: of the whole inputs, ``(B + 1, D M)``, and of the whole motion, ``(B + 1, N)``.
-        inputs: M.
-    """
-
-    inner: np.ndarray
-    with_motion: np.ndarray
-    motion: np.ndarray
-    squares: tuple[np.ndarray, np.ndarray]
-    inputs: int
-
-    @classmethod
-    def of(cls, known: np.ndarray, data: _Smoothed, target: np.ndarray) -> _Remainder:
-        u = _standard(data.u.reshape(len(data.u), -1))
-        y = _standard(target)
-        both = np.hstack([known, u, y])
-        blocks = np.stack([x.T @ x for x in (both[data.block == b] for b in range(_BLOCKS))])
-        grams = np.concatenate([blocks.sum(axis=0)[None], blocks.sum(axis=0) - blocks])
-        k, e = known.shape[1], known.shape[1] + u.shape[1]
-        ridge = 1e-9 * np.trace(grams[0, :k, :k]) / k * np.eye(k)
-        left = grams[:, k:, k:] - grams[:, k:, :k] @ np.linalg.solve(
-            grams[:, :k, :k] + ridge, grams[:, :k, k:]
-        )
-        squares = np.diagonal(grams, axis1=1, axis2=2)
-        m = e - k
-        return cls(
-            left[:, :m, :m],
-            left[:, :m, m:],
-            np.diagonal(left[:, m:, m:], axis1=1, axis2=2),
-            (squares[:, k:e], squares[:, e:]),
-            data.u.shape[2],
-        )
-
-    def of_targets(self) -> np.ndarray:
-        """Share of each input that the known terms leave, ``(B + 1, D, M)``."""
-        left = np.diagonal(self.inner, axis1=1, axis2=2)
-        share = left / self.squares[0].clip(min=1e-300)
-        return share.reshape(len(share), -1, self.inputs).clip(1e-12, 1)
-
-    def of_inputs(self, lag: np.ndarray, moved: Sequence[int]) -> np.ndarray:
-        """Share of the motion that known terms and inputs leave, ``(B + 1, D)``.
-
-        Args:
-            lag: number of the candidate that each of the M inputs has, ``(M,)``.
-            moved: the inputs that take every candidate in turn instead.
-        """
-        lags = self.inner.shape[1] // self.inputs
-        shares = []
-        for d in range(lags):
-            at = lag.copy()
-            at[list(moved)] = d
-            rows = at * self.inputs + np.arange(self.inputs)
-            gram = self.inner[:, rows[:, None], rows] + 1e-6 * self.squares[0][
-                :, :1, None
-            ] * np.eye(len(rows))
-            product = self.with_motion[:, rows]
-            explained = (product * np.linalg.solve(gram, product)).sum(axis=1)
-            shares.append(
-                ((self.motion - explained) / self.squares[1].clip(min=1e-300)).mean(axis=1)
-            )
-        return np.stack(shares, axis=1).clip(1e-12, 1)
-
-
-def _standard(x: np.ndarray) -> np.ndarray:
-    return (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
-
-
 def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
     """The verdict on the shares that each delay leaves, ``(B + 1, D)``."""
     gap = candidates[1] - candidates[0]
     whole, best = shares[0], int(shares[0].argmin())
     each = np.array([_minimum(candidates, share) for share in shares[1:]])
-    spread = float(np.sqrt((_BLOCKS - 1) * each.var()))
+    spread = float(np.sqrt((BLOCKS - 1) * each.var()))
     reason = ""
     if whole[best] > _UNEXPLAINED:
         reason = f"the equation of motion leaves {100 * whole[best]:.0f} % unexplained at any delay"
