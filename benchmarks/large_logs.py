@@ -1,8 +1,8 @@
 """Time and memory to read large logs: python -m benchmarks.large_logs [gigabytes] [million rows].
 
 A bag of JointStates of seven joints and a CSV file of 22 columns are written into a temporary
-folder, without randomness, and read in a process each; then the CSV file is loaded as a data
-source: read, checked, split and cut.
+folder, without randomness. Each is read, loaded as a data source (read, checked, split and cut) and
+looked at as check.py does, in a process each.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs import LogSource
 from pinn_dyn.data.logs.reader import read_table
+from pinn_dyn.evaluation.log_check import check_log
 
 RATE = 1000.0
 JOINTS = [f"panda_joint{k + 1}" for k in range(7)]
@@ -81,18 +82,30 @@ def read(path: Path) -> str:
     return f"{len(table)} rows read"
 
 
-def load(path: Path) -> str:
-    """Load the file as a training does; the number of samples in words."""
+def source(path: Path) -> LogSource:
+    """The log as a data source of seven joints."""
     q, v, u = (COLUMNS[7 * k : 7 * (k + 1)] for k in range(3))
-    ends = {"seconds": 100.0, "piece": 10.0}
-    splits = LogSource(
+    ends = {"seconds": 20.0, "piece": 10.0}
+    return LogSource(
         name="large", root=str(path.parent), files=path.name,
         time={"columns": "/joint_states/t", "unit": "s"}, q={"columns": q, "unit": "rad"},
         v={"columns": v, "unit": "rad/s"}, u={"columns": u, "unit": "Nm"},
         validation=ends, test=ends,
-    ).load()  # fmt: skip
-    samples = sum(len(run.t) for run in splits.train)
-    return f"{samples} samples of training loaded"
+    )  # fmt: skip
+
+
+def load(path: Path) -> str:
+    """Load the log as a training does; the number of samples in words."""
+    splits = source(path).load()
+    return f"{sum(len(run.t) for run in splits.train)} samples of training loaded"
+
+
+def check(path: Path) -> str:
+    """Look at the log as check.py does, figures left out; the number of warnings in words."""
+    return f"{len(check_log(source(path)).warnings)} warnings of the check"
+
+
+WORK = {work.__name__: work for work in (read, load, check)}
 
 
 def measure(work: Callable[[Path], str], path: Path) -> None:
@@ -118,15 +131,15 @@ def main(gigabytes: float, million_rows: float) -> None:
         if million_rows:
             write_csv(place / "log.csv", round(1e6 * million_rows))
         for path in sorted(place.iterdir()):
-            for work in ("read", "load") if path.suffix == ".csv" else ("read",):
+            for work in WORK:
                 subprocess.run(
                     [sys.executable, "-m", "benchmarks.large_logs", work, str(path)], check=True
                 )
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] in (["read"], ["load"]):
-        measure(read if sys.argv[1] == "read" else load, Path(sys.argv[2]))
+    if sys.argv[1:] and sys.argv[1] in WORK:
+        measure(WORK[sys.argv[1]], Path(sys.argv[2]))
     else:
         given = [float(word) for word in sys.argv[1:]] + [1.0, 5.0][len(sys.argv) - 1 :]
         main(*given)
