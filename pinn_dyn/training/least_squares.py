@@ -200,12 +200,15 @@ class LeastSquares:
         spread = torch.where(
             held[:, None] & held, covariance.to(z), torch.diag(_CHANGED**2 * free.to(z))
         )
-        if torch.linalg.cholesky_ex(spread).info:
+        factor, failed = torch.linalg.cholesky_ex(spread)
+        if failed:
             raise ValueError(
                 "the covariance of the earlier fit is no positive definite matrix of finite "
                 "numbers: its checkpoint is damaged, fit it again"
             )
-        return Prior(z, torch.linalg.cholesky(torch.linalg.inv(spread)).mT)
+        # Not by way of the inverse: rounding makes it indefinite where much is known for certain.
+        root = torch.linalg.solve_triangular(factor, torch.eye(len(z)).to(z), upper=False)
+        return Prior(z, root)
 
     def _identify(
         self,

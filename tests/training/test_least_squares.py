@@ -108,6 +108,25 @@ def test_what_has_changed_is_refused_by_name(runs):
         solver.fit(model, runs, windows, torch.eye(3))
 
 
+def test_a_fit_that_knew_much_for_certain_can_be_started_from(runs):
+    """Standard deviations from 1e-7 of the prior's to all of it, in directions across bodies."""
+    model = robot_model("generic")
+    count = sum(p.numel() for p in model.parameters())
+    generator = torch.Generator().manual_seed(0)
+    basis, _ = torch.linalg.qr(torch.randn(count, count, generator=generator).double())
+    covariance = basis @ torch.diag(torch.logspace(-14, 0, count).double()) @ basis.mT
+    covariance = (covariance + covariance.mT) / 2
+    windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
+    solver = LeastSquares(cutoff=20.0, rollouts=False, changed=["tip"], evaluations=2)
+    root = solver.fit(model, runs, windows, covariance).prior.root
+    held = torch.tensor([not name.endswith(" of tip") for name in model.parameter_names()])
+    known = covariance[held][:, held]
+    # R^T R is the inverse of what is known: |R x| is the length of x in standard deviations.
+    x = torch.linalg.cholesky(known)
+    lengths = (root[:, held] @ x).norm(dim=0)
+    torch.testing.assert_close(lengths, torch.ones_like(lengths), rtol=1e-3, atol=0)
+
+
 def test_the_information_is_that_of_the_inputs_that_are_missed(truth, runs):
     """Gauss-Newton's matrix, by central differences of r = k^-1 (M a + ... - o) - u."""
     model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, gain_spread=0.3)
