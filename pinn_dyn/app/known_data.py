@@ -104,7 +104,7 @@ def _how_to_agree(
     if len(columns) > len(joints):
         some = 0 < len(unnamed) < len(columns)
         named = f", {', '.join(unnamed)} by their names" if some else ""
-        return f"Leave out the columns that are no joints{named}"
+        return f"Leave out the columns that are no joints{named}, or give this robot's URDF"
     if len(columns) == len(joints) - len(without):
         return f"No column names the others: lock them, {place}.locked_joints=" + (
             f"[{','.join([*locked, *without])}]"

@@ -87,11 +87,12 @@ def explained_shares(
 
 def _rest_of(y: np.ndarray, x: np.ndarray) -> float:
     """Share of the variance of y that x leaves, per degree of freedom."""
-    moving = y.std(axis=0) > 0
+    spread = y.std(axis=0)
+    moving = spread > 1e-12 * np.abs(y).max(axis=0)  # a constant has the spread of rounding
     if not moving.any():
         return 1.0
     left = len(x) - x.shape[1]
-    y = (y[:, moving] - y[:, moving].mean(axis=0)) / y[:, moving].std(axis=0)
+    y = (y[:, moving] - y[:, moving].mean(axis=0)) / spread[moving]
     x = x / np.abs(x).max(axis=0).clip(min=1e-300)
     rest = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
     return float((rest**2).mean()) * len(x) / left
