@@ -25,6 +25,7 @@ _BEYOND = {
     ("soft_arm_2", "two-segment soft arm at 100 Hz, 10 s"): "soft_arm_2/100hz_wide",
     ("panda", "Panda in PyBullet, 2 s"): "panda",
 }
+_PAYLOAD = ROOT / "results" / "panda" / "payload"
 _GEOMETRY_KNOWN = "known_system"
 """Knows the arm, so that it says nothing of networks elsewhere."""
 FIGURE = ROOT / "docs" / "figures" / "sample_efficiency.png"
@@ -37,6 +38,7 @@ def tables() -> dict[str, str]:
         **{f"{name}_commands": train_commands(name) for name in _PREDICTED},
         "generalization": generalization_table(),
         "beyond": beyond_table(),
+        "payload": payload_table(),
         "hardware": hardware_table(),
         "control": control_table(),
         "terms": terms_table(),
@@ -121,19 +123,40 @@ def beyond_table() -> str:
     return table(["task", "model", "in range", "beyond, 1.3 times", "left the data beyond"], rows)
 
 
+def payload_table() -> str:
+    """The Panda with a load, before its models have seen it and after 2 s of motion with it."""
+    before, after = (pd.read_csv(_PAYLOAD / when / SUMMARY) for when in ("before", "after"))
+    rows = []
+    for model, run in after.set_index("model").iterrows():
+        torque = [data.set_index("model")["torque_share"][model] for data in (before, after)]
+        took = "–" if run["floor"] else f"{run['training_seconds']:.0f}"
+        rows.append(
+            [
+                _label(after, model),
+                _mean_and_median(before, model),
+                _mean_and_median(after, model),
+                number(run["window_0.5s_error_mean"]),
+                "–" if pd.isna(torque).any() else " → ".join(number(value) for value in torque),
+                took,
+            ]
+        )
+    head = ["model", "before", "after 2 s of motion", "over 0.5 s", "torque error, share", "fit, s"]
+    return table(head, rows)
+
+
 def _label(data: pd.DataFrame, model: str) -> str:
     return model if data.set_index("model")["floor"][[model]].iloc[0] else f"`{model}`"
 
 
 def _mean_and_median(data: pd.DataFrame, model: str) -> str:
-    """Errors of a model, bold where they are the smallest of what was trained."""
-    runs, trained = data[data["model"] == model], data[data["pairs"].notna()]
+    """Errors of a model, bold where they are the smallest of all and it is no floor."""
+    runs = data[data["model"] == model]
     if runs.empty:
         return "–"
     figures = []
     for column in ("error_mean", "error_median"):
-        error = runs[column].mean()
-        figures.append(bold(number(error), error == trained.groupby("model")[column].mean().min()))
+        error, smallest = runs[column].mean(), data.groupby("model")[column].mean().min()
+        figures.append(bold(number(error), error == smallest and not runs["floor"].any()))
     return f"{', '.join(figures)}{lost(runs)}"
 
 

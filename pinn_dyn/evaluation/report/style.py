@@ -53,7 +53,8 @@ def simplify(
         log: whether the axis is logarithmic; what is not positive becomes a gap.
     """
     times, values = t.double().numpy(), y.double().numpy()
-    drawable = np.isfinite(values) & ((values > 0) | (not log))
+    # A page holds single precision: what has diverged beyond it is a gap.
+    drawable = (np.abs(values) < np.finfo(np.float32).max) & ((values > 0) | (not log))
     values = np.where(drawable, values, np.nan)
     heights = np.log10(values) if log else values
     # The ends, and both sides of where a gap begins or stops.
