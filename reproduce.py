@@ -198,17 +198,17 @@ def run(name: str, entry: Entry, folder: Path) -> None:
     if "control" in entry:
         for path in runs:
             if not (folder / name / path.name / SUMMARY).is_file():
-                out = f"hydra.run.dir={_quoted(folder / name / path.name)}"
-                call("control.py", *entry["control"], f"run={_quoted(path)}", out)
+                out = f"hydra.run.dir={quoted(folder / name / path.name)}"
+                call("control.py", *entry["control"], f"run={quoted(path)}", out)
         return
     if "train" in entry:
         starts = [
-            [f"seed={read_yaml(path / METRICS)['seed']}", f"start_from={_quoted(path)}"]
+            [f"seed={read_yaml(path / METRICS)['seed']}", f"start_from={quoted(path)}"]
             for path in runs
         ]
         # train.py itself passes over what is finished, and goes on with what is not.
         for start in starts or [[]]:
-            sweep = f"hydra.sweep.dir={_quoted(folder / name)}"
+            sweep = f"hydra.sweep.dir={quoted(folder / name)}"
             call("train.py", "-m", *entry["train"], *start, sweep)
         runs = trained(folder / name)
         if not runs:
@@ -216,12 +216,12 @@ def run(name: str, entry: Entry, folder: Path) -> None:
     (table,) = tables(name, entry, folder)
     newest = max((path / METRICS).stat().st_mtime for path in runs)
     if not table.is_file() or table.stat().st_mtime < newest:
-        found = ",".join(_quoted(path) for path in runs)
-        out = f"hydra.run.dir={_quoted(table.parent)}"
+        found = ",".join(quoted(path) for path in runs)
+        out = f"hydra.run.dir={quoted(table.parent)}"
         call("evaluate.py", f"runs=[{found}]", *entry["evaluate"], out)
 
 
-def _quoted(path: Path) -> str:
+def quoted(path: Path) -> str:
     """A path as a value of an override, whatever characters it has."""
     text = str(path)
     if re.fullmatch(r"[\w./-]+", text, re.ASCII):

@@ -24,19 +24,24 @@ class Pendulum(pinn_dyn.MechanicalSystem):
         return torch.ones_like(q).unsqueeze(-1)
 
 
-motions = dict(duration=4.0, step=0.01, train_initial_states=20, train_inputs=20, test=2)
 source = SimulatedSource(
     name="pendulum",
     system=Pendulum(num_coordinates=1, num_inputs=1),
     excitation=MultiSine([0.0], [3.0], frequency=[0.1, 1.5], harmonics=4),
     initial_states=InitialStates(q_low=[-2.0], q_high=[2.0], v_max=[2.0]),
-    **dict(**motions, pairing="matched", validation=2, cache="~/.cache/pinn_dyn"),
-    **dict(labels=["angle [rad]"], input_labels=["torque [Nm]"], configurations={}),
+    duration=4.0,
+    step=0.01,
+    train_initial_states=5,
+    train_inputs=4,
+    validation=2,
+    test=2,
+    labels=["angle [rad]"],
+    input_labels=["torque [Nm]"],
 )
 # A motor in the joint: A = I, so that M, D and G are found in their own units.
 own = ["model/input=fixed", "model.angles=[0]", "loss=midpoint", "data.stride=1"]
-steps = int(sys.argv[2]) if sys.argv[1:2] == ["--steps"] else 2000
-model = pinn_dyn.fit(source, model="lnn", steps=steps, overrides=[*own, *sys.argv[3:]])
+own += ["trainer.steps=2000", "trainer.validations=10"]
+model = pinn_dyn.fit(source, model="lnn", overrides=own + sys.argv[1:])
 
 learned, true = model.terms([1.0]), source.system.double().terms(torch.ones(1).double())
 for name in ("M", "D", "G"):

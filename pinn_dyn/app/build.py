@@ -155,7 +155,7 @@ def build_learner(
         except TypeError as error:
             raise ConfigError(f"optimizer: {error}") from error
     scheduler = build_part("scheduler", config["scheduler"], partial_=True)
-    _try_step(optimizer, scheduler, config["trainer"]["steps"])
+    try_step(optimizer, scheduler, config["trainer"]["steps"])
     return (EnsembleLearner if ensemble else DynamicsLearner)(
         model,
         loss=loss,
@@ -169,7 +169,7 @@ def build_learner(
     )
 
 
-def _try_step(optimizer: Any, scheduler: Any, steps: int) -> None:
+def try_step(optimizer: Any, scheduler: Any, steps: int) -> None:
     """Refuse settings that the first step of a training would, by a step on a small matrix."""
     weights = torch.nn.Parameter(torch.eye(2))
 

@@ -106,7 +106,7 @@ def read_foreign(path: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
     dataset = config.get("dataset")
     if isinstance(dataset, dict):
         dataset.pop("cache", None)
-    for where, part in _mappings(config, ""):
+    for where, part in mappings(config, ""):
         _check_mapping(path, where, part, trust)
     if isinstance(dataset, dict):
         check_name(f"{path}: dataset.name", dataset.get("name"))
@@ -172,7 +172,7 @@ def _size(value: Any, known: dict[int, int]) -> int:
     return known[id(value)]
 
 
-def _mappings(value: Any, where: str) -> Iterator[tuple[str, dict[Any, Any]]]:
+def mappings(value: Any, where: str) -> Iterator[tuple[str, dict[Any, Any]]]:
     """All mappings in a configuration, with their places; texts that would still be computed.
 
     Raises:
@@ -181,10 +181,10 @@ def _mappings(value: Any, where: str) -> Iterator[tuple[str, dict[Any, Any]]]:
     if isinstance(value, dict):
         yield where, value
         for key, item in value.items():
-            yield from _mappings(item, f"{where}.{key}" if where else str(key))
+            yield from mappings(item, f"{where}.{key}" if where else str(key))
     elif isinstance(value, list):
         for index, item in enumerate(value):
-            yield from _mappings(item, f"{where}[{index}]")
+            yield from mappings(item, f"{where}[{index}]")
     elif isinstance(value, str) and "${" in value:
         raise ConfigError(
             f"{where} is {value[:80]!r}, an expression: the configuration in a run folder has "

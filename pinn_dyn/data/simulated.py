@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -88,10 +89,10 @@ class SimulatedSource(DataSource):
         rtol: float = 1e-8,
         atol: float = 1e-9,
         compile: bool = False,
-        cache: str,
+        cache: str = "~/.cache/pinn_dyn",
         labels: Sequence[str],
         input_labels: Sequence[str],
-        configurations: Mapping[str, Sequence[float]],
+        configurations: Mapping[str, Sequence[float]] = MappingProxyType({}),
     ):
         if not 0 < step <= duration:
             raise ValueError(

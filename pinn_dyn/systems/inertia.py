@@ -5,10 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-"""Names of the ten parameters: kg, kg m (mass times centre of mass), and kg m^2 about the origin
-of the body's frame; the order is that of Pinocchio."""
-
 _MOMENTS = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
 
 

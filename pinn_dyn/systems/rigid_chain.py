@@ -183,8 +183,8 @@ class RigidChain(MechanicalSystem):
     def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         """Y ``(*batch, N, 10 N)`` with M a + C v + G = Y pi.
 
-        pi ``(10 N,)`` are the ten inertial parameters of each body, in the order of
-        :data:`pinn_dyn.systems.inertia.PARAMETERS`, body after body.
+        pi ``(10 N,)`` are ten parameters of each body, body after body, in the order of Pinocchio:
+        m in kg, m c in kg m, and Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the frame's origin in kg m^2.
         """
         at = self.kinematics(q)
         moving = self._accelerations(at, v, a, self._gravity) @ at.poses

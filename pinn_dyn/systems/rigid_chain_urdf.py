@@ -15,9 +15,8 @@ from torch import Tensor
 
 from pinn_dyn.systems.inertia import pseudo_inertia
 from pinn_dyn.systems.urdf import find_urdf
-from pinn_dyn.systems.urdf_checks import number, parse_urdf
+from pinn_dyn.systems.urdf_checks import TURNING, number, parse_urdf
 
-_TURNING = ("revolute", "continuous")
 _SLIDING = ("prismatic",)
 
 
@@ -95,7 +94,7 @@ def read_tree(
             found.joints.append(name)
             found.bodies.append(child)
             found.parents.append(body)
-            found.turning.append(joint.get("type") in _TURNING)
+            found.turning.append(joint.get("type") in TURNING)
             visit(child, len(found.joints) - 1, np.eye(4))
 
     visit(root, -1, np.eye(4))
@@ -126,7 +125,7 @@ def _link(joint: ET.Element, end: str) -> str:
 
 
 def _axis(path: Path, name: str, joint: ET.Element) -> np.ndarray:
-    if joint.get("type") not in _TURNING + _SLIDING or joint.find("mimic") is not None:
+    if joint.get("type") not in TURNING + _SLIDING or joint.find("mimic") is not None:
         kind = "a mimic joint" if joint.find("mimic") is not None else repr(joint.get("type"))
         raise ValueError(
             f"{path}: joint {name!r} is {kind}, expected revolute, continuous, prismatic or fixed: "

@@ -12,16 +12,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pinn_dyn.spelling import did_you_mean
-from pinn_dyn.systems.urdf_checks import end_of, number, parse_urdf
+from pinn_dyn.systems.urdf_checks import MOMENTS, TURNING, end_of, number, parse_urdf
 
 Inertia = Literal["file", "collision"]
 """Whether inertias are those of the URDF, or those that Bullet computes from collision shapes."""
 
 POINT_MASS = "pinn_dyn_point_mass"
 """Name of the link that is added for a payload."""
-
-_TURNING = ("revolute", "continuous")
-_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class JointLimits(NamedTuple):
@@ -90,7 +87,7 @@ def read_urdf(
         if joint.get("type") != "fixed" and name not in locked_joints
     }
     for name, joint in moving.items():
-        if joint.get("type") not in _TURNING:
+        if joint.get("type") not in TURNING:
             raise ValueError(
                 f"{path}: joint {name!r} is of type {joint.get('type')!r}, but an arm has a fixed "
                 "base and revolute joints: add it to locked_joints, or use another URDF"
@@ -192,7 +189,7 @@ def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Iner
         if inertial.find("mass") is None:
             ET.SubElement(inertial, "mass", value="0")
         if inertial.find("inertia") is None:
-            ET.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
+            ET.SubElement(inertial, "inertia", dict.fromkeys(MOMENTS, "0"))
 
 
 def _tip(path: Path, robot: ET.Element, tip: str | None) -> str:
@@ -230,7 +227,7 @@ def _scale_masses(path: Path, robot: ET.Element, factor: float) -> None:
 def _add_point_mass(robot: ET.Element, link: str, mass: float) -> None:
     inertial = ET.SubElement(ET.SubElement(robot, "link", name=POINT_MASS), "inertial")
     ET.SubElement(inertial, "mass", value=repr(mass))
-    ET.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
+    ET.SubElement(inertial, "inertia", dict.fromkeys(MOMENTS, "0"))
     joint = ET.SubElement(robot, "joint", name=POINT_MASS, type="fixed")
     ET.SubElement(joint, "parent", link=link)
     ET.SubElement(joint, "child", link=POINT_MASS)

@@ -10,6 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+TURNING = ("revolute", "continuous")
+"""Types of joints that turn."""
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Attributes of an inertia."""
 MOST_BYTES = 20_000_000
 MOST_DEPTH = 30
 MOST_JOINTS = 100
@@ -19,7 +23,6 @@ MOST_LETTERS = 200
 
 _LARGEST = 1000.0  # m or rad, of an origin
 _HEAVIEST = 1e6  # kg, and kg m^2: beyond it Bullet's arithmetic ends
-_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _TOLERANCE = 1e-6  # of the largest principal moment
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
 
@@ -204,7 +207,7 @@ def _check_inertial(path: Path, link: ET.Element, counts: bool) -> None:
     inertia = link.find("inertial/inertia")
     if inertia is None or not counts:
         return
-    xx, xy, xz, yy, yz, zz = (number(path, name, inertia, key) for key in _MOMENTS)
+    xx, xy, xz, yy, yz, zz = (number(path, name, inertia, key) for key in MOMENTS)
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if np.abs(tensor).max() > _HEAVIEST:
         raise ValueError(

@@ -65,7 +65,7 @@ def test_everything_that_conf_names_may_be_built():
     """So a run of our own configurations is never refused."""
     found = set()
     for path in CONF.rglob("*.yaml"):
-        for _, part in trust._mappings(_plain(yaml.safe_load(path.read_text())), ""):
+        for _, part in trust.mappings(_plain(yaml.safe_load(path.read_text())), ""):
             if "_target_" in part:
                 found.add(part["_target_"])
     # In no run's configuration: one of Hydra, and a search, of which a run keeps the draw alone.

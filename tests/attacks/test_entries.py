@@ -109,5 +109,5 @@ def test_a_training_that_leaves_nothing(monkeypatch):
 
 @pytest.mark.parametrize("folder", ["my runs", "a,b=[c]", "it's {x}", "é", "plain/a-1"])
 def test_any_folder_is_a_value(folder):
-    word = f"hydra.sweep.dir={reproduce._quoted(Path(folder))}"
+    word = f"hydra.sweep.dir={reproduce.quoted(Path(folder))}"
     assert parsed([word])[0].value() == folder

@@ -6,21 +6,17 @@ Some hundred here, the same ones each time. Others, for longer:
 
 import csv
 import functools
-import gzip
 import io
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.io import savemat
 
 from pinn_dyn.data.logs import LogError
 from tests.attacks.damage import byte_hits, hit, places
-from tests.data import log_formats as formats
+from tests.attacks.formats import FORMATS, formatted
 from tests.data.logs_files import motion, source
 
 COLUMNS = ["t", "q1", "v1", "u1", "q2", "v2", "u2"]
@@ -153,55 +149,6 @@ def test_a_damaged_table_is_refused_or_read_as_it_is(tmp_path_factory, edits):
     for raw in raws:
         found = np.stack([raw.q, raw.v, raw.u], axis=-1).reshape(len(raw), -1)
         np.testing.assert_allclose(found, [expected[t] for t in raw.t], rtol=1e-12)
-
-
-MATRICES = {
-    "q": dict(columns=["q_1", "q_2"], unit="rad"),
-    "v": dict(columns=["v_1", "v_2"], unit="rad/s"),
-    "u": dict(columns=["u_1", "u_2"], unit="Nm"),
-}
-IN_LOG = {
-    name: {**part, "columns": [f"log/{x}" for x in part["columns"]]}
-    for name, part in MATRICES.items()
-} | {"time": dict(columns="log/t", unit="s")}
-
-
-def write_mat(path, table, *, packed=False):
-    arrays = {name: table[[f"{name}1", f"{name}2"]].to_numpy() for name in "qvu"}
-    savemat(path, {"t": table[["t"]].to_numpy(), **arrays}, do_compression=packed)
-
-
-def write_gzip(path, table):
-    path.write_bytes(gzip.compress(table.to_csv(index=False).encode()))
-
-
-FORMATS = {
-    "csv.gz": (write_gzip, {}),
-    "npz": (formats.write_npz, MATRICES),
-    "mat": (write_mat, MATRICES),
-    "packed.mat": (functools.partial(write_mat, packed=True), MATRICES),
-    "h5": (formats.write_hdf5, IN_LOG),
-    "parquet": (lambda path, table: table.to_parquet(path), {}),
-    "mcap": (lambda path, table: write_bag(path, table, mcap=True), formats.BAG),
-    "db3": (lambda path, table: write_bag(path, table, mcap=False), formats.BAG),
-    "bag": (functools.partial(formats.write_bag, version=1), formats.BAG),
-}
-
-
-def write_bag(path, table, *, mcap):
-    """The file alone of a bag of ROS 2."""
-    formats.write_bag(path.with_suffix(""), table, mcap=mcap)
-    (file,) = path.with_suffix("").glob(f"*{path.suffix}")
-    file.rename(path)
-
-
-@functools.cache
-def formatted(name):
-    """The bytes of the log in a format."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"run.{name}"
-        FORMATS[name][0](path, motion(5.0))
-        return path.read_bytes()
 
 
 @pytest.mark.parametrize("name", FORMATS)

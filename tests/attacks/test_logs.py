@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from pinn_dyn.data.logs import LogError
-from tests.attacks.test_fuzzed_logs import MATRICES, formatted
+from tests.attacks.formats import MATRICES, formatted
 from tests.data.logs_files import motion, source
 
 ROW = 300

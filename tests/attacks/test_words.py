@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pinn_dyn.app.build import _try_step
+from pinn_dyn.app.build import try_step
 from pinn_dyn.app.config import ConfigError, completed, composed
 from pinn_dyn.app.flags import in_order
 from pinn_dyn.app.parts import build_part
@@ -159,7 +159,7 @@ def test_what_the_first_step_refuses(settings, steps, says):
     from pinn_dyn.training import one_cycle
 
     with pytest.raises(ConfigError, match=says):
-        _try_step(partial(SOAP, **settings), one_cycle, steps)
+        try_step(partial(SOAP, **settings), one_cycle, steps)
 
 
 @pytest.mark.parametrize(("motions", "duration", "step"), [(10**9, 1.0, 0.1), (1, 1e300, 1e-300)])

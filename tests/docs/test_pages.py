@@ -57,6 +57,14 @@ def test_every_equation_has_its_code_or_its_tests():
             assert "- Tests: `tests/" in section, section.splitlines()[0]
 
 
+def test_no_test_file_imports_another():
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        imported = re.findall(r"^from (tests\.\S+) import (.+)$", path.read_text(), re.MULTILINE)
+        for module, names in imported:
+            assert ".test_" not in module, f"{path} imports {module}"
+            assert not names.startswith("test_"), f"{path} imports {names}"
+
+
 def test_the_recipes_of_contributing_are_diffs_of_the_files():
     diffs = [b for b in blocks(ROOT / "CONTRIBUTING.md") if b.language == "diff"]
     assert len(diffs) == 5

@@ -93,7 +93,7 @@ def test_simulate_and_learn(capsys):
 
 
 def test_own_robot(capsys):
-    run("own_robot.py", "--steps", "2", *TINY, "validator.horizon=0.2")
+    run("own_robot.py", "trainer.steps=2", "trainer.validations=1", *TINY, "validator.horizon=0.2")
     assert "M learned" in capsys.readouterr().out
 
 
