@@ -11,6 +11,18 @@ from pinn_dyn.mechanics.integrators import RK4, Integrator
 from pinn_dyn.mechanics.system import MechanicalSystem
 
 
+def _total(name: str) -> Callable[..., Tensor]:
+    """The method that adds what those of the parts give."""
+
+    def method(self: Sum, *values: Tensor) -> Tensor:
+        first, *others = (getattr(part, name)(*values) for part in self._systems())
+        for other in others:
+            first = first + other
+        return first
+
+    return method
+
+
 class Sum(MechanicalSystem):
     """The mechanical system whose terms are the sums of those of its parts::
 
@@ -45,23 +57,20 @@ class Sum(MechanicalSystem):
         self.input_affine = all(part.input_affine for part in parts.values())
         self.has_residual = any(part.has_residual for part in parts.values())
 
-    def mass_matrix(self, q: Tensor) -> Tensor:
-        return self._total(lambda part: part.mass_matrix(q))
-
-    def potential_energy(self, q: Tensor) -> Tensor:
-        return self._total(lambda part: part.potential_energy(q))
-
-    def damping_matrix(self, q: Tensor) -> Tensor:
-        return self._total(lambda part: part.damping_matrix(q))
-
-    def input_matrix(self, q: Tensor) -> Tensor:
-        return self._total(lambda part: part.input_matrix(q))
-
-    def _potential_force(self, q: Tensor) -> Tensor:
-        return self._total(lambda part: part._potential_force(q))
-
-    def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        return self._total(lambda part: part._inertial_force(q, v, a))
+    mass_matrix = _total("mass_matrix")
+    potential_energy = _total("potential_energy")
+    damping_matrix = _total("damping_matrix")
+    input_matrix = _total("input_matrix")
+    _potential_force = _total("_potential_force")
+    _inertial_force = _total("_inertial_force")
+    _damping_force = _total("_damping_force")
+    _friction_force = _total("_friction_force")
+    _friction_slope = _total("_friction_slope")
+    _input_force = _total("_input_force")
+    _applied_force = _total("_applied_force")
+    _residual_force = _total("_residual_force")
+    _kinetic_gradient = _total("_kinetic_gradient")
+    _momentum = _total("_momentum")
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         (mass, bias), *others = (part._mass_and_bias(q, v) for part in self._systems())
@@ -69,36 +78,6 @@ class Sum(MechanicalSystem):
             mass, bias = mass + other_mass, bias + other_bias
         return mass, bias
 
-    def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
-        return self._total(lambda part: part._damping_force(q, v))
-
-    def _friction_force(self, v: Tensor) -> Tensor:
-        return self._total(lambda part: part._friction_force(v))
-
-    def _friction_slope(self, v: Tensor) -> Tensor:
-        return self._total(lambda part: part._friction_slope(v))
-
-    def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        return self._total(lambda part: part._input_force(q, u))
-
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return self._total(lambda part: part._applied_force(q, v, u))
-
-    def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return self._total(lambda part: part._residual_force(q, v, u))
-
-    def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        return self._total(lambda part: part._kinetic_gradient(q, v))
-
-    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
-        return self._total(lambda part: part._momentum(q, v))
-
     def _systems(self) -> list[MechanicalSystem]:
         parts: list[Any] = list(self.parts.values())
         return parts
-
-    def _total(self, term: Callable[[MechanicalSystem], Tensor]) -> Tensor:
-        first, *others = (term(part) for part in self._systems())
-        for other in others:
-            first = first + other
-        return first
