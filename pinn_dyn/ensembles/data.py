@@ -48,11 +48,7 @@ class EnsembleData(L.LightningDataModule):
 
 
 class MemberSampler(Sampler[Tensor]):
-    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own.
-
-    Args:
-        samplers: the order of each member.
-    """
+    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own."""
 
     def __init__(self, samplers: list[BatchSampler]):
         self.samplers = samplers

@@ -86,9 +86,7 @@ def closed_loop_figure(
     Args:
         record: K runs.
         run: which of the K to draw.
-        title: plant and controller.
-        labels: name and unit of each coordinate; None takes q1 ... qN.
-        input_labels: name and unit of each input; None takes u1 ... uM.
+        labels, input_labels: names and units; None takes q1 ... qN and u1 ... uM.
 
     Raises:
         ValueError: on labels that do not fit.
@@ -113,7 +111,6 @@ def controller_comparison_figure(
 
     Args:
         records: controller names and their runs; the order of the names fixes their colours.
-        title: plant and task.
         label: name and unit of the error.
     """
     note = "mean over runs, 10–90 % band"
@@ -130,7 +127,6 @@ def tip_path_figure(t: Tensor, paths: dict[str, Tensor], wanted: Tensor, *, titl
         paths: names and positions, ``(T, 3)`` each, m; NaN after a stop. The order of the names
             fixes their colours.
         wanted: wanted positions, ``(T, 3)``, m.
-        title: plant and task.
 
     Raises:
         ValueError: on a path of another shape.
@@ -184,9 +180,7 @@ def steady_state_figure(
     bound, and those with one but without a finite error, whose bound does not hold.
 
     Args:
-        bound: predicted bounds, ``(K,)``, in the units of q.
-        measured: steady-state errors, ``(K,)``, in the units of q.
-        title: plant and controller.
+        bound, measured: predicted bounds and steady-state errors, ``(K,)``, in the units of q.
         label: name and unit of the error.
 
     Raises:

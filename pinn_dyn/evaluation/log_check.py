@@ -53,7 +53,6 @@ class LogCheck:
     """The findings on a log.
 
     Attributes:
-        name: of the data set.
         runs: one row per stretch: split, duration, rows, sample time, jitter, longest gap.
         coordinates: one row per coordinate: range, noise, rest, and what identifies its inertia.
         inputs: one row per input: range, delay and its spread, or why there is none.
@@ -110,7 +109,6 @@ def check_log(
     """Look at a log as its configuration reads, splits and cleans it.
 
     Args:
-        source: the log.
         longest_delay: the longest delay of an input that is tried, s.
         structure: the kinematics, whose joints are the coordinates of the log, if they are known.
 

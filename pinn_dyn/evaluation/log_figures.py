@@ -26,8 +26,7 @@ def cleaning_figure(
     Args:
         cleaned: the stretch, one of ``LogSource.cleaned``.
         title: data set; the run is added to it.
-        labels: name and unit of each coordinate.
-        input_labels: name and unit of each input.
+        labels, input_labels: name and unit of each coordinate and input.
         times: first and last time to draw, on the log's clock, s; None draws all.
 
     Raises:

@@ -64,8 +64,7 @@ def rollout_metrics(
     """Errors of predicted against true configurations.
 
     Args:
-        q_hat: predicted configuration, ``(K, T, N)``.
-        q: true configuration, ``(K, T, N)``.
+        q_hat, q: predicted and true configuration, ``(K, T, N)`` each.
         t: times, ``(T,)``, s.
         thresholds: name and value, in the units of q, for each valid prediction time.
 

@@ -88,10 +88,8 @@ def runs_table(
     Of runs with the same parameters and seed the last one counts.
 
     Args:
-        names: of the runs, one at least.
         configs: their flattened configurations; runs that differ in the seed alone are replicates.
         metrics: what they reached, such as ``val/error_mean`` and ``training_seconds``.
-        parameters: keys of the configurations.
     """
     chosen = {
         name: pd.Series([config.get(name) for config in configs], dtype=object)
@@ -150,12 +148,7 @@ def told_apart(parameters: list[str], configs: list[dict[str, Cell]]) -> list[st
 
 
 def sweep_text(table: pd.DataFrame, parameters: list[str]) -> str:
-    """The table as aligned text, figures as mean ± standard deviation, the best marked ``*``.
-
-    Args:
-        table: what ``sweep_table`` returns.
-        parameters: the parameters to show.
-    """
+    """The table as aligned text, figures as mean ± standard deviation, the best marked ``*``."""
     shown = table[[*parameters, "seeds"]].copy()
     for name in parameters:
         shown[name] = ["-" if pd.isna(value) else short(value) for value in shown[name]]

@@ -80,7 +80,6 @@ class CompiledDynamics(_Wrapped):
     short.
 
     Args:
-        inner: the method.
         dynamics: what it integrates, from now on at one batch shape.
     """
 

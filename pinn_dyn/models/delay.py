@@ -79,11 +79,7 @@ class LearnedDelay(Delay):
 
 
 class DelayedPredictor(ContinuousPredictor):
-    """A predictor whose input acts as late as its head says.
-
-    Attributes:
-        delay: the head.
-    """
+    """A predictor whose input acts as late as its head says."""
 
     delay: Delay
 

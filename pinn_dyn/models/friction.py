@@ -39,11 +39,7 @@ class Friction(nn.Module, abc.ABC):
 
 
 class NoFriction(Friction):
-    """F = 0: dissipation is viscous, as in the paper.
-
-    Args:
-        scales: of the data.
-    """
+    """F = 0: dissipation is viscous, as in the paper."""
 
     def __init__(self, scales: Scales):
         super().__init__()

@@ -36,11 +36,7 @@ InitialVelocityHead = Callable[[Scales], InitialVelocity]
 
 
 class MeasuredVelocity(InitialVelocity):
-    """v_0 = v.
-
-    Args:
-        scales: of the data.
-    """
+    """v_0 = v."""
 
     learned = False
 

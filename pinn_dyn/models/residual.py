@@ -38,11 +38,7 @@ ResidualHead = Callable[[Scales], Residual]
 
 
 class NoResidual(Residual):
-    """r = 0: the robot is mechanical, as in the paper.
-
-    Args:
-        scales: of the data.
-    """
+    """r = 0: the robot is mechanical, as in the paper."""
 
     learned = False
 

@@ -17,13 +17,7 @@ the members of an ensemble, ``(E,)`` and ``(E, P)``."""
 
 
 class Eager:
-    """Loss and gradient of a model, operation by operation.
-
-    Args:
-        loss: of the model.
-        model: what is trained.
-        vector: its parameters.
-    """
+    """Loss and gradient of a model, operation by operation."""
 
     def __init__(self, loss: WindowLoss, model: Predictor, vector: ParameterVector):
         self.loss = loss
