@@ -49,15 +49,11 @@ MONITORED = (
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
-    """The data source of ``config["dataset"]``."""
-    return build_part("dataset", {**_cache(config["dataset"]), **config["dataset"]})
-
-
-def _cache(dataset: dict[str, Any]) -> dict[str, str]:
-    """Where a source that simulates keeps its data, unless its configuration says so."""
-    if "cache" not in arguments(dataset.get("_target_"), "dataset"):
-        return {}
-    return {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")}
+    """The data source of ``config["dataset"]``; one that simulates has a cache."""
+    part = config["dataset"]
+    if "cache" in arguments(part.get("_target_"), "dataset"):
+        part = {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn"), **part}
+    return build_part("dataset", part)
 
 
 def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import whole, write_whole
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.drawing import units
 from pinn_dyn.evaluation.identification import (
     COLUMNS,
@@ -38,8 +38,7 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
     inputs = [units([label]) for label in source.input_labels]
     table = constants_table(model, result, inputs)
     if result.stopped_in is not None:
-        with whole(folder / _UNFINISHED) as partial:
-            table.to_csv(partial, index=False)
+        write_whole(folder / _UNFINISHED, table.to_csv(index=False))
         log.warning(
             "the fit is not finished: its best constants so far are in %s", folder / _UNFINISHED
         )
@@ -47,8 +46,7 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
     (folder / _UNFINISHED).unlink(missing_ok=True)
     together = determined_together(model, result, inputs)
     table = pd.concat([table, together])
-    with whole(folder / _CONSTANTS) as partial:
-        table.to_csv(partial, index=False)
+    write_whole(folder / _CONSTANTS, table.to_csv(index=False))
     log.info("constants and their intervals are in %s", folder / _CONSTANTS)
     left = undetermined(model, result)
     known = [

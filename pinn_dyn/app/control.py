@@ -18,9 +18,10 @@ from pinn_dyn.app.build import build_law, build_reference, build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.control_results import write_results, write_stability
 from pinn_dyn.app.parts import build_part
-from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
+from pinn_dyn.app.provenance import build_origin, data_hash, provenance
 from pinn_dyn.app.run_folder import load_run, write_config, write_json
 from pinn_dyn.app.trust import packages
+from pinn_dyn.app.words import command_line
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Controller,
@@ -117,7 +118,8 @@ def control(cfg: DictConfig) -> float:
     _check_learned(config)
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["export"] is not None:
-        path = _export(laws, Path(config["export"]))
+        with _errors_of("export"):
+            path = export_law(laws["learned"], Path(config["export"]))
         log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
     if config["guard"].get("threshold") is not None:
         laws["learned"] = _guarded(laws, config, source)
@@ -231,11 +233,6 @@ def _check_length(config: dict[str, Any], reference: Reference, runs: int) -> No
         raise ConfigError(
             f"settled_after is {config['settled_after']} s, expected at most duration, {duration} s"
         )
-
-
-def _export(laws: dict[str, Controller], path: Path) -> Path:
-    with _errors_of("export"):
-        return export_law(laws["learned"], path)
 
 
 def _guarded(laws: dict[str, Controller], config: dict[str, Any], source: DataSource) -> Controller:

@@ -27,10 +27,11 @@ from pinn_dyn.app.evaluation_results import (
     write_intervals,
 )
 from pinn_dyn.app.identification import identified
-from pinn_dyn.app.provenance import build_origin, command_line, data_hash, provenance
+from pinn_dyn.app.provenance import build_origin, data_hash, provenance
 from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, write_json
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
+from pinn_dyn.app.words import command_line
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole

@@ -168,7 +168,9 @@ def _test_figures(
             raise ConfigError(
                 f"evaluations: '{pattern}' has no summary.csv; give folders that evaluate.py wrote"
             )
-        for folder in sorted(folders, key=_summarized_at, reverse=True):
+        for folder in sorted(
+            folders, key=lambda x: (x / "summary.csv").stat().st_mtime, reverse=True
+        ):
             try:
                 summary = pd.read_csv(folder / "summary.csv")
             except ValueError as error:
@@ -193,10 +195,6 @@ def _test_figures(
         f"\ntest: {len(figures)} of {len(jobs)} runs over {next(iter(horizons.values())):g} s, "
         f"from {', '.join(horizons)}"
     )
-
-
-def _summarized_at(folder: Path) -> float:
-    return (folder / "summary.csv").stat().st_mtime
 
 
 def _row_of(job: Job, summary: pd.DataFrame) -> pd.Series | None:

@@ -27,9 +27,12 @@ def identified(runs: Sequence[Run], data: Sequence[RunData]) -> dict[int, Predic
     """
     # An earlier fit is another start, which these constants do not have.
     fits = [
-        k for k, run in enumerate(runs) if run.covariance is not None and not _started(run.config)
+        k
+        for k, run in enumerate(runs)
+        if run.covariance is not None and run.config.get("start_from") is None
     ]
-    seen = [_settings(runs[k], data[k]) for k in fits if not _rolled_out(runs[k].config)]
+    alone = [k for k in fits if not runs[k].config["optimizer"].get("rollouts", True)]
+    seen = [_settings(runs[k], data[k]) for k in alone]
     found = {}
     for k in fits:
         settings = _settings(runs[k], data[k])
@@ -41,14 +44,6 @@ def identified(runs: Sequence[Run], data: Sequence[RunData]) -> dict[int, Predic
         except ValueError as error:
             log.warning("no row 'identification' of %s: %s", runs[k].folder, error)
     return found
-
-
-def _started(config: dict[str, Any]) -> bool:
-    return config.get("start_from") is not None
-
-
-def _rolled_out(config: dict[str, Any]) -> bool:
-    return config["optimizer"].get("rollouts", True)
 
 
 def _settings(run: Run, data: RunData) -> tuple[Any, ...]:

@@ -301,10 +301,8 @@ class LearnedModel:
             TypeError: if the model is a black box or an ensemble.
             ValueError: on an argument of the wrong size.
         """
-        values = [self._coordinates(*item) for item in (("q", q), ("v", v), ("a", a))]
-        return self.system.inverse_dynamics(
-            *_together(q=values[0], v=values[1], a=values[2])
-        ).numpy()
+        values = {name: self._coordinates(name, x) for name, x in (("q", q), ("v", v), ("a", a))}
+        return self.system.inverse_dynamics(*_together(**values)).numpy()
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
         """a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``.

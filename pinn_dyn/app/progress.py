@@ -18,18 +18,12 @@ class EpochLines(L.Callback):
 
     def __init__(self, error: str):
         self.error = error
-        self._validated = False
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """The loss of the epoch is known only at its end."""
-        self._validated = True
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Log the line of this epoch."""
         names = {"train/loss": "training loss"}
-        if self._validated:
+        if (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0:
             names[self.error] = "validation error"
-        self._validated = False
         found = [
             f"{text} {float(trainer.callback_metrics[name]):.4g}"
             for name, text in names.items()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-import shlex
 import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,13 +18,6 @@ from pinn_dyn.app.run_folder import Run
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.evaluation.report import Origin
-
-
-def command_line() -> str:
-    """The command that this process was started with, to be pasted into a shell."""
-    program = Path(sys.argv[0]).name
-    start = ["python", program] if program.endswith(".py") else [program]
-    return shlex.join([*start, *sys.argv[1:]])
 
 
 def data_hash(source: DataSource) -> str:

@@ -63,7 +63,7 @@ def shared_data(runs: Sequence[Run], config: dict[str, Any]) -> list[RunData]:
             sources.append(source)
         which.append(datasets.index(dataset))
     splits = [source.load() for source in sources]
-    first = min(range(len(sources)), key=lambda k: _sample_time(splits[k]))
+    first = min(range(len(sources)), key=lambda k: float(splits[k].train[0].t.diff()[0]))
     source = sources[first]
     if config.get("dataset"):
         source = build_source(config)
@@ -82,11 +82,6 @@ def shared_data(runs: Sequence[Run], config: dict[str, Any]) -> list[RunData]:
         again = sum(other.split(" (")[0] == name for other in names)
         names.append(f"{name} ({again + 1})" if name and again else name)
     return [RunData(sources[k], splits[k], source, motions[k], names[k]) for k in which]
-
-
-def _sample_time(splits: Splits) -> float:
-    t = splits.train[0].t
-    return float(t[1] - t[0])
 
 
 def _require_same_motions(run: Run, first: Run, preparation: Sequence[str]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import shlex
 import sys
 import traceback
 from functools import partial
@@ -16,6 +15,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from pinn_dyn.app.words import command_line
 from pinn_dyn.workers import end_with_parent
 
 log = logging.getLogger(__name__)
@@ -113,6 +113,4 @@ def how_to_go_on() -> str | None:
 def _same_command(folder: Path) -> str:
     """The command that this process was called with, on the same sweep folder."""
     words = [word for word in sys.argv[1:] if not word.startswith("hydra.sweep.dir=")]
-    program = Path(sys.argv[0]).name
-    start = ["python", program] if program.endswith(".py") else [program]
-    return shlex.join([*start, *words, f"hydra.sweep.dir={folder}"])
+    return command_line([*words, f"hydra.sweep.dir={folder}"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,13 @@ _INSTEAD = {
 }
 MOST_JOBS = 100_000
 """Of a sweep."""
+
+
+def command_line(words: list[str] | None = None) -> str:
+    """The command that this process was started with, or with other words, for a shell."""
+    program = Path(sys.argv[0]).name
+    start = ["python", program] if program.endswith(".py") else [program]
+    return shlex.join([*start, *(sys.argv[1:] if words is None else words)])
 
 
 def refused(words: list[str], error: BaseException) -> str:

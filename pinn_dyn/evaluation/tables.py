@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from pinn_dyn.data.whole import whole, write_whole
+from pinn_dyn.data.whole import write_whole
 
 # A column is recognized by how its name ends, so that prefixes (windowed_, mean_) may be added.
 _LOWER_IS_BETTER = (
@@ -154,8 +154,7 @@ def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> tuple[Path, Pat
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     csv, records = folder / f"{stem}.csv", folder / f"{stem}.json"
-    with whole(csv) as partial:
-        frame.to_csv(partial, index=False)
+    write_whole(csv, frame.to_csv(index=False))
     rows = [
         {name: _json_value(value) for name, value in row.items()}
         for row in frame.astype(object).to_dict(orient="records")

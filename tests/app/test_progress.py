@@ -37,16 +37,16 @@ def test_an_epoch_without_validation_has_no_error(caplog):
     caplog.set_level("INFO")
     trainer = SimpleNamespace(
         callback_metrics={"train/loss": 0.5, "val/error_mean": 0.25},
-        current_epoch=0,
-        max_epochs=2,
+        current_epoch=1,
+        max_epochs=4,
+        check_val_every_n_epoch=2,
         global_step=10,
         is_global_zero=True,
     )
     lines = EpochLines("val/error_mean")
-    lines.on_validation_end(trainer, None)
     lines.on_train_epoch_end(trainer, None)
-    trainer.current_epoch = 1
+    trainer.current_epoch = 2
     lines.on_train_epoch_end(trainer, None)
     first, second = (record.message for record in caplog.records)
-    assert first == "epoch 1 of 2, step 10: training loss 0.5, validation error 0.25"
-    assert second == "epoch 2 of 2, step 10: training loss 0.5"
+    assert first == "epoch 2 of 4, step 10: training loss 0.5, validation error 0.25"
+    assert second == "epoch 3 of 4, step 10: training loss 0.5"

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 from pinn_dyn.app.build import build_source
-from pinn_dyn.app.provenance import command_line, data_hash, provenance
+from pinn_dyn.app.provenance import data_hash, provenance
 from pinn_dyn.app.run_folder import read_config
+from pinn_dyn.app.words import command_line
 from tests.app.entry import SET_POINTS, run_script
 from tests.evaluation.report_pages import Page
 
