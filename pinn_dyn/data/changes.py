@@ -108,7 +108,9 @@ def _settings(place: str, before: Any, after: Any) -> list[str]:
             changes.append(f"{name} was {_short(before[key])}, now there is none")
         elif key not in before:
             changes.append(f"{name} is new: {_short(after[key])}")
-        elif key == "class" and _same_name(before[key], after[key]):
+        elif (
+            key == "class" and before[key] != after[key] and _name(before[key]) == _name(after[key])
+        ):
             changes.append(f"the code of {name.removesuffix('.class')} was edited")
         else:
             changes += _settings(name, before[key], after[key])
@@ -127,10 +129,6 @@ def _without_code(value: Any) -> Any:
 
 def _name(text: Any) -> str:
     return str(text).split()[0]
-
-
-def _same_name(before: Any, after: Any) -> bool:
-    return before != after and _name(before) == _name(after)
 
 
 def _short(value: Any) -> str:

@@ -143,7 +143,7 @@ class RobotSource(DataSource):
                 Trajectory(q[k], v[k], Signal(t, u[k]), momentum=self._momentum)
                 for k in range(len(q))
             ]
-        return Splits(splits["train"], splits["validation"], splits["test"])
+        return Splits(**splits)
 
     def fingerprint(self) -> dict[str, object]:
         """What the trajectories depend on, code included: the key of the cache."""

@@ -190,7 +190,7 @@ class SimulatedSource(DataSource):
                 Trajectory(q[k], v[k], Signal(t[: q.shape[1]], u[k]), momentum=self._momentum)
                 for k in range(q.shape[0])
             ]
-        return Splits(splits["train"], splits["validation"], splits["test"])
+        return Splits(**splits)
 
     def describe(self) -> dict[str, object]:
         """What the simulation depends on, the code of the system included: the key of the cache."""
@@ -223,9 +223,7 @@ class SimulatedSource(DataSource):
         if self.test_duration == self.duration:
             return self._simulate(SPLITS, self.duration, 0)
         # Two batches of one size: the compiled equation of motion serves both.
-        states, inputs = self.counts["train"]
-        train = states * inputs if self.pairing == "product" else states
-        size = max(train, self.counts["validation"][0] + self.counts["test"][0])
+        size = max(self._size("train"), self._size("validation") + self._size("test"))
         return {
             **self._simulate(SPLITS[1:], self.test_duration, size),
             **self._simulate(SPLITS[:1], self.duration, size),  # the longer times, "t", last

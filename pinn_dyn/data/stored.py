@@ -56,7 +56,7 @@ class StoredSource(DataSource):
             splits = {split: _unpacked(split, arrays) for split in SPLITS}
         except (KeyError, IndexError) as error:
             raise ValueError(f"{self.path} lacks {error}: it may be damaged") from error
-        return Splits(splits["train"], splits["validation"], splits["test"])
+        return Splits(**splits)
 
     def fingerprint(self) -> dict[str, object]:
         """That of the other source."""

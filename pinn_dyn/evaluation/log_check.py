@@ -192,7 +192,7 @@ def check_log(
         distance,
         problems,
         warnings,
-        _unidentified(coordinates),
+        coordinates.loc[coordinates["own share of a"] < _OWN, "coordinate"].tolist(),
         excited,
         advice(measured),
     )
@@ -236,11 +236,6 @@ def _add_repeats(frame: pd.DataFrame, source: LogSource, training: list[Recordin
     if repeats:
         frame["floor of q"], frame["floor of v"] = q, v
     return repeats
-
-
-def _unidentified(coordinates: pd.DataFrame) -> list[str]:
-    """The coordinates whose acceleration follows from q, v and other accelerations."""
-    return coordinates.loc[coordinates["own share of a"] < _OWN, "coordinate"].tolist()
 
 
 def _coordinates(

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import Cleaned
+from pinn_dyn.evaluation.drawing import names
 
 _RAW = "0.65"
 _CLEAN = "#0072B2"
@@ -17,7 +18,6 @@ def cleaning_figure(
     title: str,
     labels: list[str],
     input_labels: list[str],
-    times: tuple[float, float] | None = None,
 ) -> Figure:
     """Raw dots and cleaned lines of one stretch: a column each for q, v and u.
 
@@ -27,48 +27,38 @@ def cleaning_figure(
         cleaned: the stretch, one of ``LogSource.cleaned``.
         title: data set; the run is added to it.
         labels, input_labels: name and unit of each coordinate and input.
-        times: first and last time to draw, on the log's clock, s; None draws all.
 
     Raises:
-        ValueError: on labels that do not fit, or times at which the log has no rows.
+        ValueError: on labels that do not fit.
     """
     raw = cleaned.raw
-    for name, given, width in (
-        ("labels", labels, raw.q.shape[1]),
-        ("input_labels", input_labels, [raw, *cleaned.clean][-1].u.shape[1]),
-    ):
-        if len(given) != width:
-            raise ValueError(f"{name} has {len(given)} entries, expected {width}: {given}")
-    first, last = times or (float(raw.t[0]), float(raw.t[-1]))
-    shown = (raw.t >= first) & (raw.t <= last)
-    if not shown.any():
-        raise ValueError(f"times is {times}, expected some of {raw.t[0]:g} to {raw.t[-1]:g} s")
+    inputs = [raw, *cleaned.clean][-1].u.shape[1]
+    labels = names(labels, "q", raw.q.shape[1], "labels")
+    input_labels = names(input_labels, "u", inputs, "input_labels")
     speeds = [f"d/dt {label.replace(']', '/s]')}" for label in labels]
     columns = {"q": labels, "v": speeds, "u": input_labels}
     rows = max(len(labels), len(input_labels))
     figure = Figure(figsize=(12, 1.5 * rows + 1.4), layout="constrained")
     axes = figure.subplots(rows, 3, sharex=True, squeeze=False)
-    for column, (signal, names) in enumerate(columns.items()):
+    for column, (signal, titles) in enumerate(columns.items()):
         for row in range(rows):
             ax = axes[row, column]
-            if row >= len(names):
+            if row >= len(titles):
                 ax.set_axis_off()
                 continue
             before = getattr(raw, signal)
             if before is not None and row < before.shape[1]:
-                ax.plot(raw.t[shown], before[shown, row], ".", color=_RAW, markersize=3)
+                ax.plot(raw.t, before[:, row], ".", color=_RAW, markersize=3)
             for part in cleaned.clean:
-                seen = (part.t >= first) & (part.t <= last)
-                values = getattr(part, signal)[seen, row]
-                ax.plot(part.t[seen], values, color=_CLEAN, linewidth=1)
-            ax.set_ylabel(names[row], fontsize="small")
-            if row == len(names) - 1:
+                ax.plot(part.t, getattr(part, signal)[:, row], color=_CLEAN, linewidth=1)
+            ax.set_ylabel(titles[row], fontsize="small")
+            if row == len(titles) - 1:
                 ax.set_xlabel("time (s)")
                 ax.tick_params(labelbottom=True)
-    axes[0, 0].set_xlim(first, last)
+    axes[0, 0].set_xlim(raw.t[0], raw.t[-1])
     axes[0, 0].plot(np.nan, np.nan, ".", color=_RAW, label="log")
     axes[0, 0].plot(np.nan, np.nan, color=_CLEAN, label="cleaned")
-    handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=2)
+    handles, texts = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, texts, loc="outside lower center", ncols=2)
     figure.suptitle(f"{title}: {raw.run}, {cleaned.split}")
     return figure

@@ -292,11 +292,8 @@ def _getter(message: Any, field: str, place: str, arrays: dict[str, tuple[str, i
         else:
             at = getattr(at, step, None)
         if at is None:
-            raise LogError(
-                f"{place}: its messages have no {field!r}: their fields are "
-                f"{', '.join(_fields(message))}"
-            )
-    if not hasattr(at, "__len__") and not hasattr(at, last):
+            break
+    if at is None or not (hasattr(at, "__len__") or hasattr(at, last)):
         raise LogError(
             f"{place}: its messages have no {field!r}: their fields are "
             f"{', '.join(_fields(message))}"

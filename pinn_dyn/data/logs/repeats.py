@@ -85,7 +85,9 @@ def repeat_floor(
         thin = max(1, len(piece) // _SAMPLES)
         spread = float(piece.q[::thin].var(axis=0).sum())
         for item in training:
-            if spread == 0 or len(item) < len(piece) or _shares(piece, item):
+            if spread == 0 or len(item) < len(piece):
+                continue
+            if piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]:  # cut out of it
                 continue
             distance, near = _nearest(piece.q[::thin], item.q, thin)
             if distance >= _SAME**2 * spread:
@@ -105,11 +107,6 @@ def repeat_floor(
         return 0, none, none
     q, v = np.sqrt(np.mean(squares, axis=0) / 2)
     return len(squares), q, v
-
-
-def _shares(piece: Recording, item: Recording) -> bool:
-    """Whether a piece is cut out of a stretch."""
-    return piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
 
 
 def _nearest(q: np.ndarray, track: np.ndarray, thin: int) -> tuple[float, int]:

@@ -138,7 +138,7 @@ def _summary(
         if name in summary:
             headers[name] = text
         if name == "max_error":
-            headers |= {step: _step_header(step) for step in summary if _is_step_error(step)}
+            headers |= {x: _step_header(x) for x in summary if x.startswith("step_error_after_")}
     unit = units(labels)
     parts = [
         paragraph(
@@ -166,10 +166,6 @@ def _summary(
     ):
         parts.append(details(text, table(frame)))
     return parts
-
-
-def _is_step_error(name: str) -> bool:
-    return name.startswith("step_error_after_")
 
 
 def _step_header(name: str) -> str:

@@ -149,7 +149,7 @@ def table(
             if spread and spread.get(name) in frame and text != "-":
                 text += f" ± {_cell(frame[spread[name]].iloc[index])}"
             marked = best is not None and name in best and bool(best[name].iloc[index])
-            exact = repr(float(value)) if _is_fraction(value) else ""
+            exact = repr(float(value)) if isinstance(value, float) else ""  # as of numpy too
             cells.append((text, exact, marked, isinstance(value, str)))
         rows.append(cells)
     return Markup(
@@ -164,9 +164,9 @@ def turned(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     return frame.set_index(name).T.rename_axis(None, axis=1).reset_index(names="figure")
 
 
-def figure(drawn: Figure, name: str, *, wide: bool = False) -> Markup:
-    """An interactive figure; the name is its id on the page. A wide one scrolls on a phone."""
-    drawing = Markup(
+def figure(drawn: Figure, name: str) -> Markup:
+    """An interactive figure; the name is its id on the page."""
+    return Markup(
         drawn.to_html(
             full_html=False,
             include_plotlyjs=False,
@@ -176,15 +176,10 @@ def figure(drawn: Figure, name: str, *, wide: bool = False) -> Markup:
             default_height=f"{drawn.layout.height}px",
         )
     )
-    return Markup('<div class="wide">{}</div>').format(drawing) if wide else drawing
 
 
 def _is_text(column: pd.Series) -> bool:
     return len(column) > 0 and all(isinstance(value, str) for value in column)
-
-
-def _is_fraction(value: object) -> bool:
-    return isinstance(value, float)  # numpy's float64 is one
 
 
 def _cell(value: object) -> str:
