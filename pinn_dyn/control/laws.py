@@ -51,9 +51,10 @@ class StateFeedback(Controller):
         for name, value in zip(reference._fields, reference, strict=True):
             require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
 
-    def _feedback(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor) -> Tensor:
+    def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
-        return self.position_gain.to(q) * (q_ref - q) + self.velocity_gain.to(q) * (v_ref - v)
+        K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
+        return K_P * (reference.q - q) + K_D * (reference.v - v)
 
 
 class ModelBasedLaw(StateFeedback):
@@ -129,15 +130,13 @@ class ModelBasedLaw(StateFeedback):
         with torch.no_grad():
             A = self.model.input_matrix(q)
             self._condition = condition_number(A)
-            return self._input(A, q, v, *reference)
+            return self._input(A, q, v, reference)
 
     def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
-        return self._input(self.model.input_matrix(q), q, v, q_ref, v_ref, a_ref)
+        return self._input(self.model.input_matrix(q), q, v, Motion(q_ref, v_ref, a_ref))
 
     @abc.abstractmethod
-    def _input(
-        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
-    ) -> Tensor:
+    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """The formula of the law, given A(q) ``(*batch, N, M)``."""
 
     def diagnostics(self) -> dict[str, Tensor]:
@@ -164,10 +163,8 @@ class ProportionalDerivative(ModelBasedLaw):
     errors: :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
     """
 
-    def _input(
-        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
-    ) -> Tensor:
-        return matvec(A.transpose(-1, -2), self._feedback(q, v, q_ref, v_ref))
+    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        return matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
 
 
 class Regulation(ModelBasedLaw):
@@ -184,12 +181,9 @@ class Regulation(ModelBasedLaw):
     K_P in N/m or Nm/rad and K_D in Ns/m or Nms/rad where A has no unit.
     """
 
-    def _input(
-        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
-    ) -> Tensor:
+    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         potential = pseudo_inverse_times(A, self.model.potential_force(q), self.inverse_damping)
-        feedback = self._feedback(q, v, q_ref, v_ref)
-        return potential + matvec(A.transpose(-1, -2), feedback)
+        return potential + matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
 
 
 class Tracking(ModelBasedLaw):
@@ -206,13 +200,10 @@ class Tracking(ModelBasedLaw):
     errors: :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
     """
 
-    def _input(
-        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
-    ) -> Tensor:
-        force = self.model.inverse_dynamics(q_ref, v_ref, a_ref)
+    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        force = self.model.inverse_dynamics(*reference)
         feed_forward = pseudo_inverse_times(A, force, self.inverse_damping)
-        feedback = self._feedback(q, v, q_ref, v_ref)
-        return feed_forward + matvec(A.transpose(-1, -2), feedback)
+        return feed_forward + matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
 
 
 class ComputedTorque(ModelBasedLaw):
@@ -226,10 +217,8 @@ class ComputedTorque(ModelBasedLaw):
     damped. Arguments, A^+ where M differs from N, and errors: :class:`ModelBasedLaw`.
     """
 
-    def _input(
-        self, A: Tensor, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor
-    ) -> Tensor:
-        a = a_ref + self._feedback(q, v, q_ref, v_ref)
+    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        a = reference.a + self._feedback(q, v, reference)
         return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a), self.inverse_damping)
 
 

@@ -193,7 +193,9 @@ class Guarded(Controller):
         outside = self._distance > self.threshold
         if not outside.any():
             return u
-        self._warn_once(t)
+        if not self._warned:
+            self._warned = True
+            self._warn(t, self._distance)
         if self._fallback is None:
             return u
         return torch.where(outside.unsqueeze(-1), self._fallback(t, q, v, reference), u)
@@ -224,11 +226,8 @@ class Guarded(Controller):
         outside = distance > self.threshold
         return torch.zeros_like(outside) if self._fallback is None else outside
 
-    def _warn_once(self, t: float) -> None:
-        if self._warned or self._distance is None:
-            return
-        self._warned = True
-        flat = self._distance.nan_to_num(nan=0.0).flatten()
+    def _warn(self, t: float, distance: Tensor) -> None:
+        flat = distance.nan_to_num(nan=0.0).flatten()
         farthest = int(flat.argmax())
         count = int((flat > self.threshold).sum())
         log.warning(

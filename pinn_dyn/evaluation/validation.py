@@ -131,12 +131,11 @@ class RolloutValidator:
         truth = truth.until(self.horizon)
         span = self.window or self.horizon
         steps = {max(1, round(part * span / step)) for part in _PARTS} - {round(span / step)}
-        found = [longest]
-        found += [predict_windows(model, truth, window=n * step, step=step) for n in steps]
         still = StandsStill(model.num_coordinates, model.num_inputs)
-        windows = [n * step for n in steps]
-        floors = [self.predict(still, truth)]
-        floors += [predict_windows(still, truth, window=w, step=step) for w in windows]
+        found, floors = [longest], [self.predict(still, truth)]
+        for n in steps:
+            found.append(predict_windows(model, truth, window=n * step, step=step))
+            floors.append(predict_windows(still, truth, window=n * step, step=step))
         ratios = [
             (item.error().mean(dim=1) / floor.error().mean()).nan_to_num(_WORST).clamp(max=_WORST)
             for item, floor in zip(found, floors, strict=True)
