@@ -43,7 +43,7 @@ class ParameterVector:
         leading = () if members is None else (members,)
         self._shapes = [p.shape[len(leading) :] for p in self.parameters]
         self._sizes = [shape.numel() for shape in self._shapes]
-        rows = [p.detach().reshape(*leading, n) for p, n in self._pairs()]
+        rows = [p.detach().reshape(*leading, -1) for p in self.parameters]
         self.values = nn.Parameter(torch.cat(rows, dim=-1))
         self.gradient = torch.zeros_like(self.values)
         self.values.grad = self.gradient
@@ -56,9 +56,6 @@ class ParameterVector:
         """Give the parameters their part of the gradient, which others may take from them."""
         for parameter, gradient in zip(self.parameters, self._gradients, strict=True):
             parameter.grad = gradient
-
-    def _pairs(self) -> Iterable[tuple[nn.Parameter, int]]:
-        return zip(self.parameters, self._sizes, strict=True)
 
     def split(self, vector: Tensor) -> list[Tensor]:
         """A vector ``(..., P)`` as views of the shapes of the parameters, ``(..., *shape)``."""
