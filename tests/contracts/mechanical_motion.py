@@ -67,7 +67,9 @@ class MotionContract:
         q, v, _, u = configurations
         x = torch.cat([q, v], -1)
         jacobian = partial_derivatives(
-            lambda x: system.velocity_derivative(x, u), x, self.difference_step
+            lambda x: system.velocity_derivative(x, u.expand(*x.shape[:-1], -1)),
+            x,
+            self.difference_step,
         )
         return self.step_times_rate / float(torch.linalg.eigvals(jacobian).abs().max())
 
@@ -86,7 +88,10 @@ class MotionContract:
     # Gradients.
 
     def test_gradients_through_an_rk4_step_match_finite_differences(self, system, configurations):
-        """Of a scalar of the increments, by the initial state, the input and each parameter."""
+        """Of a scalar of the increments, by the initial state, the input and all parameters.
+
+        Along one random direction each: of the parameters a unit step in every one of them.
+        """
         q, v, a, u = configurations
         second = v if system.state == "qv" else system.momentum(q, v)
         x0, u = torch.cat([q, second], -1), torch.stack([u, -u], -2)
@@ -96,26 +101,32 @@ class MotionContract:
         def loss():
             return (weights * system.increments(x0, t, Signal(t, u))[..., -1, :]).sum()
 
-        leaves = {"x0": x0, "u": u, **dict(system.named_parameters())}
+        groups = {"x0": [x0], "u": [u], "parameters": list(system.parameters())}
+        leaves = [leaf for group in groups.values() for leaf in group]
         with torch.enable_grad():
-            for leaf in leaves.values():
+            for leaf in leaves:
                 leaf.requires_grad_(True)
-            gradients = torch.autograd.grad(loss(), list(leaves.values()), allow_unused=True)
+            value = loss()
+            found = torch.autograd.grad(value, leaves, materialize_grads=True)
+        gradients = dict(zip(leaves, found, strict=True))
         generator = torch.Generator().manual_seed(1)
-        for (name, leaf), gradient in zip(leaves.items(), gradients, strict=True):
-            direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
-            direction /= direction.norm()
-            start = leaf.detach().clone()
+        for name, group in groups.items():
+            directions = [
+                torch.randn(leaf.shape, generator=generator, dtype=torch.float64) for leaf in group
+            ]
+            directions = [direction / direction.norm() for direction in directions]
+            starts = [leaf.detach().clone() for leaf in group]
 
-            def shifted(e, leaf=leaf, start=start, direction=direction):
-                leaf.copy_(start + e * direction)
-                value = loss()
-                leaf.copy_(start)
-                return value
+            def shifted(e, group=group, starts=starts, directions=directions):
+                for leaf, start, direction in zip(group, starts, directions, strict=True):
+                    leaf.copy_(start + e * direction)
+                return loss()
 
             expected = slope(shifted, self.difference_step)
-            gradient = torch.zeros_like(leaf) if gradient is None else gradient
-            actual = (gradient * direction).sum()
-            error = float((actual - expected).abs())
-            scale = float(gradient.norm()) + float(loss().abs())
+            for leaf, start in zip(group, starts, strict=True):
+                leaf.copy_(start)
+            pairs = [(gradients[leaf], d) for leaf, d in zip(group, directions, strict=True)]
+            actual = sum((gradient * direction).sum() for gradient, direction in pairs)
+            error = float(abs(actual - expected))
+            scale = sum(float(gradient.norm()) for gradient, _ in pairs) + float(value.abs())
             assert error <= self.difference_tolerance * scale, (name, actual, expected)

@@ -86,21 +86,24 @@ class MechanicalSystemContract(MotionContract):
 
     # Shapes and types.
 
-    @pytest.mark.parametrize("batch", [(), (8,), (2, 4)], ids=["unbatched", "B", "B1xB2"])
-    def test_any_batch_shape_gives_the_same_numbers(self, system, configurations, batch):
-        if batch == ():
-            at = Configurations(*(x[3] for x in configurations))
-            reference = [quantities(system, Configurations(*(x[3:4] for x in configurations)))]
-        else:
-            at = Configurations(*(x.reshape(*batch, -1) for x in configurations))
-            reference = [
-                quantities(system, Configurations(*(x[i] for x in configurations))) for i in (0, 7)
-            ]
-        for name, (value, shape) in quantities(system, at).items():
-            assert value.shape == (*batch, *shape), name
-            ends = value.reshape(-1, *shape)[[0, -1] if batch else [0]]
-            expected = torch.stack([sample[name][0].reshape(shape) for sample in reference])
-            assert_near(ends, expected, self.exact_tolerance, scale=1e-12 + expected.abs().max())
+    def test_any_batch_shape_gives_the_same_numbers(self, system, configurations):
+        """As one batch of eight, two by four, and the first and the last alone."""
+        expected = quantities(system, configurations)
+
+        def assert_same(batch, at, part):
+            for name, (value, shape) in quantities(system, at).items():
+                assert value.shape == (*batch, *shape), (name, batch)
+                one = part(expected[name][0])
+                scale = 1e-12 + one.abs().max()
+                assert_near(value.reshape(one.shape), one, self.exact_tolerance, scale)
+
+        for name, (value, shape) in expected.items():
+            assert value.shape == (8, *shape), name
+        rows = Configurations(*(x.reshape(2, 4, -1) for x in configurations))
+        assert_same((2, 4), rows, lambda value: value)
+        for i in (0, 7):
+            one = Configurations(*(x[i] for x in configurations))
+            assert_same((), one, lambda value, i=i: value[i])
 
     def test_float32_in_gives_float32_out_close_to_float64(self, system, configurations):
         exact = quantities(system, configurations)
@@ -110,56 +113,34 @@ class MechanicalSystemContract(MotionContract):
             scale = max(1e-6, float(exact[name][0].abs().max()))
             assert_near(value.double(), exact[name][0], self.float32_tolerance, scale)
 
-    @pytest.mark.parametrize(
-        ("call", "wrong"),
-        [
-            ("terms", "q"),
-            ("potential_force", "q"),
-            ("coriolis_matrix", "q"),
-            ("coriolis_matrix", "v"),
-            ("forward_dynamics", "q"),
-            ("forward_dynamics", "v"),
-            ("forward_dynamics", "u"),
-            ("inverse_dynamics", "q"),
-            ("inverse_dynamics", "v"),
-            ("inverse_dynamics", "a"),
-            ("momentum", "q"),
-            ("momentum", "v"),
-            ("velocity", "q"),
-            ("velocity", "p"),
-            ("kinetic_energy", "v"),
-            ("total_energy", "q"),
-            ("power", "q"),
-            ("power", "v"),
-            ("power", "u"),
-        ],
-    )
-    def test_a_wrong_shape_is_refused_by_name(self, system, configurations, call, wrong):
-        names = {
-            "terms": "q",
-            "potential_force": "q",
-            "coriolis_matrix": "qv",
-            "forward_dynamics": "qvu",
-            "inverse_dynamics": "qva",
-            "momentum": "qv",
-            "velocity": "qp",
-            "kinetic_energy": "qv",
-            "total_energy": "qv",
-            "power": "qvu",
-        }[call]
+    def test_a_wrong_shape_is_refused_by_name(self, system, configurations):
         values = dict(configurations._asdict(), p=configurations.a)
-        values[wrong] = torch.cat([values[wrong], values[wrong][..., :1]], -1)
-        with pytest.raises(ValueError, match=rf"^{wrong} has shape"):
-            getattr(system, call)(*(values[name] for name in names))
+        for call, names, wrongs in [
+            ("terms", "q", "q"),
+            ("potential_force", "q", "q"),
+            ("coriolis_matrix", "qv", "qv"),
+            ("forward_dynamics", "qvu", "qvu"),
+            ("inverse_dynamics", "qva", "qva"),
+            ("momentum", "qv", "qv"),
+            ("velocity", "qp", "qp"),
+            ("kinetic_energy", "qv", "v"),
+            ("total_energy", "qv", "q"),
+            ("power", "qvu", "qvu"),
+        ]:
+            for wrong in wrongs:
+                longer = torch.cat([values[wrong], values[wrong][..., :1]], -1)
+                given = [longer if name == wrong else values[name] for name in names]
+                with pytest.raises(ValueError, match=rf"^{wrong} has shape"):
+                    getattr(system, call)(*given)
 
-    @pytest.mark.parametrize("wrong", ["x0", "u"])
-    def test_prediction_refuses_a_wrong_shape_by_name(self, system, configurations, wrong):
+    def test_prediction_refuses_a_wrong_shape_by_name(self, system, configurations):
         q, v, _, u = configurations
-        values = {"x0": torch.cat([q, v], -1), "u": torch.stack([u, u], -2)}
-        values[wrong] = values[wrong][..., :-1]
+        x0, u = torch.cat([q, v], -1), torch.stack([u, u], -2)
         t = torch.tensor([0.0, 0.1], dtype=torch.float64)
-        with pytest.raises(ValueError, match=rf"^{wrong} has shape"):
-            system.predict(values["x0"], t, Signal(t, values["u"]))
+        with pytest.raises(ValueError, match=r"^x0 has shape"):
+            system.predict(x0[..., :-1], t, Signal(t, u))
+        with pytest.raises(ValueError, match=r"^u has shape"):
+            system.predict(x0, t, Signal(t, u[..., :-1]))
 
     # The four terms.
 

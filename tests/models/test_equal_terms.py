@@ -25,7 +25,7 @@ from tests.models.builders import (
 from tests.support.finite_differences import assert_near
 from tests.support.linear import LinearSystem, exact_solution
 
-T = torch.linspace(0, 0.6, 61, dtype=torch.float64)
+T = torch.linspace(0, 0.6, 31, dtype=torch.float64)
 
 
 class HandBuilt(MechanicalSystem):
@@ -48,14 +48,14 @@ class HandBuilt(MechanicalSystem):
         return self.network.input_matrix(q)
 
 
-def paths(lagrangian, hamiltonian, count=4):
+def paths(lagrangian, hamiltonian, t=T, count=4):
     """(q, v) and (q, p) along a roll-out from one start under one input, by each network."""
     q, v, _, u = random_batch(lagrangian.num_coordinates, lagrangian.num_inputs, count)
-    u = u[:, None] * torch.cos(4 * T)[:, None]
+    u = u[:, None] * torch.cos(4 * t)[:, None]
     with torch.no_grad():
-        by_velocity = lagrangian.predict(torch.cat([q, v], -1), T, Signal(T, u))
+        by_velocity = lagrangian.predict(torch.cat([q, v], -1), t, Signal(t, u))
         p = lagrangian.momentum(q, v)
-        by_momentum = hamiltonian.predict(torch.cat([q, p], -1), T, Signal(T, u))
+        by_momentum = hamiltonian.predict(torch.cat([q, p], -1), t, Signal(t, u))
     return by_velocity, by_momentum, u
 
 
@@ -101,11 +101,12 @@ def test_both_networks_have_the_same_derivatives(pair):
 
 def test_networks_move_like_the_base_class_in_the_same_coordinates(pair):
     lagrangian, hamiltonian = pair
-    by_velocity, by_momentum, u = paths(lagrangian, hamiltonian)
+    t = T[::5]  # one integrator on both sides: its error is the same
+    by_velocity, by_momentum, u = paths(lagrangian, hamiltonian, t)
     system = HandBuilt(lagrangian)
     with torch.no_grad():
-        velocity = rollout(system.velocity_derivative, by_velocity[:, 0], T, Signal(T, u))
-        momentum = rollout(system.momentum_derivative, by_momentum[:, 0], T, Signal(T, u))
+        velocity = rollout(system.velocity_derivative, by_velocity[:, 0], t, Signal(t, u))
+        momentum = rollout(system.momentum_derivative, by_momentum[:, 0], t, Signal(t, u))
     assert_near(by_velocity, velocity, 1e-9)
     assert_near(by_momentum, momentum, 1e-9)
 

@@ -11,9 +11,13 @@ def slope(function, step=1e-3):
 
 
 def partial_derivatives(function, x, step=1e-3):
-    """The slopes of ``function`` along each entry of ``x`` ``(*batch, n)``, stacked last."""
-    directions = torch.eye(x.shape[-1], dtype=x.dtype)
-    return torch.stack([slope(lambda e, d=d: function(x + e * d), step) for d in directions], -1)
+    """The slopes of ``function`` along each entry of ``x`` ``(*batch, n)``, stacked last.
+
+    The n directions are one more batch dimension, in front, of what the function is called with.
+    """
+    n = x.shape[-1]
+    directions = torch.eye(n, dtype=x.dtype).reshape(n, *[1] * (x.dim() - 1), n)
+    return slope(lambda e: function(x + e * directions), step).movedim(0, -1)
 
 
 def assert_near(actual, expected, tolerance, scale=None):
