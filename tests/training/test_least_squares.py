@@ -57,7 +57,7 @@ def held_out_error(model, truth):
 
 @pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "roll-outs"])
 def test_the_dynamics_are_found_from_a_generic_start(truth, runs, rollouts):
-    windows = draw_windows(runs, count=40, steps=4, stride=2, seed=0)
+    windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
     model = robot_model("generic")
     before = held_out_error(model, truth)
     result = LeastSquares(cutoff=20.0, rollouts=rollouts).fit(model, runs, windows)
@@ -222,7 +222,7 @@ def solved(monkeypatch):
 def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
     truth, runs, solved, monkeypatch, minimization, evaluation
 ):
-    windows = draw_windows(runs, count=40, steps=4, stride=2, seed=0)
+    windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
     solver, model = LeastSquares(cutoff=20.0), robot_model("generic")
     before = held_out_error(model, truth)
     evaluate, calls = least_squares._evaluate, itertools.count(1)

@@ -29,11 +29,11 @@ def model(request):
     return model
 
 
-def differences(model, function, step=1e-5):
-    """d function / dz by central differences, ``(..., P)``."""
+def differences(model, function, directions=None, step=1e-5):
+    """d function / dz by central differences, ``(..., P)``, or along directions ``(K, P)``."""
     z = parameters_to_vector(model.parameters()).detach()
     columns = []
-    for direction in torch.eye(len(z)).to(z):
+    for direction in torch.eye(len(z)).to(z) if directions is None else directions:
         ends = []
         for sign in (1, -1):
             vector_to_parameters(z + sign * step * direction, model.parameters())
@@ -85,5 +85,7 @@ def test_roll_outs_by_the_parameters(model, substeps):
     model.integrator = RK4(substeps)
     windows = windows_of(model, count=3, steps=4 - substeps)
     increments = partial(model.increments, windows.start("qv"), windows.t, windows.input)
-    expected = differences(model, lambda: increments()[:, 1:])
-    assert_close(rollout_slopes(model, windows), expected)
+    count = sum(p.numel() for p in model.parameters())
+    directions = torch.randn(3, count, generator=torch.Generator().manual_seed(4)).double()
+    expected = differences(model, lambda: increments()[:, 1:], directions)
+    assert_close(rollout_slopes(model, windows) @ directions.T, expected)
