@@ -26,7 +26,7 @@ def test_the_members_get_batches_of_the_same_windows():
     data = make_data()
     both = list(EnsembleData(data, 2).train_dataloader())
     single = list(data.train_dataloader())
-    assert len(both) == len(single) == 20
+    assert len(both) == len(single) == 8
     for batch, first in zip(both, single, strict=True):
         assert batch.q.shape == (2, 32, 2)
         assert batch.u.shape == (2, 32, 5, 1)

@@ -20,7 +20,7 @@ def trained_alone(folder, kind, data, index):
     """The training of one seed: its own weights, its own order of the same windows."""
     model = make_models(kind, data, 2)[index]
     learner = learn(DynamicsLearner, model, model, data)
-    order = BatchSampler(128, batch_size=32, batches=20, seed=4 + index)
+    order = BatchSampler(128, batch_size=32, batches=8, seed=4 + index)
     windows = data.windows.to(torch.device("cpu"), torch.float32)
     learner.train_dataloader = lambda: WindowLoader(windows, order)
     trainer = make_trainer(folder, max_epochs=2, enable_checkpointing=False)
@@ -30,7 +30,7 @@ def trained_alone(folder, kind, data, index):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_ensemble_of_two_ends_with_the_weights_of_two_trainings(tmp_path, kind):
-    """Forty steps in two epochs, with clipping, a schedule and a curriculum."""
+    """Sixteen steps in two epochs, with clipping, a schedule and a curriculum."""
     data = make_data()
     models = make_models(kind, data, 2)
     ensemble = Ensemble(models)

@@ -16,8 +16,8 @@ def covariance_of(model, size=0.01):
 
 def test_the_spread_of_predictions_is_that_of_the_linear_problem():
     model = known_model(gain_spread=0.3)
-    windows, covariance = windows_of(model, count=3, steps=4), covariance_of(model)
-    members = posterior_draws(model, covariance, size=1000)
+    windows, covariance = windows_of(model, count=3, steps=2), covariance_of(model)
+    members = posterior_draws(model, covariance, size=500)
     with torch.no_grad():
         found = members.member_increments(windows.start("qv"), windows.t, windows.input)[:, :, 1:]
         middle = model.increments(windows.start("qv"), windows.t, windows.input)[:, 1:]

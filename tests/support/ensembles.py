@@ -20,7 +20,7 @@ def make_data(steps=2):
         steps=steps,
         stride=2,
         batch_size=32,
-        batches_per_epoch=20,
+        batches_per_epoch=8,
         seed=4,
     )
 

@@ -1,6 +1,6 @@
 """Small trainings: a data source, models and a trainer."""
 
-from functools import partial
+from functools import cache, partial
 
 import lightning as L
 import numpy as np
@@ -43,6 +43,7 @@ class Oscillators(DataSource):
         return self.splits
 
 
+@cache
 def make_splits():
     """Six motions, four of them for training."""
     system = damped_oscillators().requires_grad_(False)
