@@ -12,10 +12,20 @@ from docs.tables.text import number
 from tests.docs.blocks import ROOT
 
 
+@pytest.fixture(scope="module")
+def made():
+    """The tables of each page, and the files that were read for them."""
+    opened = set()
+    read = pd.read_csv
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pd, "read_csv", lambda path, *a: opened.add(str(path)) or read(path, *a))
+        return {page: tables() for page, tables in PAGES.items()}, opened
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_page_is_made_of_the_results(page):
+def test_a_page_is_made_of_the_results(made, page):
     text = page.read_text()
-    assert filled(text, PAGES[page]()) == text, "run: python -m docs.tables"
+    assert filled(text, made[0][page]) == text, "run: python -m docs.tables"
 
 
 def test_a_place_without_a_table_and_a_table_without_a_place_are_refused():
@@ -50,14 +60,9 @@ def test_every_test_set_of_the_tables_has_its_floor():
     assert set(results.floors().index) == set(SETS)
 
 
-def test_every_result_is_read_by_a_page():
+def test_every_result_is_read_by_a_page(made):
     """What nothing reads goes: each file is opened by a table, or linked from a page."""
-    opened = set()
-    read = pd.read_csv
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pd, "read_csv", lambda path, *a: opened.add(str(path)) or read(path, *a))
-        for tables in PAGES.values():
-            tables()
+    _, opened = made
     linked = "".join(page.read_text() for page in (ROOT / "docs").glob("*.md"))
     for path in (ROOT / "results").rglob("*.*"):
         name = path.relative_to(ROOT).as_posix()
