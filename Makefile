@@ -34,7 +34,7 @@ reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on wher
 	$(BIN)/python reproduce.py
 
 test: $(VENV)/.installed-dev  ## run the tests, on all cores
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m "not slow"
 
 test-slow: $(VENV)/.installed-dev  ## run those that compile models, or simulate for long
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m slow

@@ -8,6 +8,18 @@ from tests.support.compositions import keep_compositions
 # The tests' tensors are small: threads beyond one only slow them down.
 torch.set_num_threads(1)
 
+# Files that take half a minute each, some with few tests: with --no-loadscope-reorder they are
+# begun first, so that at the end no worker waits long for another.
+LONG = (
+    *("test_configurations", "test_code_blocks", "test_sweep_jobs", "test_known_runs"),
+    *("test_known_systems", "test_played_pages", "test_examples", "test_least_squares"),
+    *("test_log_training", "test_evaluation", "test_control", "test_resume"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _kept_compositions():
