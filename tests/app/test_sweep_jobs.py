@@ -186,7 +186,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = [
         *("-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"),
-        *(f"hydra/launcher={launcher}", "trainer.steps=100", "trainer.validations=10"),
+        *(f"hydra/launcher={launcher}", "trainer.steps=50", "trainer.validations=5"),
     ]
     first = tmp_path / "sweep" / "0_lnn-seed0"
     log = tmp_path / "log.txt"
@@ -204,7 +204,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
     assert f"going on with the training in {first}" in (first / "train.log").read_text()
     for seed in (0, 1):
         folder = tmp_path / "sweep" / f"{seed}_lnn-seed{seed}"
-        assert record(folder)["steps"] == 100
+        assert record(folder)["steps"] == 50
 
 
 @pytest.mark.parametrize("models", ["lnn", pytest.param("lnn,mlp", marks=pytest.mark.slow)])

@@ -38,10 +38,9 @@ SMALL = {
 }
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", PLAYED)
-def test_a_page_runs_from_start_to_end(name, tmp_path, monkeypatch, request):
-    if name != "docs/tutorial.md":  # one with all its pictures is enough
-        request.getfixturevalue("undrawn")
+def test_a_page_runs_from_start_to_end(name, tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
