@@ -105,7 +105,7 @@ class TestOutsideTheData(MechanicalNetwork):
 
 
 class TestWithAnAngle(MechanicalNetwork):
-    duration = 0.2  # it turns several times a second
+    duration = 2.0  # it turns several times a second
 
     @pytest.fixture
     def system(self, seen):
@@ -115,7 +115,7 @@ class TestWithAnAngle(MechanicalNetwork):
 
 class TestThreeCoordinates(MechanicalNetwork):
     size = 3
-    duration = 2.0
+    duration = 20.0
 
     @pytest.fixture
     def system(self, seen):
@@ -128,7 +128,7 @@ class TestASerialChain(MechanicalNetwork):
     """With the chain's mass and potential."""
 
     size = 3
-    duration = 0.5  # it turns several times a second
+    duration = 5.0  # it turns several times a second
 
     @pytest.fixture
     def system(self, kind, seen):
@@ -142,7 +142,7 @@ class TestKnownMechanicsAndNetwork(MechanicalNetwork):
     """
 
     size = 4
-    duration = 0.5  # it turns several times a second
+    duration = 5.0  # it turns several times a second
 
     @pytest.fixture
     def data(self):
@@ -182,7 +182,7 @@ class TestATrainedNetwork(OutsideTheDataContract):
     largest speeds. Without limits its smallest eigenvalue falls to less than a thousandth.
     """
 
-    duration = 0.5  # a fast motion: its frequency is a hundred times that of the data
+    duration = 5.0  # a fast motion: its frequency is a hundred times that of the data
 
     @pytest.fixture
     def trained(self):
