@@ -10,7 +10,7 @@ from tests.app.conftest import cache, hnn_run, lnn_run  # noqa: F401
 # What hypothesis tries: the same each time, or others for longer.
 settings.register_profile(
     "short",
-    max_examples=40,
+    max_examples=20,
     derandomize=True,
     deadline=None,
     database=None,
