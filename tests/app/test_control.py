@@ -2,14 +2,13 @@
 
 import json
 
-import hydra
 import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from pinn_dyn.app.config import CONF, checked, config_folder
+from pinn_dyn.app.config import CONF, config_folder
 from pinn_dyn.models import LagrangianNetwork
 from tests.app.entry import (
     HIGH,
@@ -22,6 +21,7 @@ from tests.app.entry import (
     run_script,
     train,
 )
+from tests.app.pages import assert_says_how_it_came_about, page_of
 
 FOLDER = config_folder("control")
 EXPERIMENTS = sorted(
@@ -93,6 +93,18 @@ def test_figures_animation_log_and_provenance_are_written(results):
     assert record["config"]["gains"]["position"] == 5
 
 
+def test_the_page_has_the_numbers_of_its_files(results, lnn_run):
+    page, summary = page_of(results), pd.read_csv(results / "summary.csv")
+    rows = page.table("RMS error")
+    assert [row["law"][0] for row in rows] == ["learned", "truth", "pd"]
+    for row, value in zip(rows, summary["rms_error"], strict=True):
+        assert float(row["RMS error"][1]) == value
+    coordinates = pd.read_csv(results / "coordinates.csv")
+    shown = page.table("coordinate")
+    assert [float(row["max_error"][1]) for row in shown] == coordinates["max_error"].tolist()
+    assert_says_how_it_came_about(results, "control.py", lnn_run)
+
+
 @pytest.mark.slow
 def test_a_law_in_continuous_time_differs_from_a_sampled_one_by_the_sampling_only(
     tmp_path, results, lnn_run, undrawn
@@ -122,7 +134,8 @@ def test_limits_noise_and_delay_reach_the_loop(tmp_path, results, lnn_run, undra
 
 def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, lnn_run):
     words = ["gains.position=1e5", "gains.velocity=1e3", "rate=100", "duration=0.4", "runs=1"]
-    folder = control(tmp_path / "out", lnn_run, *words, "settled_after=0.2")
+    words += ["settled_after=0.2", "~controllers.truth", "~controllers.pd"]
+    folder = control(tmp_path / "out", lnn_run, *words)
     assert pd.read_csv(folder / "summary.csv").set_index("controller").loc["learned", "stopped"]
     assert (folder / "closed_loop_learned.png").is_file()
     assert not (folder / "strip.png").exists()  # one pose is no motion
@@ -207,13 +220,6 @@ def test_a_run_of_measured_data_gets_a_report_of_the_model_alone(tmp_path, monke
     assert "example_log" in text
     assert text in capsys.readouterr().out
     assert not (folder / "summary.csv").exists()
-
-
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_control_experiment_composes(experiment):
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(FOLDER)):
-        cfg = hydra.compose("control", overrides=[f"experiment={experiment}", "run=runs/x"])
-    assert "learned" in checked("control", cfg)["controllers"]
 
 
 def test_there_are_control_experiments():

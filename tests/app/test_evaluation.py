@@ -12,6 +12,7 @@ from matplotlib.image import imread
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.run_folder import read_config
 from tests.app.entry import NO_FIGURES, TINY_DATA, refused_text, run_script, train
+from tests.app.pages import assert_says_how_it_came_about, page_of
 
 SHORT = ["horizon=0.1", "windows=[0.02,0.05]"]
 
@@ -111,6 +112,20 @@ def test_terms_are_compared_for_the_structured_model_alone(evaluation):
     assert len(terms) > 0
     assert "hnn" in (evaluation / "terms.txt").read_text()
     assert not list(evaluation.glob("terms_mlp*"))
+
+
+def test_the_page_has_the_numbers_of_its_files(evaluation, hnn_run):
+    page, summary = page_of(evaluation), pd.read_csv(evaluation / "summary.csv")
+    rows = page.table("mean error ± std")
+    assert [row["run"][0] for row in rows][:3] == ["hnn", "mlp", "[stands still]"]
+    for row, value in zip(rows, summary["error_mean"], strict=True):
+        assert float(row["mean error ± std"][1]) == value
+    terms = pd.read_csv(evaluation / "terms_hnn.csv")
+    shown = page.table("|X_L − X| / |X|")
+    assert [row["term X"][0] for row in shown] == terms["term"].tolist()
+    for row, value in zip(shown, terms["relative_error_best_P"], strict=True):
+        assert float(row["|X_L − P X| / |X_L|"][1]) == value
+    assert_says_how_it_came_about(evaluation, "evaluate.py", hnn_run)
 
 
 def test_the_records_say_what_was_evaluated(evaluation):
@@ -283,6 +298,7 @@ def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, 
     assert "open report.html" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_step_too_long_for_the_fastest_motion_is_named_with_its_coordinate(tmp_path, lnn_run):
     run_script(
         "evaluate.py",

@@ -87,7 +87,9 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
     assert not (tmp_path / "out" / "terms.txt").exists()
 
 
-def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, capsys):
+def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
+    monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+    monkeypatch.setattr("pinn_dyn.app.evaluate.draw", lambda *_: None)
     run_script(
         "train.py",
         *TINY,
@@ -100,7 +102,8 @@ def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, capsys):
     seconds = found["model/input_delay_seconds"]
     assert 0.01 < seconds < 0.03
     assert seconds != 0.02
-    run_script("evaluate.py", *evaluation_of(tmp_path / "run", tmp_path / "out"))
+    short = ["horizon=1", "windows=[0.2]"]
+    run_script("evaluate.py", *evaluation_of(tmp_path / "run", tmp_path / "out"), *short)
     row, *floors = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert row["input_delay_seconds"] == pytest.approx(seconds, abs=1e-3)
     assert all(one["input_delay_seconds"] is None for one in floors)
@@ -112,6 +115,7 @@ def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):
     assert "horizon is 6" in said(error, capsys)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_horizon_takes_the_test_motions_that_are_long_enough(run, tmp_path, capsys):
     """Whole runs of 5 s, one of which is cut to 3 s."""
     log = pd.read_csv(EXAMPLES / "example_log.csv")

@@ -35,6 +35,8 @@ def test_every_experiment_is_accepted(monkeypatch, command, experiment):
     if command == "train":
         assert epochs(config) == (1, 5, 1)
         assert config["compile"] is False
+    else:
+        assert "learned" in config["controllers"]
 
 
 @pytest.mark.parametrize(
