@@ -103,6 +103,7 @@ def test_an_evaluation_says_so(tmp_path, capsys, lnn_run):
 
 def test_a_control_experiment_says_so(tmp_path, capsys, lnn_run):
     words = ["control.py", f"run={lnn_run}", *SET_POINTS, f"hydra.run.dir={tmp_path}"]
+    words += ["rate=200", "~controllers.truth", "~controllers.pd"]
     ends_in_a_line(capsys, 20_000, ".png", *words)
     assert not (tmp_path / "report.html").exists()
 
