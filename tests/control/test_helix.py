@@ -110,7 +110,10 @@ def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
     ("changes", "message"),
     [
         ({"pitch": 2.0}, r"at t = [\d.]+ s its tip should be at \[.*\] m.* are [\d.e-]+ m from it"),
-        ({"radius": 0.3, "turns": 0.5, "rise_time": 1.0}, r"cannot follow the helix .*at t = .* take a smaller radius"),
+        (
+            {"radius": 0.3, "turns": 0.5, "rise_time": 1.0},
+            r"cannot follow the helix .*at t = .* take a smaller radius",
+        ),
         (
             {"posture": [0.1, -0.3, 0, -2.2, 0, 4.0, 0]},
             r"t = 0 s joint 'panda_joint6' would be at 4",
