@@ -155,8 +155,9 @@ def _mean_and_median(data: pd.DataFrame, model: str) -> str:
         return "–"
     figures = []
     for column in ("error_mean", "error_median"):
-        error, smallest = runs[column].mean(), data.groupby("model")[column].mean().min()
-        figures.append(bold(number(error), error == smallest and not runs["floor"].any()))
+        means = data.groupby("model")[column].mean()
+        best = means.idxmin() == model and not runs["floor"].any()
+        figures.append(bold(number(means[model]), best))
     return f"{', '.join(figures)}{lost(runs)}"
 
 
