@@ -32,6 +32,13 @@ def frame_dataset(
 ) -> list[str]:
     """Write a frame and ``dataset/frame.yaml`` to a folder; returns the overrides that use them.
 
+    Args:
+        frame: the log.
+        signals: columns of time, q, u and, where there is one, v.
+        run: column that tells runs apart, or None.
+        seed: of the choice of runs.
+        folder: the run folder.
+
     Raises:
         LogError: on columns that are not there or hold no numbers, or too few rows.
     """
@@ -109,10 +116,14 @@ def _plain(value: Any) -> Any:
 
 
 def _split(runs: dict[str, np.ndarray], seed: int) -> tuple[dict[str, Any], dict[str, float]]:
-    """Validation and test of runs of some times, s, and the windows and roll-outs that fit them.
+    """Validation and test of a data set, and the windows and roll-outs that fit it.
 
     Of five runs or more, 15 % are the test and as many the validation, whole, drawn among those of
     at least the median length. Of fewer, the ends of each: all in pieces of at most 5 s.
+
+    Args:
+        runs: times of each run, s.
+        seed: of the choice.
     """
     spacing = np.concatenate([np.diff(t) for t in runs.values()])
     step = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0

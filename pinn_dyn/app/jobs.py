@@ -33,6 +33,7 @@ class Job:
     """A folder that train.py wrote, whatever became of the training.
 
     Attributes:
+        folder: the run folder.
         config: its flattened configuration, as far as it is known.
         derived: keys that the configuration computes from others.
         record: what metrics.json holds; None if the training did not get there.

@@ -43,6 +43,12 @@ def check_structure(
 ) -> None:
     """Refuse a structure whose joints are not the data's.
 
+    Args:
+        place: where it stands in the configuration.
+        part: what stands there.
+        structure: what was built of it.
+        source: the data.
+
     Raises:
         ConfigError: if there are more or fewer columns than joints, or their names or units show
             another order.

@@ -15,6 +15,11 @@ from pinn_dyn.mechanics import Predictor, Signal
 def predict_frame(model: Predictor, source: LogSource, frame: pd.DataFrame) -> pd.DataFrame:
     """q and v along each run of a frame, from the first row of the run and under its inputs.
 
+    Args:
+        model: what predicts, in float64.
+        source: columns, units and cleaning of the log.
+        frame: rows of such a log.
+
     Raises:
         LogError: on a frame that is no such log; names the place.
         ValueError: if a model that predicts in fixed steps does not fit the sample time.

@@ -42,7 +42,14 @@ def provenance() -> dict[str, str]:
 def build_origin(
     runs: Mapping[str, Run], source: DataSource, record: Mapping[str, str], config: dict[str, Any]
 ) -> Origin:
-    """The last section of a report."""
+    """The last section of a report.
+
+    Args:
+        runs: names of the runs as they are in the tables.
+        source: the data that they share.
+        record: what :func:`provenance` and :func:`command_line` say.
+        config: the resolved configuration of this program.
+    """
     rows = [
         {
             "run": name,

@@ -126,6 +126,8 @@ def load_run(folder: Path, checkpoint: str, trust: tuple[str, ...] = ()) -> Run:
     """Load a run's model from one of its checkpoints, ``best`` or ``last``.
 
     Args:
+        folder: the run folder.
+        checkpoint: ``best`` or ``last``.
         trust: packages whose classes the run's configuration may build, besides those of this one.
 
     Raises:
@@ -185,6 +187,12 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
 
 def require_same(path: Path, saved: dict[str, Any], folder: Path, config: dict[str, Any]) -> None:
     """Refuse a checkpoint whose training was not that of a run's configuration.
+
+    Args:
+        path: the checkpoint.
+        saved: the configuration that it holds.
+        folder: the run folder.
+        config: the configuration of the run.
 
     Raises:
         ConfigError: with the first value that differs.

@@ -178,6 +178,8 @@ def train_in(
     """Train in a folder that is claimed, and write the record; returns the last validation error.
 
     Args:
+        folder: the run folder.
+        config: the resolved configuration.
         last: the checkpoint to go on from, if any.
         trust: packages whose classes the run of ``start_from`` may build.
         source: the data; None builds those of ``config["dataset"]``.

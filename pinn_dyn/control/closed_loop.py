@@ -45,7 +45,8 @@ def close_loop(
         plant: what is controlled.
         controller: the law; it is reset first.
         reference: the desired motion.
-        q0, v0: initial configurations and velocities, ``(K, N)`` each, float64.
+        q0: initial configurations, ``(K, N)``, float64.
+        v0: initial velocities, ``(K, N)``, float64.
         duration: length of the run in s, an integer multiple of 1 / rate.
         rate: control instants per second, 1/s.
         actuator: limits of the input; none if None.

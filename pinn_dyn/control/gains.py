@@ -16,6 +16,11 @@ def diagonal_gain(name: str, value: Gain, size: int) -> Tensor:
 
     Paper, Propositions on regulation and tracking: K_P and K_D must be positive definite.
 
+    Args:
+        name: what to call the gain in an error.
+        value: one number for all coordinates, or N of them.
+        size: N.
+
     Raises:
         ValueError: on a gain that is no number, not finite, not positive, or not 1 or N of them.
     """

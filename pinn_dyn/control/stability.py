@@ -33,6 +33,7 @@ class StabilityCertificate:
     """Proposition 1 at K configurations of a region. Each is ``(K,)`` unless it says otherwise.
 
     Attributes:
+        region: name of the region.
         q: configurations, ``(K, N)``.
         position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``.
         condition_1: smallest eigenvalue of the symmetric part of A A_L^T, eq. (PD_transpose); the
@@ -117,9 +118,11 @@ def certify(
     """Proposition 1 at every configuration of a region.
 
     Args:
-        model, truth: the learned and the true system, with the same N = M.
+        model: the learned system.
+        truth: the true system, with the same N = M.
         q: configurations, ``(K, N)``.
-        position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
+        position_gain: diagonal of K_P, one number or N.
+        velocity_gain: diagonal of K_D, one number or N.
         region: a name for where the configurations come from.
 
     Raises:

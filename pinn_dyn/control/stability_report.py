@@ -27,6 +27,7 @@ class ModelCheck:
     """What can be said of a learned model alone, at K configurations, ``(K,)`` each.
 
     Attributes:
+        region: name of the region.
         q: configurations, ``(K, N)``.
         mass_eigenvalue, mass_condition: smallest eigenvalue and condition number of M_L.
         damping_eigenvalue: smallest eigenvalue of D_L.

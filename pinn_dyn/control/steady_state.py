@@ -103,7 +103,8 @@ def predict_steady_state(
     The poles are those of M x'' + (D + Khat_D) x' + Khat_P (I - dh/dq) x = 0 at q_ss.
 
     Args:
-        model, truth: the learned and the true system, with the same N = M.
+        model: the learned system.
+        truth: the true system, with the same N = M.
         q_ref: set points, ``(K, N)``.
         position_gain: diagonal of K_P, one number or N.
         velocity_gain: diagonal of K_D, one number or N; only the poles depend on it.

@@ -38,7 +38,10 @@ def load_or_make(
     ``.damaged`` and made again. A folder that may only be read serves what is there.
 
     Args:
+        folder: the cache folder, made if missing.
+        name: readable first part of the file name.
         description: everything the arrays depend on, JSON-serializable.
+        make: computes the arrays.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{cache_key(description)}.npz"

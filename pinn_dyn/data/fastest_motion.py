@@ -36,7 +36,13 @@ def periods(trajectories: Sequence[Trajectory]) -> Tensor:
 def too_long_for(
     trajectories: Sequence[Trajectory], step: float, labels: Sequence[str]
 ) -> str | None:
-    """What is wrong with a step of a roll-out or a window, in s; None where nothing is."""
+    """What is wrong with a step, in a sentence; None where nothing is.
+
+    Args:
+        trajectories: of the data, each with samples of one distance.
+        step: of a roll-out or a training window, s.
+        labels: names of the coordinates.
+    """
     found = periods(trajectories)
     k = int(found.argmin())
     if not found[k] < _SAMPLES * step:

@@ -46,17 +46,20 @@ class SimulatedSource(DataSource):
         test_duration: length of each validation and test trajectory, s; ``duration`` if None.
         step: sample time of the simulation, s.
         keep_every: keep every n-th sample, for a lower rate from the same simulation.
-        train_initial_states, train_inputs: how many of both there are for training.
+        train_initial_states: number of initial states for training.
+        train_inputs: number of inputs for training.
         pairing: ``"product"`` trains on every combination of these, ``"matched"`` gives each
             initial state an input of its own.
         q_limits: lower and upper limits of the configuration, ``(2, N)``, which no motion leaves;
             they take ``pairing="matched"``. None: no limits.
-        validation, test: number of trajectories.
+        validation: number of validation trajectories.
+        test: number of test trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
         compile: compile the equation of motion for the simulation.
         cache: folder of the cache; ``~`` is the home folder.
-        labels, input_labels: name and unit of each coordinate, N, and of each input, M.
+        labels: name and unit of each coordinate, N of them.
+        input_labels: name and unit of each input, M of them.
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
 
     Raises:

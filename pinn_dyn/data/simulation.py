@@ -34,6 +34,12 @@ class SimulationError(RuntimeError):
 def check_amount(name: str, motions: int, duration: float, step: float, width: int) -> None:
     """Refuse motions that no memory holds, before they are simulated.
 
+    Args:
+        name: of the data set.
+        motions: how many.
+        duration, step: of each, s.
+        width: numbers in a sample.
+
     Raises:
         ValueError: with the numbers that they have.
     """
@@ -67,10 +73,12 @@ def simulate(
 
     Args:
         system: the truth.
-        q0, v0: initial configurations and velocities, ``(K, N)`` each.
+        q0: initial configurations, ``(K, N)``.
+        v0: initial velocities, ``(K, N)``.
         signal: inputs as a function of time, ``(T,) -> (K, T, M)``; must be smooth.
         t: sample times, ``(T,)``, s, increasing.
-        rtol, atol: relative and absolute tolerance of the solver.
+        rtol: relative tolerance of the solver.
+        atol: absolute tolerance of the solver.
         compile: compile the equation of motion first; takes half a minute, and pays for a long
             simulation of a small batch. Without a C++ compiler it runs uncompiled, and says so.
         q_limits: lower and upper limits of q, ``(2, N)``; a motion that leaves them is held where

@@ -12,6 +12,9 @@ from pathlib import Path
 def whole(path: Path) -> Iterator[Path]:
     """A file that is replaced only by a whole one, whenever its writer is killed or fails.
 
+    Args:
+        path: the file; its folder exists.
+
     Yields:
         ``<name>.<process>.partial`` beside it, to be written; it is then moved into place.
 

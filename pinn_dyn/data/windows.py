@@ -291,6 +291,10 @@ class BatchSampler(Sampler[Tensor]):
     an uninterrupted one would have seen.
 
     Args:
+        size: number of windows.
+        batch_size: windows in a batch.
+        batches: batches in an epoch.
+        seed: seed of the order.
         rank, processes: of several processes that train together, each yields its own share of
             every batch, so that all of them see what one alone would have seen.
     """

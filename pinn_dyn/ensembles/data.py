@@ -48,7 +48,11 @@ class EnsembleData(L.LightningDataModule):
 
 
 class MemberSampler(Sampler[Tensor]):
-    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own."""
+    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own.
+
+    Args:
+        samplers: the order of each member.
+    """
 
     def __init__(self, samplers: list[BatchSampler]):
         self.samplers = samplers

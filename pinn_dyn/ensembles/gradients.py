@@ -20,6 +20,11 @@ class CompiledMembers:
     Where a window costs few evaluations of the dynamics, one program for the loss and the gradient
     of a single model serves all members, side by side on the threads of torch. Elsewhere the
     dynamics of all members are compiled as one.
+
+    Args:
+        loss: of a model, or of stacked members.
+        stack: the members.
+        vector: their parameters.
     """
 
     def __init__(self, loss: WindowLoss, stack: ContinuousStack, vector: ParameterVector):

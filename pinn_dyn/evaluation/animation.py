@@ -34,7 +34,13 @@ def animate(record: ClosedLoopRecord, run: int, robot: object, path: Path) -> No
 def animate_lines(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> None:
     """Write a GIF of a robot's lines in motion, in real time, with the path of its tip in red.
 
-    The wanted shape is in grey; a stopped run is drawn up to its stop.
+    The wanted shape is in grey.
+
+    Args:
+        record: K runs.
+        run: which of the K to draw; a stopped one is drawn up to its stop.
+        robot: what gives the lines of q.
+        path: the GIF; its folder is made if there is none.
     """
     samples = _frames(record, run, _FRAME)
     shape, wanted = _shapes(record, run, robot)
@@ -67,6 +73,7 @@ def pose_strip(
         run: which of the K to draw.
         robot: what gives the lines of q.
         times: when, s, on the clock of the record; the nearest sample is drawn.
+        title: plant and controller.
 
     Raises:
         ValueError: on no times, or times outside the run, which ends where it was stopped.
@@ -97,6 +104,12 @@ def animate_pictures(record: ClosedLoopRecord, run: int, robot: Rendered, path: 
     """Write a GIF of the pictures that a robot's simulator takes of its motion, in real time.
 
     The path of the tip in red and the wanted one in grey are in front of the robot.
+
+    Args:
+        record: K runs.
+        run: which of the K to draw; a stopped one is drawn up to its stop.
+        robot: what takes the pictures.
+        path: the GIF; its folder is made if there is none.
     """
     samples = _frames(record, run, _PICTURE)
     q, q_ref = (x[run, samples].double() for x in (record.q, record.reference.q))

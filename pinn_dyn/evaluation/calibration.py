@@ -144,6 +144,7 @@ def calibration_figure(found: Mapping[str, Mapping[float, Calibration]], *, titl
 
     Args:
         found: names of runs, and their calibration for each window in s.
+        title: data set.
     """
     windows = sorted({window for item in found.values() for window in item})
     size = (max(3.6 * len(windows) + 0.6, 6.0), 4.2 + 0.25 * len(found))

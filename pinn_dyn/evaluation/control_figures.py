@@ -86,7 +86,9 @@ def closed_loop_figure(
     Args:
         record: K runs.
         run: which of the K to draw.
-        labels, input_labels: names and units; None takes q1 ... qN and u1 ... uM.
+        title: plant and controller.
+        labels: name and unit of each coordinate; None takes q1 ... qN.
+        input_labels: name and unit of each input; None takes u1 ... uM.
 
     Raises:
         ValueError: on labels that do not fit.
@@ -111,6 +113,7 @@ def controller_comparison_figure(
 
     Args:
         records: controller names and their runs; the order of the names fixes their colours.
+        title: plant and task.
         label: name and unit of the error.
     """
     note = "mean over runs, 10–90 % band"
@@ -127,6 +130,7 @@ def tip_path_figure(t: Tensor, paths: dict[str, Tensor], wanted: Tensor, *, titl
         paths: names and positions, ``(T, 3)`` each, m; NaN after a stop. The order of the names
             fixes their colours.
         wanted: wanted positions, ``(T, 3)``, m.
+        title: plant and task.
 
     Raises:
         ValueError: on a path of another shape.
@@ -180,7 +184,9 @@ def steady_state_figure(
     bound, and those with one but without a finite error, whose bound does not hold.
 
     Args:
-        bound, measured: predicted bounds and steady-state errors, ``(K,)``, in the units of q.
+        bound: predicted bounds, ``(K,)``, in the units of q.
+        measured: steady-state errors, ``(K,)``, in the units of q.
+        title: plant and controller.
         label: name and unit of the error.
 
     Raises:

@@ -98,7 +98,9 @@ def trajectory_figure(
     Args:
         truth, predictions: K trajectories and roll-outs of them.
         trajectory: which of the K to draw.
-        labels, input_labels: names and units; None takes q1 ... qN and u1 ... uM.
+        title: data set and horizon.
+        labels: name and unit of each coordinate; None takes q1 ... qN.
+        input_labels: name and unit of each input; None takes u1 ... uM.
         floors: what the models have to beat, in thin grey lines.
 
     Raises:
@@ -137,6 +139,7 @@ def error_figure(
 
     Args:
         predictions: model names and their roll-outs; the order of the names fixes their colours.
+        title: data set and horizon.
         floors: what the models have to beat, in thin grey lines.
         label: name and unit of the error.
     """
@@ -154,6 +157,7 @@ def spread_figure(prediction: Prediction, *, title: str) -> Figure:
 
     Args:
         prediction: the roll-outs of an ensemble.
+        title: data set, model and horizon.
     """
     kept = ~diverged_trajectories(prediction)
     lost = (~kept).all()[None]
@@ -184,6 +188,7 @@ def terms_figure(
     Args:
         comparison: true and learned terms.
         configuration: which of the K configurations to draw.
+        title: data set and model.
         inverse_mass: draw the inverse of M, which a Hamiltonian model learns, in place of M.
     """
     matrices = comparison.matrices()

@@ -20,7 +20,8 @@ class TermComparison:
     Attributes:
         names: K names of configurations.
         q: configurations, ``(K, N)``.
-        true, learned: M, D, G, A of the true system and of the model.
+        true: M, D, G, A of the true system.
+        learned: M, D, G, A of the model.
         P: best-fit factor, ``(K, N, N)``, see
             :func:`pinn_dyn.control.factor.fit_factor`.
         P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``; the paper's controllers

@@ -30,6 +30,7 @@ class Measured:
     """What the rules go by.
 
     Attributes:
+        source: the log.
         training: its stretches after the cleaning, of one sample time.
         step: sample time, s.
         delays: of the inputs, found; None where there is no answer.
@@ -91,6 +92,7 @@ class Advice:
     Attributes:
         place: ``steps`` or ``dataset`` of the YAML; of a command line ``model``, which is of the
             mechanical model alone, or ``training``.
+        line: the line.
         reason: why, by what was measured.
     """
 

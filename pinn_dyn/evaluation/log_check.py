@@ -53,6 +53,7 @@ class LogCheck:
     """The findings on a log.
 
     Attributes:
+        name: of the data set.
         runs: one row per stretch: split, duration, rows, sample time, jitter, longest gap.
         coordinates: one row per coordinate: range, noise, rest, and what identifies its inertia.
         inputs: one row per input: range, delay and its spread, or why there is none.
@@ -109,6 +110,7 @@ def check_log(
     """Look at a log as its configuration reads, splits and cleans it.
 
     Args:
+        source: the log.
         longest_delay: the longest delay of an input that is tried, s.
         structure: the kinematics, whose joints are the coordinates of the log, if they are known.
 
@@ -192,6 +194,7 @@ def check_log(
         distance,
         problems,
         warnings,
+        # Their acceleration follows from q, v and the other accelerations.
         coordinates.loc[coordinates["own share of a"] < _OWN, "coordinate"].tolist(),
         excited,
         advice(measured),

@@ -26,7 +26,8 @@ def cleaning_figure(
     Args:
         cleaned: the stretch, one of ``LogSource.cleaned``.
         title: data set; the run is added to it.
-        labels, input_labels: name and unit of each coordinate and input.
+        labels: name and unit of each coordinate.
+        input_labels: name and unit of each input.
 
     Raises:
         ValueError: on labels that do not fit.

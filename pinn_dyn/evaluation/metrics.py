@@ -64,7 +64,8 @@ def rollout_metrics(
     """Errors of predicted against true configurations.
 
     Args:
-        q_hat, q: predicted and true configuration, ``(K, T, N)`` each.
+        q_hat: predicted configuration, ``(K, T, N)``.
+        q: true configuration, ``(K, T, N)``.
         t: times, ``(T,)``, s.
         thresholds: name and value, in the units of q, for each valid prediction time.
 

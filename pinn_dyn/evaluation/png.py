@@ -27,6 +27,7 @@ def motion_png(
     Args:
         columns: panels of each column.
         motion: which of the K motions.
+        title: what is drawn.
         end: time of an early end, marked in all panels, s.
     """
     rows = max(map(len, columns))
@@ -57,6 +58,7 @@ def mean_png(panel: Panel, *, title: str, note: str, lost: str) -> Figure:
     """Means over the kept curves of each line and their 10-90 % bands, over time.
 
     Args:
+        panel: one panel.
         title: data set and horizon.
         note: what the means are over, above the names.
         lost: what happened to curves that are in no mean, as "diverged".

@@ -113,6 +113,8 @@ def rigid_excitation(
     Swevers et al. 1997, "Optimal robot excitation and identification".
 
     Args:
+        structure: the kinematics.
+        trajectories: the motions.
         cutoff: of the filter, Hz: above the motion, below the noise.
         still: of each joint whether it moves by no more than its noise, and so counts as at rest.
 

@@ -88,8 +88,10 @@ def runs_table(
     Of runs with the same parameters and seed the last one counts.
 
     Args:
+        names: of the runs, one at least.
         configs: their flattened configurations; runs that differ in the seed alone are replicates.
         metrics: what they reached, such as ``val/error_mean`` and ``training_seconds``.
+        parameters: keys of the configurations.
     """
     chosen = {
         name: pd.Series([config.get(name) for config in configs], dtype=object)
@@ -148,7 +150,12 @@ def told_apart(parameters: list[str], configs: list[dict[str, Cell]]) -> list[st
 
 
 def sweep_text(table: pd.DataFrame, parameters: list[str]) -> str:
-    """The table as aligned text, figures as mean ± standard deviation, the best marked ``*``."""
+    """The table as aligned text, figures as mean ± standard deviation, the best marked ``*``.
+
+    Args:
+        table: what ``sweep_table`` returns.
+        parameters: the parameters to show.
+    """
     shown = table[[*parameters, "seeds"]].copy()
     for name in parameters:
         shown[name] = ["-" if pd.isna(value) else short(value) for value in shown[name]]

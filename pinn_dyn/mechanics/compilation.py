@@ -80,6 +80,7 @@ class CompiledDynamics(_Wrapped):
     short.
 
     Args:
+        inner: the method.
         dynamics: what it integrates, from now on at one batch shape.
     """
 

@@ -63,6 +63,7 @@ def path_between(
     """Increments x(t_k) - x(t_0), ``(*batch, T, S)``, unchecked: for what is called in a training.
 
     Args:
+        dynamics: what is integrated.
         integrator: the method, with its substeps between two times of ``t``.
         x0: initial state, ``(*batch, S)``.
         t: times of the solution, ``(T,)``, s.

@@ -79,7 +79,11 @@ class LearnedDelay(Delay):
 
 
 class DelayedPredictor(ContinuousPredictor):
-    """A predictor whose input acts as late as its head says."""
+    """A predictor whose input acts as late as its head says.
+
+    Attributes:
+        delay: the head.
+    """
 
     delay: Delay
 

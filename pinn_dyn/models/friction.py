@@ -39,7 +39,11 @@ class Friction(nn.Module, abc.ABC):
 
 
 class NoFriction(Friction):
-    """F = 0: dissipation is viscous, as in the paper."""
+    """F = 0: dissipation is viscous, as in the paper.
+
+    Args:
+        scales: of the data.
+    """
 
     def __init__(self, scales: Scales):
         super().__init__()

@@ -36,7 +36,11 @@ InitialVelocityHead = Callable[[Scales], InitialVelocity]
 
 
 class MeasuredVelocity(InitialVelocity):
-    """v_0 = v."""
+    """v_0 = v.
+
+    Args:
+        scales: of the data.
+    """
 
     learned = False
 

@@ -16,6 +16,9 @@ from pinn_dyn.models.scales import Scales
 class InputMatrix(nn.Module, abc.ABC):
     """A(q) ``(*batch, N, M)``.
 
+    Args:
+        scales: of the data.
+
     Attributes:
         affine: whether the force is A(q) u, with an A that does not depend on u.
     """
@@ -153,7 +156,11 @@ class ConstantInput(InputMatrix):
 
 
 class NoInput(InputMatrix):
-    """A = 0: the part of a sum that another part drives."""
+    """A = 0: the part of a sum that another part drives.
+
+    Args:
+        scales: of the data.
+    """
 
     def forward(self, q: Tensor) -> Tensor:
         return q.new_zeros(*q.shape[:-1], *self.shape)

@@ -60,6 +60,8 @@ class PositiveConstants(Constants):
     Args:
         start: the median a priori, ``(n,)``.
         spread: standard deviation of the logarithm; 0.7 is a factor of two.
+        names: n names.
+        units: n units.
 
     Raises:
         ValueError: unless start and spread are positive.
@@ -86,6 +88,8 @@ class RealConstants(Constants):
 
     Args:
         spread: standard deviation a priori, ``(n,)``.
+        names: n names.
+        units: n units.
     """
 
     spread: Tensor
@@ -116,6 +120,7 @@ class PhysicalBodies(Constants):
     Args:
         start: pseudo-inertias, ``(n, 4, 4)``, kg, kg m, kg m^2.
         spread: standard deviation of (a, d, s, t) a priori.
+        bodies: n names.
 
     Raises:
         ValueError: on a start that is no body of positive density, naming it, or a spread that is

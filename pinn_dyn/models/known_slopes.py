@@ -22,6 +22,9 @@ class KnownSlopes(Slopes):
 
     The bodies need Y alone; the drive of a joint depends on its own constants, so one reverse pass
     through drives with constants of their own for each sample gives all of the rest.
+
+    Args:
+        model: at the z of interest.
     """
 
     def __init__(self, model: LearnedConstants):

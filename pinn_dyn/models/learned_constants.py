@@ -66,7 +66,11 @@ class LearnedConstants(MechanicalSystem):
 
 
 class Slopes:
-    """Derivatives of the missing force e at the z of the model, a reverse pass for each entry."""
+    """Derivatives of the missing force e, one reverse pass for each of its N entries.
+
+    Args:
+        model: at the z of interest.
+    """
 
     def __init__(self, model: LearnedConstants):
         self.model: Any = model

@@ -38,7 +38,11 @@ ResidualHead = Callable[[Scales], Residual]
 
 
 class NoResidual(Residual):
-    """r = 0: the robot is mechanical, as in the paper."""
+    """r = 0: the robot is mechanical, as in the paper.
+
+    Args:
+        scales: of the data.
+    """
 
     learned = False
 

@@ -252,7 +252,13 @@ class DynamicsLearner(L.LightningModule):
 
 
 def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> Tensor:
-    """A gradient ``(*members, P)`` scaled down to a norm, of each member, or cut off at a value."""
+    """A gradient ``(*members, P)`` scaled down to a norm, each member's own, or cut off at a value.
+
+    Args:
+        gradient: of all parameters.
+        largest: norm, or value; None: as it is.
+        by_value: whether it is a value.
+    """
     if largest is None:
         return gradient
     if by_value:

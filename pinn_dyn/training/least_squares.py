@@ -115,6 +115,7 @@ class LeastSquares:
         """Fit the model in place; it comes back in the precision it had.
 
         Args:
+            model: what is fitted.
             trajectories: the training trajectories, for the inverse dynamics.
             windows: the training windows, for the roll-outs.
             covariance: of the z that the model has from an earlier fit, ``(P, P)``, if any.

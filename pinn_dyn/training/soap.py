@@ -196,6 +196,7 @@ class _Layout:
     """Where the numbers of parameters are in one vector: batches of matrices, then the rest.
 
     Args:
+        parameters: the parameters, with gradients.
         leading: dimensions of a parameter before those of its matrix.
     """
 

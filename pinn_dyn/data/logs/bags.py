@@ -49,6 +49,8 @@ def read_bag(path: Path, time: str, columns: Sequence[str], max_age: float) -> p
     """The columns asked for, one row per message of the topic of the time.
 
     Args:
+        path: the bag.
+        time: column of the time.
         columns: all columns to read, the time among them or not.
         max_age: how old a message of another topic may be, s.
 

@@ -284,7 +284,14 @@ def check_velocities(
 def check_velocities_of_runs(
     parts: Mapping[str, list[Recording]], q: Columns, v: Columns, step: float, report: Report
 ) -> None:
-    """Warns of single runs whose v has another unit or sign than that of most runs."""
+    """Warns of single runs whose v has another unit or sign than that of most runs.
+
+    Args:
+        parts: the stretches of training, validation and test.
+        q, v: their columns.
+        step: the sample time, s.
+        report: takes the warnings.
+    """
     runs: dict[tuple[str, str], list[Recording]] = {}
     for split, stretches in parts.items():
         for item in stretches:

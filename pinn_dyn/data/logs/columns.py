@@ -30,6 +30,10 @@ class ShortForm:
     def from_config(cls: type[_Described], name: str, given: Any) -> _Described:
         """An object, as it is or from its short form.
 
+        Args:
+            name: where it is given.
+            given: the object or the mapping.
+
         Raises:
             LogError: naming the key that is missing or misspelt, or with what the class said.
         """

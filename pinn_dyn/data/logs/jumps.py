@@ -27,8 +27,10 @@ class Rows:
     """One signal of one run as it was read, in SI units, and where it comes from.
 
     Attributes:
+        path: the file.
         lines: lines of the rows in the file, ``(T,)``.
         signal: q, v or u.
+        columns: names and units of the columns.
         values: ``(T, K)``.
     """
 

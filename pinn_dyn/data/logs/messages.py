@@ -76,7 +76,9 @@ def layout_of(raw: bytes, kind: str, definitions: Any, *, cdr: bool) -> Layout |
 
     Args:
         raw: the message, as CDR (ROS 2) or as ROS 1 writes it.
+        kind: its type.
         definitions: type to its fields, as rosbags has them.
+        cdr: whether it is CDR.
     """
     if cdr and raw[:2] != b"\x00\x01":  # little-endian, plain
         return None

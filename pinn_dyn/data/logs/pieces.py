@@ -39,7 +39,10 @@ def long_enough(
     """Without the stretches that a step left too short to be of use.
 
     Args:
+        name: of the step.
+        cleaned: all stretches.
         least: for each split what sets the shortest stretch, and how long it is, s.
+        report: takes a warning of each that is dropped.
 
     Raises:
         LogError: where nothing of a split is left.
@@ -92,6 +95,13 @@ def pieces_of(
     """Roll-outs of one length, or whole stretches; neighbours share a sample, or two.
 
     A stretch of T samples that lasts one sample less than n pieces has n of them all the same.
+
+    Args:
+        name: of the split, such as test.
+        part: its description.
+        cleaned: all stretches.
+        step: their sample time, s.
+        report: told what is left over.
 
     Raises:
         LogError: if the pieces are no multiple of the sample time, or longer than every stretch.

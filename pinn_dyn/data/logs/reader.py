@@ -127,6 +127,8 @@ def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) ->
     ``attrs`` has ``unusable``, why there is no such column, and ``notes``, what was dropped.
 
     Args:
+        path: the file.
+        time: column of the time.
         columns: what will be asked for; files whose columns cost little give all that they have.
         max_age: how old a message of another topic of a bag may be, s.
 

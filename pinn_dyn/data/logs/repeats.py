@@ -47,6 +47,12 @@ def check_repeats(
 
     It does where, at some shift s along a training stretch, the mean over its samples of
     ‖q_test(t) - q_train(t + s)‖² is below 0.05² times the variance of q_test, all at one rate.
+
+    Args:
+        training: training stretches.
+        test: the roll-outs.
+        name: of their split.
+        report: takes the warnings.
     """
     found: dict[tuple[str, str], int] = {}
     for piece in test:

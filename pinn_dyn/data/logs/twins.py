@@ -20,7 +20,13 @@ _MOST_ROWS = 50_000
 def check_twins(
     recordings: list[Recording], signals: Mapping[str, Columns], report: Report
 ) -> None:
-    """Warns of two columns that are the same signal but for a factor and an offset."""
+    """Warns of two columns that are the same signal but for a factor and an offset.
+
+    Args:
+        recordings: the runs as they were read.
+        signals: the columns of q, u, and v where the log has it.
+        report: takes the warnings.
+    """
     thin = slice(None, None, max(1, sum(map(len, recordings)) // _MOST_ROWS))
     names, values = [], []
     for signal, columns in signals.items():
@@ -45,7 +51,13 @@ def check_twins(
 def check_units_of_runs(
     recordings: list[Recording], signals: Mapping[str, Columns], report: Report
 ) -> None:
-    """Warns of runs in which all columns of a signal spread far more than in most runs."""
+    """Warns of runs in which all columns of a signal spread far more than in most runs.
+
+    Args:
+        recordings: the runs as they were read, of which three or more can tell.
+        signals: the columns of q, u, and v where the log has it.
+        report: takes the warnings.
+    """
     if len(recordings) < 3:
         return
     for signal in signals:

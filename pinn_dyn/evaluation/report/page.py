@@ -135,6 +135,7 @@ def table(
     """A table; a number has three digits, and all of them in its tooltip.
 
     Args:
+        frame: what to show.
         headers: columns to show and their headings; None takes all by their names.
         best: which cells to mark, with columns of ``frame``.
         spread: columns whose cells get ``± x``, and the columns of ``frame`` that hold it.

@@ -28,7 +28,9 @@ class Compiled:
     the dynamics alone are compiled. Large batches are taken in parts that fit into the cache.
 
     Args:
+        loss: of the model.
         model: what is trained; anything but its training goes on uncompiled.
+        vector: its parameters.
         steps: of the training, about.
     """
 

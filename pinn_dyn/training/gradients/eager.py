@@ -17,7 +17,13 @@ the members of an ensemble, ``(E,)`` and ``(E, P)``."""
 
 
 class Eager:
-    """Loss and gradient of a model, operation by operation."""
+    """Loss and gradient of a model, operation by operation.
+
+    Args:
+        loss: of the model.
+        model: what is trained.
+        vector: its parameters.
+    """
 
     def __init__(self, loss: WindowLoss, model: Predictor, vector: ParameterVector):
         self.loss = loss

@@ -33,7 +33,9 @@ class LossProgram:
     by side on the threads of torch.
 
     Args:
+        loss: of the model, by operations that can be traced.
         model: what is trained, or one whose parameters are stacked over members.
+        vector: its parameters.
     """
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
