@@ -25,16 +25,19 @@ from pinn_dyn.mechanics.signal import Signal
 # benchmarks/long_rollout.py, on two cores; benchmarks/README.md has the tables.
 
 STEPS_FOR_DERIVATIVE = 5_000
-"""Training steps from which it pays to compile: twice what makes up for half a minute."""
+"""Training steps from which it pays to compile the derivative: at batch 256 and N = 3 that saves 11
+ms of a step and takes 19 to 33 s."""
 STEPS_FOR_PROGRAM = 20_000
-"""Training steps from which it pays to compile loss and gradient as one program; for the members of
-an ensemble it always does."""
+"""Training steps from which it pays to compile loss and gradient as one program: that saves another
+4 ms of a step, and takes 54 s longer at N = 3 (made up for in 14,000 steps), 124 s at N = 7 (28,000
+steps). For the members of an ensemble it always pays."""
 MOST_EVALUATIONS = 4
 """Evaluations of the dynamics in a window up to which it is compiled as one program: the time to
 compile grows with them."""
 CHUNK = 256
 """Windows of MOST_EVALUATIONS that are taken at once, four times as many of one evaluation: what
-they keep for the gradient stays in the cache. Less than twice as many are not cut."""
+they keep for the gradient stays in the cache (8,192 by the midpoint loss in parts of 256 took 76 ms
+at N = 3, of 1,024 55 ms). Less than twice as many are not cut."""
 WORK_FOR_LOOP = 4_500_000
 """Steps times (batch + 300) from which a compiled loop pays in a roll-out: it saves 2 ms of a step
 and 7 us for each trajectory, and takes 20 s to compile."""
@@ -86,6 +89,7 @@ class CompiledDynamics(_Wrapped):
 
     def __init__(self, inner: Integrator, dynamics: Dynamics):
         super().__init__(inner)
+        _keep_rows()
         # Each is compiled when it is first called: a method calls one of the two.
         self._compiled = SimpleNamespace(
             state_derivative=torch.compile(dynamics.state_derivative),
@@ -125,6 +129,7 @@ def compile_graph(
     It is traced once: numbers and tensors that are not arguments become constants of the program.
     The program checks nothing when called, and runs in one thread.
     """
+    _keep_rows()
     graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
     for node in graph.graph.nodes:  # shapes are taken from the arguments: those noted do not fit
         node.meta.clear()
@@ -170,10 +175,23 @@ def compile_loop(
     return program
 
 
+def _keep_rows() -> None:
+    """Let the compiler hand matrices to triangular solves in rows, as they are given.
+
+    It leaves the order open, and takes columns, of which each solve makes a copy: at N = 48 a tenth
+    of a step.
+    """
+    from torch._inductor import lowering  # takes a second, and only compiling needs it
+
+    solve = torch.ops.aten.linalg_solve_triangular.default
+    lowering.add_layout_constraint(solve, lowering.constrain_to_fx_strides)
+
+
 _OPTIONS = {"cpp_wrapper": True, "post_grad_fusion_options": {"decompose_mm_pass": {}}}
 
 
 def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+    _keep_rows()
     options = {**options, **_OPTIONS, "guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
     return torch.compile(function, dynamic=False, options=options)
 
