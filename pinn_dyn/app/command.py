@@ -94,8 +94,13 @@ def _in_a_line(command: str, error: BaseException) -> str | None:
     """What Hydra or the system says that a user can mend; None of what looks like a bug."""
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return words.said(config_folder(command), error)
-    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-        return f"there is not enough memory ({error}): choose smaller sizes, as data.batch_size"
+    # torch.OutOfMemoryError, of a GPU, goes by its name: --help does without torch.
+    full = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    if full or "can't allocate memory" in str(error):
+        return (
+            f"there is not enough memory ({error}): choose smaller sizes, as of data.batch_size or "
+            "ensemble"
+        )
     if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
         error = error.__cause__  # logging says so of a file that it cannot open
     if isinstance(error, OSError) and error.errno in _DISK:

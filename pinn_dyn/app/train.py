@@ -24,6 +24,7 @@ from pinn_dyn.app.build import (
     build_trainer,
     build_validator,
     check_processes,
+    compiles,
     epochs,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
@@ -185,13 +186,14 @@ def train_in(
         source: the data; None builds those of ``config["dataset"]``.
 
     Raises:
-        ConfigError: on data, or a model, that do not fit together.
+        ConfigError: on data, or a model, that do not fit together, or if there is no compiler.
         NonFiniteLossError: if the loss becomes NaN or infinite.
         SystemExit: if it was interrupted.
     """
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
 
+    compiles(config)  # refuses what cannot be compiled before the data are simulated
     data = build_data(config, source)
     log.info("%s: loading data", config["name"])
     try:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, run_script
 
@@ -145,6 +146,27 @@ def test_a_value_that_does_not_fit_the_data_is_reported(elsewhere, capsys, overr
     for word in words:
         assert word in text
     assert "Traceback" not in text
+
+
+@pytest.mark.parametrize("error", [MemoryError, torch.OutOfMemoryError])
+def test_a_training_that_does_not_fit_into_memory(elsewhere, capsys, monkeypatch, error):
+    def build(*_):
+        raise error("tried to allocate 80 GiB")
+
+    monkeypatch.setattr("pinn_dyn.app.train.build_data", build)
+    text = said(fails("train.py", *TINY, NO_FIGURES, "ensemble=200"), capsys)
+    assert "there is not enough memory (tried to allocate 80 GiB)" in text
+    assert "data.batch_size or ensemble" in text
+    assert "Traceback" not in text
+
+
+def test_compiling_without_a_compiler_is_refused_before_the_data_are_made(
+    elsewhere, capsys, monkeypatch
+):
+    monkeypatch.setattr("pinn_dyn.app.build.has_cpp_compiler", lambda: False)
+    monkeypatch.setattr("pinn_dyn.app.train.build_data", lambda *_: pytest.fail("made data"))
+    text = said(fails("train.py", *TINY, NO_FIGURES, "compile=true"), capsys)
+    assert "compile is true, but there is no C++ compiler" in text
 
 
 @pytest.mark.parametrize("exists", [False, True])
