@@ -56,14 +56,34 @@ def entries_of(group: str) -> dict[str, Entry]:
     }
 
 
+def floors_of(dataset: str, *, ground: bool = False) -> pd.DataFrame:
+    """Errors of the floors on a data set, or of the true equation, a row for each."""
+    data = pd.read_csv(FILE)
+    return data[(data["dataset"] == dataset) & ((data["model"] == GROUND) == ground)].set_index(
+        "model"
+    )
+
+
+def best_floor(dataset: str) -> tuple[str, float]:
+    """The floor of the smallest mean error over the whole horizon that loses no roll-out."""
+    floors = floors_of(dataset)
+    errors = floors["error_mean"][floors["diverged"] == 0]
+    return str(errors.idxmin()), float(errors.min())
+
+
 def prediction_table(group: str) -> str:
-    """Prediction errors, a row for each entry: means over the seeds."""
+    """Prediction errors, a row for each entry: means over the seeds, floors below.
+
+    Bold is what is ahead of the paper and of every floor, and loses no roll-out.
+    """
     entries = {name: (entry, recorded(entry)) for name, entry in entries_of(group).items()}
     head = ["model", "paper", "ours: mean norm ± std", "squared norm of (q, v), mean ± variance"]
     head += ["each seed", "pairs (paper)", "training, s"]
-    rows = []
+    rows, (_, lowest) = [], best_floor(group)
     for name, (entry, data) in entries.items():
         mean = data.mean(numeric_only=True)
+        paper = float(entry["paper"].split()[0]) if "paper" in entry else float("inf")
+        ahead = mean["error_mean"] < min(lowest, paper) and not lost(data)
         square, variance, of = squared_norm(data)
         took = training_seconds(data)
         pairs = f" ({entry['pairs']:,})" if "pairs" in entry else ""
@@ -71,13 +91,17 @@ def prediction_table(group: str) -> str:
             [
                 name,
                 entry.get("paper", "–"),
-                f"**{number(mean['error_mean'])}** ± {number(mean['error_std'])}{lost(data)}",
+                f"{bold(number(mean['error_mean']), ahead)} ± {number(mean['error_std'])}"
+                f"{lost(data)}",
                 f"{square:.1e} ± {variance:.1e}{of}",
                 " / ".join(number(value) for value in data.sort_values("seed")["error_mean"]),
                 f"{int(data['pairs'].iloc[0]) * entry.get('steps', 1):,}{pairs}",
                 f"{took.min():.0f}" + (f"–{took.max():.0f}" if len(took) > 1 else ""),
             ]
         )
+    for floor, row in floors_of(group).iterrows():
+        error = f"{number(row['error_mean'])} ± {number(row['error_std'])}{lost(row.to_frame().T)}"
+        rows.append([str(floor), "–", error, *["–"] * (len(head) - 3)])
     return table(head, rows)
 
 
@@ -149,15 +173,16 @@ def _label(data: pd.DataFrame, model: str) -> str:
 
 
 def _mean_and_median(data: pd.DataFrame, model: str) -> str:
-    """Errors of a model, bold where they are the smallest of all and it is no floor."""
+    """Errors of a model, bold where none that loses no roll-out has smaller ones, nor does it."""
     runs = data[data["model"] == model]
     if runs.empty:
         return "–"
+    whole = data[data.groupby("model")["diverged"].transform("sum") == 0]
     figures = []
     for column in ("error_mean", "error_median"):
-        means = data.groupby("model")[column].mean()
-        best = means.idxmin() == model and not runs["floor"].any()
-        figures.append(bold(number(means[model]), best))
+        lowest = whole.groupby("model")[column].mean().idxmin()
+        best = lowest == model and not runs["floor"].any()
+        figures.append(bold(number(runs[column].mean()), best))
     return f"{', '.join(figures)}{lost(runs)}"
 
 
@@ -171,8 +196,7 @@ def _left(data: pd.DataFrame, model: str) -> str:
 
 def _truth(dataset: str) -> str:
     """Errors of the true equation in the same steps."""
-    data = pd.read_csv(FILE)
-    row = data[(data["dataset"] == dataset) & (data["model"] == GROUND)]
+    row = floors_of(dataset, ground=True)
     figures = (f"{row[column].iloc[0]:.1e}" for column in ("error_mean", "error_median"))
     return f"{', '.join(figures)}{lost(row)}"
 

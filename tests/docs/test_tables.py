@@ -5,11 +5,13 @@ import re
 import pandas as pd
 import pytest
 
-from docs.tables import results
-from docs.tables.floors import SETS
+from docs.tables import paper, results
+from docs.tables.floors import FILE, GROUND, SETS
 from docs.tables.pages import PAGES, filled
 from docs.tables.text import number
 from tests.docs.blocks import ROOT
+
+FLOORS = {"stands still", "keeps its velocity", "ARX", "EDMDc degree 2"}
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +46,54 @@ def test_numbers_have_two_digits(value, text):
     assert number(value) == text
 
 
-def test_the_best_of_a_log_is_bold_unless_the_floor_is_better():
-    rows = [line.split(" | ") for line in results.logs().strip().splitlines()[2:]]
-    log = ""
-    for cells in rows:
-        log = next(iter(re.findall(r"`(\w+)`", cells[0])), log)
-        bold = [index for index, cell in enumerate(cells[2:]) if "**" in cell]
-        if "velocity" in cells[1]:
-            wins = results.floors().loc[log, results.WINDOWS].to_numpy()
-            models = results.read_log(log).groupby("model")[results.WINDOWS].mean().min().to_numpy()
-            assert bold == [k for k in range(3) if wins[k] < models[k]], log
+def cells_of(text):
+    """The cells of a table below its head."""
+    rows = [line for line in text.splitlines() if line.startswith("|")][2:]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+
+
+def value(cell):
+    """The first number of a cell."""
+    found = re.match(r"[\d.e+-]+", cell.strip("*"))
+    return float(found.group()) if found else float("inf")
+
+
+def test_of_a_log_the_smallest_is_bold_be_it_a_floor():
+    logs, log = {}, ""
+    for name, *cells in cells_of(results.logs()):
+        log = name or log
+        logs.setdefault(log, []).append(cells)
+    assert len(logs) == len(results.LOGS)
+    for log, rows in logs.items():
+        assert {"stands still", "keeps its velocity"} <= {model for model, *_ in rows}, log
+        for column in zip(*(figures for _, *figures in rows), strict=True):
+            smallest = min(map(value, column))
+            assert {value(cell) for cell in column if "**" in cell} == {smallest}, (log, column)
+
+
+@pytest.mark.parametrize("group", ["soft_arm_1_wide", "soft_arm_1", "soft_arm_2", "panda"])
+def test_bold_is_ahead_of_the_paper_and_of_every_floor(group):
+    rows = cells_of(paper.prediction_table(group))
+    floors = [row for row in rows if row[0] in FLOORS]
+    assert len(floors) == len(FLOORS)
+    lowest = min(value(row[2]) for row in floors if "diverged" not in row[2])
+    for model, theirs, ours, *_ in rows:
+        ahead = value(ours) < min(lowest, value(theirs)) and "diverged" not in ours
+        assert ("**" in ours) == (ahead and model not in FLOORS), model
+
+
+@pytest.mark.parametrize("make", [paper.generalization_table, paper.beyond_table])
+def test_bold_elsewhere_lost_no_roll_out(make):
+    cells = [cell for row in cells_of(make()) for cell in row if "**" in cell]
+    assert cells
+    assert not any("diverged" in cell for cell in cells)
 
 
 def test_every_test_set_of_the_tables_has_its_floor():
-    assert set(results.floors().index) == set(SETS)
+    data = pd.read_csv(FILE)
+    for name in SETS:
+        there = set(data["model"][data["dataset"] == name])
+        assert there >= ({GROUND} if name.endswith("_beyond") else FLOORS), name
 
 
 def test_every_result_is_read_by_a_page(made):
