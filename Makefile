@@ -78,16 +78,20 @@ $(VENV): $(VENV)/.installed-dev
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
+# All but the benchmarks by one call of pip, for .ci/run: each call reads what all packages need.
+$(VENV)/.installed-all: MORE = dev,docs,notebooks
+$(VENV)/.installed-all: STAMPS = $(VENV)/.installed $(addprefix $(VENV)/.installed-,dev docs notebooks)
+
 # PyBullet has Linux wheels for Python 3.10 and 3.11 only; building it from source is not tried.
-$(VENV)/.installed: pyproject.toml setup.py constraints.txt | $(BIN)/python
-	@echo "installing the runtime packages into $(VENV)"
+$(VENV)/.installed $(VENV)/.installed-all: pyproject.toml setup.py constraints.txt | $(BIN)/python
+	@echo "installing the packages into $(VENV): runtime $(MORE)"
 	@if $(INSTALL) --dry-run --no-deps --only-binary pybullet pybullet >/dev/null 2>&1; then \
-	    $(INSTALL) --only-binary pybullet -e '.[panda]'; \
+	    $(INSTALL) --only-binary pybullet -e '.[panda$(MORE:%=,%)]'; \
 	else \
 	    echo "no PyBullet wheel for this Python: the PyBullet parts (Panda) are skipped"; \
-	    $(INSTALL) -e .; \
+	    $(INSTALL) -e '.$(MORE:%=[%])'; \
 	fi
-	@touch $@
+	@touch $(STAMPS) $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "installing the test and lint tools into $(VENV)"
