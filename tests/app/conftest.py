@@ -1,5 +1,8 @@
 """One cache and a few tiny runs for all tests of the entry points."""
 
+import functools
+from importlib.metadata import entry_points
+
 import pytest
 
 from tests.app.entry import NO_FIGURES, train
@@ -12,6 +15,15 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PINN_DYN_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kept_entry_points():
+    """Lightning asks all installed packages for callbacks at each trainer: most of its set-up."""
+    with pytest.MonkeyPatch.context() as patch:
+        kept = functools.cache(entry_points)
+        patch.setattr("lightning.fabric.utilities.registry.entry_points", kept)
+        yield
 
 
 @pytest.fixture(scope="session")
