@@ -67,30 +67,47 @@ def _text(values: np.ndarray) -> str:
     return " ".join(map(str, values))
 
 
-def random_motion(model: KnownMechanics, generator: np.random.Generator) -> Trajectory:
+class Plan(NamedTuple):
+    """A motion before it is simulated: u ``(T, N)``, start ``(2N,)``, white noise of q and v."""
+
+    u: torch.Tensor
+    start: torch.Tensor
+    noise: tuple[torch.Tensor, torch.Tensor]
+
+
+T = torch.arange(int(5 * RATE) + 1, dtype=torch.float64) / RATE
+
+
+def drawn(model: KnownMechanics, generator: np.random.Generator) -> Plan:
     """5 s under sines of 0.3 to 2.4 Hz that outweigh gravity."""
     size = model.num_coordinates
 
     def draw(low: float, high: float, *shape: int) -> torch.Tensor:
         return torch.from_numpy(generator.uniform(low, high, (*shape, size)))
 
-    t = torch.arange(int(5 * RATE) + 1, dtype=torch.float64) / RATE
     with torch.no_grad():
         amplitude = 0.15 + 1.5 * model.potential_force(draw(-3, 3, 200)).abs().mean(0)
-        u = torch.zeros(len(t), size, dtype=torch.float64)
-        for k in range(1, 9):
-            phase = 2 * torch.pi * 0.3 * k * t[:, None] + draw(0, 2 * np.pi)
-            u += amplitude * draw(-1, 1) * torch.sin(phase)
-        start = torch.cat([draw(-1, 1), torch.zeros(size, dtype=torch.float64)])
-        q, v = model.predict(start, t, Signal(t, u)).chunk(2, dim=-1)
-    return Trajectory(q, v, Signal(t, u))
+    u = torch.zeros(len(T), size, dtype=torch.float64)
+    for k in range(1, 9):
+        phase = 2 * torch.pi * 0.3 * k * T[:, None] + draw(0, 2 * np.pi)
+        u += amplitude * draw(-1, 1) * torch.sin(phase)
+    start = torch.cat([draw(-1, 1), torch.zeros(size, dtype=torch.float64)])
+    noise = tuple(torch.from_numpy(generator.normal(size=u.shape)) for _ in "qv")
+    return Plan(u, start, noise)
 
 
-def noisy(run: Trajectory, generator: np.random.Generator) -> Trajectory:
+def simulated(model: KnownMechanics, plans: list[Plan]) -> list[Trajectory]:
+    """The motions, all at once."""
+    u, start = (torch.stack([plan[k] for plan in plans]) for k in (0, 1))
+    with torch.no_grad():
+        q, v = model.predict(start, T, Signal(T, u)).chunk(2, dim=-1)
+    return [Trajectory(*one, Signal(T, plan.u)) for *one, plan in zip(q, v, plans, strict=True)]
+
+
+def noisy(run: Trajectory, plan: Plan) -> Trajectory:
     """The same with white noise on q and v."""
     q, v = (
-        x + NOISE * x.std(0) * torch.from_numpy(generator.normal(size=x.shape))
-        for x in (run.q, run.v)
+        x + NOISE * x.std(0) * white for x, white in zip((run.q, run.v), plan.noise, strict=True)
     )
     return Trajectory(q, v, run.input)
 
@@ -103,14 +120,15 @@ def fit_of_a_random_chain(seed: int) -> Outcome:
     with torch.no_grad():
         for part, middle in ((truth.viscous, 0.8), (truth.offset, 0.0)):
             part.z.copy_(torch.from_numpy(generator.normal(middle, 0.3, part.z.shape)))
-    runs = [noisy(random_motion(truth, generator), generator) for _ in range(3)]
+    plans = [drawn(truth, generator) for _ in range(4)]
+    *runs, unseen = simulated(truth, plans)
+    runs = [noisy(run, plan) for run, plan in zip(runs, plans, strict=False)]
     model = known_model(urdf, (), friction=None, start="generic")
     windows = draw_windows(runs, count=100, steps=10, stride=4, seed=seed)
     table = constants_table(model, LeastSquares(cutoff=10.0).fit(model, runs, windows))
     true = torch.cat([item.values for item in truth.physical_constants()]).detach().numpy()
     error = (table.value - true) / ((table.high - table.value) / 1.96)
     error = error[table.known > 0.99]
-    unseen = random_motion(truth, generator)
     with torch.no_grad():
         found, expected = (
             one.forward_dynamics(unseen.q, unseen.v, unseen.u) for one in (model, truth)
