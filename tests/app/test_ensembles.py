@@ -111,7 +111,8 @@ def test_a_controller_takes_one_member(tmp_path, capsys, monkeypatch, ensemble_r
 
     def errors(run, *arguments):
         folder = tmp_path / f"{run.name}-{len(arguments)}"
-        run_script("control.py", f"run={run}", f"hydra.run.dir={folder}", *SET_POINTS, *arguments)
+        words = [f"run={run}", f"hydra.run.dir={folder}", *SET_POINTS, "rate=200"]
+        run_script("control.py", *words, *arguments)
         return pd.read_csv(folder / "summary.csv")["rms_error"].tolist()
 
     first, second = errors(ensemble_run), errors(ensemble_run, "member=1")

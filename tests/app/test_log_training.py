@@ -117,16 +117,16 @@ def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_horizon_takes_the_test_motions_that_are_long_enough(run, tmp_path, capsys):
-    """Whole runs of 5 s, one of which is cut to 3 s."""
+    """Whole runs of 5 s, one of which is cut to 1 s."""
     log = pd.read_csv(EXAMPLES / "example_log.csv")
     runs = list(log["run"].unique()[-3:])
-    log[(log["run"] != runs[0]) | (log["t"] <= 3.0)].to_csv(tmp_path / "example_log.csv")
-    words = ["dataset=example_log", f"dataset.root='{tmp_path}'", "horizon=4", "windows=[]"]
+    log[(log["run"] != runs[0]) | (log["t"] <= 1.0)].to_csv(tmp_path / "example_log.csv")
+    words = ["dataset=example_log", f"dataset.root='{tmp_path}'", "horizon=1.5", "windows=[]"]
     words += [f"dataset.test={{runs: {runs}, piece: whole}}"]
     run_script("evaluate.py", *words, *evaluation_of(run, tmp_path / "out"))
-    assert "2 unseen test trajectories, 4 s" in capsys.readouterr().out
+    assert "2 unseen test trajectories, 1.5 s" in capsys.readouterr().out
     said = (tmp_path / "out" / "evaluate.log").read_text()
-    assert "1 of 3 unseen test trajectories of example_log are shorter than horizon=4" in said
+    assert "1 of 3 unseen test trajectories of example_log are shorter than horizon=1.5" in said
 
 
 def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
@@ -202,7 +202,7 @@ def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
     formats.write_bag(tmp_path / "run", table)
     write(tmp_path, table)
     small = ["data=multi_step", "data.pairs=64", "data.steps=2", "data.batch_size=32"]
-    small += ["validator.horizon=0.5", "compile=false"]
+    small += ["validator.horizon=0.1", "trainer.validations=1", "compile=false"]
     weights = []
     for log in (source(tmp_path, files="run", **formats.BAG), source(tmp_path)):
         weights.append(fit(log, model="lnn", steps=3, overrides=small).model.state_dict())
