@@ -18,7 +18,7 @@ from tests.app.entry import NO_FIGURES, ROOT, compose, own_logging
 
 EXAMPLES = ROOT / "examples"
 TINY = [NO_FIGURES, "data.pairs=64", "data.batch_size=32", "trainer.enable_progress_bar=false"]
-TINY_LOG = [*TINY, "data.steps=2", "validator.horizon=0.2"]
+TINY_LOG = [*TINY, "data.steps=2", "validator.horizon=0.1"]
 TINY_MOTIONS = ["dataset.duration=0.4", "dataset.train_initial_states=2", "dataset.train_inputs=2"]
 
 
@@ -32,9 +32,9 @@ def home(tmp_path_factory):
         patch.setenv("PINN_DYN_CACHE", str(folder / "cache"))
         # The picture of the cleaning takes longer than the training.
         patch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
-        # Two of the five seconds of each run: the examples predict whole runs.
+        # One of the five seconds of each run: the examples predict whole runs.
         log = pd.read_csv(EXAMPLES / "example_log.csv")
-        log[log.t <= 2.0].to_csv(folder / "example_log.csv", index=False)
+        log[log.t <= 1.0].to_csv(folder / "example_log.csv", index=False)
         for script in EXAMPLES.glob("*.py"):
             shutil.copy(script, folder)
         yield folder
@@ -94,7 +94,7 @@ def test_export_and_call(own_log, home, capsys):
 
 
 def test_simulate_and_learn(capsys):
-    run("simulate_and_learn.py", "--steps", "2", *TINY, *TINY_MOTIONS, "validator.horizon=0.2")
+    run("simulate_and_learn.py", "--steps", "2", *TINY, *TINY_MOTIONS, "validator.horizon=0.02")
     text = capsys.readouterr().out
     assert "mean error over 2 s: {'Δx [rad]'" in text
     assert "A^-1 M, true:" in text
@@ -116,12 +116,13 @@ def test_ensemble_with_spread(capsys):
 def test_write_example_bag(home):
     """The bag that conf/dataset/example_bag.yaml reads, its joints by their names."""
     main = runpy.run_path("write_example_bag.py")["main"]
-    main.__globals__["SECONDS"] = 30  # of a minute
+    main.__globals__["SECONDS"] = 12  # of a minute
     main(Path("example_bag"))
-    config = compose("dataset=example_bag", f"dataset.root='{home}'").dataset
+    short = [f"dataset.{split}.seconds=4" for split in ("validation", "test")]
+    config = compose("dataset=example_bag", f"dataset.root='{home}'", *short).dataset
     source = instantiate(OmegaConf.to_container(config, resolve=True), _convert_="all")
     (train,) = source.load().train
-    assert len(train.t) == 899
+    assert len(train.t) == 298
     assert train.q[:, 0].std() > 1.2 * train.q[:, 1].std() > 0.1  # shoulder and elbow
 
 
