@@ -109,9 +109,13 @@ def test_one_member_that_breaks_stops_the_training(tmp_path):
 
 @pytest.mark.slow
 def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(tmp_path, traced):
+    """By a program for a step, and by compiled dynamics, which are built, for windows of two.
+
+    Of the model with the fewest loops: those of networks with a mass matrix take a minute.
+    """
     data, weights = make_data(), []
     for compile in (False, True):
-        models = make_models("lnn", data, 2)
+        models = make_models("acceleration", data, 2)
         ensemble = Ensemble(models)
         train(
             tmp_path,
