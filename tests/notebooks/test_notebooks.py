@@ -9,6 +9,8 @@ import pytest
 nbformat = pytest.importorskip("nbformat", reason="needs the notebooks extra")
 nbclient = pytest.importorskip("nbclient", reason="needs the notebooks extra")
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 NEEDS_PYBULLET = pytest.mark.skipif(
