@@ -65,6 +65,9 @@ def check_python(words, folder):
             assert f'"{word.split("=")[0]}"' in path.read_text(), f"{script} has no {word}"
 
 
+# What fits every configuration of train.py. A sweep over experiments of nothing else composes the
+# first: tests/app/test_configurations.py trains them all.
+PLAIN = re.compile(r"(experiment|seed|hydra\.(run|sweep)\.dir)=")
 FLAGS = {"-m", "--multirun", "--help", "--hydra-help", "--resolve", "--info", "-sc", "--cfg", "job"}
 
 
@@ -80,6 +83,12 @@ def check_overrides(program, words, folder):
             assert "=" in word or word.startswith("~"), f"{word} is neither a flag nor an override"
             overrides.append(word)
     choices = [_choices(word) for word in overrides]
+    if program == "train" and all(map(PLAIN.match, overrides)):
+        for option in (option for options in choices for option in options[1:]):
+            key, _, value = option.partition("=")
+            path = config_folder(program) / key / f"{value}.yaml"
+            assert key != "experiment" or path.is_file(), f"no {option}"
+        choices = [options[:1] for options in choices]
     first = [options[0] for options in choices]
     for index, options in enumerate(choices):
         for option in options if index == 0 else options[1:]:

@@ -135,6 +135,7 @@ def test_commands_exist(block, files):
         "python train.py experiment=soft_arm_1/none",
         "python train.py data.pair=4",
         "python train.py -m model=lnn,lmm",
+        "python train.py -m experiment=soft_arm_1/hnn,soft_arm_1/none",
         "python train.py data.pairs",
         "python train.py trainer.max_epochs=3",
         "python train.py model.integrator=rosenbrock",

@@ -76,6 +76,7 @@ def test_the_recipes_of_contributing_are_diffs_of_the_files():
                 assert line.removeprefix("+") in text, f"{block}: {line}"
 
 
+@pytest.fixture(scope="module")
 def reference():
     pytest.importorskip("griffe", reason="the configuration reference is made with the docs extra")
     path = ROOT / "docs" / "config_reference.py"
@@ -85,28 +86,26 @@ def reference():
     return module.config_reference()
 
 
-def test_the_configuration_reference_has_every_option_and_every_key():
-    page = reference()
+def test_the_configuration_reference_has_every_option_and_every_key(reference):
     for path in CONF.rglob("*.yaml"):
         name = path.relative_to(CONF).with_suffix("").as_posix().removeprefix("control/")
         group, _, option = name.rpartition("/")
         if name.startswith("experiment/"):
-            assert f"| `{name.removeprefix('experiment/')}` |" in page
+            assert f"| `{name.removeprefix('experiment/')}` |" in reference
         elif group:
-            assert re.search(rf"### `\+?{group}={option}`\n", page), name
+            assert re.search(rf"### `\+?{group}={option}`\n", reference), name
             values = yaml.safe_load(path.read_text()) or {}
-            section = re.split(rf"### `\+?{group}={option}`\n", page)[1].split("\n### ")[0]
+            section = re.split(rf"### `\+?{group}={option}`\n", reference)[1].split("\n### ")[0]
             for key in values.keys() - {"defaults", "_target_", "_partial_", "hydra"}:
                 assert f"{key}`" in section, f"{name}: {key}"
 
 
-def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments():
-    page = reference()
+def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments(reference):
     # From the docstring of NetworkCholesky.
     kind, text = "a list, each a whole number", "widths of the hidden layers."
-    assert f"| `model.mass.hidden` | `[32, 32, 32]` | {kind} | {text} |" in page
+    assert f"| `model.mass.hidden` | `[32, 32, 32]` | {kind} | {text} |" in reference
     # From the comment beside the key.
-    assert "| `gains.position` | `100.0` |  | K\\_P. |" in page
+    assert "| `gains.position` | `100.0` |  | K\\_P. |" in reference
     # From the comment above the key.
     above = "Control instants per second, with the input held in between;"
-    assert f"| `rate` | `1000.0` | a number above 0 or null | {above}" in page
+    assert f"| `rate` | `1000.0` | a number above 0 or null | {above}" in reference

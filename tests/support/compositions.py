@@ -2,14 +2,16 @@
 
 import copy
 import dataclasses
+import itertools
 import pickle
 from pathlib import Path
 
-from hydra._internal import config_loader_impl
+from hydra._internal import config_loader_impl, defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.defaults_list import Overrides
 from hydra.core.object_type import ObjectType
+from omegaconf import flag_override
 
 from pinn_dyn.app.config import CONF
 
@@ -22,6 +24,7 @@ def keep_compositions(patch):
     load = ConfigRepository.load_config
     list_defaults = config_loader_impl.create_defaults_list
     compose = ConfigLoaderImpl._compose_config_from_defaults_list
+    map_choices = defaults_list._create_interpolation_map
     files, lists, configs = {}, {}, {}
 
     def kept_file(self, config_path):
@@ -44,14 +47,35 @@ def keep_compositions(patch):
     def kept_config(self, defaults, repo):
         key = (*map(dataclasses.astuple, defaults), *_places(repo))
         if key not in configs:
-            configs[key] = pickle.dumps(compose(self, defaults, repo))
+            configs[key] = pickle.dumps(composed(self, defaults, repo))
         return pickle.loads(configs[key])
+
+    def composed(self, defaults, repo):
+        # Hydra's own files come first and are mostly the same: ours are merged into those.
+        own = list(itertools.dropwhile(_is_hydras, defaults))
+        if len(own) in (0, len(defaults)):
+            return compose(self, defaults, repo)
+        config = kept_config(self, defaults[: -len(own)], repo)
+        with flag_override(config, "no_deepcopy_set_nodes", True):
+            config.merge_with(compose(self, own, repo))
+        return config
+
+    def needed_map(overrides, defaults, self_added):
+        # Hydra makes it for every file; those without an interpolation never look at it.
+        if any(default.is_interpolation() for default in defaults):
+            return map_choices(overrides, defaults, self_added)
+        return None
 
     # Hydra copies all that its plugins stored for each question about a group.
     patch.setattr(ConfigRepository, "__deepcopy__", lambda self, _: copy.copy(self), raising=False)
     patch.setattr(ConfigRepository, "load_config", kept_file)
     patch.setattr(config_loader_impl, "create_defaults_list", kept_list)
+    patch.setattr(defaults_list, "_create_interpolation_map", needed_map)
     patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", kept_config)
+
+
+def _is_hydras(default):
+    return default.config_path.startswith("hydra/")
 
 
 def _places(repo):
