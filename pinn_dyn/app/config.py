@@ -11,7 +11,11 @@ import hydra
 from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import (
+    InterpolationToMissingValueError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
 
 from pinn_dyn.app.keys import GIVEN, KEYS
 from pinn_dyn.app.schema import ConfigError, check, short_form
@@ -41,13 +45,13 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
         ConfigError: naming every value that is still missing, or one that cannot be computed.
     """
     try:
+        values = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    except (MissingMandatoryValue, InterpolationToMissingValueError) as error:
         missing = sorted(OmegaConf.missing_keys(cfg))
-        if missing:
-            raise ConfigError(
-                f"no value for {', '.join(missing)}: give it on the command line, as in "
-                f"'{missing[0]}=...'"
-            )
-        values = OmegaConf.to_container(cfg, resolve=True)
+        raise ConfigError(
+            f"no value for {', '.join(missing)}: give it on the command line, as in "
+            f"'{missing[0]}=...'"
+        ) from error
     except OmegaConfBaseException as error:
         raise ConfigError(said(CONF, error)) from error
     assert isinstance(values, dict)

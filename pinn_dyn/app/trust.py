@@ -154,7 +154,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def _check_depth(path: Path, text: str) -> None:
     """Refuse mappings in mappings in mappings without end, which take the parser for ever."""
     depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+    for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MOST_DEPTH:
