@@ -34,14 +34,11 @@ def _watch(event, arguments):
         _seen.append(f"{event} {arguments}")
 
 
-@pytest.fixture(scope="session")
-def watched():
-    """Python never lets go of a hook, and calls it for much that other tests do as well."""
-    sys.addaudithook(_watch)
+sys.addaudithook(_watch)
 
 
 @pytest.fixture(autouse=True)
-def nothing_runs(watched, tmp_path, monkeypatch):
+def nothing_runs(tmp_path, monkeypatch):
     """No program is started, nobody is called, and nothing named ``was_here`` appears."""
     global _seen
     monkeypatch.chdir(tmp_path)
