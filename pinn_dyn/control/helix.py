@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.interpolate import make_interp_spline
-from torch.autograd import functional
 
 from pinn_dyn.control.contracts import Motion, Reference
 from pinn_dyn.control.references import require_positive, smooth_step
@@ -142,8 +141,8 @@ class Helix(Reference):
         """The configuration nearest to rest that puts the tip at p(phi)."""
         target, q = self._point(phi), guess
         for _ in range(_ITERATIONS):
-            error = target - _tip(arm, q)
-            jacobian = functional.jacobian(arm.tip_position, torch.from_numpy(q)).numpy()
+            tip, jacobian = _tip_and_jacobian(arm, q)
+            error = target - tip
             left, values, rows = np.linalg.svd(jacobian, full_matrices=False)
             homing = rest - q  # of which only the part in the null space is used
             change = homing + rows.T @ (
@@ -163,11 +162,11 @@ class Helix(Reference):
 
     def _measure(self, arm: HasTip, angles: np.ndarray) -> float:
         """The largest path error at the angles, where the joint limits are checked as well."""
-        errors = []
-        for phi in angles:
-            q = self._curve(phi)
-            self._require_within_limits(arm, q, phi)
-            errors.append(float(np.linalg.norm(_tip(arm, q) - self._point(phi))))
+        q = self._curve(angles)
+        for row, phi in zip(q, angles, strict=True):
+            self._require_within_limits(arm, row, phi)
+        points = np.array([self._point(phi) for phi in angles])
+        errors = np.linalg.norm(_tip(arm, q) - points, axis=-1)
         worst = int(np.argmax(errors))
         if not errors[worst] < _MAX_PATH_ERROR:
             raise ValueError(
@@ -176,7 +175,7 @@ class Helix(Reference):
                 f"allowed is {_MAX_PATH_ERROR:g} m, as near a singular configuration: take a "
                 "smaller radius or pitch, or another posture"
             )
-        return errors[worst]
+        return float(errors[worst])
 
     def _require_within_limits(self, arm: HasTip, q: np.ndarray, phi: float) -> None:
         if not isinstance(arm, HasLimits):
@@ -204,3 +203,12 @@ def _names(arm: HasTip) -> list[str]:
 
 def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:
     return arm.tip_position(torch.from_numpy(q)).numpy()
+
+
+def _tip_and_jacobian(arm: HasTip, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The tip's position ``(3,)`` and its derivative by q, ``(3, N)``."""
+    with torch.enable_grad():
+        x = torch.from_numpy(q).requires_grad_()
+        tip = arm.tip_position(x)
+        rows = [torch.autograd.grad(entry, x, retain_graph=True)[0] for entry in tip]
+    return tip.detach().numpy(), torch.stack(rows).numpy()

@@ -35,7 +35,7 @@ def tip(arm, q):
 
 
 def test_tip_follows_the_path_between_knots_too(arm, helix):
-    times = np.random.default_rng(0).uniform(0, helix.duration, 200)
+    times = np.random.default_rng(0).uniform(0, helix.duration, 60)
     errors = [np.linalg.norm(tip(arm, helix(t).q) - helix.path(t)) for t in times]
     assert max(errors) < 1e-7
     assert max(errors) < 1.1 * helix.path_error
