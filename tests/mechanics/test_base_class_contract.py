@@ -1,4 +1,7 @@
-"""The base class's automatic differentiation, on systems that give only the four terms."""
+"""The base class's automatic differentiation, on a system that gives only the four terms.
+
+And the closed formulas of the linear system, which many tests move.
+"""
 
 import pytest
 
