@@ -78,6 +78,7 @@ ARMS = {"arm": (2, arm_torque), "seven joints": (7, seven_torques)}
 """Number of joints, and the torques of a motion."""
 
 
+@functools.cache
 def log(kind, seed, delay, *, seconds=12.0, rate=100.0, noise=1e-3, highest=2.0, number=6):
     """A recording whose input acts ``delay`` s after it was logged.
 

@@ -189,20 +189,15 @@ class Remainder:
             moved: the inputs that take every candidate in turn instead.
         """
         lags = self.inner.shape[1] // self.inputs
-        shares = []
-        for d in range(lags):
-            at = lag.copy()
-            at[list(moved)] = d
-            rows = at * self.inputs + np.arange(self.inputs)
-            gram = self.inner[:, rows[:, None], rows] + 1e-6 * self.squares[0][
-                :, :1, None
-            ] * np.eye(len(rows))
-            product = self.with_motion[:, rows]
-            explained = (product * np.linalg.solve(gram, product)).sum(axis=1)
-            shares.append(
-                ((self.motion - explained) / self.squares[1].clip(min=1e-300)).mean(axis=1)
-            )
-        return np.stack(shares, axis=1).clip(1e-12, 1)
+        at = np.tile(lag, (lags, 1))
+        at[:, list(moved)] = np.arange(lags)[:, None]
+        rows = at * self.inputs + np.arange(self.inputs)
+        ridge = 1e-6 * self.squares[0][:, :1, None, None] * np.eye(self.inputs)
+        gram = self.inner[:, rows[:, :, None], rows[:, None, :]] + ridge
+        product = self.with_motion[:, rows]
+        explained = (product * np.linalg.solve(gram, product)).sum(axis=2)
+        left = (self.motion[:, None] - explained) / self.squares[1][:, None].clip(min=1e-300)
+        return left.mean(axis=2).clip(1e-12, 1)
 
 
 def _standard(x: np.ndarray) -> np.ndarray:
