@@ -1,9 +1,13 @@
 """Settings for all tests."""
 
+import gc
+
 import pytest
 import torch
 
 from tests.support.compositions import keep_compositions
+
+gc.disable()  # until all is imported
 
 # The tests' tensors are small: threads beyond one only slow them down.
 torch.set_num_threads(1)
@@ -22,8 +26,13 @@ LONG = (
 
 
 def pytest_collection_modifyitems(items):
-    # The attacks last: their watch on Python's events stays, and slows what comes after.
-    items.sort(key=lambda item: (item.path.stem not in LONG, item.path.parent.name == "attacks"))
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
+
+def pytest_collection_finish():
+    # What is imported stays: a collection of garbage need not go through it, a fifth of a second.
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
