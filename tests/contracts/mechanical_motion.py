@@ -39,14 +39,22 @@ class MotionContract:
         )
         assert_near(system.power(q, v, u), expected, self.difference_tolerance)
 
-    def test_rollout_keeps_the_balance_of_energy(self, system, configurations):
-        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F).
+    def test_rollouts_keep_the_balance_of_energy_and_are_the_same_in_both_forms(
+        self, system, configurations
+    ):
+        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F), by velocity and by momentum.
 
         The input is one straight line over the whole roll-out, so the power is smooth, and both
         the integrator and Simpson's rule are of fourth order in the step.
         """
-        t, x = self._rollout(system, configurations, system.velocity_derivative)
-        q, v = x.chunk(2, -1)
+        end = self.steps * self._step(system, configurations)
+        t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
+        q, v = self._rollout(system, configurations, system.velocity_derivative, t).chunk(2, -1)
+        hamiltonian = self._rollout(system, configurations, system.momentum_derivative, t)
+        q_hamiltonian, p = hamiltonian.chunk(2, -1)
+        moved = (q - q[..., :1, :]).abs().max()
+        assert_near(q_hamiltonian, q, self.rollout_tolerance, scale=moved)
+        assert_near(system.velocity(q_hamiltonian, p), v, self.rollout_tolerance)
         u = self._input(configurations, t)
         supplied = (product(system.input_matrix(q), u) * v).sum(-1)
         lost = (system.dissipative_force(q, v) * v).sum(-1)
@@ -55,15 +63,6 @@ class MotionContract:
         turnover = simpson((supplied.abs() + lost.abs()).numpy(), x=t.numpy(), axis=-1).max()
         change = energy[..., -1] - energy[..., 0]
         assert_near(change, work, self.rollout_tolerance, scale=turnover)
-
-    def test_rollouts_in_velocity_and_momentum_give_the_same_motion(self, system, configurations):
-        _, lagrangian = self._rollout(system, configurations, system.velocity_derivative)
-        _, hamiltonian = self._rollout(system, configurations, system.momentum_derivative)
-        q, v = lagrangian.chunk(2, -1)
-        q_hamiltonian, p = hamiltonian.chunk(2, -1)
-        moved = (q - q[..., :1, :]).abs().max()
-        assert_near(q_hamiltonian, q, self.rollout_tolerance, scale=moved)
-        assert_near(system.velocity(q_hamiltonian, p), v, self.rollout_tolerance)
 
     def _step(self, system, configurations):
         """A step that resolves the fastest motion of the linearized dynamics."""
@@ -80,13 +79,11 @@ class MotionContract:
         """From u to -u on a straight line, ``(8, T, M)``."""
         return (1 - 2 * t / t[-1])[:, None] * configurations.u[:, None, :]
 
-    def _rollout(self, system, configurations, derivative):
+    def _rollout(self, system, configurations, derivative, t):
         q, v, _, _ = configurations
-        end = self.steps * self._step(system, configurations)
-        t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
         second = v if derivative == system.velocity_derivative else system.momentum(q, v)
         u = self._input(configurations, t[[0, -1]])
-        return t, rollout(derivative, torch.cat([q, second], -1), t, Signal(t[[0, -1]], u))
+        return rollout(derivative, torch.cat([q, second], -1), t, Signal(t[[0, -1]], u))
 
     # Gradients.
 

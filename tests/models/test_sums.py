@@ -138,7 +138,7 @@ def test_what_the_network_contributes_is_penalized():
 
 def test_what_each_part_contributes():
     model = perturb(both().double(), spread=0.2)
-    truth = stack([motion(model, seconds=0.5)])
+    truth = stack([motion(model, seconds=0.1)])
     table = part_shares(model, truth).set_index(["part", "term"])
     q = truth.q[0]
     sizes = {
