@@ -32,8 +32,7 @@ def uncompiled(monkeypatch):
 
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
-@pytest.mark.parametrize("batch", [(), (2, 3)])
-@pytest.mark.parametrize("substeps", [1, 3])
+@pytest.mark.parametrize(("batch", "substeps"), [((2, 3), 1), ((), 3)])
 def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
     """More steps than a block, an input that jumps, and solution times that skip samples."""
     system = damped_oscillators().requires_grad_(False)
