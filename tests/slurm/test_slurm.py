@@ -63,21 +63,18 @@ def sweep(environment, folder, *arguments):
 
 
 def test_a_sweep_runs_as_slurm_jobs_and_lists_the_one_that_failed(slurm, tmp_path):
-    choices = ["model=lnn", "optimizer.lr=0.005,0.01,1e9"]  # the last one diverges
+    choices = ["model=lnn", "optimizer.lr=0.005,1e9"]  # the last one diverges
     done = sweep(slurm, tmp_path, *choices)
     said = done.stdout + done.stderr
     assert done.returncode == 1, said
-    assert "1 job failed:\n  sweep/2_lnn-seed0\n    NonFiniteLossError: " in said
-    for number in (0, 1):
-        record = json.loads(
-            (tmp_path / "sweep" / f"{number}_lnn-seed0" / "metrics.json").read_text()
-        )
-        assert record["validation"]["val/error_mean"] > 0
+    assert "1 job failed:\n  sweep/1_lnn-seed0\n    NonFiniteLossError: " in said
+    record = json.loads((tmp_path / "sweep" / "0_lnn-seed0" / "metrics.json").read_text())
+    assert record["validation"]["val/error_mean"] > 0
     # SLURM ran them: it numbered the jobs, and its own log of each is there.
-    assert len(list((tmp_path / "sweep" / ".submitit").glob("*_[012]/*_log.out"))) == 3
+    assert len(list((tmp_path / "sweep" / ".submitit").glob("*_[01]/*_log.out"))) == 2
     assert len(list((tmp_path / "cache").glob("*.npz"))) == 1
 
     again = sweep(slurm, tmp_path, *choices)
     logs = "".join(path.read_text() for path in (tmp_path / "sweep").glob("*/train.log"))
     assert again.returncode == 1, again.stdout + again.stderr
-    assert logs.count("already trained") == 2
+    assert logs.count("already trained") == 1
