@@ -126,7 +126,7 @@ def generalization_table() -> str:
         )
     truth = [_truth(name) for name in ("soft_arm_1_wide", "soft_arm_1_wide_beyond")]
     rows.append(["true equation", *truth, *["–"] * (len(tables) - 1)])
-    head = list(tables)
+    head = [f"{name}: mean, median" for name in tables]
     return table(["model", *head[:2], "left the data beyond", *head[2:]], rows)
 
 
@@ -144,7 +144,8 @@ def beyond_table() -> str:
             rows.append(["" if index else task, label, *cells, _left(beyond, model)])
         truth = (_truth(name) for name in (dataset, f"{dataset}_beyond"))
         rows.append(["", "true equation", *truth, "–"])
-    return table(["task", "model", "in range", "beyond, 1.3 times", "left the data beyond"], rows)
+    head = [f"{name}: mean, median" for name in list(_ELSEWHERE)[:2]]
+    return table(["task", "model", *head, "left the data beyond"], rows)
 
 
 def payload_table() -> str:
@@ -164,7 +165,8 @@ def payload_table() -> str:
                 took,
             ]
         )
-    head = ["model", "before", "after 2 s of motion", "over 0.5 s", "torque error, share", "fit, s"]
+    head = ["model", "before: mean, median", "after 2 s of motion: mean, median", "over 0.5 s"]
+    head += ["torque error, share", "fit, s"]
     return table(head, rows)
 
 
