@@ -30,7 +30,7 @@ SUMMARY = [
         "soft_arm_2/mlp_100hz",
     ),
     ("Panda in PyBullet, its kinematics known, 2 s", "known", "panda/known", "panda/mlp"),
-    ("double pendulum, real, 2 s", "lnn", "double_pendulum/lnn", "double_pendulum/acceleration"),
+    ("double pendulum, real, 2 s", "lnn", "double_pendulum/lnn", "double_pendulum/mlp"),
     ("tendon-driven trunk, real, 10 s", "lnn", "trunk/lnn", "trunk/mlp"),
 ]
 LOGS = {"double_pendulum": "rad", "panda_gaz": "rad", "soft_neck": "rad", "trunk": "m"}
