@@ -42,6 +42,7 @@ class JaxLoops:
     def __init__(
         self, model: Any, windows: Windows, loss: str, scale: Any, step: float, rates: list[float]
     ):
+        jax.config.update("jax_default_matmul_precision", "highest")  # float32 on a GPU, as torch
         self.parameters = jax_networks.parameters_of(model)
         self.network = jax_networks.Network(model)
         self.loss, self.scale = jax_networks.LOSSES[loss], scale

@@ -9,6 +9,7 @@ end with the same weights. SOAP, which optax lacks, is timed alone.
 
     python benchmarks/training_loop.py                              # all cells that the file lacks
     python benchmarks/training_loop.py --sizes 3 --batches 256      # some of them
+    python benchmarks/training_loop.py --device gpu --output training_loop_gpu.csv
     python benchmarks/training_loop.py --quick                      # a smoke run, no file
     python benchmarks/training_loop.py --quick --optimizers soap    # without jax and optax
 
@@ -16,7 +17,7 @@ A cell is written as soon as it is measured, and one that is there is not measur
 was stopped goes on. One core and one thread. After each epoch of ours, JAX takes as many steps, and
 so does our loss and gradient alone: what an epoch takes beyond them is the loop and the optimizer.
 Shares and ratios are of the processor time of the process, which others on the machine hardly
-disturb; wall time stands beside it.
+disturb; wall time stands beside it. On a GPU they are of wall time, until the card has done all.
 """
 
 from __future__ import annotations
@@ -86,10 +87,11 @@ class Sines(DataSource):
 
 
 def configuration(
-    size: int, batch: int, loss: str, optimizer: str, compiled: bool
+    size: int, batch: int, loss: str, optimizer: str, device: str, compiled: bool
 ) -> dict[str, Any]:
     """That of a long training, of which the first epochs are run, up to no validation."""
     words = [
+        f"trainer={device}",
         "model=lnn",
         "model_name=lnn",
         f"loss={loss}",
@@ -108,7 +110,9 @@ def configuration(
 
 
 def clocks() -> tuple[float, float]:
-    """Of the processor and on the wall, s."""
+    """Of the processor and on the wall, s, when a GPU has done what it was given."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
     return time.process_time(), time.perf_counter()
 
 
@@ -155,6 +159,7 @@ def run_cell(
     optimizer: str,
     *,
     rounds: int,
+    device: str = "cpu",
     steps: int | None = None,
     compiled: bool = True,
 ) -> Row:
@@ -164,7 +169,7 @@ def run_cell(
         most = min(max(200_000 // batch, 40), 500)
         steps = next(n for n in range(most, 0, -1) if STEPS_FOR_PROGRAM % n == 0)
     build.LONGEST_EPOCH = steps
-    config = configuration(size, batch, loss, optimizer, compiled)
+    config = configuration(size, batch, loss, optimizer, device, compiled)
     L.seed_everything(0, verbose=False)
     data = build.build_data(config, Sines(size))
     model = build.build_model(config, data.statistics)
@@ -172,6 +177,9 @@ def run_cell(
     learner = build.build_learner(config, model, data.statistics, validator)
     windows = data.windows.to(torch.device("cpu"), torch.float32)
     first = windows[next(iter(data.sampler(0)))]
+    if device == "gpu":
+        first = first.to(torch.device("cuda"))
+    clock = 0 if device == "cpu" else 1
     others: dict[str, Callable[[], Any]] = {
         "loss and gradient": lambda: [learner._gradients(first) for _ in range(steps)]
     }
@@ -182,7 +190,7 @@ def run_cell(
         scale = learner.loss.scale.numpy().reshape(-1)
         rates = schedule(config, learner)
         loops = jax_loops.JaxLoops(model, windows, loss, scale, STEP, rates)
-        chosen, fastest = rival(loops, config, data)
+        chosen, fastest = rival(loops, config, data, clock)
         others["jax"] = lambda: fastest(islice(data.sampler(0), steps))
     turns = Turns(others, rounds)
     fit(config, data, learner, validator, turns)
@@ -193,12 +201,12 @@ def run_cell(
 
     row: Row = dict(zip(CELL, (size, batch, loss, optimizer), strict=True))
     row |= {"ms": milliseconds("ours", 0), "wall_ms": milliseconds("ours", 1)}
-    row["loss_and_gradient_ms"] = milliseconds("loss and gradient", 0)
-    shares = [1 - turn["loss and gradient"][0] / turn["ours"][0] for turn in times]
+    row["loss_and_gradient_ms"] = milliseconds("loss and gradient", clock)
+    shares = [1 - turn["loss and gradient"][clock] / turn["ours"][clock] for turn in times]
     row["loop_and_optimizer"] = round(statistics.median(shares), 3)
     row |= dict.fromkeys(("jax_ms", "jax_wall_ms", "jax_slower", "smallest", "largest"), "")
     if chosen:
-        ratios = [turn["jax"][0] / turn["ours"][0] for turn in times]
+        ratios = [turn["jax"][clock] / turn["ours"][clock] for turn in times]
         row |= {"jax_ms": milliseconds("jax", 0), "jax_wall_ms": milliseconds("jax", 1)}
         row["jax_slower"] = round(statistics.median(ratios), 3)
         row |= {"smallest": round(min(ratios), 3), "largest": round(max(ratios), 3)}
@@ -206,7 +214,7 @@ def run_cell(
     return {**row, "first_epoch_s": round(turns.times[0]["ours"][1], 1)}
 
 
-def rival(loops: Any, config: dict[str, Any], data: Any) -> tuple[str, Loop]:
+def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[str, Loop]:
     """The fastest loop of JAX, and its name: of two spellings, step by step or as a scan."""
 
     def checked(make: Callable[[str], Loop], spelling: str) -> tuple[float, str, Loop]:
@@ -214,9 +222,9 @@ def rival(loops: Any, config: dict[str, Any], data: Any) -> tuple[str, Loop]:
         check_weights(config, data, name, run(islice(data.sampler(0), CHECKED)))
         took = []
         for _ in range(5):
-            start = time.process_time()
+            start = clocks()
             run(islice(data.sampler(0), CHECKED))
-            took.append(time.process_time() - start)
+            took.append(since(start)[clock])
         print(f"{name}: {1e3 * min(took) / CHECKED:.3f} ms", flush=True)
         return min(took), name, run
 
@@ -270,7 +278,7 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     learner = build.build_learner(config, model, data.statistics, validator)
     fit(config, data, learner, validator, Turns({}, 0))
     build.LONGEST_EPOCH = steps
-    ours, theirs = dict(model.named_parameters()), named(tree)
+    ours, theirs = dict(model.cpu().named_parameters()), named(tree)
     way = sum(float((ours[key].detach() - start[key]).square().sum()) for key in start)
     apart = sum(
         float((ours[key].detach() - theirs[key]).square().sum()) for key in start if key in theirs
@@ -327,6 +335,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=[256, 1024, 8192])
     parser.add_argument("--losses", nargs="+", default=["increment", "midpoint"])
     parser.add_argument("--optimizers", nargs="+", default=["adamw", "soap"])
+    parser.add_argument("--device", choices=["cpu", "gpu"], default="cpu")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, help="steps in a round")
     parser.add_argument("--quick", action="store_true", help="smoke run: a small cell, no file")
@@ -337,7 +346,9 @@ def main(words: list[str] | None = None) -> None:
             "adamw is timed beside jax and optax, which are not installed: "
             "pip install -e '.[bench]', or take --optimizers soap"
         )
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
+    if arguments.device == "cpu":
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
+        os.environ["JAX_PLATFORMS"] = "cpu"
     torch.set_num_threads(1)
     if arguments.quick:
         for optimizer in arguments.optimizers:
@@ -346,6 +357,8 @@ def main(words: list[str] | None = None) -> None:
     rows = rows_of(arguments.output)
     there = {tuple(row[key] for key in CELL) for row in rows}
     record = {key: provenance()[key] for key in ("hardware", "torch", "commit")} | versions()
+    if arguments.device == "gpu":
+        record["hardware"] = torch.cuda.get_device_name()
     for optimizer in arguments.optimizers:
         for loss in arguments.losses:
             for size in arguments.sizes:
@@ -354,8 +367,12 @@ def main(words: list[str] | None = None) -> None:
                     if cell in there:
                         print(f"{', '.join(cell)}: is in {arguments.output}", flush=True)
                         continue
-                    rounds, steps = arguments.rounds, arguments.steps
-                    row = run_cell(size, batch, loss, optimizer, rounds=rounds, steps=steps)
+                    row = run_cell(
+                        *(size, batch, loss, optimizer),
+                        rounds=arguments.rounds,
+                        steps=arguments.steps,
+                        device=arguments.device,
+                    )
                     row |= record
                     append(row, arguments.output)
                     print(row, flush=True)

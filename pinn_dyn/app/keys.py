@@ -105,7 +105,7 @@ class Kinematics(Section):
 TRAINER: dict[str, Any] = {
     "steps": Annotated[int, Range(1, 10**9)],
     "validations": Annotated[int, Range(1, 10**6)],
-    "accelerator": Literal["cpu", "gpu", "cuda", "mps", "auto"],
+    "accelerator": Literal["cpu", "gpu", "cuda", "auto"],
     "devices": Count | Sequence[Index] | Literal["auto"],
     "num_nodes": Count,
     "strategy": str,

@@ -114,6 +114,7 @@ class DynamicsLearner(L.LightningModule):
         optimizer = self.optimizers(use_pl_optimizer=False)
         schedule = self.lr_schedulers()
         step, until, done = self.global_step, time.monotonic() + MOST_SECONDS, 0
+        known = len(self._losses)
         try:
             for batch, _, _ in islice(dataloader_iter, self._steps_until_due(before)):
                 optimizer.step(self._closure(batch, step + done))  # type: ignore[union-attr, arg-type]
@@ -127,6 +128,8 @@ class DynamicsLearner(L.LightningModule):
             # moves it: its loggers and monitors take the step from there.
             loop.batch_progress.increment_by(done - 1)
             loop._batches_that_stepped += done - 1
+            if self.device.type == "cuda" and (new := self._losses[known:]):
+                self._refuse_non_finite(torch.stack(new), step)
         if before + done >= trainer.num_training_batches:
             self.log_losses(torch.stack(self._losses).mean(0))
             self._losses.clear()
@@ -154,22 +157,27 @@ class DynamicsLearner(L.LightningModule):
 
         def closure() -> Tensor:
             losses, gradient = self._gradients(windows)
-            loss = losses.sum()  # a single number, but for the members of an ensemble
-            if not math.isfinite(loss):
-                raise NonFiniteLossError(
-                    f"the training loss became {float(loss)} at step {step} (epoch "
-                    f"{self.current_epoch}); the checkpoints written before are kept. Lower "
-                    "optimizer.lr, shorten the window (data.steps, data.stride) or raise the "
-                    "heads' epsilon, then start again"
-                )
+            if not losses.is_cuda:  # a GPU would have to be waited for: it is asked later
+                self._refuse_non_finite(losses[None], step)
             gradient = self.trainer.strategy.reduce(gradient)  # mean over processes
             self._vector.gradient.copy_(clipped(gradient, self._most, self._by_value))
             if self._vector.parameters[0].grad is None:  # the trainer clears them once
                 self._vector.show_gradients()
             self._losses.append(losses)
-            return loss
+            return losses.sum()  # a single number, but for the members of an ensemble
 
         return closure
+
+    def _refuse_non_finite(self, losses: Tensor, first: int) -> None:
+        """Raise where the losses of the steps from ``first`` on, a row each, are not finite."""
+        for step, loss in enumerate(losses.reshape(len(losses), -1).sum(1).tolist(), first):
+            if not math.isfinite(loss):
+                raise NonFiniteLossError(
+                    f"the training loss became {loss} at step {step} (epoch "
+                    f"{self.current_epoch}); the checkpoints written before are kept. Lower "
+                    "optimizer.lr, shorten the window (data.steps, data.stride) or raise the "
+                    "heads' epsilon, then start again"
+                )
 
     def log_losses(self, losses: Tensor) -> None:
         """Log the mean loss of an epoch.
@@ -264,6 +272,7 @@ def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> 
     if by_value:
         return gradient.clamp(-largest, largest)
     norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
-    if norm.numel() == 1 and float(norm) < largest:  # as in most steps: one operation, not five
+    # As in most steps: one operation, not five; a GPU would have to be waited for.
+    if norm.numel() == 1 and not norm.is_cuda and float(norm) < largest:
         return gradient
     return gradient * (largest / (norm + 1e-6)).clamp(max=1.0)

@@ -63,9 +63,9 @@ def make_splits():
     return Splits(made[:4], made[4:5], made[5:])
 
 
-def make_trainer(folder, *, max_epochs, **extra):
+def make_trainer(folder, *, max_epochs, accelerator="cpu", **extra):
     return L.Trainer(
-        accelerator="cpu",
+        accelerator=accelerator,
         max_epochs=max_epochs,
         logger=False,
         enable_progress_bar=False,

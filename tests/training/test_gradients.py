@@ -19,6 +19,7 @@ from pinn_dyn.models import (
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
+from pinn_dyn.training.gradients.program import LossProgram
 from tests.models.builders import make_model, make_structured, perturb
 from tests.support.windows import for_members, make_windows, one_step
 
@@ -112,6 +113,18 @@ def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
     batches = [make_windows(6, seed=k) for k in range(3)]
     losses, gradients = compiled(for_members(batches))
     assert len(compiled._program._programs) == 1
+    for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
+        assert_same((losses[k], gradients[k]), engine(Eager, loss, member)(batch))
+
+
+def test_a_program_of_all_members_has_the_same(traced):
+    """It is what a GPU takes."""
+    members = [perturb(make_model("lnn"), seed=k) for k in range(3)]
+    stack = Ensemble(members).stack
+    loss = IncrementLoss(one_step(size=2), members[0]).double()
+    program = LossProgram(loss, stack, ParameterVector(stack.parameters(), members=3))
+    batches = [make_windows(6, size=2, seed=k) for k in range(3)]
+    losses, gradients = program(for_members(batches), part=3)
     for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
         assert_same((losses[k], gradients[k]), engine(Eager, loss, member)(batch))
 

@@ -24,8 +24,8 @@ class Compiled:
     """Loss and gradient of a model with compiled dynamics, or with all of it compiled.
 
     One program for loss and gradient is fastest, and takes longest to compile: it is made where
-    the training is long and a window costs few evaluations of the dynamics, on a CPU. Elsewhere
-    the dynamics alone are compiled. Large batches are taken in parts that fit into the cache.
+    the training is long and a window costs few evaluations of the dynamics. Elsewhere the dynamics
+    alone are compiled. On a CPU large batches are taken in parts that fit into the cache.
 
     Args:
         loss: of the model.
@@ -48,8 +48,8 @@ class Compiled:
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
         evaluations = self.evaluations(windows)
         on_cpu = windows.q.device.type == "cpu"
-        if on_cpu and worth_a_program(evaluations, self.steps):
-            part = CHUNK * MOST_EVALUATIONS // evaluations
+        if worth_a_program(evaluations, self.steps):
+            part = CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)
             return self._program(windows, part)
         if not on_cpu or len(windows) < 2 * CHUNK:
             return self._loss_and_gradient(windows)

@@ -25,16 +25,17 @@ _ROWS = {"qv": ("q", "v", "dq", "dv"), "qp": ("q", "p", "dq", "dp")}
 
 
 class LossProgram:
-    """The loss of windows and its gradient in the parameters, by one call of a C++ program.
+    """The loss of windows and its gradient in the parameters, by one call of a compiled program.
 
     A compiled derivative still leaves some hundred operations around it to Python and autograd,
     which is half of the time of a small batch. Here the roll-out, the loss and the gradient are
     traced as one graph and compiled for the batch sizes that come. Parts of a batch are taken side
-    by side on the threads of torch.
+    by side on the threads of torch, on a GPU one after the other.
 
     Args:
         loss: of the model, by operations that can be traced.
-        model: what is trained, or one whose parameters are stacked over members.
+        model: what is trained; of an ensemble all members as one, or one of them, whose parameters
+            are then stacked over all.
         vector: its parameters.
     """
 
@@ -63,7 +64,8 @@ class LossProgram:
         programs = list(map(self._program, batches, arguments))
         # Even a single batch goes to a thread of the pool: its small products gain by one thread.
         threads = torch.get_num_threads()
-        run = map if threads == 1 else _pool(threads).map
+        alone = threads == 1 or self._vector.values.is_cuda
+        run = map if alone else _pool(threads).map
         return run(_call, programs, arguments)
 
     def _program(self, windows: Windows, arguments: tuple[Any, ...]) -> Program:
@@ -86,8 +88,8 @@ class LossProgram:
                 values = [value.detach().requires_grad_() for value in self._vector.split(vector)]
                 parameters = dict(zip(self._names, values, strict=True))
                 loss = functional_call(self._loss, parameters, (batch,))
-                gradients = torch.autograd.grad(loss, values, allow_unused=True)
-            return [loss.detach(), self._vector.joined(gradients)]
+                gradients = torch.autograd.grad(loss.sum(), values, allow_unused=True)
+            return [loss.detach(), self._vector.joined(gradients, tuple(vector.shape[:-1]))]
 
         return loss_and_gradient
 

@@ -1,0 +1,110 @@
+"""What only a GPU does: compiled programs as CUDA graphs, and trainings there."""
+
+import copy
+
+import pytest
+import torch
+
+from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
+from pinn_dyn.ensembles.gradients import CompiledMembers
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.training import (
+    DynamicsLearner,
+    IncrementLoss,
+    MidpointLoss,
+    NonFiniteLossError,
+    ParameterVector,
+)
+from pinn_dyn.training.gradients import Compiled, Eager
+from tests.models.builders import make_model, perturb
+from tests.support.ensembles import learn, make_data, make_models, train
+from tests.support.windows import for_members, make_windows, one_step
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
+GPU = torch.device("cuda")
+
+
+def batches_of(size):
+    return [make_windows(size, size=2, seed=seed) for seed in range(3)]
+
+
+@pytest.mark.parametrize(("kind", "kind_of_loss"), [("lnn", MidpointLoss), ("hnn", IncrementLoss)])
+def test_a_recorded_program_gives_the_loss_and_gradient_of_the_eager_model_on_a_cpu(
+    kind, kind_of_loss
+):
+    """Also of other data and other weights than those it was recorded with."""
+    model = make_model(kind)
+    moved = copy.deepcopy(model).to(GPU)
+    loss = kind_of_loss(one_step(size=2), model).double()
+    compiled = Compiled(
+        copy.deepcopy(loss).to(GPU), moved, ParameterVector(moved.parameters()), STEPS_FOR_PROGRAM
+    )
+    eager = Eager(loss, model, ParameterVector(model.parameters()))
+    kept = []
+    for batch in batches_of(8):
+        found, expected = compiled(batch.to(GPU)), eager(batch)
+        kept.append((found, [value.clone() for value in found]))
+        for a, b in zip(found, expected, strict=True):
+            torch.testing.assert_close(a.cpu(), b, rtol=1e-9, atol=1e-12)
+        with torch.no_grad():
+            eager.vector.values.mul_(0.9)
+            compiled.vector.values.mul_(0.9)
+    assert len(compiled._program._programs) == 1
+    for found, at_once in kept:  # a later step does not write over what an earlier one gave
+        assert all(map(torch.equal, found, at_once))
+
+
+def test_one_program_gives_all_members_their_losses_and_gradients():
+    members = [perturb(make_model("lnn"), seed=k) for k in range(3)]
+    loss = IncrementLoss(one_step(size=2), members[0]).double()
+    stack = Ensemble(members).stack.to(GPU)
+    vector = ParameterVector(stack.parameters(), members=3)
+    compiled = CompiledMembers(copy.deepcopy(loss).to(GPU), stack, vector)
+    batches = batches_of(6)
+    losses, gradients = compiled(for_members(batches).to(GPU))
+    assert len(compiled._program._programs) == 1
+    for k, (member, batch) in enumerate(zip(members, batches, strict=True)):
+        expected = Eager(loss, member, ParameterVector(member.parameters()))(batch)
+        torch.testing.assert_close(losses[k].cpu(), expected[0], rtol=1e-9, atol=0)
+        torch.testing.assert_close(gradients[k].cpu(), expected[1], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("compile", [False, True])
+@pytest.mark.parametrize("kind", ["lnn", "hnn", "next state"])
+def test_a_training_ends_with_the_weights_that_it_has_on_a_cpu(tmp_path, kind, compile):
+    """Sixteen steps in two epochs, with clipping, a schedule and a curriculum."""
+    ends = []
+    for accelerator in ("cpu", "gpu"):
+        data = make_data()
+        model = make_models(kind, data, 1)[0]
+        compiled = compile and accelerator == "gpu"
+        learner = learn(DynamicsLearner, model, model, data, compile=compiled)
+        train(tmp_path, learner, data, accelerator=accelerator)
+        ends.append([p.detach().cpu() for p in model.parameters()])
+    for found, expected in zip(*ends, strict=True):
+        # Adam divides by the size of a gradient: rounding counts where that is near zero.
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
+
+
+def test_members_end_with_the_weights_that_they_have_on_a_cpu(tmp_path):
+    ends = []
+    for accelerator in ("cpu", "gpu"):
+        data = make_data()
+        models = make_models("lnn", data, 2)
+        ensemble = Ensemble(models)
+        compiled = accelerator == "gpu"
+        learner = learn(EnsembleLearner, ensemble, models[0], data, compile=compiled)
+        train(tmp_path, learner, EnsembleData(data, 2), accelerator=accelerator)
+        ends.append([p.detach().cpu() for p in ensemble.parameters()])
+    for found, expected in zip(*ends, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
+
+
+def test_a_loss_that_is_not_a_number_is_found_though_the_steps_run_ahead(tmp_path):
+    data = make_data()
+    model = make_models("lnn", data, 1)[0]
+    learner = learn(DynamicsLearner, model, model, data)
+    with torch.no_grad():
+        next(model.parameters()).fill_(float("nan"))
+    with pytest.raises(NonFiniteLossError, match="became nan at step 0"):
+        train(tmp_path, learner, data, accelerator="gpu")
