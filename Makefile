@@ -1,4 +1,4 @@
-# make demo | reproduce | test | test-slow | test-notebooks | test-slurm | test-long | test-next | lint | docs | bench: each builds what it needs of the environment first.
+# make demo | reproduce | test | test-slow | test-notebooks | test-slurm | test-next | lint | docs | bench: each builds what it needs of the environment first.
 #
 #   PYTHON     the interpreter the environment is made from   (make test PYTHON=python3.11)
 #   VENV       where the environment lies
@@ -18,7 +18,7 @@ INSTALL = $(BIN)/python -m pip install -qq --disable-pip-version-check --no-comp
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce test test-slow test-notebooks test-slurm test-long test-next lint docs notebooks bench clean $(VENV)
+.PHONY: help demo reproduce test test-slow test-notebooks test-slurm test-next lint docs notebooks bench clean $(VENV)
 
 help:  ## list the targets
 	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-14s %s\n", $$1, $$2 }'
@@ -36,17 +36,14 @@ reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on wher
 test: $(VENV)/.installed-dev  ## run the tests, on all cores
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m "not slow"
 
-test-slow: $(VENV)/.installed-dev  ## run those that compile models, or simulate for long
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m slow
+test-slow: $(VENV)/.installed-notebooks  ## run those left out of make test: compiled models, long simulations, notebooks, SLURM
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -o norecursedirs='.* build' -m slow
 
 test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean kernels
 	$(BIN)/python -m pytest tests/notebooks --numprocesses auto --dist worksteal
 
 test-slurm: $(VENV)/.installed-dev  ## test a sweep on a real SLURM; needs root, slurm-wlm and munge
 	$(BIN)/python -m pytest tests/slurm
-
-test-long: $(VENV)/.installed-notebooks  ## run all but make test by one call, in which no core waits for another
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -o norecursedirs='.* build' -m slow
 
 test-next: $(VENV)/.installed-dev  ## run the tests of the commands on the next Hydra and OmegaConf
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade --pre --no-deps --target $(VENV)/next \

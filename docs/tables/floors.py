@@ -32,7 +32,8 @@ from pinn_dyn.mechanics import Predictor, stack_until
 
 FILE = Path(__file__).resolve().parents[2] / "results" / "floors.csv"
 GROUND = "true equation"
-# Linear rivals do better in long steps than in those of the simulated models, s.
+# The least step of linear rivals, s: on the wide range ARX has 0.48 and EDMDc 0.18 in such, in the
+# networks' steps of 2 ms 0.57 and 0.22.
 _LINEAR_STEP = 0.01
 # Of each data set: horizon, step of the roll-outs and windows, all in s.
 SETS = {
@@ -73,8 +74,9 @@ def floors(name: str) -> list[dict[str, object]]:
         row = {"dataset": name, "model": label, "step": step, **figures.to_dict()}
         for window in windows:
             part = predict_windows(model, truth, window=window, step=step)
-            error = rollout_metrics(part.q_hat, part.q, part.t, thresholds={}).error_mean
-            row[f"window_{window:g}s_error_mean"] = error
+            found = rollout_metrics(part.q_hat, part.q, part.t, thresholds={})
+            row[f"window_{window:g}s_error_mean"] = found.error_mean
+            row[f"window_{window:g}s_diverged"] = found.diverged
         rows.append(row)
     return rows
 

@@ -175,7 +175,7 @@ def _label(data: pd.DataFrame, model: str) -> str:
 
 
 def _mean_and_median(data: pd.DataFrame, model: str) -> str:
-    """Errors of a model, bold where none that loses no roll-out has smaller ones, nor does it."""
+    """Errors of a model, bold where they are the smallest of those that lose no roll-out."""
     runs = data[data["model"] == model]
     if runs.empty:
         return "–"
@@ -267,21 +267,30 @@ def sample_efficiency() -> pd.DataFrame:
 
 
 def sample_efficiency_table() -> str:
-    """Errors against pairs: mean ± standard deviation, and the worst trajectory."""
-    data = sample_efficiency()
+    """Errors against pairs: mean ± standard deviation, and the worst trajectory.
+
+    Floors, which take all of the training data, are below.
+    """
+    data, floors = sample_efficiency(), floors_of("soft_arm_1")
     sizes = sorted(data["pairs"].unique())
+    lowest = data.groupby("pairs")["error_mean"].min().clip(upper=floors["error_mean"].min())
     rows = []
     for model, runs in data.groupby("model", sort=False):
         by_size = runs.set_index("pairs")
         took = training_seconds(runs)
-        cells = [_errors(by_size.loc[size]) if size in by_size.index else "–" for size in sizes]
+        cells = [
+            _errors(by_size.loc[size], lowest[size]) if size in by_size.index else "–"
+            for size in sizes
+        ]
         rows.append([f"`{model}`", *cells, f"{took.min():.0f}–{took.max():.0f}"])
+    for floor, row in floors.iterrows():
+        rows.append([str(floor), *["–"] * (len(sizes) - 1), _errors(row), "–"])
     return table(["model", *(f"{size:,} pairs" for size in sizes), "training, s"], rows)
 
 
-def _errors(row: pd.Series) -> str:
+def _errors(row: pd.Series, lowest: float | None = None) -> str:
     mean, std, worst = (number(row[f"error_{name}"]) for name in ("mean", "std", "worst"))
-    return f"**{mean}** ± {std}, {worst}"
+    return f"{bold(mean, row['error_mean'] == lowest)} ± {std}, {worst}"
 
 
 def draw(path: Path) -> None:

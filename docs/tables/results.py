@@ -39,10 +39,11 @@ WINDOWS = ["window_0.1s_error_mean", "window_1s_error_mean", "error_mean"]
 
 
 def read_log(name: str) -> pd.DataFrame:
-    """The evaluations of one log."""
+    """The evaluations of networks on one log; its floors are in a file of their own."""
     folders = [RESULTS / "logs" / f"{name}{rest}" for rest in ("", "_mlp")]
     files = [folder / "summary.csv" for folder in folders]
-    return pd.concat([pd.read_csv(path) for path in files if path.is_file()])
+    data = pd.concat([pd.read_csv(path) for path in files if path.is_file()])
+    return data[data["model"].isin(_NETWORKS)]
 
 
 def rows_of(entry: str) -> pd.DataFrame:
@@ -110,38 +111,39 @@ def panda() -> str:
     return table(head, rows)
 
 
-_LINEAR = ("ARX", "EDMDc degree 2")
-"""Rivals by least squares, without a seed."""
+_NETWORKS = ("lnn", "lnn_residual", "acceleration", "mlp")
 
 
 def logs() -> str:
     """The logs of real robots: means over the seeds, with the smallest and the largest."""
     rows = []
     for name, unit in LOGS.items():
-        data, floors = read_log(name), floors_of(name).drop(list(_LINEAR), errors="ignore")
+        data, floors = read_log(name), floors_of(name)
         means = data.groupby("model")[WINDOWS].mean()
-        rows_of_log = ("lnn", "lnn_residual", "acceleration", "mlp", *_LINEAR)
-        present = [model for model in rows_of_log if model in means.index]
+        lowest = means.min().combine(floors[WINDOWS].min(), min)
+        present = [model for model in _NETWORKS if model in means.index]
         for index, model in enumerate(present):
             runs = data[data["model"] == model]
             cells = []
             for column in WINDOWS:
                 mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
-                best = mean == means[column].min() and mean < floors[column].min()
                 spread = f" ({_precise(low)}–{_precise(high)})" if len(runs) > 1 else ""
-                cells.append(f"{bold(_error(mean), best)}{spread}{_lost(runs, column, mean)}")
-            label = model if model in _LINEAR else f"`{model}`"
-            rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells])
-        lowest = means.min().combine(floors[WINDOWS].min(), min)
+                shown = bold(_error(mean), mean == lowest[column])
+                cells.append(f"{shown}{spread}{_lost(runs, column, mean)}")
+            rows.append([f"`{name}`, {unit}" if index == 0 else "", f"`{model}`", *cells])
         for floor, row in floors.iterrows():
-            figures = (bold(_precise(row[c]), row[c] == lowest[c]) for c in WINDOWS)
-            rows.append(["", str(floor), *figures])
+            alone = row.to_frame().T
+            cells = [
+                f"{bold(_error(row[c]), row[c] == lowest[c])}{_lost(alone, c, row[c])}"
+                for c in WINDOWS
+            ]
+            rows.append(["", str(floor), *cells])
     return table(["log", "model", "0.1 s windows", "1 s windows", "open loop"], rows)
 
 
 _RIGID_ROWS = (
     *("identification", "known", "known_and_network", "lnn", "acceleration", "mlp"),
-    *("stands still", "keeps its velocity", *_LINEAR),
+    *("stands still", "keeps its velocity", "ARX", "EDMDc degree 2"),
 )
 
 
@@ -149,7 +151,7 @@ def rigid() -> str:
     """Known mechanics on the logs of rigid robots, and what they have to beat."""
     rows = []
     for name, unit in RIGID.items():
-        data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
+        data = _of_log(name)
         means = data.groupby("model")[["floor", *WINDOWS, "torque_share"]].mean()
         means = means.loc[[model for model in _RIGID_ROWS if model in means.index]]
         for index, (model, row) in enumerate(means.iterrows()):
@@ -227,10 +229,15 @@ def verdict() -> str:
 
 
 def _of_log(name: str) -> pd.DataFrame:
-    """The evaluations of a log with its floors."""
-    if name in RIGID:
-        return pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
-    return pd.concat([read_log(name), floors_of(name).drop(list(_LINEAR)).reset_index()])
+    """All evaluations of a log with its floors: of networks those of every seed there is."""
+    if name not in RIGID:
+        return pd.concat([read_log(name), floors_of(name).reset_index()])
+    data = pd.read_csv(RESULTS / "logs" / f"{name}_known" / "summary.csv")
+    if name not in LOGS:
+        return data
+    networks = read_log(name).assign(floor=False)
+    key = ["model", "seed"]  # networks of both are the same trainings
+    return networks.set_index(key).combine_first(data.set_index(key)).reset_index()
 
 
 def _precise(value: float) -> str:

@@ -192,19 +192,27 @@ def compiles(config: dict[str, Any]) -> bool:
     """Whether to compile the dynamics: as told, or with ``auto`` where it pays.
 
     Raises:
-        ConfigError: if it is true and there is no C++ compiler.
+        ConfigError: as :func:`require_compiler`.
     """
-    choice = config["compile"]
-    if choice == "auto":
-        on_cpu = config["trainer"]["accelerator"] == "cpu"
-        long = config["trainer"]["steps"] >= STEPS_FOR_DERIVATIVE
-        return on_cpu and long and has_cpp_compiler()
-    if choice and not has_cpp_compiler():
+    require_compiler(config)
+    if config["compile"] != "auto":
+        return config["compile"]
+    on_cpu = config["trainer"]["accelerator"] == "cpu"
+    long = config["trainer"]["steps"] >= STEPS_FOR_DERIVATIVE
+    return on_cpu and long and has_cpp_compiler()
+
+
+def require_compiler(config: dict[str, Any]) -> None:
+    """Refuse to compile without a compiler.
+
+    Raises:
+        ConfigError: if ``compile`` is true and there is no C++ compiler.
+    """
+    if config["compile"] is True and not has_cpp_compiler():
         raise ConfigError(
             "compile is true, but there is no C++ compiler (g++ or clang++) on the path: install "
             "one, or set compile=false"
         )
-    return choice
 
 
 def build_validator(config: dict[str, Any], training_step: float) -> RolloutValidator:

@@ -31,6 +31,12 @@ from pinn_dyn.app.sweep import how_to_go_on, write_error
 
 # Of a disk that is full, also by a quota or a limit on one file, or that may only be read.
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+# What takes less memory.
+_LESS = {
+    "train": "lower data.batch_size or ensemble",
+    "evaluate": "give fewer runs, or lower horizon",
+    "control": "lower runs or duration",
+}
 
 
 def main(command: str) -> None:
@@ -97,10 +103,7 @@ def _in_a_line(command: str, error: BaseException) -> str | None:
     # torch.OutOfMemoryError, of a GPU, goes by its name: --help does without torch.
     full = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
     if full or "can't allocate memory" in str(error):
-        return (
-            f"there is not enough memory ({error}): choose smaller sizes, as of data.batch_size or "
-            "ensemble"
-        )
+        return f"there is not enough memory ({error}): {_LESS.get(command, 'give it less')}"
     if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
         error = error.__cause__  # logging says so of a file that it cannot open
     if isinstance(error, OSError) and error.errno in _DISK:

@@ -24,8 +24,8 @@ from pinn_dyn.app.build import (
     build_trainer,
     build_validator,
     check_processes,
-    compiles,
     epochs,
+    require_compiler,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
 from pinn_dyn.app.constants import write_constants
@@ -193,7 +193,7 @@ def train_in(
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
 
-    compiles(config)  # refuses what cannot be compiled before the data are simulated
+    require_compiler(config)  # before the data are simulated
     data = build_data(config, source)
     log.info("%s: loading data", config["name"])
     try:

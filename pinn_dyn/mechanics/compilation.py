@@ -197,7 +197,7 @@ def compile_loop(
 def _keep_rows() -> None:
     """Let the compiler hand matrices to triangular solves in rows, as they are given.
 
-    It leaves the order open, and takes columns, of which each solve makes a copy: at N = 48 a tenth
+    It leaves the order open, and takes columns, of which each solve makes a copy: at N = 48 a sixth
     of a step.
     """
     from torch._inductor import lowering  # takes a second, and only compiling needs it

@@ -1,8 +1,12 @@
 """Every experiment, every model and every head composes and trains through the entry point."""
 
+import json
+import subprocess
+import sys
+
 import pytest
 
-from pinn_dyn.app.config import CONF
+from pinn_dyn.app.config import CONF, composed
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -118,10 +122,15 @@ def test_every_other_model_trains(tmp_path, model):
     assert_trained(train(tmp_path / "run", f"model={model}", NO_FIGURES))
 
 
-@pytest.mark.parametrize("number", range(max(map(len, HEADS.values()))))
-def test_every_head_trains(tmp_path, number):
+TOGETHER = [
+    [f"model/{group}={found[number % len(found)]}" for group, found in HEADS.items()]
+    for number in range(max(map(len, HEADS.values())))
+]
+
+
+@pytest.mark.parametrize("heads", TOGETHER, ids=" ".join)
+def test_every_head_trains(tmp_path, heads):
     """The first option of every group together, then the second, and so on."""
-    heads = [f"model/{group}={found[number % len(found)]}" for group, found in HEADS.items()]
     values = [VALUES[head] for head in heads if head in VALUES]
     assert_trained(train(tmp_path / "run", "model=lnn", *heads, *values, NO_FIGURES))
 
@@ -197,3 +206,21 @@ def test_there_are_models_heads_and_experiments_to_test():
     assert {"soft_arm_1", "soft_arm_2", "panda", "logs", "example_log", "neck", "panda_real"} <= {
         x.split("/")[0] for x in EXPERIMENTS
     }
+
+
+def test_what_the_tests_compose_faster_is_what_hydra_composes():
+    """:mod:`tests.support.compositions` replaces parts of Hydra; another process has all of it."""
+    choices = [
+        [],
+        ["experiment=soft_arm_2/lnn_wide", "model/integrator=rosenbrock", "trainer=gpu"],
+        ["experiment=logs/ur10e/known", "optimizer.rollouts=false", "~callbacks.figures"],
+        ["model=hnn", "model.integrator.substeps=2", "search=equal", "search.draw=3"],
+    ]
+    choices = [[*words, "model_name=any"] for words in choices]
+    program = (
+        "import json, sys; from pinn_dyn.app.config import composed; "
+        "print(json.dumps([composed('train', words) for words in json.loads(sys.argv[1])]))"
+    )
+    command = [sys.executable, "-c", program, json.dumps(choices)]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert json.loads(found.stdout) == [composed("train", words) for words in choices]

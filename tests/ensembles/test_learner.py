@@ -107,15 +107,21 @@ def test_one_member_that_breaks_stops_the_training(tmp_path):
         train(tmp_path, learner, EnsembleData(data, 2))
 
 
-@pytest.mark.slow
-def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(tmp_path, traced):
-    """By a program for a step, and by compiled dynamics, which are built, for windows of two.
+@pytest.mark.parametrize(
+    ("kind", "built"), [("lnn", False), pytest.param("acceleration", True, marks=pytest.mark.slow)]
+)
+def test_a_compiled_ensemble_learns_what_an_uncompiled_one_does(
+    tmp_path, monkeypatch, traced, kind, built
+):
+    """By a program for a step, and by compiled dynamics for windows of two.
 
-    Of the model with the fewest loops: those of networks with a mass matrix take a minute.
+    They are built of the model with the fewest loops: a mass matrix takes a minute.
     """
+    if not built:
+        monkeypatch.setattr(torch, "compile", lambda function: function)
     data, weights = make_data(), []
     for compile in (False, True):
-        models = make_models("acceleration", data, 2)
+        models = make_models(kind, data, 2)
         ensemble = Ensemble(models)
         train(
             tmp_path,
