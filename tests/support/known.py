@@ -104,5 +104,5 @@ def motion(model, *, seconds=2.0, rate=200.0, seed=0):
 
 def windows_of(model, *, count, steps, stride=2):
     return draw_windows(
-        [motion(model, seconds=0.3)], count=count, steps=steps, stride=stride, seed=0
+        [motion(model, seconds=0.1)], count=count, steps=steps, stride=stride, seed=0
     )

@@ -90,8 +90,8 @@ def test_fixed_gains_do_not_depend_on_the_parameters():
 
 @pytest.mark.parametrize("substeps", [1, 2])
 def test_roll_outs_by_the_parameters(model, substeps):
-    model.integrator = RK4(substeps)
     windows = windows_of(model, count=3, steps=4 - substeps)
+    model.integrator = RK4(substeps)
     increments = partial(model.increments, windows.start("qv"), windows.t, windows.input)
     directions = some_directions(model)
     expected = differences(model, lambda: increments()[:, 1:], directions)
