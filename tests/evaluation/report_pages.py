@@ -124,7 +124,7 @@ def comparisons_of(names):
 
 
 def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
-    """The page, and the summary that it was made of."""
+    """The page, without figures of the terms, and the summary that it was made of."""
     real = truth()
     found = predictions(real, (*names, *floors))
     summary = summary_of(found, floors)
@@ -139,7 +139,7 @@ def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
         "trajectory": 0,
         "labels": LABELS,
         "input_labels": INPUTS,
-        "comparisons": comparisons_of(names[:1]),
+        "comparisons": {},
         "joints": pd.DataFrame(),
         "constants": {},
         "parts": pd.DataFrame(),

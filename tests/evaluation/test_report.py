@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import re
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -21,6 +22,7 @@ from pinn_dyn.evaluation.report.style import POINTS, simplify
 from tests.evaluation.report_pages import (
     ODD,
     Page,
+    comparisons_of,
     control_page,
     origin,
     prediction_page,
@@ -30,7 +32,7 @@ from tests.evaluation.report_pages import (
 
 @pytest.fixture(scope="module")
 def prediction():
-    text, summary = prediction_page()
+    text, summary = prediction_page(comparisons=comparisons_of(["hnn"]))
     return text, Page(text), summary
 
 
@@ -118,7 +120,9 @@ def test_the_configuration_and_the_origin_are_there(either):
         assert text in page.text
 
 
-@pytest.mark.parametrize("make", [prediction_page, control_page])
+@pytest.mark.parametrize(
+    "make", [partial(prediction_page, comparisons=comparisons_of([ODD])), control_page]
+)
 def test_odd_names_are_text(make):
     text, _ = make(names=(ODD, "lnn"), title=ODD)
     page = Page(text)
@@ -139,7 +143,7 @@ def test_odd_text_in_a_stability_report_is_text():
 
 
 def test_without_the_truth_the_page_says_so():
-    text, _ = prediction_page(comparisons={})
+    text, _ = prediction_page()
     assert "of measured data nobody knows the true ones" in Page(text).text
     assert 'id="figure-terms"' not in text
 
@@ -270,7 +274,8 @@ def test_the_terms_are_pictures_of_every_model_and_configuration(prediction):
 
 
 def test_floors_are_in_brackets_and_a_model_that_loses_to_one_has_no_bold_figure():
-    text, summary = prediction_page(names=("hnn",), floors=("ARX",))
+    names = {"names": ("hnn",), "floors": ("ARX",)}
+    text, summary = prediction_page(**names, comparisons=comparisons_of(["hnn"]))
     page = Page(text)
     rows = page.table("mean error ± std")
     assert [row["run"][0] for row in rows] == ["hnn", "[ARX]"]
@@ -278,7 +283,7 @@ def test_floors_are_in_brackets_and_a_model_that_loses_to_one_has_no_bold_figure
     assert "ARX" not in page.table("configuration")[0]["run"][0]
     # The second of the names errs twice as much: now the floor is the better one.
     swapped = summary.assign(floor=[True, False])
-    page = Page(prediction_page(names=("hnn",), floors=("ARX",), summary=swapped)[0])
+    page = Page(prediction_page(**names, summary=swapped)[0])
     assert "No model beats every floor in error_mean: 'hnn' has" in page.text
 
 

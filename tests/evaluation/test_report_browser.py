@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from tests.evaluation.report_pages import control_page, prediction_page
+from tests.evaluation.report_pages import comparisons_of, control_page, prediction_page
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 from selenium.webdriver.chrome.service import Service  # noqa: E402
@@ -103,7 +103,7 @@ class Opened:
 @pytest.fixture(scope="module")
 def prediction(browser, tmp_path_factory):
     path = tmp_path_factory.mktemp("prediction") / "report.html"
-    path.write_text(prediction_page()[0], encoding="utf-8")
+    path.write_text(prediction_page(comparisons=comparisons_of(["hnn"]))[0], encoding="utf-8")
     return path
 
 
