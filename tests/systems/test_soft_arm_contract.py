@@ -19,7 +19,8 @@ def arm_configurations(segments, bending):
 
 
 class TestBentSoftArm(MechanicalSystemContract):
-    @pytest.fixture(params=[1, 2, 3], ids=["one", "two", "three"])
+    # The straight one below has two.
+    @pytest.fixture(params=[1, 3], ids=["one", "three"])
     def system(self, request):
         return SoftArm(request.param)
 
