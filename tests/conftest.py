@@ -36,10 +36,11 @@ def pytest_collection_finish():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _kept_compositions():
+def kept_compositions():
+    """What makes Hydra faster, to be undone in a copy of this process."""
     with pytest.MonkeyPatch.context() as patch:
         keep_compositions(patch)
-        yield
+        yield patch
 
 
 @pytest.fixture

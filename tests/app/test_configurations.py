@@ -1,10 +1,9 @@
 """Every experiment, every model and every head composes and trains through the entry point."""
 
 import json
-import subprocess
-import sys
 
 import pytest
+from hydra._internal.config_repository import ConfigRepository as Hydra
 
 from pinn_dyn.app.config import CONF, composed
 from tests.app.entry import (
@@ -20,6 +19,7 @@ from tests.app.entry import (
     train,
 )
 from tests.app.hardware_logs import write_neck, write_panda
+from tests.support.processes import fork
 from tests.support.recorded_logs import LOGS, needs_logs
 
 # Known mechanics need a rigid robot: the experiments on logs train them, with every structure.
@@ -208,8 +208,8 @@ def test_there_are_models_heads_and_experiments_to_test():
     }
 
 
-def test_what_the_tests_compose_faster_is_what_hydra_composes():
-    """:mod:`tests.support.compositions` replaces parts of Hydra; another process has all of it."""
+def test_what_the_tests_compose_faster_is_what_hydra_composes(tmp_path, kept_compositions):
+    """:mod:`tests.support.compositions` replaces parts of Hydra; a copy of this process has all."""
     choices = [
         [],
         ["experiment=soft_arm_2/lnn_wide", "model/integrator=rosenbrock", "trainer=gpu"],
@@ -217,10 +217,17 @@ def test_what_the_tests_compose_faster_is_what_hydra_composes():
         ["model=hnn", "model.integrator.substeps=2", "search=equal", "search.draw=3"],
     ]
     choices = [[*words, "model_name=any"] for words in choices]
-    program = (
-        "import json, sys; from pinn_dyn.app.config import composed; "
-        "print(json.dumps([composed('train', words) for words in json.loads(sys.argv[1])]))"
-    )
-    command = [sys.executable, "-c", program, json.dumps(choices)]
-    found = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
-    assert json.loads(found.stdout) == [composed("train", words) for words in choices]
+    found = tmp_path / "found.json"
+
+    def work():
+        kept_compositions.undo()
+        assert Hydra.load_config is not faster
+        found.write_text(json.dumps([composed("train", words) for words in choices]))
+
+    faster, log = Hydra.load_config, tmp_path / "log.txt"
+    with log.open("w") as output:
+        process = fork(work, output)
+        process.join(60)
+        process.kill()  # if it has not ended
+    assert process.exitcode == 0, log.read_text()
+    assert json.loads(found.read_text()) == [composed("train", words) for words in choices]
