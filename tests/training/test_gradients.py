@@ -15,6 +15,7 @@ from pinn_dyn.models import (
     ConstantCholesky,
     ConstantInput,
     LearnedVelocity,
+    NetworkCholesky,
     NetworkPotential,
 )
 from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
@@ -119,7 +120,8 @@ def test_members_of_an_ensemble_have_losses_and_gradients_of_their_own(
 
 def test_a_program_of_all_members_has_the_same(traced):
     """It is what a GPU takes."""
-    members = [perturb(make_model("lnn"), seed=k) for k in range(3)]
+    mass = partial(NetworkCholesky, hidden=[3])
+    members = [perturb(SMALL_LNN(n=2, m=2, mass=mass), seed=k) for k in range(3)]
     stack = Ensemble(members).stack
     loss = IncrementLoss(one_step(size=2), members[0]).double()
     program = LossProgram(loss, stack, ParameterVector(stack.parameters(), members=3))
