@@ -90,7 +90,7 @@ DATA = {
 
 
 # Of a fit that would go on until nothing changes: what it finds is of tests/training.
-SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200", "data.steps=5"]
+SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200", "data.steps=2"]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,8 @@ from tests.support.recorded_logs import LOGS, needs_logs
 
 pytestmark = needs_logs
 KNOWN = "experiment=logs/double_pendulum/known"
-WINDOWS = ["data.pairs=20", "data.batch_size=20", "data.steps=2", NO_FIGURES]
+WINDOWS = ["data.pairs=20", "data.batch_size=20", "data.steps=2", "validator.horizon=0.1"]
+WINDOWS += [NO_FIGURES]
 SMALL = [*WINDOWS, "optimizer.rollouts=false"]
 
 
@@ -148,7 +149,7 @@ def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path, fitted,
     run_script("train.py", KNOWN, *WINDOWS, f"hydra.run.dir={rolled}")
     rows = {}
     for name, runs in {"rolled": [rolled], "both": [rolled, fitted]}.items():
-        words = ["windows=[0.1]", "horizon=0.5", f"hydra.run.dir={tmp_path / name}"]
+        words = ["windows=[0.1]", "horizon=0.2", f"hydra.run.dir={tmp_path / name}"]
         run_script("evaluate.py", f"runs=[{','.join(map(str, runs))}]", *words)
         rows[name] = pd.read_csv(tmp_path / name / "summary.csv").set_index("run")
     assert "identification: the constants of known by its inverse" in capsys.readouterr().out
@@ -211,7 +212,8 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, stop, sta
 
     with log.open("w") as output, monkeypatch.context() as patch:
         patch.setattr("pinn_dyn.training.least_squares.rollout_slopes", endless)
-        words = [KNOWN, *WINDOWS, "optimizer.samples=200", f"hydra.run.dir={folder}"]
+        short = ["optimizer.samples=200", "optimizer.evaluations=5"]
+        words = [KNOWN, *WINDOWS, *short, f"hydra.run.dir={folder}"]
         process = fork_script("train.py", *words, folder=tmp_path, output=output)
         try:
             while not begun.exists() and process.is_alive():
