@@ -38,13 +38,13 @@ class CompiledMembers:
 
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """The losses on windows ``(E, B, ...)``, and their gradients."""
-        batches = [windows[index] for index in torch.arange(len(windows))]
-        if self._evaluations(batches[0]) > MOST_EVALUATIONS:
+        if self._evaluations(next(windows.unbind())) > MOST_EVALUATIONS:
             with integrated_by(self.stack, self._integrator):
                 losses = self.loss(self.stack, windows)
             return losses.detach(), self.vector.gradient_of(losses.sum())
         if windows.q.is_cuda:
             return self._program(windows, len(windows))
+        batches = [windows[index] for index in torch.arange(len(windows))]
         taken = self._program.side_by_side(self.vector.values.detach().unbind(), batches)
         losses, gradients = map(torch.stack, zip(*taken, strict=True))
         return losses, gradients
