@@ -103,7 +103,8 @@ def _in_a_line(command: str, error: BaseException) -> str | None:
     # torch.OutOfMemoryError, of a GPU, goes by its name: --help does without torch.
     full = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
     if full or "can't allocate memory" in str(error):
-        return f"there is not enough memory ({error}): {_LESS.get(command, 'give it less')}"
+        less = _LESS.get(command, "give fewer runs or shorter logs")
+        return f"there is not enough memory ({error}): {less}"
     if isinstance(error, ValueError) and isinstance(error.__cause__, OSError):
         error = error.__cause__  # logging says so of a file that it cannot open
     if isinstance(error, OSError) and error.errno in _DISK:
