@@ -95,7 +95,10 @@ SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200", "data.steps=2"]
 
 @pytest.mark.parametrize(
     "experiment",
-    [pytest.param(x, marks=needs_logs if x.startswith("logs/") else ()) for x in EXPERIMENTS],
+    [
+        pytest.param(x, marks=[needs_logs, pytest.mark.slow] if x.startswith("logs/") else ())
+        for x in EXPERIMENTS
+    ],
 )
 def test_every_experiment_trains(tmp_path, monkeypatch, experiment):
     monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))

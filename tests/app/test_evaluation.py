@@ -298,6 +298,7 @@ def test_a_damaged_run_is_named_and_the_others_are_evaluated(tmp_path, mlp_run, 
     assert "open report.html" in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_step_too_long_for_the_fastest_motion_is_named_with_its_coordinate(tmp_path, lnn_run):
     run_script(

@@ -159,6 +159,7 @@ def ended(process, log, seconds=300):
     return process.exitcode, log.read_text()
 
 
+@pytest.mark.slow
 def test_jobs_side_by_side_simulate_once_lose_one_and_the_others_are_done(
     sweep, tmp_path, monkeypatch
 ):

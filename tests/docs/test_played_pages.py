@@ -38,6 +38,7 @@ SMALL = {
 }
 
 
+@pytest.mark.slow  # three short pages of commands, as whole runs
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", PLAYED)
 def test_a_page_runs_from_start_to_end(name, tmp_path, monkeypatch):

@@ -105,6 +105,7 @@ def test_own_robot(capsys):
     assert "M learned" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_ensemble_with_spread(capsys):
     run("ensemble_with_spread.py", "--members", "2", "--steps", "2", *TINY_LOG)
     lines = capsys.readouterr().out.splitlines()

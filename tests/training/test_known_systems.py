@@ -66,7 +66,10 @@ STARTS = {
 }
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize(
+    "start",
+    ["ten times", *(pytest.param(x, marks=pytest.mark.slow) for x in ("a tenth", "mixed"))],
+)
 def test_a_soft_arm_is_found_from_starts_that_are_far_off(arm_runs, start):
     truth = known_arm()
     table, fit = fitted(known_arm(**STARTS[start]), arm_runs[0])
@@ -76,6 +79,7 @@ def test_a_soft_arm_is_found_from_starts_that_are_far_off(arm_runs, start):
     assert not undetermined(truth, fit)
 
 
+@pytest.mark.slow
 def test_two_segments_are_found(two_segments):
     truth, runs = two_segments
     table, _ = fitted(known_arm(2, mass=2.0, stiffness=60.0, damping=6.0), runs)
@@ -92,7 +96,7 @@ def test_constants_that_are_not_linear_are_found_with_fewer_inputs_than_coordina
 
 @pytest.mark.parametrize(
     ("rollouts", "fits", "unlikely"),
-    [(False, 4, 5), (True, 2, 4)],
+    [(False, 4, 5), pytest.param(True, 2, 4, marks=pytest.mark.slow)],
     ids=["identification", "roll-outs"],
 )
 def test_the_truth_lies_in_the_intervals(arm_runs, rollouts, fits, unlikely):
@@ -108,6 +112,7 @@ def test_the_truth_lies_in_the_intervals(arm_runs, rollouts, fits, unlikely):
     assert outside < unlikely
 
 
+@pytest.mark.slow
 def test_what_no_motion_shows_is_named():
     """In the plane of x nothing tells of bending along y."""
     truth, model = known_arm(), known_arm(mass=2.0)
@@ -128,6 +133,7 @@ def test_data_at_rest_are_refused(arm_runs):
         fitted(known_arm(), [still])
 
 
+@pytest.mark.slow
 def test_a_segment_that_has_changed_is_free_again(two_segments):
     """A payload on the second one: all else is held by what the first fit found."""
     model, (_, clean) = known_arm(2, mass=1.0), two_segments

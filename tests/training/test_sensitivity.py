@@ -88,7 +88,7 @@ def test_fixed_gains_do_not_depend_on_the_parameters():
     assert not model.slopes().gain().any()
 
 
-@pytest.mark.parametrize("substeps", [1, 2])
+@pytest.mark.parametrize("substeps", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_roll_outs_by_the_parameters(model, substeps):
     windows = windows_of(model, count=3, steps=4 - substeps)
     model.integrator = RK4(substeps)
