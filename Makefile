@@ -36,7 +36,7 @@ reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on wher
 test: $(VENV)/.installed-dev  ## run the tests, on all cores
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -m "not slow"
 
-test-slow: $(VENV)/.installed-notebooks  ## run those left out of make test: compiled models, long simulations, notebooks, SLURM
+test-slow: $(VENV)/.installed-notebooks  ## run those left out of make test: compiled models, long simulations and fits, pages, notebooks, SLURM
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder -o norecursedirs='.* build' -m slow
 
 test-notebooks: $(VENV)/.installed-notebooks  ## run the notebooks from clean kernels
