@@ -27,11 +27,10 @@ from pinn_dyn.app.evaluation_results import (
     write_intervals,
 )
 from pinn_dyn.app.identification import identified
-from pinn_dyn.app.provenance import build_origin, data_hash, provenance
-from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, write_json
+from pinn_dyn.app.provenance import write_origin
+from pinn_dyn.app.run_folder import METRICS, Run, find_runs, load_run
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
-from pinn_dyn.app.words import command_line
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
@@ -170,9 +169,9 @@ def evaluate(cfg: DictConfig) -> float:
         write_table(joints, folder, "torque")
     if len(parts):
         write_table(parts, folder, "parts")
-    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    made = {"config": config, "dataset": runs[plain].config["dataset"], **record}
-    write_json(folder / "provenance.json", made)
+    by_label = dict(zip(labels, runs, strict=True))
+    beside = {"dataset": runs[plain].config["dataset"]}
+    origin = write_origin(by_label, source, config, beside, folder)
     draw(evaluations, best_floor(summary), truth, source, config, folder)
     intervals = write_intervals(trained, source, split, folder)
     comparisons = compare_with_truth(trained, source, folder)
@@ -209,12 +208,10 @@ def evaluate(cfg: DictConfig) -> float:
         input_labels=source.input_labels,
         comparisons=comparisons,
         joints=joints,
-        constants=read_constants(
-            {label: run.folder for label, run in zip(labels, runs, strict=True)}
-        ),
+        constants=read_constants({label: run.folder for label, run in by_label.items()}),
         parts=parts,
         intervals=intervals,
-        origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
+        origin=origin,
     )
     write_whole(folder / "report.html", report)
     print(f"\nfigures and tables are in {folder}; open report.html there in a browser")
@@ -238,10 +235,6 @@ def _load_all(
     for folder in folders:
         try:
             run = load_run(folder, checkpoint, trust)
-            if missing := [
-                key for key in ("dataset", "model_name", "seed") if key not in run.config
-            ]:
-                raise ConfigError(f"its {CONFIG} has no {', '.join(missing)}, it may be cut short")
             runs.append(run)
             if not (folder / METRICS).is_file():
                 log.warning(

@@ -52,6 +52,29 @@ _GROUP_HEADERS = {
     "worst_error_mean": "worst seed",
     "worst_error_worst": "worst trajectory of all",
 }
+# Of a table what it says, and the headings of its columns.
+_TORQUE = (
+    "Inverse dynamics on the same motions, τ = A(q) u: an arm that hardly moves may predict "
+    "its torques well and its motion badly, or the other way round.",
+    {
+        "run": "run",
+        "joint": "joint",
+        "torque_rms": "RMS of τ̂ − τ",
+        "torque_spread": "spread of τ",
+        "torque_share": "RMS / spread",
+    },
+)
+_PARTS = (
+    "What the parts of a sum contribute along the test motions. A network with a large share "
+    "says that the known mechanics leave something out, or that its constants are not found.",
+    {
+        "run": "run",
+        "term": "term",
+        "part": "part",
+        "rms": "RMS of its force",
+        "share": "share of all parts",
+    },
+)
 
 
 def prediction_report(
@@ -119,17 +142,13 @@ def prediction_report(
                 input_labels,
             ),
         ),
+        *([Section("Constants", _constants(constants))] if constants else []),
+        *([Section("Torque", _table(joints, *_TORQUE))] if len(joints) else []),
+        *([Section("Parts", _table(parts, *_PARTS))] if len(parts) else []),
+        *([Section("Intervals", _intervals(intervals))] if intervals else []),
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
     ]
-    if intervals:
-        sections.insert(3, Section("Intervals", _intervals(intervals)))
-    if len(parts):
-        sections.insert(3, Section("Parts", _parts(parts)))
-    if len(joints):
-        sections.insert(3, Section("Torque", _torques(joints)))
-    if constants:
-        sections.insert(3, Section("Constants", _constants(constants)))
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
@@ -226,34 +245,8 @@ def _constants(constants: Mapping[str, pd.DataFrame]) -> list[Markup]:
     return parts
 
 
-def _torques(joints: pd.DataFrame) -> list[Markup]:
-    headers = {
-        "run": "run",
-        "joint": "joint",
-        "torque_rms": "RMS of τ̂ − τ",
-        "torque_spread": "spread of τ",
-        "torque_share": "RMS / spread",
-    }
-    text = (
-        "Inverse dynamics on the same motions, τ = A(q) u: an arm that hardly moves may predict "
-        "its torques well and its motion badly, or the other way round."
-    )
-    return [paragraph(text), table(joints, headers=headers)]
-
-
-def _parts(parts: pd.DataFrame) -> list[Markup]:
-    headers = {
-        "run": "run",
-        "term": "term",
-        "part": "part",
-        "rms": "RMS of its force",
-        "share": "share of all parts",
-    }
-    text = (
-        "What the parts of a sum contribute along the test motions. A network with a large share "
-        "says that the known mechanics leave something out, or that its constants are not found."
-    )
-    return [paragraph(text), table(parts, headers=headers)]
+def _table(frame: pd.DataFrame, text: str, headers: Mapping[str, str]) -> list[Markup]:
+    return [paragraph(text), table(frame, headers=headers)]
 
 
 def _intervals(intervals: Mapping[str, Mapping[float, Calibration]]) -> list[Markup]:
