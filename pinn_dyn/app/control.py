@@ -270,7 +270,12 @@ def _close_loop(
     """One controller on the robot, in continuous time or at a rate."""
     actuator = build_part("actuator", config["actuator"])
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
-    progress = f"closing the loop: {name}"
+    motion = law, reference, q0, v0
+    common = {
+        "duration": config["duration"],
+        "actuator": actuator,
+        "progress": f"closing the loop: {name}",
+    }
     with _errors_of(f"controllers.{name}"):
         if config["rate"] is None:
             if config["delay"] or np.any(sensor.q_noise) or np.any(sensor.v_noise):
@@ -279,28 +284,11 @@ def _close_loop(
                     "noise: give a rate, or set them to 0"
                 )
             return close_loop_continuous(
-                robot,
-                law,
-                reference,
-                q0,
-                v0,
-                duration=config["duration"],
-                samples_rate=config["samples_rate"],
-                actuator=actuator,
-                progress=progress,
+                robot, *motion, samples_rate=config["samples_rate"], **common
             )
+        plant = build_part("plant", config["plant"], robot)
         return close_loop(
-            build_part("plant", config["plant"], robot),
-            law,
-            reference,
-            q0,
-            v0,
-            duration=config["duration"],
-            rate=config["rate"],
-            actuator=actuator,
-            sensor=sensor,
-            delay=config["delay"],
-            progress=progress,
+            plant, *motion, rate=config["rate"], sensor=sensor, delay=config["delay"], **common
         )
 
 

@@ -27,8 +27,9 @@ from pinn_dyn.app.evaluation_results import (
     write_intervals,
 )
 from pinn_dyn.app.identification import identified
+from pinn_dyn.app.jobs import find_runs
 from pinn_dyn.app.provenance import write_origin
-from pinn_dyn.app.run_folder import METRICS, Run, find_runs, load_run
+from pinn_dyn.app.run_folder import METRICS, Run, load_run
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data import DataSource, Splits
