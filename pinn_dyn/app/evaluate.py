@@ -59,27 +59,12 @@ from pinn_dyn.evaluation import (
     write_table,
 )
 from pinn_dyn.evaluation.report import prediction_report
+from pinn_dyn.evaluation.report.prediction_page import shown_columns
 from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack_until
 
 log = logging.getLogger(__name__)
 
 _PRINTED = 8  # coordinates whose matrices a terminal has room for
-# Columns of the terminal's table; the files hold all of them.
-_SHOWN = (
-    "error_mean",
-    "error_std",
-    "error_median",
-    "error_worst",
-    "diverged",
-    "left_data",
-    "left_data_after",
-    "torque_share",
-    "residual_share",
-    "member_error_mean",
-    "member_error_std",
-    "spread_over_error",
-    "input_delay_seconds",
-)
 
 
 def evaluate(cfg: DictConfig) -> float:
@@ -177,9 +162,8 @@ def evaluate(cfg: DictConfig) -> float:
     intervals = write_intervals(trained, source, split, folder)
     comparisons = compare_with_truth(trained, source, folder)
 
-    shown = ["run", "seed", "floor", "pairs", *_SHOWN]
-    shown += [name for name in summary if name.startswith("valid_time_")]
-    shown += [name for name in summary if name.endswith(("s_error_mean", "s_diverged"))]
+    columns = {"floor", "error_std", *shown_columns(summary)} - {"training_seconds"}
+    shown = [name for name in summary if name in columns or name.endswith("s_diverged")]
     text = terms_text(comparisons)
     if comparisons and len(source.labels) > _PRINTED:
         text = f"learned and true terms are in {folder / 'terms.txt'}"
@@ -189,7 +173,7 @@ def evaluate(cfg: DictConfig) -> float:
     headers = {name: name.removesuffix("_error_mean") for name in summary if "window_" in name}
     headers |= {"left_data_after": "after", "torque_share": "torque", "residual_share": "residual"}
     headers |= {"input_delay_seconds": "delay"}
-    print(format_table(summary[[name for name in shown if name in summary]], headers))
+    print(format_table(summary[shown], headers))
     verdict = beaten_by_floors(summary)
     star = "* best; only a model that beats all in brackets; valid_time, after and delay in s"
     print("\n".join([star, *notes, *verdict, *interval_lines(intervals)]))

@@ -42,6 +42,9 @@ _HEADERS = {
     "left_data_after": "first after [s]",
     "torque_share": "torque error / spread",
     "residual_share": "share of the residual force",
+    "member_error_mean": "mean error of a member",
+    "member_error_std": "its std over the members",
+    "spread_over_error": "spread of the members / error",
     "input_delay_seconds": "learned input delay [s]",
     "training_seconds": "training [s]",
 }
@@ -155,13 +158,7 @@ def prediction_report(
 def _summary(
     summary: pd.DataFrame, grouped: pd.DataFrame, notes: Sequence[str], labels: Sequence[str]
 ) -> list[Markup]:
-    headers = {name: text for name, text in _HEADERS.items() if name in summary}
-    for name in summary:
-        if name.startswith("valid_time_"):
-            headers[name] = f"valid time, {name.removeprefix('valid_time_')} [s]"
-        if name.startswith("window_") and name.endswith("_error_mean"):
-            span = name.removeprefix("window_").removesuffix("s_error_mean")
-            headers[name] = f"mean error, re-set every {span} s"
+    headers = shown_columns(summary)
     marks = pd.DataFrame({name: best(summary, name) for name in headers})
     unit = units(labels)
     parts = [
@@ -182,6 +179,22 @@ def _summary(
         parts.append(table(bracketed(grouped), headers=shown, best=marks))
     parts.append(details("All figures of every run (summary.csv)", table(turned(summary, "run"))))
     return parts
+
+
+def shown_columns(summary: pd.DataFrame) -> dict[str, str]:
+    """The columns of the summary that a page and a terminal show, and their headings on the page.
+
+    Args:
+        summary: one row per run, as :func:`pinn_dyn.evaluation.summary_table` makes it.
+    """
+    headers = {name: text for name, text in _HEADERS.items() if name in summary}
+    for name in summary:
+        if name.startswith("valid_time_"):
+            headers[name] = f"valid time, {name.removeprefix('valid_time_')} [s]"
+        if name.startswith("window_") and name.endswith("_error_mean"):
+            span = name.removeprefix("window_").removesuffix("s_error_mean")
+            headers[name] = f"mean error, re-set every {span} s"
+    return headers
 
 
 def _trajectories(
