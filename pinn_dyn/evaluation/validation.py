@@ -21,7 +21,7 @@ from pinn_dyn.evaluation.prediction import (
     samples_of_window,
 )
 from pinn_dyn.evaluation.run_log import log_figures
-from pinn_dyn.evaluation.shares import residual_share
+from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 log = logging.getLogger(__name__)
