@@ -64,7 +64,7 @@ def base_parameters(regressor: np.ndarray) -> np.ndarray:
     norms = np.linalg.norm(regressor, axis=0)
     # The rounded angles of a URDF leave next to nothing of a column that would be zero.
     scale = np.where(norms > _DEPENDENT * norms.max(), norms, 1.0)
-    triangle = np.linalg.qr(regressor / scale, mode="r")
+    _, triangle = np.linalg.qr(regressor / scale)
     basis, kept = np.zeros((len(triangle), 0)), []
     for k, column in enumerate(triangle.T):
         rest = column

@@ -185,8 +185,7 @@ def _motions(
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Section]:
-    error = with_unit(ERROR, labels)
-    states, inputs = control_panels(records, labels, input_labels, error=error, held=held)
+    states, inputs = control_panels(records, labels, input_labels, held=held)
     first = next(iter(records.values()))
     shown = shown_motions(len(first.stopped), [run, *map(_worst, records.values())])
     stopped = torch.stack([stopped_runs(record) for record in records.values()]).any(dim=0)

@@ -206,9 +206,7 @@ def _trajectories(
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Markup]:
-    states, inputs = trajectory_panels(
-        truth, predictions, labels, input_labels, with_unit(ERROR, labels), floors
-    )
+    states, inputs = trajectory_panels(truth, predictions, labels, input_labels, floors)
     count = len(truth.q)
     worst = {int(row.worst_trajectory): row.run for row in summary.itertuples()}
     shown = shown_motions(count, [first, *worst])
