@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.override_parser.types import IntervalSweep
@@ -194,18 +194,15 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
             key = getattr(error.__cause__, "full_key", None)
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
-            return key, _plain_keys(hydra.compose(command, overrides=groups))
+            return key, _unresolved(command, groups)
         except (ValueError, TypeError, AttributeError, LookupError) as error:
-            known = _plain_keys(hydra.compose(command, overrides=groups))
-            said_by_hydra = refused(words, error)
-            raise ConfigError(_below_a_value(known, overrides) or said_by_hydra) from error
+            below = _below_a_value(_unresolved(command, groups), overrides)
+            raise ConfigError(below or refused(words, error)) from error
     return None
 
 
-def _plain_keys(cfg: DictConfig) -> dict[str, Any]:
-    known = OmegaConf.to_container(cfg)
-    assert isinstance(known, dict)
-    return {str(name): value for name, value in known.items()}
+def _unresolved(command: str, overrides: list[str]) -> dict[str, Any]:
+    return cast(dict[str, Any], OmegaConf.to_container(hydra.compose(command, overrides=overrides)))
 
 
 def _below_a_value(known: dict[str, Any], words: list[str]) -> str | None:

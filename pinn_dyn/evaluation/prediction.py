@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,13 +57,12 @@ class Prediction:
 
     def every(self, samples: int) -> Prediction:
         """The same roll-outs at every ``samples``-th time, to be compared on a coarser grid."""
-        q_hat, q, *others = (
-            None if values is None else values[..., ::samples, :]
-            for values in (self.q_hat, self.q, self.members, self.v_hat, self.v)
-        )
-        assert q_hat is not None
-        assert q is not None
-        return Prediction(self.t[::samples], q_hat, q, *others)
+        thinned: dict[str, Any] = {
+            name: None if values is None else values[..., ::samples, :]
+            for name, values in vars(self).items()
+            if name != "t"
+        }
+        return Prediction(self.t[::samples], **thinned)
 
     def deviation(self) -> Tensor:
         """Standard deviation of each coordinate over the E members, ``(K, T, N)``.
