@@ -16,12 +16,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import hydra
 import pandas as pd
-from omegaconf import OmegaConf
 
 from pinn_dyn.app.build import build_source
-from pinn_dyn.app.config import CONF
+from pinn_dyn.app.config import composed
 from pinn_dyn.evaluation import (
     build_floors,
     predict_trajectories,
@@ -54,10 +52,7 @@ SETS = {
 def floors(name: str) -> list[dict[str, object]]:
     """Errors on the test trajectories of one data set, as evaluate.py counts them."""
     horizon, step, windows = SETS[name]
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        cfg = hydra.compose("train", overrides=[f"dataset={name}"])
-    dataset = OmegaConf.to_container(cfg.dataset, resolve=True)
-    source = build_source({"dataset": dataset})
+    source = build_source(composed("train", [f"dataset={name}", "model_name=floors"]))
     splits = source.load()
     truth = stack_until(splits.test, horizon)
     models: dict[str, tuple[Predictor, float]] = {}

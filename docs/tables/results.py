@@ -114,37 +114,20 @@ def panda() -> str:
 _NETWORKS = ("lnn", "lnn_residual", "acceleration", "mlp")
 
 
+_FLOORS = ("stands still", "keeps its velocity", "ARX", "EDMDc degree 2")
+
+
 def logs() -> str:
     """The logs of real robots: means over the seeds, with the smallest and the largest."""
     rows = []
     for name, unit in LOGS.items():
-        data, floors = read_log(name), floors_of(name)
-        means = data.groupby("model")[WINDOWS].mean()
-        lowest = means.min().combine(floors[WINDOWS].min(), min)
-        present = [model for model in _NETWORKS if model in means.index]
-        for index, model in enumerate(present):
-            runs = data[data["model"] == model]
-            cells = []
-            for column in WINDOWS:
-                mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
-                spread = f" ({_precise(low)}–{_precise(high)})" if len(runs) > 1 else ""
-                shown = bold(_error(mean), mean == lowest[column])
-                cells.append(f"{shown}{spread}{_lost(runs, column, mean)}")
-            rows.append([f"`{name}`, {unit}" if index == 0 else "", f"`{model}`", *cells])
-        for floor, row in floors.iterrows():
-            alone = row.to_frame().T
-            cells = [
-                f"{bold(_error(row[c]), row[c] == lowest[c])}{_lost(alone, c, row[c])}"
-                for c in WINDOWS
-            ]
-            rows.append(["", str(floor), *cells])
+        floors = floors_of(name)
+        data = pd.concat([read_log(name), floors.reset_index()])
+        rows += _log_rows(name, unit, data, [*_NETWORKS, *floors.index], spread=True)
     return table(["log", "model", "0.1 s windows", "1 s windows", "open loop"], rows)
 
 
-_RIGID_ROWS = (
-    *("identification", "known", "known_and_network", "lnn", "acceleration", "mlp"),
-    *("stands still", "keeps its velocity", "ARX", "EDMDc degree 2"),
-)
+_RIGID_ROWS = ("identification", "known", "known_and_network", "lnn", "acceleration", "mlp")
 
 
 def rigid() -> str:
@@ -152,19 +135,29 @@ def rigid() -> str:
     rows = []
     for name, unit in RIGID.items():
         data = _of_log(name)
-        means = data.groupby("model")[["floor", *WINDOWS, "torque_share"]].mean()
-        means = means.loc[[model for model in _RIGID_ROWS if model in means.index]]
-        for index, (model, row) in enumerate(means.iterrows()):
-            label = model if row["floor"] else f"`{model}`"
-            runs = data[data["model"] == model]
-            cells = [
-                f"{bold(_error(row[c]), row[c] == means[c].min())}{_lost(runs, c, row[c])}"
-                for c in WINDOWS
-            ]
-            torque = "–" if pd.isna(row["torque_share"]) else number(row["torque_share"])
-            rows.append([f"`{name}`, {unit}" if index == 0 else "", label, *cells, torque])
+        torque = data.groupby("model")["torque_share"].mean()
+        for row in _log_rows(name, unit, data, [*_RIGID_ROWS, *_FLOORS]):
+            share = torque[row[1].strip("`")]
+            rows.append([*row, "–" if pd.isna(share) else number(share)])
     head = ["log", "model", "0.1 s windows", "1 s windows", "open loop", "torque error / spread"]
     return table(head, rows)
+
+
+def _log_rows(
+    name: str, unit: str, data: pd.DataFrame, order: list[str], *, spread: bool = False
+) -> list[list[str]]:
+    """A row for each model and floor of a log: means over the seeds, the smallest bold."""
+    means, rows = data.groupby("model")[WINDOWS].mean(), []
+    for model in (one for one in order if one in means.index):
+        runs, cells = data[data["model"] == model], []
+        for column in WINDOWS:
+            mean, low, high = means.loc[model, column], runs[column].min(), runs[column].max()
+            between = f" ({_precise(low)}–{_precise(high)})" if spread and len(runs) > 1 else ""
+            shown = bold(_error(mean), mean == means[column].min())
+            cells.append(f"{shown}{between}{_lost(runs, column, mean)}")
+        label = model if model in _FLOORS else f"`{model}`"
+        rows.append(["" if rows else f"`{name}`, {unit}", label, *cells])
+    return rows
 
 
 def torque() -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.override_parser.types import IntervalSweep
@@ -17,7 +16,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from pinn_dyn.app.keys import GIVEN, KEYS
+from pinn_dyn.app.keys import GIVEN, KEYS, places
 from pinn_dyn.app.schema import ConfigError, check, short_form
 from pinn_dyn.app.schema import arguments as arguments_of
 from pinn_dyn.app.words import OVERRIDE, check_words, chooses, parsed, refused, said
@@ -116,7 +115,8 @@ def completed(command: str, arguments: list[str]) -> list[str]:
                 )
             taken = _takes(command, known, place)
             also = (f"{place}.{one}" if place else one for one in taken)
-            keys = list(dict.fromkeys([*_keys(known), *also]))
+            there = (one for one, _ in places(known) if one and "[" not in one)
+            keys = list(dict.fromkeys([*there, *also]))
             if key in keys:  # under a part that another word takes away
                 raise ConfigError(f"there is no {place} for '{key}' with {' '.join(before)}")
             close = did_you_mean(key, [one for one in keys if one not in GIVEN])
@@ -194,18 +194,15 @@ def _unknown_key(command: str, arguments: list[str]) -> tuple[str, dict[str, Any
             key = getattr(error.__cause__, "full_key", None)
             if not key or "is not in struct" not in str(error.__cause__):
                 return None
-            return key, _plain_keys(hydra.compose(command, overrides=groups))
+            return key, _unresolved(command, groups)
         except (ValueError, TypeError, AttributeError, LookupError) as error:
-            known = _plain_keys(hydra.compose(command, overrides=groups))
-            said_by_hydra = refused(words, error)
-            raise ConfigError(_below_a_value(known, overrides) or said_by_hydra) from error
+            below = _below_a_value(_unresolved(command, groups), overrides)
+            raise ConfigError(below or refused(words, error)) from error
     return None
 
 
-def _plain_keys(cfg: DictConfig) -> dict[str, Any]:
-    known = OmegaConf.to_container(cfg)
-    assert isinstance(known, dict)
-    return {str(name): value for name, value in known.items()}
+def _unresolved(command: str, overrides: list[str]) -> dict[str, Any]:
+    return cast(dict[str, Any], OmegaConf.to_container(hydra.compose(command, overrides=overrides)))
 
 
 def _below_a_value(known: dict[str, Any], words: list[str]) -> str | None:
@@ -218,10 +215,3 @@ def _below_a_value(known: dict[str, Any], words: list[str]) -> str | None:
             if value is not None and not isinstance(value, dict):
                 return f"{word}: {path} is {value!r}, which has no keys: give {path}=..."
     return None
-
-
-def _keys(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, value in values.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, dict):
-            yield from _keys(value, f"{prefix}{key}.")

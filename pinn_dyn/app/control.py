@@ -18,10 +18,9 @@ from pinn_dyn.app.build import build_law, build_reference, build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.control_results import write_results, write_stability
 from pinn_dyn.app.parts import build_part
-from pinn_dyn.app.provenance import build_origin, data_hash, provenance
-from pinn_dyn.app.run_folder import load_run, write_config, write_json
+from pinn_dyn.app.provenance import write_origin
+from pinn_dyn.app.run_folder import load_run, write_config
 from pinn_dyn.app.trust import packages
-from pinn_dyn.app.words import command_line
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Controller,
@@ -85,9 +84,7 @@ def control(cfg: DictConfig) -> float:
         )
     learned = double_copy(model)
     source = build_source(run.config)
-    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    write_json(folder / "provenance.json", {"config": config, "run": run.config, **record})
-    origin = build_origin({run.config["name"]: run}, source, record, config)
+    origin = write_origin({run.config["name"]: run}, source, config, {"run": run.config}, folder)
     if source.system is None:
         return _report_without_truth(learned, source, folder, origin)
 
@@ -273,7 +270,12 @@ def _close_loop(
     """One controller on the robot, in continuous time or at a rate."""
     actuator = build_part("actuator", config["actuator"])
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
-    progress = f"closing the loop: {name}"
+    motion = law, reference, q0, v0
+    common = {
+        "duration": config["duration"],
+        "actuator": actuator,
+        "progress": f"closing the loop: {name}",
+    }
     with _errors_of(f"controllers.{name}"):
         if config["rate"] is None:
             if config["delay"] or np.any(sensor.q_noise) or np.any(sensor.v_noise):
@@ -282,28 +284,11 @@ def _close_loop(
                     "noise: give a rate, or set them to 0"
                 )
             return close_loop_continuous(
-                robot,
-                law,
-                reference,
-                q0,
-                v0,
-                duration=config["duration"],
-                samples_rate=config["samples_rate"],
-                actuator=actuator,
-                progress=progress,
+                robot, *motion, samples_rate=config["samples_rate"], **common
             )
+        plant = build_part("plant", config["plant"], robot)
         return close_loop(
-            build_part("plant", config["plant"], robot),
-            law,
-            reference,
-            q0,
-            v0,
-            duration=config["duration"],
-            rate=config["rate"],
-            actuator=actuator,
-            sensor=sensor,
-            delay=config["delay"],
-            progress=progress,
+            plant, *motion, rate=config["rate"], sensor=sensor, delay=config["delay"], **common
         )
 
 

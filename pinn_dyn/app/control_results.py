@@ -40,25 +40,11 @@ from pinn_dyn.evaluation import (
 )
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
+from pinn_dyn.evaluation.report.control_page import shown_columns
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
 
 log = logging.getLogger(__name__)
-
-# Columns of the terminal's table; the files hold all of them.
-_SHOWN = (
-    "controller",
-    "runs",
-    "stopped",
-    "rms_error",
-    "max_error",
-    "step_error",
-    "settling_time_worst",
-    "overshoot_worst",
-    "steady_state_error_percent",
-    "input_peak",
-    "saturated_percent",
-)
 
 _STRIP_TIMES = (0.0, 0.1, 0.3, 0.6, 1.0)  # s, those of the paper's figure
 _WANTED_ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
@@ -112,10 +98,9 @@ def write_results(
     if config["animate"]:
         animate(records[first], config["trajectory"], robot, animation)
 
-    shown = [column for column in table if column.startswith(_SHOWN)]
     duration, runs = f"{config['duration']:g} s", len(records[first].stopped)
     print(f"\n{source.name}: closed loop of {duration}, {runs} run{'s' if runs > 1 else ''}")
-    print(format_table(table[shown]))
+    print(format_table(table[[*shown_columns(table)]]))
     report = control_report(
         title=f"{source.name}: closed loop on a learned model",
         summary=table,

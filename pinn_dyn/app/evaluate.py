@@ -27,11 +27,11 @@ from pinn_dyn.app.evaluation_results import (
     write_intervals,
 )
 from pinn_dyn.app.identification import identified
-from pinn_dyn.app.provenance import build_origin, data_hash, provenance
-from pinn_dyn.app.run_folder import CONFIG, METRICS, Run, find_runs, load_run, write_json
+from pinn_dyn.app.jobs import find_runs
+from pinn_dyn.app.provenance import write_origin
+from pinn_dyn.app.run_folder import METRICS, Run, load_run
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
-from pinn_dyn.app.words import command_line
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
@@ -59,27 +59,12 @@ from pinn_dyn.evaluation import (
     write_table,
 )
 from pinn_dyn.evaluation.report import prediction_report
+from pinn_dyn.evaluation.report.prediction_page import shown_columns
 from pinn_dyn.mechanics import Predictor, Trajectory, samples_of, stack_until
 
 log = logging.getLogger(__name__)
 
 _PRINTED = 8  # coordinates whose matrices a terminal has room for
-# Columns of the terminal's table; the files hold all of them.
-_SHOWN = (
-    "error_mean",
-    "error_std",
-    "error_median",
-    "error_worst",
-    "diverged",
-    "left_data",
-    "left_data_after",
-    "torque_share",
-    "residual_share",
-    "member_error_mean",
-    "member_error_std",
-    "spread_over_error",
-    "input_delay_seconds",
-)
 
 
 def evaluate(cfg: DictConfig) -> float:
@@ -170,16 +155,15 @@ def evaluate(cfg: DictConfig) -> float:
         write_table(joints, folder, "torque")
     if len(parts):
         write_table(parts, folder, "parts")
-    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    made = {"config": config, "dataset": runs[plain].config["dataset"], **record}
-    write_json(folder / "provenance.json", made)
+    by_label = dict(zip(labels, runs, strict=True))
+    beside = {"dataset": runs[plain].config["dataset"]}
+    origin = write_origin(by_label, source, config, beside, folder)
     draw(evaluations, best_floor(summary), truth, source, config, folder)
     intervals = write_intervals(trained, source, split, folder)
     comparisons = compare_with_truth(trained, source, folder)
 
-    shown = ["run", "seed", "floor", "pairs", *_SHOWN]
-    shown += [name for name in summary if name.startswith("valid_time_")]
-    shown += [name for name in summary if name.endswith(("s_error_mean", "s_diverged"))]
+    columns = {"floor", "error_std", *shown_columns(summary)} - {"training_seconds"}
+    shown = [name for name in summary if name in columns or name.endswith("s_diverged")]
     text = terms_text(comparisons)
     if comparisons and len(source.labels) > _PRINTED:
         text = f"learned and true terms are in {folder / 'terms.txt'}"
@@ -189,7 +173,7 @@ def evaluate(cfg: DictConfig) -> float:
     headers = {name: name.removesuffix("_error_mean") for name in summary if "window_" in name}
     headers |= {"left_data_after": "after", "torque_share": "torque", "residual_share": "residual"}
     headers |= {"input_delay_seconds": "delay"}
-    print(format_table(summary[[name for name in shown if name in summary]], headers))
+    print(format_table(summary[shown], headers))
     verdict = beaten_by_floors(summary)
     star = "* best; only a model that beats all in brackets; valid_time, after and delay in s"
     print("\n".join([star, *notes, *verdict, *interval_lines(intervals)]))
@@ -209,12 +193,10 @@ def evaluate(cfg: DictConfig) -> float:
         input_labels=source.input_labels,
         comparisons=comparisons,
         joints=joints,
-        constants=read_constants(
-            {label: run.folder for label, run in zip(labels, runs, strict=True)}
-        ),
+        constants=read_constants({label: run.folder for label, run in by_label.items()}),
         parts=parts,
         intervals=intervals,
-        origin=build_origin(dict(zip(labels, runs, strict=True)), source, record, config),
+        origin=origin,
     )
     write_whole(folder / "report.html", report)
     print(f"\nfigures and tables are in {folder}; open report.html there in a browser")
@@ -238,10 +220,6 @@ def _load_all(
     for folder in folders:
         try:
             run = load_run(folder, checkpoint, trust)
-            if missing := [
-                key for key in ("dataset", "model_name", "seed") if key not in run.config
-            ]:
-                raise ConfigError(f"its {CONFIG} has no {', '.join(missing)}, it may be cut short")
             runs.append(run)
             if not (folder / METRICS).is_file():
                 log.warning(

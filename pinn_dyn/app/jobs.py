@@ -1,4 +1,4 @@
-"""What became of trainings: run folders with and without a result."""
+"""Which run folders are meant, and what became of their trainings."""
 
 from __future__ import annotations
 
@@ -47,19 +47,46 @@ class Job:
     problem: str
 
 
+def find_runs(patterns: list[str] | str) -> list[Path]:
+    """Run folders that match paths or globs; folders without a config are passed over in globs.
+
+    Raises:
+        ConfigError: if a pattern matches nothing, or a plain path is no run folder.
+    """
+    found: dict[Path, Path] = {}  # a run that is linked, or named in two ways, is one
+    for pattern, matches in _matched(patterns):
+        folders = [p for p in matches if (p / CONFIG).is_file()]
+        if not folders:
+            what = "matches nothing" if not matches else f"matches no run folder (no {CONFIG})"
+            raise ConfigError(f"runs: '{pattern}' {what}; give folders that train.py wrote")
+        for p in folders:
+            found.setdefault(p.resolve(), p)
+    return list(found.values())
+
+
+def _matched(patterns: list[str] | str) -> Iterator[tuple[str, list[Path]]]:
+    """Each path or glob, and what it matches.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    if not patterns:
+        raise ConfigError("runs is empty, expected run folders or globs, as runs=[runs/my_arm/*]")
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        matches = sorted(Path(p) for p in glob.glob(os.path.expanduser(pattern)))
+        if pattern and not matches and Path(pattern).is_dir():  # a name with [ or * in it
+            matches = [Path(pattern)]
+        yield pattern, matches
+
+
 def find_jobs(patterns: list[str] | str) -> list[Job]:
     """Jobs of train.py in folders, or below them; in the order in which they finished.
 
     Raises:
         ConfigError: if a pattern leads to no job.
     """
-    if not patterns:
-        raise ConfigError("runs is empty, expected run folders, folders of them, or globs")
     found: dict[Path, Job] = {}
-    for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        places = [Path(p) for p in sorted(glob.glob(os.path.expanduser(pattern)))]
-        if pattern and not places and Path(pattern).is_dir():  # a name with [ or * in it
-            places = [Path(pattern)]
+    for pattern, places in _matched(patterns):
         below = {
             path.parent.parent if path.parent.name == ".hydra" else path.parent
             for place in places

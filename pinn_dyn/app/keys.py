@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -259,3 +259,14 @@ GIVEN = {
         _LENGTH,
     ),
 }
+
+
+def places(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """A value of a configuration and all that is in it, at any depth, each with its place."""
+    yield where, value
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from places(item, f"{where}.{key}" if where else str(key))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from places(item, f"{where}[{index}]")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -11,7 +10,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
-from pinn_dyn.app.keys import KEYS, Part
+from pinn_dyn.app.keys import KEYS, Part, places
 from pinn_dyn.app.schema import ConfigError, check_value
 
 _HINTS = KEYS["control"] | KEYS["train"] | {"robot": Part}
@@ -53,7 +52,7 @@ def _said(name: str, config: dict[str, Any], error: BaseException) -> str:
     """What a constructor said, and what to do about it."""
     if found := _MISSING.search(str(error)):
         builder, keys = found.groups()
-        place = next(_places(name, config, builder), name)
+        place = next((one for one, part in places(config, name) if _is_of(part, builder)), name)
         key = re.findall(r"'(\w+)'", keys)[0]
         return (
             f"{keys} of {place} is missing: give {place}.{key}=..., or leave out the "
@@ -66,10 +65,6 @@ def _said(name: str, config: dict[str, Any], error: BaseException) -> str:
     return f"cannot be built with these values: {type(error).__name__}: {error}"
 
 
-def _places(name: str, part: Any, builder: str) -> Iterator[str]:
-    """Where a part or those in it name a class."""
-    if isinstance(part, dict):
-        if str(part.get("_target_")).rsplit(".", 1)[-1] == builder:
-            yield name
-        for key, value in part.items():
-            yield from _places(f"{name}.{key}", value, builder)
+def _is_of(part: Any, builder: str) -> bool:
+    """Whether this is a part that names a class."""
+    return isinstance(part, dict) and str(part.get("_target_")).rsplit(".", 1)[-1] == builder

@@ -14,7 +14,8 @@ import torch
 import yaml
 
 from pinn_dyn import __version__
-from pinn_dyn.app.run_folder import Run
+from pinn_dyn.app.run_folder import Run, write_json
+from pinn_dyn.app.words import command_line
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.evaluation.report import Origin
@@ -39,17 +40,24 @@ def provenance() -> dict[str, str]:
     }
 
 
-def build_origin(
-    runs: Mapping[str, Run], source: DataSource, record: Mapping[str, str], config: dict[str, Any]
+def write_origin(
+    runs: Mapping[str, Run],
+    source: DataSource,
+    config: dict[str, Any],
+    beside: dict[str, Any],
+    folder: Path,
 ) -> Origin:
-    """The last section of a report.
+    """Write ``provenance.json``; returns the same as the last section of a report.
 
     Args:
         runs: names of the runs as they are in the tables.
         source: the data that they share.
-        record: what :func:`provenance` and :func:`command_line` say.
         config: the resolved configuration of this program.
+        beside: what the file has beside that configuration.
+        folder: where it is written.
     """
+    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
+    write_json(folder / "provenance.json", {"config": config, **beside, **record})
     rows = [
         {
             "run": name,

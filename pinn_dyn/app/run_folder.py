@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import json
 import logging
 import math
-import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -197,9 +195,10 @@ def require_same(path: Path, saved: dict[str, Any], folder: Path, config: dict[s
     Raises:
         ConfigError: with the first value that differs.
     """
-    for part in ("model", "dataset"):
-        there = {k: v for k, v in saved[part].items() if k != "cache"}
-        here = {k: v for k, v in config[part].items() if k != "cache"}
+    for part in _WHAT:
+        here, there = (
+            {k: v for k, v in one[part].items() if k != "cache"} for one in (config, saved)
+        )
         if there != here:
             raise ConfigError(
                 f"{path} holds weights of another {_WHAT[part]} than {folder / CONFIG} describes "
@@ -326,28 +325,6 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write a record that is whole or absent."""
     write_whole(path, json.dumps(values, indent=2))
-
-
-def find_runs(patterns: list[str] | str) -> list[Path]:
-    """Run folders that match paths or globs; folders without a config are passed over in globs.
-
-    Raises:
-        ConfigError: if a pattern matches nothing, or a plain path is no run folder.
-    """
-    if not patterns:
-        raise ConfigError("runs is empty, expected run folders or globs, as runs=[runs/my_arm/*]")
-    found: dict[Path, Path] = {}  # a run that is linked, or named in two ways, is one
-    for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        matches = sorted(Path(p) for p in glob.glob(os.path.expanduser(pattern)))
-        if not matches and (Path(pattern) / CONFIG).is_file():  # a name with [ or * in it
-            matches = [Path(pattern)]
-        folders = [p for p in matches if (p / CONFIG).is_file()]
-        if not folders:
-            what = "matches nothing" if not matches else f"matches no run folder (no {CONFIG})"
-            raise ConfigError(f"runs: '{pattern}' {what}; give folders that train.py wrote")
-        for p in folders:
-            found.setdefault(p.resolve(), p)
-    return list(found.values())
 
 
 @contextlib.contextmanager

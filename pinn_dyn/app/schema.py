@@ -13,7 +13,7 @@ import inspect
 import itertools
 import math
 import types
-from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -28,6 +28,7 @@ from pinn_dyn.app.keys import (
     Part,
     Range,
     Section,
+    places,
 )
 from pinn_dyn.spelling import did_you_mean
 
@@ -68,7 +69,9 @@ def _missing(path: str, hint: Any) -> ConfigError:
 def _check_weights(config: Mapping[str, Any]) -> None:
     """Refuse networks that no machine holds, before they are built."""
     members = config.get("ensemble", 1)
-    for path, widths in _layers("model", config["model"]):
+    for path, widths in places(config["model"], "model"):
+        if not path.endswith(".hidden") or not isinstance(widths, list):
+            continue
         if len(widths) > 100:
             raise ConfigError(f"{path} has {len(widths)} layers, expected at most 100")
         weights = members * sum(a * b for a, b in itertools.pairwise(widths))
@@ -77,15 +80,6 @@ def _check_weights(config: Mapping[str, Any]) -> None:
                 f"{path} is {_shown(widths)}, {weights:.2g} weights with ensemble={members}: "
                 f"expected at most {MOST_WEIGHTS:.2g}, choose fewer or narrower layers"
             )
-
-
-def _layers(path: str, part: Any) -> Iterator[tuple[str, list[int]]]:
-    """The widths of the layers of all networks in a part, with their places."""
-    if isinstance(part, Mapping):
-        for key, value in part.items():
-            if key == "hidden" and isinstance(value, list):
-                yield f"{path}.{key}", value
-            yield from _layers(f"{path}.{key}", value)
 
 
 def check_value(path: str, value: Any, hint: Any) -> None:

@@ -9,12 +9,12 @@ classes below, and those of a package that the user trusts by ``trust=my_package
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from pinn_dyn.app.keys import places
 from pinn_dyn.app.schema import ConfigError, find
 
 # By libyaml where it is there: in a tenth of the time.
@@ -109,8 +109,14 @@ def read_foreign(path: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
     dataset = config.get("dataset")
     if isinstance(dataset, dict):
         dataset.pop("cache", None)
-    for where, part in mappings(config, ""):
-        _check_mapping(path, where, part, trust)
+    for where, value in places(config):
+        if isinstance(value, dict):
+            _check_mapping(path, where, value, trust)
+        elif isinstance(value, str) and "${" in value:
+            raise ConfigError(
+                f"{where} is {value[:80]!r}, an expression: the configuration in a run folder has "
+                "values only"
+            )
     if isinstance(dataset, dict):
         check_name(f"{path}: dataset.name", dataset.get("name"))
         for name in dataset.get("configurations") or ():
@@ -173,26 +179,6 @@ def _size(value: Any, known: dict[int, int]) -> int:
         items = value.values() if isinstance(value, dict) else value
         known[id(value)] = 1 + sum(_size(item, known) for item in items)
     return known[id(value)]
-
-
-def mappings(value: Any, where: str) -> Iterator[tuple[str, dict[Any, Any]]]:
-    """All mappings in a configuration, with their places; texts that would still be computed.
-
-    Raises:
-        ConfigError: on a text with ``${``.
-    """
-    if isinstance(value, dict):
-        yield where, value
-        for key, item in value.items():
-            yield from mappings(item, f"{where}.{key}" if where else str(key))
-    elif isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from mappings(item, f"{where}[{index}]")
-    elif isinstance(value, str) and "${" in value:
-        raise ConfigError(
-            f"{where} is {value[:80]!r}, an expression: the configuration in a run folder has "
-            "values only"
-        )
 
 
 def _check_mapping(path: Path, where: str, part: dict[Any, Any], trust: tuple[str, ...]) -> None:

@@ -27,7 +27,6 @@ from pinn_dyn.evaluation.figures import (
     trajectory_figure,
 )
 from pinn_dyn.evaluation.floors import KeepsVelocity, StandsStill, build_floors
-from pinn_dyn.evaluation.horizons import common_stride, default_horizon, default_windows
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import (
@@ -41,11 +40,13 @@ from pinn_dyn.evaluation.metrics import (
 from pinn_dyn.evaluation.png import save
 from pinn_dyn.evaluation.prediction import (
     Prediction,
+    common_stride,
+    default_horizon,
+    default_windows,
     predict_trajectories,
     predict_windows,
 )
 from pinn_dyn.evaluation.run_log import RunDescription
-from pinn_dyn.evaluation.shares import part_shares, residual_share
 from pinn_dyn.evaluation.tables import (
     RunResult,
     beaten_by_floors,
@@ -55,7 +56,12 @@ from pinn_dyn.evaluation.tables import (
     summary_table,
     write_table,
 )
-from pinn_dyn.evaluation.torque import TorqueError, torque_error
+from pinn_dyn.evaluation.torque import (
+    TorqueError,
+    part_shares,
+    residual_share,
+    torque_error,
+)
 from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator, ValidationHistory
 
 __all__ = [

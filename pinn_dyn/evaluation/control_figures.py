@@ -31,7 +31,6 @@ def control_panels(
     labels: Sequence[str],
     input_labels: Sequence[str],
     *,
-    error: str = ERROR,
     held: bool = True,
 ) -> tuple[list[Panel], list[Panel]]:
     """A panel per coordinate, reached and dotted reference, the error below; and one per input.
@@ -39,7 +38,6 @@ def control_panels(
     Args:
         records: names of laws and their K runs; the order fixes colours and dashes.
         labels, input_labels: name and unit of each coordinate and input.
-        error: name and unit of the error.
         held: whether the input holds between two control instants.
     """
     laws = [(name, record, *look(k)) for k, (name, record) in enumerate(records.items())]
@@ -50,7 +48,7 @@ def control_panels(
         wanted = Line("reference", first.t, first.reference.q[..., k], DARK, "dot", always=True)
         states.append(Panel(label, [*lines, wanted]))
     errors = [Line(name, r.t, control_errors(r), c, d) for name, r, c, d in laws]
-    states.append(Panel(error, errors, log=True))
+    states.append(Panel(with_unit(ERROR, labels), errors, log=True))
     inputs = [
         Panel(label, [Line(name, r.t, r.u[..., k], c, d, held=held) for name, r, c, d in laws])
         for k, label in enumerate(input_labels)
@@ -95,8 +93,7 @@ def closed_loop_figure(
     """
     labels = names(labels, "q", record.q.shape[-1], "labels")
     inputs = names(input_labels, "u", record.u.shape[-1], "input_labels")
-    error = with_unit(ERROR, labels)
-    columns = control_panels({"reached": record}, labels, inputs, error=error)
+    columns = control_panels({"reached": record}, labels, inputs)
     reason, end = record.stopped[run], None
     if reason is not None:
         end = float(record.t[samples_before_stop(record, run) - 1])

@@ -36,6 +36,7 @@ class Line:
         t: times, ``(T,)``, s.
         y: values, ``(K, T)``.
         colour, dash, width: how it is drawn.
+        dots: whether its samples are dots without a line, in a PNG.
         held: whether a value holds until the next one.
         always: whether a menu that chooses among lines leaves it visible.
         lost: which of the K count as lost and are in no mean, ``(K,)``; None for none.
@@ -48,6 +49,7 @@ class Line:
     colour: str
     dash: str = "solid"
     width: float = 1.6
+    dots: bool = False
     held: bool = False
     always: bool = False
     lost: Tensor | None = None
@@ -92,7 +94,7 @@ class Panel:
         """Ends of the vertical axis for one motion."""
         lines = self.lines if self.leading is None else [self.leading]
         every = [y[torch.isfinite(y)] for y in (line.y[motion].double() for line in lines)]
-        values = torch.cat(every)
+        values = torch.cat([torch.empty(0, dtype=torch.float64), *every])
         if self.log:
             values = values[values > 0]
             if not len(values):

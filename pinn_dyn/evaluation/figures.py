@@ -42,7 +42,6 @@ def trajectory_panels(
     predictions: Mapping[str, Prediction],
     labels: Sequence[str],
     input_labels: Sequence[str],
-    error: str = ERROR,
     floors: Mapping[str, Prediction] | None = None,
 ) -> tuple[list[Panel], list[Panel]]:
     """A panel per coordinate, truth and models, with the error below; and a panel per input.
@@ -54,7 +53,6 @@ def trajectory_panels(
         predictions: model names and their roll-outs of the same K trajectories; the order of the
             names fixes their colours and dashes.
         labels, input_labels: name and unit of each coordinate and input.
-        error: name and unit of the error.
         floors: what the models have to beat, in thin grey lines.
     """
     styled = [(name, item, *look(k), 1.3) for k, (name, item) in enumerate(predictions.items())]
@@ -71,7 +69,7 @@ def trajectory_panels(
         Line(name, item.t, item.error(), colour, dash, width)
         for name, item, colour, dash, width in styled
     ]
-    states.append(Panel(error, distances, log=True))
+    states.append(Panel(with_unit(ERROR, labels), distances, log=True))
     held = truth.input.interpolation == "hold"
     inputs = [
         Panel(
@@ -108,8 +106,7 @@ def trajectory_figure(
     """
     labels = names(labels, "q", truth.q.shape[-1], "labels")
     inputs = names(input_labels, "u", truth.u.shape[-1], "input_labels")
-    error = with_unit(ERROR, labels)
-    columns = trajectory_panels(truth, predictions, labels, inputs, error, floors)
+    columns = trajectory_panels(truth, predictions, labels, inputs, floors)
     return motion_png(columns, trajectory, title=title)
 
 

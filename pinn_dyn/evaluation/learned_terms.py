@@ -54,21 +54,17 @@ class TermComparison:
 
         An error is 0 where both terms vanish and infinite where only the reference does.
         """
-        rows = []
-        for term, (true, learned, fitted) in self.matrices().items():
-            identity = _relative(learned - true, true)
-            best = _relative(learned - fitted, learned)
-            for index, name in enumerate(self.names):
-                rows.append((index, name, term, float(identity[index]), float(best[index])))
-        columns = [
-            "index",
-            "configuration",
-            "term",
-            "relative_error_identity",
-            "relative_error_best_P",
+        errors = {
+            term: (_relative(learned - true, true), _relative(learned - fitted, learned))
+            for term, (true, learned, fitted) in self.matrices().items()
+        }
+        rows = [
+            (name, term, float(identity[index]), float(best[index]))
+            for index, name in enumerate(self.names)
+            for term, (identity, best) in errors.items()
         ]
-        frame = pd.DataFrame(rows, columns=columns).sort_values("index", kind="stable")
-        return frame.drop(columns="index").reset_index(drop=True)
+        columns = ["configuration", "term", "relative_error_identity", "relative_error_best_P"]
+        return pd.DataFrame(rows, columns=columns)
 
     def to_text(self) -> str:
         """True and learned matrices side by side, as in the paper's tables, then P."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import Cleaned
-from pinn_dyn.evaluation.drawing import names
-
-_RAW = "0.65"
-_CLEAN = "#0072B2"
+from pinn_dyn.evaluation.drawing import COLOURS, TRUTH, Line, Panel, names
+from pinn_dyn.evaluation.png import motion_png
 
 
 def cleaning_figure(
@@ -37,29 +35,18 @@ def cleaning_figure(
     labels = names(labels, "q", raw.q.shape[1], "labels")
     input_labels = names(input_labels, "u", inputs, "input_labels")
     speeds = [f"d/dt {label.replace(']', '/s]')}" for label in labels]
-    columns = {"q": labels, "v": speeds, "u": input_labels}
-    rows = max(len(labels), len(input_labels))
-    figure = Figure(figsize=(12, 1.5 * rows + 1.4), layout="constrained")
-    axes = figure.subplots(rows, 3, sharex=True, squeeze=False)
-    for column, (signal, titles) in enumerate(columns.items()):
-        for row in range(rows):
-            ax = axes[row, column]
-            if row >= len(titles):
-                ax.set_axis_off()
-                continue
-            before = getattr(raw, signal)
-            if before is not None and row < before.shape[1]:
-                ax.plot(raw.t, before[:, row], ".", color=_RAW, markersize=3)
-            for part in cleaned.clean:
-                ax.plot(part.t, getattr(part, signal)[:, row], color=_CLEAN, linewidth=1)
-            ax.set_ylabel(titles[row], fontsize="small")
-            if row == len(titles) - 1:
-                ax.set_xlabel("time (s)")
-                ax.tick_params(labelbottom=True)
-    axes[0, 0].set_xlim(raw.t[0], raw.t[-1])
-    axes[0, 0].plot(np.nan, np.nan, ".", color=_RAW, label="log")
-    axes[0, 0].plot(np.nan, np.nan, color=_CLEAN, label="cleaned")
-    handles, texts = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside lower center", ncols=2)
-    figure.suptitle(f"{title}: {raw.run}, {cleaned.split}")
-    return figure
+    looks = [(raw, "log", TRUTH, True)]
+    looks += [(part, "cleaned", COLOURS[0], False) for part in cleaned.clean]
+    columns = []
+    for signal, titles in (("q", labels), ("v", speeds), ("u", input_labels)):
+        panels = []
+        for k, label in enumerate(titles):
+            lines = []
+            for part, name, colour, dots in looks:
+                values = getattr(part, signal)
+                if values is not None and k < values.shape[1]:
+                    t, y = (torch.from_numpy(x.copy()) for x in (part.t, values[:, k]))
+                    lines.append(Line(name, t, y[None], colour, width=1.0, dots=dots))
+            panels.append(Panel(label, lines))
+        columns.append(panels)
+    return motion_png(columns, 0, title=f"{title}: {raw.run}, {cleaned.split}")

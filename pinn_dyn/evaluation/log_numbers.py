@@ -58,23 +58,20 @@ def explained_shares(
     width = max(_SMOOTH / step, 1.5)
     edge = int(4 * width) + 1
     lags = [round((curve.delay or 0.0) / step) for curve in delays]
-    q: list[np.ndarray] = []
-    v: list[np.ndarray] = []
-    a: list[np.ndarray] = []
-    u: list[np.ndarray] = []
+    parts = []
     for item in training:
         first = edge + max(lags)
         # So far apart that their averages are independent.
         rows = np.arange(first, len(item) - edge, max(1, int(3.5 * width)))
         if not len(rows):
             continue
-        for parts, order in ((q, 0), (v, 1), (a, 2)):
-            parts.append(gaussian_filter1d(item.q, width, axis=0, order=order)[rows])
+        motion = [gaussian_filter1d(item.q, width, axis=0, order=k)[rows] for k in range(3)]
         smooth = gaussian_filter1d(item.u, width, axis=0)
-        u.append(np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)]))
-    if not q or sum(len(x) for x in q) < 6 * (3 * q[0].shape[1] + len(delays)):
+        acting = np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)])
+        parts.append([*motion, acting])
+    if sum(len(q) for q, *_ in parts) < 6 * (3 * training[0].q.shape[1] + len(delays)):
         return 1.0, 0.0
-    position, speed, acceleration, inputs = (np.vstack(x) for x in (q, v, a, u))
+    position, speed, acceleration, inputs = map(np.vstack, zip(*parts, strict=True))
     known = np.hstack([np.ones((len(position), 1)), position, np.sin(position), np.cos(position)])
     gains = [
         _rest_of(y, x) - _rest_of(y, np.hstack([x, inputs]))

@@ -34,6 +34,7 @@ def motion_png(
     size = (5.8 * len(columns), 1.55 * rows + 1.3)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, len(columns), sharex="col", squeeze=False)
+    t = columns[0][0].lines[0].t
     for column, panels in enumerate(columns):
         for row in range(rows):
             ax = axes[row, column]
@@ -46,7 +47,6 @@ def motion_png(
             if row == len(panels) - 1:
                 ax.set_xlabel("time [s]")
                 ax.tick_params(labelbottom=True)
-        t = panels[0].lines[0].t
         axes[0, column].set_xlim(float(t[0]), float(t[-1]))
         figure.align_ylabels(axes[:, column])
     _legend(figure)
@@ -99,6 +99,8 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def _style(line: Line) -> dict[str, Any]:
+    if line.dots:
+        return {"color": line.colour, "linestyle": "none", "marker": ".", "markersize": 3}
     return {"color": line.colour, "linestyle": DASHES[line.dash], "linewidth": line.width}
 
 

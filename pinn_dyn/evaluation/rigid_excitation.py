@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,18 +23,6 @@ _STATES = 600
 _DEPENDENT = 1e-6
 """Of its length, what other columns leave of one that they determine, but for rounding."""
 _DRIVE = ("armature", "viscous friction", "dry friction", "offset")
-
-
-class BaseParameters(NamedTuple):
-    """The combinations of P parameters that a regressor depends on.
-
-    Attributes:
-        columns: numbers of the b columns that no earlier ones determine, ``(b,)``.
-        grouping: W = W[:, columns] @ grouping, ``(b, P)``: base parameters = grouping @ parameters.
-    """
-
-    columns: np.ndarray
-    grouping: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -67,8 +54,8 @@ class RigidExcitation:
         return f"{shown}; and {more} more" if more > 0 else shown
 
 
-def base_parameters(regressor: np.ndarray) -> BaseParameters:
-    """The columns of a regressor ``(R, P)`` that are independent of those before them.
+def base_parameters(regressor: np.ndarray) -> np.ndarray:
+    """The columns of a regressor ``(R, P)`` that no earlier ones determine, ``(b,)``.
 
     Of bodies in the order of the chain these are the usual ones: what a link shares with the one
     before it is counted there. Source: Gautier 1991, "Numerical calculation of the base inertial
@@ -86,8 +73,7 @@ def base_parameters(regressor: np.ndarray) -> BaseParameters:
         if (length := np.linalg.norm(rest)) > _DEPENDENT:
             kept.append(k)
             basis = np.column_stack([basis, rest / length])
-    grouping = np.linalg.lstsq(triangle[:, kept], triangle, rcond=None)[0]
-    return BaseParameters(np.array(kept), grouping * scale / scale[kept][:, None])
+    return np.array(kept)
 
 
 def rigid_excitation(
@@ -130,7 +116,7 @@ def rigid_excitation(
     size = structure.num_coordinates
     generator = torch.Generator().manual_seed(0)
     states = 3 * torch.rand(3, _STATES, size, generator=generator).to(motion.q) - 1.5
-    base = base_parameters(_regressor(structure, *states).flatten(0, 1).numpy()).columns
+    base = base_parameters(_regressor(structure, *states).flatten(0, 1).numpy())
     rows = _regressor(structure, motion.q, motion.v, motion.a)[moves].numpy()[:, base]
     rows = np.vstack([rows, np.zeros((len(base), len(base)))])  # of a short motion there are fewer
     scaled = rows / np.linalg.norm(rows, axis=0).clip(min=1e-300)

@@ -54,24 +54,26 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: list[str], y: str) -> Fig
             f"{len(groups)} lines, one for each combination of {', '.join(lines)}, cannot be told "
             f"apart: choose some with filter, for at most {len(styles)}"
         )
-    places, categories = _places(finite[x])
+    numeric = all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in finite[x])
+    places = finite[x].astype(float if numeric else str)
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     ax = figure.subplots()
+    if not numeric:
+        ax.xaxis.update_units(sorted(set(places)))  # words side by side
     for (label, rows), (colour, marker) in zip(groups, styles[: len(groups)], strict=True):
-        at = rows[x].map(places)
+        at = places[rows.index]
         means = rows[y].astype(float).groupby(at).mean()
         ax.plot(means.index, means, color=colour, marker=marker, label=label)
         if len(rows) > len(means):
             ax.plot(at, rows[y], marker, color=colour, alpha=0.4, markersize=4, linestyle="none")
-    if categories:
-        ax.set_xticks(range(len(categories)), categories)
-    else:
-        logarithmic = _spans_decades(list(places.values()))
+    if numeric:
+        texts = {float(value): str(value) for value in finite[x]}
+        logarithmic = _spans_decades([*texts])
         if logarithmic:
             ax.set_xscale("log")
-        if len(places) <= _LABELLED and (logarithmic or _apart(list(places.values()))):
+        if len(texts) <= _LABELLED and (logarithmic or _apart([*texts])):
             # The values themselves, not powers of ten or numbers between them.
-            ax.set_xticks(list(places.values()), [str(value) for value in places])
+            ax.set_xticks([*texts], texts.values())
             ax.minorticks_off()
     if _spans_decades(finite[y].tolist()):
         ax.set_yscale("log")
@@ -88,15 +90,6 @@ def _line_name(lines: list[str], key: tuple[object, ...]) -> str:
     if len(lines) == 1:
         return "-" if pd.isna(key[0]) else str(key[0])
     return ", ".join(f"{n}={v}" for n, v in zip(lines, key, strict=True) if not pd.isna(v))
-
-
-def _places(values: pd.Series) -> tuple[dict[object, float], list[str]]:
-    """Where each value stands on the axis; words stand side by side and label their place."""
-    different = list(dict.fromkeys(values))
-    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in different):
-        return {value: float(value) for value in different}, []
-    words = sorted(different, key=str)
-    return {word: float(place) for place, word in enumerate(words)}, [str(word) for word in words]
 
 
 def _spans_decades(values: list[float]) -> bool:

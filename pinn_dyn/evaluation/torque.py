@@ -1,4 +1,4 @@
-"""Torque error: inverse dynamics of a mechanical model on measured motions."""
+"""Forces along measured motions: the torque error, and who contributes what."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 from scipy.signal import savgol_filter
 from torch import Tensor
 
-from pinn_dyn.mechanics import MechanicalSystem, Trajectory, double_copy
+from pinn_dyn.mechanics import MechanicalSystem, Sum, Trajectory, double_copy
 
 _SMOOTHED = 0.05  # s of velocity that one acceleration is fitted to, at least 5 samples
-_SAMPLES = 5_000  # at which the error is taken, at most
+_OF_ERROR, _OF_SHARES = 5_000, 2_000  # samples at which they are taken, at most
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,11 @@ def torque_error(
     Raises:
         ValueError: if a measured trajectory has fewer than 5 samples or its sample time varies.
     """
-    chosen = slice(None, None, -(-truth.q.shape[:2].numel() // _SAMPLES))
     learned = double_copy(model)
     with torch.no_grad():
-        u = learned.acting_samples(truth)
-        q, v, u = (x.double().flatten(0, 1)[chosen] for x in (truth.q, truth.v, u))
+        q, v, u = _samples(learned, truth, _OF_ERROR)
         if system is None:
-            a = _slope(truth).flatten(0, 1)[chosen]
+            a = _some(_slope(truth), _OF_ERROR)
         else:
             a = double_copy(system).forward_dynamics(q, v, u).double()
         # A(q) u, also of a model whose A depends on u.
@@ -80,6 +78,58 @@ def torque_error(
         rms=rms,
         spread=spread,
     )
+
+
+def residual_share(model: MechanicalSystem, truth: Trajectory) -> float:
+    """rms |r| / (rms |A u| + rms |r|) along measured motions: 0 is a mechanical robot, 1 is none.
+
+    Args:
+        model: a model with a residual force.
+        truth: K trajectories stacked, q ``(K, T, N)``.
+    """
+    q, v, u = _samples(model, truth, _OF_SHARES)
+    with torch.no_grad():
+        residual = model.residual_force(q, v, u)
+        applied = model.inverse_dynamics(q, v, model.forward_dynamics(q, v, u))  # A u + r
+        taken, driven = _rms(residual), _rms(applied - residual)
+    return taken / (taken + driven)
+
+
+def part_shares(model: Sum, truth: Trajectory) -> pd.DataFrame:
+    """What each part of a sum contributes along measured motions: part, term, rms, share.
+
+    The terms are the forces M a + C v, G and D v + F, with the acceleration that the sum gives; the
+    rms is that of its norm, N m or N, and the share is of the rms of all parts.
+    """
+    q, v, u = _samples(model, truth, _OF_SHARES)
+    rows = []
+    with torch.no_grad():
+        a = model.forward_dynamics(q, v, u)
+        for name, part in model.parts.items():
+            assert isinstance(part, MechanicalSystem)
+            rest, lost = part.potential_force(q), part.dissipative_force(q, v)
+            moving = part.inverse_dynamics(q, v, a) - rest - lost
+            for term, force in (("M a + C v", moving), ("G", rest), ("D v + F", lost)):
+                rows.append((name, term, _rms(force)))
+    table = pd.DataFrame(rows, columns=["part", "term", "rms"])
+    table["share"] = table["rms"] / table.groupby("term")["rms"].transform("sum")
+    return table
+
+
+def _samples(model: MechanicalSystem, truth: Trajectory, most: int) -> list[Tensor]:
+    """q, v and the acting u at some of the samples, ``(S, .)`` each, in the model's precision."""
+    like = next(model.parameters(), torch.empty(0, dtype=torch.float64))
+    u = model.acting_samples(truth).detach()
+    return [_some(x, most).to(like) for x in (truth.q, truth.v, u)]
+
+
+def _some(values: Tensor, most: int) -> Tensor:
+    """Every n-th of the samples ``(K, T, .)`` of all trajectories."""
+    return values.flatten(0, 1)[:: -(-values.shape[:2].numel() // most)]
+
+
+def _rms(force: Tensor) -> float:
+    return float(force.square().sum(-1).mean().sqrt())
 
 
 def _slope(truth: Trajectory) -> Tensor:

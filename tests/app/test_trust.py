@@ -5,6 +5,7 @@ import yaml
 
 from pinn_dyn.app import trust
 from pinn_dyn.app.config import CONF, ConfigError
+from pinn_dyn.app.keys import places
 from pinn_dyn.app.run_folder import load_run
 from tests.app.entry import run_script
 from tests.support.foreign_runs import foreign
@@ -65,8 +66,8 @@ def test_everything_that_conf_names_may_be_built():
     """So a run of our own configurations is never refused."""
     found = set()
     for path in CONF.rglob("*.yaml"):
-        for _, part in trust.mappings(_plain(yaml.safe_load(path.read_text())), ""):
-            if "_target_" in part:
+        for _, part in places(_plain(yaml.safe_load(path.read_text()))):
+            if isinstance(part, dict) and "_target_" in part:
                 found.add(part["_target_"])
     # In no run's configuration: one of Hydra, and a search, of which a run keeps the draw alone.
     found -= {"pinn_dyn.app.sweep.SweepCallback", "pinn_dyn.app.search.EqualSearch"}

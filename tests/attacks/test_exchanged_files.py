@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.jobs import find_jobs
-from pinn_dyn.app.run_folder import find_runs, load_run
+from pinn_dyn.app.jobs import find_jobs, find_runs
+from pinn_dyn.app.run_folder import load_run
 from tests.app.entry import NO_FIGURES, refused_text, train
 
 

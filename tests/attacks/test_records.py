@@ -7,8 +7,8 @@ import pytest
 
 from pinn_dyn.app import jobs
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.jobs import find_jobs
-from pinn_dyn.app.run_folder import find_runs, load_run, read_metrics
+from pinn_dyn.app.jobs import find_jobs, find_runs
+from pinn_dyn.app.run_folder import load_run, read_metrics
 from tests.app.entry import refused_text, run_script
 
 RECORDS = {

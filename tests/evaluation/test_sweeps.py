@@ -111,7 +111,7 @@ def test_narrow_ranges_are_drawn_on_linear_axes_and_words_side_by_side():
     runs = figure_runs(["relu", "elu"], [1.0, 0.5])
     ax, lines, _ = drawn(sweep_figure(runs, x="x", lines=["model_name"], y="error"))
     assert [label.get_text() for label in ax.get_xticklabels()] == ["elu", "relu"]
-    assert lines["lnn"] == {0: 1.0, 1: 2.0}
+    assert lines["lnn"] == {"elu": 1.0, "relu": 2.0}
 
 
 def test_diverged_runs_are_counted_where_they_cannot_be_drawn():

@@ -133,12 +133,6 @@ def _summary(
     records: Mapping[str, ClosedLoopRecord],
     labels: Sequence[str],
 ) -> list[Markup]:
-    headers = {}
-    for name, text in _HEADERS.items():
-        if name in summary:
-            headers[name] = text
-        if name == "max_error":
-            headers |= {x: _step_header(x) for x in summary if x.startswith("step_error_after_")}
     unit = units(labels)
     parts = [
         paragraph(
@@ -147,7 +141,7 @@ def _summary(
             + ", over the runs that went to their end. A number under the pointer shows all its "
             "digits."
         ),
-        table(summary, headers=headers),
+        table(summary, headers=shown_columns(summary)),
     ]
     stops = pd.DataFrame(
         [
@@ -168,9 +162,20 @@ def _summary(
     return parts
 
 
-def _step_header(name: str) -> str:
-    seconds, kind = name.removeprefix("step_error_after_").split("_s_")
-    return f"error after {seconds} s, {kind.removesuffix('_percent')} [% of step]"
+def shown_columns(summary: pd.DataFrame) -> dict[str, str]:
+    """The columns of the summary that a page and a terminal show, and their headings on the page.
+
+    Args:
+        summary: one row per law, as :func:`pinn_dyn.evaluation.comparison_table` makes it.
+    """
+    headers = {}
+    for name in summary:
+        if name in _HEADERS:
+            headers[name] = _HEADERS[name]
+        elif name.startswith("step_error_after_"):
+            seconds, kind = name.removeprefix("step_error_after_").split("_s_")
+            headers[name] = f"error after {seconds} s, {kind.removesuffix('_percent')} [% of step]"
+    return headers
 
 
 def _motions(
@@ -180,8 +185,7 @@ def _motions(
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Section]:
-    error = with_unit(ERROR, labels)
-    states, inputs = control_panels(records, labels, input_labels, error=error, held=held)
+    states, inputs = control_panels(records, labels, input_labels, held=held)
     first = next(iter(records.values()))
     shown = shown_motions(len(first.stopped), [run, *map(_worst, records.values())])
     stopped = torch.stack([stopped_runs(record) for record in records.values()]).any(dim=0)

@@ -42,6 +42,9 @@ _HEADERS = {
     "left_data_after": "first after [s]",
     "torque_share": "torque error / spread",
     "residual_share": "share of the residual force",
+    "member_error_mean": "mean error of a member",
+    "member_error_std": "its std over the members",
+    "spread_over_error": "spread of the members / error",
     "input_delay_seconds": "learned input delay [s]",
     "training_seconds": "training [s]",
 }
@@ -52,6 +55,29 @@ _GROUP_HEADERS = {
     "worst_error_mean": "worst seed",
     "worst_error_worst": "worst trajectory of all",
 }
+# Of a table what it says, and the headings of its columns.
+_TORQUE = (
+    "Inverse dynamics on the same motions, τ = A(q) u: an arm that hardly moves may predict "
+    "its torques well and its motion badly, or the other way round.",
+    {
+        "run": "run",
+        "joint": "joint",
+        "torque_rms": "RMS of τ̂ − τ",
+        "torque_spread": "spread of τ",
+        "torque_share": "RMS / spread",
+    },
+)
+_PARTS = (
+    "What the parts of a sum contribute along the test motions. A network with a large share "
+    "says that the known mechanics leave something out, or that its constants are not found.",
+    {
+        "run": "run",
+        "term": "term",
+        "part": "part",
+        "rms": "RMS of its force",
+        "share": "share of all parts",
+    },
+)
 
 
 def prediction_report(
@@ -119,30 +145,20 @@ def prediction_report(
                 input_labels,
             ),
         ),
+        *([Section("Constants", _constants(constants))] if constants else []),
+        *([Section("Torque", _table(joints, *_TORQUE))] if len(joints) else []),
+        *([Section("Parts", _table(parts, *_PARTS))] if len(parts) else []),
+        *([Section("Intervals", _intervals(intervals))] if intervals else []),
         Section("Learned and true terms", _terms(comparisons)),
         origin.section(),
     ]
-    if intervals:
-        sections.insert(3, Section("Intervals", _intervals(intervals)))
-    if len(parts):
-        sections.insert(3, Section("Parts", _parts(parts)))
-    if len(joints):
-        sections.insert(3, Section("Torque", _torques(joints)))
-    if constants:
-        sections.insert(3, Section("Constants", _constants(constants)))
     return page(title, f"{trajectories}, {truth.duration:g} s open loop", sections)
 
 
 def _summary(
     summary: pd.DataFrame, grouped: pd.DataFrame, notes: Sequence[str], labels: Sequence[str]
 ) -> list[Markup]:
-    headers = {name: text for name, text in _HEADERS.items() if name in summary}
-    for name in summary:
-        if name.startswith("valid_time_"):
-            headers[name] = f"valid time, {name.removeprefix('valid_time_')} [s]"
-        if name.startswith("window_") and name.endswith("_error_mean"):
-            span = name.removeprefix("window_").removesuffix("s_error_mean")
-            headers[name] = f"mean error, re-set every {span} s"
+    headers = shown_columns(summary)
     marks = pd.DataFrame({name: best(summary, name) for name in headers})
     unit = units(labels)
     parts = [
@@ -165,6 +181,22 @@ def _summary(
     return parts
 
 
+def shown_columns(summary: pd.DataFrame) -> dict[str, str]:
+    """The columns of the summary that a page and a terminal show, and their headings on the page.
+
+    Args:
+        summary: one row per run, as :func:`pinn_dyn.evaluation.summary_table` makes it.
+    """
+    headers = {name: text for name, text in _HEADERS.items() if name in summary}
+    for name in summary:
+        if name.startswith("valid_time_"):
+            headers[name] = f"valid time, {name.removeprefix('valid_time_')} [s]"
+        if name.startswith("window_") and name.endswith("_error_mean"):
+            span = name.removeprefix("window_").removesuffix("s_error_mean")
+            headers[name] = f"mean error, re-set every {span} s"
+    return headers
+
+
 def _trajectories(
     summary: pd.DataFrame,
     truth: Trajectory,
@@ -174,9 +206,7 @@ def _trajectories(
     labels: Sequence[str],
     input_labels: Sequence[str],
 ) -> list[Markup]:
-    states, inputs = trajectory_panels(
-        truth, predictions, labels, input_labels, with_unit(ERROR, labels), floors
-    )
+    states, inputs = trajectory_panels(truth, predictions, labels, input_labels, floors)
     count = len(truth.q)
     worst = {int(row.worst_trajectory): row.run for row in summary.itertuples()}
     shown = shown_motions(count, [first, *worst])
@@ -226,34 +256,8 @@ def _constants(constants: Mapping[str, pd.DataFrame]) -> list[Markup]:
     return parts
 
 
-def _torques(joints: pd.DataFrame) -> list[Markup]:
-    headers = {
-        "run": "run",
-        "joint": "joint",
-        "torque_rms": "RMS of τ̂ − τ",
-        "torque_spread": "spread of τ",
-        "torque_share": "RMS / spread",
-    }
-    text = (
-        "Inverse dynamics on the same motions, τ = A(q) u: an arm that hardly moves may predict "
-        "its torques well and its motion badly, or the other way round."
-    )
-    return [paragraph(text), table(joints, headers=headers)]
-
-
-def _parts(parts: pd.DataFrame) -> list[Markup]:
-    headers = {
-        "run": "run",
-        "term": "term",
-        "part": "part",
-        "rms": "RMS of its force",
-        "share": "share of all parts",
-    }
-    text = (
-        "What the parts of a sum contribute along the test motions. A network with a large share "
-        "says that the known mechanics leave something out, or that its constants are not found."
-    )
-    return [paragraph(text), table(parts, headers=headers)]
+def _table(frame: pd.DataFrame, text: str, headers: Mapping[str, str]) -> list[Markup]:
+    return [paragraph(text), table(frame, headers=headers)]
 
 
 def _intervals(intervals: Mapping[str, Mapping[float, Calibration]]) -> list[Markup]:
