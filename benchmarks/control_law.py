@@ -75,9 +75,7 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     world = open_world(arm.urdf.text, arm.inertia, arm.gravity)
 
     def bullet(q: list[float], v: list[float], a: list[float]) -> Any:
-        return world.bullet.calculateInverseDynamics(
-            world.body, q, v, a, physicsClientId=world.client
-        )
+        return world.bullet.calculateInverseDynamics(world.body, q, v, a)
 
     desired = states[:, 2:].numpy()
     rivals: dict[str, Call] = {"PyBullet inverse dynamics": (bullet, desired.tolist())}

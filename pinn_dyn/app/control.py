@@ -38,12 +38,11 @@ from pinn_dyn.control import (
     model_report,
 )
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.limits import HasDomain
 from pinn_dyn.data.whole import whole, write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.report import Origin, measured_model_report
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, double_copy
-from pinn_dyn.systems import HasLimits
+from pinn_dyn.systems import HasDomain, HasLimits
 
 log = logging.getLogger(__name__)
 

@@ -24,15 +24,3 @@ def seconds_of(name: str, length: str) -> float:
             f"unit ({', '.join(_SECONDS)}), such as '20 ms'"
         )
     return float(match[1]) * _SECONDS[match[2]]
-
-
-def samples_in(name: str, length: Length, sample_time: float, *, odd: bool = False) -> int:
-    """A length as a number of samples, at least 1, the closest to a time, odd where asked for.
-
-    Raises:
-        ValueError: as :func:`seconds_of`.
-    """
-    if not isinstance(length, str):
-        return length
-    count = seconds_of(name, length) / sample_time
-    return max(2 * round((count - 1) / 2) + 1 if odd else round(count), 1)

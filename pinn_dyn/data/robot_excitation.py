@@ -10,27 +10,15 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from pinn_dyn.data.excitation import MultiSine
+from pinn_dyn.systems import HasLimits
 
 # Fine enough for references of a few Hz.
 _CHECK_STEP = 0.02
 
 
 @runtime_checkable
-class Robot(Protocol):
-    """What a recording needs of a robot, beyond being a mechanical system with A = I.
-
-    Attributes:
-        joint_names: names of the joints, N.
-        q_low, q_high: position limits, ``(N,)``, rad.
-        v_max: velocity limits, ``(N,)``, rad/s.
-        u_max: torque limits, ``(N,)``, Nm.
-    """
-
-    joint_names: list[str]
-    q_low: np.ndarray
-    q_high: np.ndarray
-    v_max: np.ndarray
-    u_max: np.ndarray
+class Robot(HasLimits, Protocol):
+    """What a recording needs of a robot, beyond being a mechanical system with A = I."""
 
     def describe(self) -> dict[str, object]:
         """Everything the motion depends on, JSON-serializable."""

@@ -16,11 +16,11 @@ from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation, Joined
 from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
-from pinn_dyn.data.initial_states import InitialStates
-from pinn_dyn.data.limits import HasDomain, Limits
+from pinn_dyn.data.initial_states import InitialStates, Limits
 from pinn_dyn.data.simulation import SimulationError, check_amount, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
+from pinn_dyn.systems import HasDomain
 
 # Part of the cache key: raise it when the same description would give other numbers.
 _VERSION = 3
@@ -147,10 +147,7 @@ class SimulatedSource(DataSource):
                     f"{name}: q_limits with pairing = {pairing!r}: a motion that leaves them is "
                     "drawn anew, which would break the combinations; expected 'matched'"
                 )
-            try:
-                self.limits = Limits(q_limits, around=ranges["initial_states"])
-            except ValueError as error:
-                raise ValueError(f"{name}: q_limits {error}") from error
+            self.limits = Limits(f"{name}: q_limits", q_limits, around=ranges["initial_states"])
             ranges["q_limits"] = (q_limits[0], q_limits[1])
         if isinstance(system, HasDomain):
             for key, (low, high) in ranges.items():

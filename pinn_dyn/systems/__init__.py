@@ -1,13 +1,14 @@
 """Analytic and simulated robots, the truth that models are compared with."""
 
 from pinn_dyn.systems.bullet_arm import BulletArm
-from pinn_dyn.systems.protocols import Drawable, HasLimits, HasTip, Rendered, Stepped
+from pinn_dyn.systems.protocols import Drawable, HasDomain, HasLimits, HasTip, Rendered, Stepped
 from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.soft_arm import SoftArm
 
 __all__ = [
     "BulletArm",
     "Drawable",
+    "HasDomain",
     "HasLimits",
     "HasTip",
     "Rendered",

@@ -209,7 +209,7 @@ class BulletArm(MechanicalSystem):
             q, v and u, ``(steps + 1, N)`` each.
         """
         self.set_state(q0, v0)
-        self._set_time_step(step)
+        self._world.bullet.setTimeStep(step)
         q, v, u = (np.empty((steps + 1, self.num_coordinates)) for _ in range(3))
         q[0], v[0] = q0, v0
         for k in range(steps + 1):
@@ -233,7 +233,7 @@ class BulletArm(MechanicalSystem):
             torque: motor torque, ``(N,)``, Nm, held over the step.
             step: time step, s.
         """
-        self._set_time_step(step)
+        self._world.bullet.setTimeStep(step)
         return self._move(self._world.state()[1], torque)
 
     def render(
@@ -241,9 +241,6 @@ class BulletArm(MechanicalSystem):
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """Pictures of the arm, locked joints at zero; see :class:`Rendered`."""
         return photograph(self.urdf.path, self.joint_names, q, points, size)
-
-    def _set_time_step(self, step: float) -> None:
-        self._world.bullet.setTimeStep(step, physicsClientId=self._world.client)
 
     def _move(self, v: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One step from the present state, whose velocity is v."""
@@ -253,9 +250,8 @@ class BulletArm(MechanicalSystem):
             world.joints,
             world.bullet.TORQUE_CONTROL,
             forces=(torque - self._friction * v).tolist(),
-            physicsClientId=world.client,
         )
-        world.bullet.stepSimulation(physicsClientId=world.client)
+        world.bullet.stepSimulation()
         return world.state()
 
     def _potential_force(self, q: Tensor) -> Tensor:
@@ -281,18 +277,12 @@ class BulletArm(MechanicalSystem):
 
     def _mass(self, q: np.ndarray) -> np.ndarray:
         world = self._world
-        return np.array(
-            world.bullet.calculateMassMatrix(world.body, q.tolist(), physicsClientId=world.client)
-        )
+        return np.array(world.bullet.calculateMassMatrix(world.body, q.tolist()))
 
     def _inverse_dynamics(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """M a + C v + G."""
-        world = self._world
-        return np.array(
-            world.bullet.calculateInverseDynamics(
-                world.body, q.tolist(), v.tolist(), a.tolist(), physicsClientId=world.client
-            )
-        )
+        world, at = self._world, (q.tolist(), v.tolist(), a.tolist())
+        return np.array(world.bullet.calculateInverseDynamics(world.body, *at))
 
     def _bias(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """C v + G."""
@@ -317,9 +307,7 @@ class BulletArm(MechanicalSystem):
     def _energy(self, q: np.ndarray) -> np.ndarray:
         world = self._scratch
         world.put(q, 0 * q)
-        states = world.bullet.getLinkStates(
-            world.body, world.links, computeForwardKinematics=True, physicsClientId=world.client
-        )
+        states = world.bullet.getLinkStates(world.body, world.links, computeForwardKinematics=True)
         centres = np.array([state[0] for state in states])
         return -world.masses @ (centres @ np.array(self.gravity))
 
@@ -329,7 +317,7 @@ class BulletArm(MechanicalSystem):
         link = world.link_names.index(self.urdf.tip)
         # Of the link's own frame Bullet gives float32 only, of its centre of mass float64.
         centre, turn, offset, own_turn = world.bullet.getLinkState(
-            world.body, link, computeForwardKinematics=True, physicsClientId=world.client
+            world.body, link, computeForwardKinematics=True
         )[:4]
         frame = Rotation.from_quat(turn) * Rotation.from_quat(own_turn).inv()
         return np.array(centre) - frame.apply(offset)
@@ -337,14 +325,9 @@ class BulletArm(MechanicalSystem):
     def _tip_slope(self, q: np.ndarray) -> np.ndarray:
         world, zero = self._world, [0.0] * len(q)
         # Bullet counts the point (0, 0, 0) from the link's frame, whatever its manual says.
+        link = world.link_names.index(self.urdf.tip)
         linear, angular = world.bullet.calculateJacobian(
-            world.body,
-            world.link_names.index(self.urdf.tip),
-            [0.0, 0.0, 0.0],
-            q.tolist(),
-            zero,
-            zero,
-            physicsClientId=world.client,
+            world.body, link, [0.0, 0.0, 0.0], q.tolist(), zero, zero
         )
         return np.array([*linear, *angular])
 

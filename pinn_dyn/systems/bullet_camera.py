@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pinn_dyn.systems.bullet_world import import_bullet
+from pinn_dyn.systems.bullet_world import connect
 
 
 def photograph(
@@ -28,23 +28,21 @@ def photograph(
     Returns:
         T pictures ``(H, W, 3)`` of bytes, and columns and rows of the points, ``(P, 2)``.
     """
-    bullet = import_bullet()
-    client = bullet.connect(bullet.DIRECT)
-    target = {"physicsClientId": client}
+    bullet = connect()
     try:
-        body = bullet.loadURDF(str(urdf), useFixedBase=True, **target)
-        links = list(range(bullet.getNumJoints(body, **target)))
-        names = [bullet.getJointInfo(body, link, **target)[1].decode() for link in links]
+        body = bullet.loadURDF(str(urdf), useFixedBase=True)
+        links = list(range(bullet.getNumJoints(body)))
+        names = [bullet.getJointInfo(body, link)[1].decode() for link in links]
         joints = [names.index(name) for name in joint_names]
 
         def pose(row: np.ndarray) -> None:
             for joint, angle in zip(joints, row.tolist(), strict=True):
-                bullet.resetJointState(body, joint, angle, **target)
+                bullet.resetJointState(body, joint, angle)
 
         seen = [np.zeros((1, 3)), points]
         for row in q:
             pose(row)
-            states = bullet.getLinkStates(body, links, computeForwardKinematics=True, **target)
+            states = bullet.getLinkStates(body, links, computeForwardKinematics=True)
             seen.append(np.array([state[4] for state in states]))
         view, projection = camera(bullet, np.concatenate(seen), size)
         pictures = []
@@ -57,11 +55,10 @@ def photograph(
                 shadow=0,
                 renderer=bullet.ER_TINY_RENDERER,
                 flags=bullet.ER_NO_SEGMENTATION_MASK,
-                **target,
             )
             pictures.append(np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8))
     finally:
-        bullet.disconnect(client)
+        bullet.disconnect()
     return pictures, pixels(points, view, projection, size)
 
 

@@ -41,6 +41,14 @@ class HasLimits(Protocol):
 
 
 @runtime_checkable
+class HasDomain(Protocol):
+    """A system that knows where its equation of motion holds."""
+
+    def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
+        """Raise a ValueError unless it holds for all q from ``q_low`` to ``q_high``, ``(N,)``."""
+
+
+@runtime_checkable
 class Stepped(Protocol):
     """A robot whose simulator moves it in steps of its own."""
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pinn_dyn.systems.inertia import pseudo_inertia
 from pinn_dyn.systems.urdf import find_urdf
-from pinn_dyn.systems.urdf_checks import TURNING, number, parse_urdf
+from pinn_dyn.systems.urdf_checks import TURNING, link_of, number, parse_urdf, tip_of
 
 _SLIDING = ("prismatic",)
 
@@ -63,12 +63,9 @@ def read_tree(
             raise ValueError(f"{path} has no joint {name!r} to lock: its joints are {list(joints)}")
     children: dict[str, list[str]] = {}
     for name, joint in joints.items():
-        children.setdefault(_link(joint, "parent"), []).append(name)
-    behind = [_link(joint, "child") for joint in joints.values()]
-    (root,) = (name for name in links if name not in behind)
-    tip = tip or [name for name in behind if name not in children][-1]
-    if tip not in links:
-        raise ValueError(f"{path}: tip is {tip!r}, expected one of its links: {list(links)}")
+        children.setdefault(link_of(joint, "parent"), []).append(name)
+    (root,) = links.keys() - {link_of(joint, "child") for joint in joints.values()}
+    tip = tip_of(path, robot, tip)
 
     found = Tree([], [], [], torch.empty(0), torch.empty(0), [], torch.empty(0))
     placements: list[np.ndarray] = []
@@ -83,7 +80,7 @@ def read_tree(
                 inertia[body] += payload * np.outer(pose[:, 3], pose[:, 3])
         for name in children.get(link, []):
             joint = joints[name]
-            child = _link(joint, "child")
+            child = link_of(joint, "child")
             placement = pose @ _pose(joint.find("origin"))
             if joint.get("type") == "fixed" or name in locked_joints:
                 visit(child, body, placement)
@@ -116,12 +113,6 @@ def _parse(urdf: str) -> tuple[Path, ET.Element]:
         path = find_urdf(urdf, shipped)
         content = path.read_bytes()
     return path, parse_urdf(path, content)
-
-
-def _link(joint: ET.Element, end: str) -> str:
-    element = joint.find(end)
-    assert element is not None  # parse_urdf has seen it
-    return element.get("link", "")
 
 
 def _axis(path: Path, name: str, joint: ET.Element) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pinn_dyn.spelling import did_you_mean
-from pinn_dyn.systems.urdf_checks import MOMENTS, TURNING, end_of, number, parse_urdf
+from pinn_dyn.systems.urdf_checks import MOMENTS, TURNING, link_of, number, parse_urdf, tip_of
 
 Inertia = Literal["file", "collision"]
 """Whether inertias are those of the URDF, or those that Bullet computes from collision shapes."""
@@ -99,15 +99,17 @@ def read_urdf(
         )
     limits = {name: _limits(path, name, joint) for name, joint in moving.items()}
     _check_masses(path, robot, set(moving), inertia)
-    tip = _tip(path, robot, tip)
+    tip = tip_of(path, robot, tip)
     if mass_scale != 1:
         _scale_masses(path, robot, mass_scale)
     digest = hashlib.sha256(content)
+    unused = ("visual", "collision") if inertia == "file" else ("visual",)
     for name, joint in joints.items():
         joint.set("type", "continuous" if name in moving else "fixed")
         _make_unit(joint.find("axis"))
     for link in robot.findall("link"):
-        _remove(link, "visual", *(["collision"] if inertia == "file" else []))
+        for shape in [part for part in link if part.tag in unused]:
+            link.remove(shape)
         for mesh in link.iter("mesh"):
             file = _find_mesh(path, mesh.get("filename", ""))
             digest.update(file.read_bytes())
@@ -155,16 +157,15 @@ def _limits(path: Path, name: str, joint: ET.Element) -> JointLimits:
 def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Inertia) -> None:
     """Every body that moves, a link with all that is fixed to it, needs a mass and an inertia."""
     links = {link.get("name", ""): link for link in robot.findall("link")}
-    joints = robot.findall("joint")
-    starts = {joint.get("name", ""): end_of(path, joint, "child", list(links)) for joint in joints}
+    starts: dict[str, str] = {}
     rigid: dict[str, list[str]] = {}
-    for joint in joints:
-        if joint.get("name") not in moving:
-            parent = end_of(path, joint, "parent", list(links))
-            rigid.setdefault(parent, []).append(end_of(path, joint, "child", list(links)))
+    for joint in robot.findall("joint"):
+        name, child = joint.get("name", ""), link_of(joint, "child")
+        if name in moving:
+            starts[name] = child
+        else:
+            rigid.setdefault(link_of(joint, "parent"), []).append(child)
     for joint_name, start in starts.items():
-        if joint_name not in moving:
-            continue
         body, mass = [start], 0.0
         for name in body:
             body += rigid.get(name, [])
@@ -190,20 +191,6 @@ def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Iner
             ET.SubElement(inertial, "mass", value="0")
         if inertial.find("inertia") is None:
             ET.SubElement(inertial, "inertia", dict.fromkeys(MOMENTS, "0"))
-
-
-def _tip(path: Path, robot: ET.Element, tip: str | None) -> str:
-    links = {link.get("name", ""): link for link in robot.findall("link")}
-    joints = robot.findall("joint")
-    children = [end_of(path, joint, "child", list(links)) for joint in joints]
-    if tip is None:
-        parents = {end_of(path, joint, "parent", list(links)) for joint in joints}
-        return [name for name in children if name not in parents][-1]
-    if tip not in children:
-        raise ValueError(
-            f"{path}: tip is {tip!r}, expected a link behind a joint: {', '.join(children)}"
-        )
-    return tip
 
 
 def _make_unit(axis: ET.Element | None) -> None:
@@ -255,9 +242,3 @@ def _find_mesh(path: Path, filename: str) -> Path:
         f"{path}: mesh {filename!r} not found in {path.parent} or above: put it there, or use "
         "inertia = 'file', which needs no mesh"
     )
-
-
-def _remove(parent: ET.Element, *tags: str) -> None:
-    for tag in tags:
-        for element in parent.findall(tag):
-            parent.remove(element)

@@ -89,15 +89,23 @@ def parse_urdf(path: Path, content: bytes, *, inertias: bool = True) -> ET.Eleme
     return robot
 
 
-def end_of(path: Path, joint: ET.Element, end: str, links: list[str]) -> str:
-    """The ``parent`` or ``child`` link of a joint."""
-    found = [one.get("link", "") for one in joint.findall(end)]
-    if len(found) != 1 or found[0] not in links:
+def link_of(joint: ET.Element, end: str) -> str:
+    """The ``parent`` or ``child`` of a joint that :func:`parse_urdf` has let pass."""
+    return joint.find(end).get("link", "")  # type: ignore[union-attr]
+
+
+def tip_of(path: Path, robot: ET.Element, tip: str | None) -> str:
+    """The link at the end of a robot; by default the last of the file with no joint behind it."""
+    joints = robot.findall("joint")
+    children = [link_of(joint, "child") for joint in joints]
+    if tip is None:
+        parents = {link_of(joint, "parent") for joint in joints}
+        return [name for name in children if name not in parents][-1]
+    if tip not in children:
         raise ValueError(
-            f"{path}: joint {joint.get('name')!r} has the {end} {', '.join(map(repr, found))}, "
-            f"which is no link: expected one of {', '.join(links)}"
+            f"{path}: tip is {tip!r}, expected a link behind a joint: {', '.join(children)}"
         )
-    return found[0]
+    return tip
 
 
 def number(path: Path, owner: str, element: ET.Element, key: str) -> float:
@@ -153,7 +161,15 @@ def _check_tree(path: Path, robot: ET.Element) -> str:
     moved_by: dict[str, str] = {}
     below: dict[str, list[str]] = {}
     for joint in robot.findall("joint"):
-        parent, child = (end_of(path, joint, end, links) for end in ("parent", "child"))
+        for end in ("parent", "child"):
+            found = [one.get("link", "") for one in joint.findall(end)]
+            if len(found) != 1 or found[0] not in links:
+                raise ValueError(
+                    f"{path}: joint {joint.get('name')!r} has the {end} "
+                    f"{', '.join(map(repr, found))}, which is no link: expected one of "
+                    f"{', '.join(links)}"
+                )
+        parent, child = link_of(joint, "parent"), link_of(joint, "child")
         if child in moved_by:
             raise ValueError(
                 f"{path}: link {child!r} is the child of the joints {moved_by[child]!r} and "

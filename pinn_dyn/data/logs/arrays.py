@@ -7,7 +7,7 @@ An array with as many rows as the time is a column; one with several columns is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -113,43 +113,36 @@ class _Found:
         return table
 
 
-def read_mat(path: Path, time: str) -> pd.DataFrame:
-    """The variables of a MATLAB file, of version 7.3 too.
+def read_arrays(path: Path, time: str) -> pd.DataFrame:
+    """The arrays of a file of one of the ``ARRAY_SUFFIXES``; objects are never unpickled.
 
     Raises:
         LogError: if it cannot be read, or has no such time.
     """
     found = _Found()
+    kind, read = _READERS[path.suffix]
+    try:
+        read(path, found)
+    except LogError:
+        raise
+    except Exception as error:  # a damaged file raises nearly anything
+        raise LogError(f"{path}: cannot be read as {kind}: {error}") from error
+    return found.table(path, time)
+
+
+def _read_mat(path: Path, found: _Found) -> None:
     try:
         check_elements(path)
         content = loadmat(path, squeeze_me=False, struct_as_record=True)
     except NotImplementedError:  # version 7.3 is HDF5
-        content = _read_mat73(path)
-    except Exception as error:  # a damaged file raises nearly anything
-        raise LogError(f"{path}: cannot be read as a MATLAB file: {error}") from error
+        content = optional("pymatreader", path).read_mat(str(path))
     for name, value in content.items():
         if not name.startswith("__"):
             found.flatten(name, value)
-    return found.table(path, time)
 
 
-def _read_mat73(path: Path) -> Mapping[str, Any]:
-    try:
-        return optional("pymatreader", path).read_mat(str(path))
-    except LogError:
-        raise
-    except Exception as error:  # a damaged file raises nearly anything
-        raise LogError(f"{path}: cannot be read as a MATLAB 7.3 file: {error}") from error
-
-
-def read_hdf5(path: Path, time: str) -> pd.DataFrame:
-    """The data sets of an HDF5 file, by their paths.
-
-    Raises:
-        LogError: if it cannot be read, or has no such time.
-    """
+def _read_hdf5(path: Path, found: _Found) -> None:
     h5py = optional("h5py", path)
-    found = _Found()
 
     def visit(name: str, item: Any) -> str | None:
         if name.count("/") > _DEEPEST:
@@ -168,27 +161,21 @@ def read_hdf5(path: Path, time: str) -> pd.DataFrame:
             found.add(name, np.asarray(item[()]))
         return None
 
-    try:
-        with h5py.File(path, "r") as file:
-            deep = file.visititems(visit)
-    except Exception as error:  # a damaged file raises nearly anything
-        raise LogError(f"{path}: cannot be read as HDF5, it may be cut short: {error}") from error
-    if deep is not None:
-        raise LogError(f"{path}: has groups more than {_DEEPEST} levels deep, expected a log")
-    return found.table(path, time)
+    with h5py.File(path, "r") as file:
+        if file.visititems(visit) is not None:
+            raise LogError(f"{path}: has groups more than {_DEEPEST} levels deep, expected a log")
 
 
-def read_npz(path: Path, time: str) -> pd.DataFrame:
-    """The arrays of an NPZ file; arrays of objects are never unpickled.
+def _read_npz(path: Path, found: _Found) -> None:
+    with np.load(path, allow_pickle=False) as file:
+        for name in file.files:
+            found.add_member(file, name)
 
-    Raises:
-        LogError: if it cannot be read, or has no such time.
-    """
-    found = _Found()
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            for name in file.files:
-                found.add_member(file, name)
-    except Exception as error:  # a damaged file raises nearly anything
-        raise LogError(f"{path}: cannot be read as NPZ, it may be cut short: {error}") from error
-    return found.table(path, time)
+
+_READERS: dict[str, tuple[str, Callable[[Path, _Found], None]]] = {
+    ".mat": ("a MATLAB file", _read_mat),
+    ".h5": ("HDF5, it may be cut short", _read_hdf5),
+    ".hdf5": ("HDF5, it may be cut short", _read_hdf5),
+    ".npz": ("NPZ, it may be cut short", _read_npz),
+}
+ARRAY_SUFFIXES = tuple(_READERS)

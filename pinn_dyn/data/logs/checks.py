@@ -254,11 +254,9 @@ def check_velocities(
     noisy than derivatives. The stretches count over which the two agree best.
     """
     names = [f"columns {a!r} and {b!r}" for a, b in zip(q.columns, v.columns, strict=True)]
-    agreement = [_agreement(training, step, samples) for samples in (10, 100, 1000)]
+    correlations, factors = _agreement(training, step)
     for k, name in enumerate(names):
-        correlation, factor = max(
-            ((abs(c[k, k]), f[k, k]) for c, f in agreement), key=lambda pair: pair[0]
-        )
+        correlation, factor = correlations[k, k], factors[k]
         if correlation >= _CLEAR and _FACTORS[0] <= factor <= _FACTORS[1]:
             continue
         if correlation >= _CLEAR:
@@ -269,11 +267,10 @@ def check_velocities(
             cause = "one of them is in degrees" if degrees else "check unit, scale and sign of both"
             report.warn(f"{name}: the derivative of q is {factor:.4g} times v, expected 1: {cause}")
         elif moves(training, k):
-            best = np.max([np.abs(c[k]) for c, _ in agreement], axis=0)
-            other = int(best.argmax())
+            other = int(correlations[k].argmax())
             zero = all(not item.v[:, k].any() for item in training if item.v is not None)
             cause = "v is zero throughout" if zero else "is this the right column?"
-            if best[other] >= _CLEAR and other != k:
+            if correlations[k, other] >= _CLEAR and other != k:
                 cause = f"{v.columns[other]!r} fits it: are columns of v exchanged?"
             report.warn(
                 f"{name}: v is not the derivative of q, their correlation is {correlation:.2f}, "
@@ -296,7 +293,8 @@ def check_velocities_of_runs(
     for split, stretches in parts.items():
         for item in stretches:
             runs.setdefault((item.run, split), []).append(item)
-    factors = np.array([_clear_factors(own, step) for own in runs.values()])
+    found = [_agreement(own, step) for own in runs.values()]
+    factors = np.array([np.where(np.diag(c) >= _CLEAR, f, np.nan) for c, f in found])
     low, high = _FACTORS_OF_A_RUN
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
         clear = factors[~np.isnan(factors[:, k]), k]
@@ -314,16 +312,6 @@ def check_velocities_of_runs(
                 )
 
 
-def _clear_factors(stretches: list[Recording], step: float) -> np.ndarray:
-    """What v is multiplied by to be the derivative of q, ``(N,)``; NaN where that is not clear."""
-    found = [_agreement(stretches, step, samples) for samples in (10, 100, 1000)]
-    correlations = np.abs([np.diag(c) for c, _ in found])
-    best = correlations.argmax(axis=0)[None]
-    clear = np.take_along_axis(correlations, best, 0)[0] >= _CLEAR
-    factors = np.take_along_axis(np.array([np.diag(f) for _, f in found]), best, 0)[0]
-    return np.where(clear, factors, np.nan)
-
-
 def moves(training: list[Recording], k: int) -> bool:
     """Whether coordinate k moves by more than noise.
 
@@ -334,10 +322,18 @@ def moves(training: list[Recording], k: int) -> bool:
     return bool(np.ptp(every) > 0 and (steps**2).mean() <= every.var())
 
 
-def _agreement(
+def _agreement(training: list[Recording], step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of Δq_i with ∫ v_k dt, ``(N, N)``, and of each v_i its factor, ``(N,)``."""
+    found = [_agreement_over(training, step, samples) for samples in (10, 100, 1000)]
+    correlations, factors = (np.array(each) for each in zip(*found, strict=True))
+    own = correlations.diagonal(axis1=1, axis2=2)
+    return correlations.max(axis=0), factors[own.argmax(axis=0), range(own.shape[1])]
+
+
+def _agreement_over(
     training: list[Recording], step: float, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correlation of Δq_i with ∫ v_k dt over stretches, and their factors, ``(N, N)`` each."""
+    """The same over stretches of so many samples."""
     size = training[0].q.shape[1]
     dq, dv = [np.zeros((0, size))], [np.zeros((0, size))]
     for item in training:
@@ -350,12 +346,9 @@ def _agreement(
     moved, integrated = np.vstack(dq), np.vstack(dv)
     squares = (integrated**2).sum(axis=0)
     norms = np.sqrt(np.outer((moved**2).sum(axis=0), squares))
-    product = moved.T @ integrated
-    if len(moved) < 5:  # too few to tell
-        return 0 * product, 0 * product
-    return product / np.where(norms > 0, norms, np.inf), product / np.where(
-        squares > 0, squares, np.inf
-    )
+    product = moved.T @ integrated * (len(moved) >= 5)  # fewer are too few to tell
+    correlations = np.abs(product) / np.where(norms > 0, norms, np.inf)
+    return correlations, np.diag(product) / np.where(squares > 0, squares, np.inf)
 
 
 def check_force_signs(training: list[Recording], u: Columns, step: float, report: Report) -> None:

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
+from pinn_dyn.data.logs.arrays import ARRAY_SUFFIXES, read_arrays
 from pinn_dyn.data.logs.bags import BAG_SUFFIXES, is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes, shown
 from pinn_dyn.data.logs.parquet import read_parquet
@@ -137,12 +137,8 @@ def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) ->
     """
     if is_bag(path):
         return read_bag(path, time, columns, max_age)
-    if path.suffix == ".mat":
-        return read_mat(path, time)
-    if path.suffix in (".h5", ".hdf5"):
-        return read_hdf5(path, time)
-    if path.suffix == ".npz":
-        return read_npz(path, time)
+    if path.suffix in ARRAY_SUFFIXES:
+        return read_arrays(path, time)
     if path.suffix == ".parquet":
         return read_parquet(path)
     if (how := _CONVERTED.get(path.suffix.lower())) is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -54,16 +56,7 @@ def check_repeats(
         name: of their split.
         report: takes the warnings.
     """
-    found: dict[tuple[str, str], int] = {}
-    for piece in test:
-        thin = max(1, len(piece) // _SAMPLES)
-        q = piece.q[::thin]
-        spread = float(q.var(axis=0).sum())
-        if spread == 0:
-            continue
-        for item in training:
-            if len(item) >= len(piece) and _nearest(q, item.q, thin)[0] < _SAME**2 * spread:
-                found[piece.run, item.run] = found.get((piece.run, item.run), 0) + 1
+    found = Counter((piece.run, item.run) for piece, item, _ in _repeats(test, training))
     for (run, other), pieces in found.items():
         report.warn(
             f"{name}: {pieces} of the motions of {run} repeat one of {other}, which is in the "
@@ -87,32 +80,39 @@ def repeat_floor(
         The number of repeats, and the floors of q and of v, ``(N,)`` each, NaN without a repeat.
     """
     squares = []
-    for piece in pieces:
-        thin = max(1, len(piece) // _SAMPLES)
-        spread = float(piece.q[::thin].var(axis=0).sum())
-        for item in training:
-            if spread == 0 or len(item) < len(piece):
-                continue
-            if piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]:  # cut out of it
-                continue
-            distance, near = _nearest(piece.q[::thin], item.q, thin)
-            if distance >= _SAME**2 * spread:
-                continue
-            firsts = range(max(near - thin, 0), min(near + thin, len(item) - len(piece)) + 1)
-            parts = [item.rows(slice(first, first + len(piece))) for first in firsts]
-            other = min(parts, key=lambda part: float(((part.q - piece.q) ** 2).sum()))
-            assert piece.v is not None
-            assert other.v is not None
-            dq, dv = piece.q - other.q, piece.v - other.v
-            shift = float((dq * other.v).sum() / max((other.v**2).sum(), 1e-300))
-            dq = dq - shift * other.v
-            if dq.any():  # a copy of a file tells nothing
-                squares.append([(x**2).mean(axis=0) for x in (dq, dv)])
+    for piece, item, firsts in _repeats(pieces, training):
+        parts = [item.rows(slice(first, first + len(piece))) for first in firsts]
+        other = min(parts, key=lambda part: float(((part.q - piece.q) ** 2).sum()))
+        assert piece.v is not None
+        assert other.v is not None
+        dq, dv = piece.q - other.q, piece.v - other.v
+        shift = float((dq * other.v).sum() / max((other.v**2).sum(), 1e-300))
+        dq = dq - shift * other.v
+        if dq.any():  # a copy of a file tells nothing
+            squares.append([(x**2).mean(axis=0) for x in (dq, dv)])
     if not squares:
         none = np.full(training[0].q.shape[1], np.nan)
         return 0, none, none
     q, v = np.sqrt(np.mean(squares, axis=0) / 2)
     return len(squares), q, v
+
+
+def _repeats(
+    pieces: list[Recording], training: list[Recording]
+) -> Iterator[tuple[Recording, Recording, range]]:
+    """Each piece with each stretch that it repeats, and the samples where that may begin."""
+    for piece in pieces:
+        thin = max(1, len(piece) // _SAMPLES)
+        q = piece.q[::thin]
+        spread = float(q.var(axis=0).sum())
+        for item in training:
+            cut_out = piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
+            if spread == 0 or cut_out or len(item) < len(piece):
+                continue
+            distance, near = _nearest(q, item.q, thin)
+            if distance < _SAME**2 * spread:
+                last = min(near + thin, len(item) - len(piece))
+                yield piece, item, range(max(near - thin, 0), last + 1)
 
 
 def _nearest(q: np.ndarray, track: np.ndarray, thin: int) -> tuple[float, int]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pinn_dyn.data.lengths import Length, samples_in, seconds_of
+from pinn_dyn.data.lengths import Length, seconds_of
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording
 
@@ -114,20 +114,18 @@ def check_window(
 
 
 def window_samples(window: Length, recording: Recording, least: int, *, odd: bool = False) -> int:
-    """A window in samples of the usual sample time of a recording, of at least ``least``."""
-    return max(samples_in("window", window, float(np.median(np.diff(recording.t))), odd=odd), least)
+    """The samples, at least ``least``, that are closest to a window in a recording."""
+    if not isinstance(window, str):
+        return max(window, least)
+    count = seconds_of("window", window) / float(np.median(np.diff(recording.t)))
+    return max(2 * round((count - 1) / 2) + 1 if odd else round(count), least)
 
 
-def check_signals(signals: Sequence[str]) -> tuple[str, ...]:
-    """The signals that a step works on.
-
-    Raises:
-        LogError: on anything but q, v and u.
-    """
+def check_signals(signals: Sequence[str]) -> None:
+    """Refuse signals of a step that are other than q, v and u."""
     wrong = [name for name in signals if name not in SIGNALS]
     if wrong or isinstance(signals, str) or not signals:
         raise LogError(f"signals is {signals!r}, expected a list of some of {', '.join(SIGNALS)}")
-    return tuple(signals)
 
 
 def change(
