@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.models.friction import Friction
-from pinn_dyn.models.known_constants import Named, PositiveConstants
+from pinn_dyn.models.known_constants import Named
 from pinn_dyn.models.scales import Scales
 
 _SLOWEST = 0.01
@@ -45,18 +45,13 @@ class DriveCoulomb(Friction):
                 raise ValueError(f"friction: {key} is {value}, expected a positive number")
         force, v_std = scales.value, scales.statistics.v_std.double()
         self.slowest = _SLOWEST * float(v_std.mean())
-        names = [joint.name for joint in scales.joints]
-        self.forces = [joint.force for joint in scales.joints]
-        self.speeds = [joint.speed for joint in scales.joints]
-        self.level = PositiveConstants(
-            level * force, spread, [f"Coulomb friction of {name}" for name in names], self.forces
-        )
-        self.width = PositiveConstants(
-            width * v_std, spread, [f"friction width of {name}" for name in names], self.speeds
-        )
-        self._add_constants(scales, names)
+        forces = [joint.force for joint in scales.joints]
+        speeds = [joint.speed for joint in scales.joints]
+        self.level = scales.positive("Coulomb friction", level * force, spread, forces)
+        self.width = scales.positive("friction width", width * v_std, spread, speeds)
+        self._add_constants(scales)
 
-    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+    def _add_constants(self, scales: Scales) -> None:
         """What a law of a higher rung has besides level and width."""
 
     def physical_constants(self) -> list[Named]:
@@ -89,18 +84,17 @@ class AsymmetricCoulomb(DriveCoulomb):
     A level for each direction, as worn and preloaded gears have. Arguments as of the rung below.
     """
 
-    def _add_constants(self, scales: Scales, names: list[str]) -> None:
+    def _add_constants(self, scales: Scales) -> None:
         # c+ and c- are the level times the asymmetry, and divided by it.
-        asymmetries = [f"friction asymmetry of {name}" for name in names]
-        ones = torch.ones(scales.size)
-        self.ratio = PositiveConstants(ones, 0.5, asymmetries, ["1"] * scales.size)
+        start = torch.ones(scales.size)
+        self.ratio = scales.positive("friction asymmetry", start, 0.5, ["1"] * scales.size)
 
     def _levels(self) -> list[Named]:
         level, ratio = self.level(), self.ratio()
         found = []
         for sign, values in ((">", level * ratio), ("<", level / ratio)):
             names = [name.replace(" of ", f" (v {sign} 0) of ", 1) for name in self.level.names]
-            found.append(Named(names, self.forces, values, lower=0.0))
+            found.append(Named(names, self.level.units, values, lower=0.0))
         return found
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,12 +110,11 @@ class Stribeck(AsymmetricCoulomb):
     the rungs below.
     """
 
-    def _add_constants(self, scales: Scales, names: list[str]) -> None:
-        super()._add_constants(scales, names)
-        rises = [f"Stribeck rise of {name}" for name in names]
-        speeds = [f"Stribeck speed of {name}" for name in names]
-        self.rise = PositiveConstants(0.03 * scales.value, 1.0, rises, self.forces)
-        self.speed = PositiveConstants(0.3 * scales.statistics.v_std, 1.0, speeds, self.speeds)
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        v_std = scales.statistics.v_std
+        self.rise = scales.positive("Stribeck rise", 0.03 * scales.value, 1.0, self.level.units)
+        self.speed = scales.positive("Stribeck speed", 0.3 * v_std, 1.0, self.width.units)
 
     def physical_constants(self) -> list[Named]:
         return [*super().physical_constants(), self.rise.named(), self.speed.named()]
@@ -148,13 +141,10 @@ class LoadDependent(Stribeck):
 
     by_load = True
 
-    def _add_constants(self, scales: Scales, names: list[str]) -> None:
-        super()._add_constants(scales, names)
-        self.odds = self._odds_of("loss by load", 0.05, names)
-
-    def _odds_of(self, what: str, start: float, names: list[str]) -> PositiveConstants:
-        full = torch.full((len(names),), start)
-        return PositiveConstants(full, 1.0, [f"{what} of {n}" for n in names], ["1"] * len(names))
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        start = torch.full((scales.size,), 0.05)
+        self.odds = scales.positive("loss by load", start, 1.0, ["1"] * scales.size)
 
     def physical_constants(self) -> list[Named]:
         loss = self.odds.named()
@@ -178,9 +168,11 @@ class LoadDependentStribeck(LoadDependent):
     source. Arguments as of the rungs below.
     """
 
-    def _add_constants(self, scales: Scales, names: list[str]) -> None:
-        super()._add_constants(scales, names)
-        self.odds_rise = self._odds_of("loss by load near rest", 0.02, names)
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        start = torch.full((scales.size,), 0.02)
+        what = "loss by load near rest"
+        self.odds_rise = scales.positive(what, start, 1.0, ["1"] * scales.size)
 
     def physical_constants(self) -> list[Named]:
         rest = self.odds_rise.named()._replace(values=_part(self.odds() + self.odds_rise()))

@@ -139,33 +139,24 @@ class KnownMechanics(LearnedConstants):
         bodies = structure.generic_inertia() if start == "generic" else structure.inertia
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
         damping = 0.1 * force / statistics.v_std.double()
-        self.armature = PositiveConstants(
-            0.03 * force / acceleration,
-            1.5,
-            [f"armature of {joint.name}" for joint in joints],
-            [joint.inertia for joint in joints],
+        scales = Scales(statistics, force, named=joints)
+        self.armature = scales.positive(
+            "armature", 0.03 * force / acceleration, 1.5, [joint.inertia for joint in joints]
         )
-        self.viscous = PositiveConstants(
-            damping,
-            1.5,
-            [f"viscous friction of {joint.name}" for joint in joints],
-            [joint.damping for joint in joints],
+        self.viscous = scales.positive(
+            "viscous friction", damping, 1.5, [joint.damping for joint in joints]
         )
         self.offset = RealConstants(
             0.3 * force,
             [f"{'torque' if joint.turns else 'force'} offset of {joint.name}" for joint in joints],
             [joint.force for joint in joints],
         )
-        self.friction = friction(Scales(statistics, force, named=joints))
+        self.friction = friction(scales)
         self.input_affine = not self.friction.by_load
         self.gain: PositiveConstants | None = None
         if gain_spread > 0:
-            self.gain = PositiveConstants(
-                gain,
-                gain_spread,
-                [f"drive gain of {joint.name}" for joint in joints],
-                [f"{joint.force}/u" for joint in joints],
-            )
+            units = [f"{joint.force}/u" for joint in joints]
+            self.gain = scales.positive("drive gain", gain, gain_spread, units)
         self.register_buffer("fixed_gain", gain.clone())
         self.fixed_gain: Tensor
         self.float()

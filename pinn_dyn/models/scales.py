@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from pinn_dyn.models.known_constants import PositiveConstants
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.statistics import Statistics
 
@@ -69,6 +70,13 @@ class Scales:
     def inputs(self) -> int:
         """M."""
         return self.statistics.num_inputs
+
+    def positive(
+        self, what: str, start: Tensor, spread: float, units: Sequence[str]
+    ) -> PositiveConstants:
+        """A learned positive constant of each joint, called "<what> of <joint>"."""
+        names = [f"{what} of {joint.name}" for joint in self.joints]
+        return PositiveConstants(start, spread, names, units)
 
     def network(
         self,
