@@ -2,7 +2,6 @@
 
 from pinn_dyn.training.losses.increment import IncrementLoss
 from pinn_dyn.training.losses.midpoint import MidpointLoss
-from pinn_dyn.training.losses.penalized import Penalized
-from pinn_dyn.training.losses.window_loss import WindowLoss
+from pinn_dyn.training.losses.window_loss import Penalized, WindowLoss
 
 __all__ = ["IncrementLoss", "MidpointLoss", "Penalized", "WindowLoss"]
