@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.factor import FactorBounds, factor_bounds, fit_factor
-from pinn_dyn.control.gains import Gain, diagonal_gain
+from pinn_dyn.control.laws import Gain, diagonal_gain
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 from pinn_dyn.mechanics.arrays import matvec, require_finite, require_last_dim
 
@@ -45,7 +45,7 @@ class StabilityCertificate:
         rest_error: |Khat_P^-1 Delta_all|, the distance from q_ref of an arm that rests at q.
         rest_error_bound: delta_all / (min K_P * condition_1), a cruder bound on the same;
             infinite where condition 1 fails.
-        smallest_singular_value: of A and A_L, ``(K, 2)``.
+        smallest_singular_value_A, smallest_singular_value_A_L: of the true and the learned one.
         fitted: bounds with the P that fits M, D, G and A together.
         matched: bounds with P = A_L A^-1, which makes Delta_A vanish.
     """
@@ -61,49 +61,20 @@ class StabilityCertificate:
     potential_force: Tensor
     rest_error: Tensor
     rest_error_bound: Tensor
-    smallest_singular_value: Tensor
+    smallest_singular_value_A: Tensor
+    smallest_singular_value_A_L: Tensor
     fitted: FactorBounds
     matched: FactorBounds
 
     def to_frame(self) -> pd.DataFrame:
         """One row per configuration: q1 to qN, then every number of that configuration."""
-        columns = {
-            "condition_1": self.condition_1,
-            "position_eigenvalue": self.position_eigenvalue,
-            "velocity_eigenvalue": self.velocity_eigenvalue,
-            "delta_all": self.delta_all,
-            "potential_force": self.potential_force,
-            "rest_error": self.rest_error,
-            "rest_error_bound": self.rest_error_bound,
-            "smallest_singular_value_A": self.smallest_singular_value[:, 0],
-            "smallest_singular_value_A_L": self.smallest_singular_value[:, 1],
-        }
-        for name, bounds in (("fitted", self.fitted), ("matched", self.matched)):
-            numbers = {key: value for key, value in vars(bounds).items() if key != "P"}
-            columns |= {f"{name}_{key}": value for key, value in numbers.items()}
+        columns = {}
+        for name, value in vars(self).items():
+            if isinstance(value, FactorBounds):
+                columns |= {f"{name}_{key}": x for key, x in vars(value).items() if key != "P"}
+            elif name not in ("region", "q", "position_gain", "velocity_gain"):
+                columns[name] = value
         return per_configuration(self.q, columns)
-
-    def summary(self) -> dict[str, float | int | str]:
-        """Of every number the worst over the region, with the failures of each condition."""
-        numbers: dict[str, float | int | str] = {"region": self.region, "samples": len(self.q)}
-        for name in ("condition_1", "position_eigenvalue", "velocity_eigenvalue"):
-            values = getattr(self, name)
-            numbers[f"{name}_min"] = float(values.min())
-            numbers[f"{name}_failures"] = int((values <= 0).sum())
-        for name, bounds in (("fitted", self.fitted), ("matched", self.matched)):
-            numbers[f"{name}_condition_2_failures"] = int((bounds.condition_2 >= 1).sum())
-            for key, value in vars(bounds).items():
-                if key != "P":
-                    numbers[f"{name}_{key}_max"] = float(value.max())
-        for name in ("delta_all", "rest_error"):
-            numbers[f"{name}_mean"] = float(getattr(self, name).mean())
-            numbers[f"{name}_max"] = float(getattr(self, name).max())
-        numbers["potential_force_mean"] = float(self.potential_force.mean())
-        # The region's worst delta over the region's worst eigenvalue, as in the paper's argument.
-        weakest = float(self.condition_1.min()) * float(self.position_gain.min())
-        crude = float(self.delta_all.max()) / weakest if weakest > 0 else float("inf")
-        numbers["rest_error_bound"] = crude
-        return numbers
 
 
 def certify(
@@ -136,7 +107,6 @@ def certify(
     with torch.no_grad():
         true, learned = truth.terms(q), model.terms(q)
         A, A_L = true.A, learned.A
-        singular = torch.stack([torch.linalg.svdvals(X)[..., -1] for X in (A, A_L)], -1)
         K_A = A @ A_L.mT
         delta_all = matvec(A, solve(A_L, learned.G)) - true.G
         size = torch.linalg.vector_norm(delta_all, dim=-1)
@@ -155,7 +125,8 @@ def certify(
             potential_force=torch.linalg.vector_norm(true.G, dim=-1),
             rest_error=torch.linalg.vector_norm(rest, dim=-1),
             rest_error_bound=crude,
-            smallest_singular_value=singular,
+            smallest_singular_value_A=torch.linalg.svdvals(A)[..., -1],
+            smallest_singular_value_A_L=torch.linalg.svdvals(A_L)[..., -1],
             fitted=factor_bounds(fit_factor(true, learned), true, learned),
             matched=factor_bounds(A_L @ torch.linalg.inv(A), true, learned),
         )
@@ -186,11 +157,7 @@ def prepare(
 
 
 def require_system(name: str, system: object) -> None:
-    """Check that ``system`` is a mechanical system.
-
-    Raises:
-        TypeError: if not; the message names the argument.
-    """
+    """Refuse what is no mechanical system by a TypeError."""
     if not isinstance(system, MechanicalSystem):
         raise TypeError(
             f"{name} is a {type(system).__name__}, expected a MechanicalSystem: only a "
@@ -199,12 +166,7 @@ def require_system(name: str, system: object) -> None:
 
 
 def require_same_robot(model: object, truth: object) -> None:
-    """Check that both are mechanical systems of the same sizes.
-
-    Raises:
-        TypeError: if one is no mechanical system.
-        ValueError: if N or M differ.
-    """
+    """Refuse systems of other sizes by a ValueError, and what is none by a TypeError."""
     sizes = []
     for name, system in (("model", model), ("truth", truth)):
         require_system(name, system)
@@ -215,11 +177,7 @@ def require_same_robot(model: object, truth: object) -> None:
 
 
 def require_samples(name: str, q: Tensor, system: MechanicalSystem) -> Tensor:
-    """The configurations ``(K, N)`` in float64, checked.
-
-    Raises:
-        ValueError: on another shape, none of them, or entries that are not finite.
-    """
+    """The configurations ``(K, N)`` in float64; a ValueError if they are none."""
     if q.ndim != 2 or q.shape[0] < 1:
         raise ValueError(
             f"{name} has shape {tuple(q.shape)}, expected (K, N) with at least one row"

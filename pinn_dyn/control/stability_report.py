@@ -223,7 +223,9 @@ def _gravity_error(c: StabilityCertificate) -> str:
         [text, _number(getattr(c.fitted, name).max()), _number(getattr(c.matched, name).max())]
         for name, text in names.items()
     ]
-    summary = c.summary()
+    # The region's worst delta over the region's worst eigenvalue, as in the paper's argument.
+    weakest = float(c.condition_1.min() * c.position_gain.min())
+    crude = float(c.delta_all.max()) / weakest if weakest > 0 else float("inf")
     return (
         "## Error of the compensated potential force\n\n"
         "Delta_all = A A_L^-1 G_L - G is the force left over; it does not depend on P. "
@@ -232,10 +234,10 @@ def _gravity_error(c: StabilityCertificate) -> str:
         "Largest over the region, for two choices of P:\n\n"
         + _table(["", "P fitted to all terms", "P = A_L A^-1"], rows)
         + "\n\nAn arm that rests at one of these configurations is "
-        f"{_number(summary['rest_error_mean'])} from its set point on average and "
+        f"{_number(c.rest_error.mean())} from its set point on average and "
         f"{_number(c.rest_error.max())} at worst, ‖(A A_L^T K_P)^-1 Delta_all‖. From the worst "
         "force over the weakest stiffness of the region it would be "
-        f"{_number(summary['rest_error_bound'])}.\n\n"
+        f"{_number(crude)}.\n\n"
         + _worst(c.q, "distance from the set point", c.rest_error, c.rest_error)
     )
 
@@ -329,7 +331,7 @@ def _vector(values: Tensor) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"
 
 
-def _number(value: Tensor | float | int | str) -> str:
+def _number(value: Tensor | float) -> str:
     return f"{float(value):.3g}"
 
 

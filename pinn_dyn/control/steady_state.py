@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.gains import Gain, diagonal_gain
+from pinn_dyn.control.laws import Gain, diagonal_gain
 from pinn_dyn.control.stability import per_configuration, prepare, smallest_eigenvalue, solve
 from pinn_dyn.mechanics import MechanicalSystem
 

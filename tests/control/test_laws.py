@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from pinn_dyn.control import Motion
-from pinn_dyn.control.gains import diagonal_gain
 from pinn_dyn.control.laws import (
     ComputedTorque,
     ProportionalDerivative,
     Regulation,
     Tracking,
+    diagonal_gain,
     pseudo_inverse_times,
 )
 from pinn_dyn.models import NetworkCholesky, Positive
