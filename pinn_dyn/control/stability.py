@@ -68,7 +68,7 @@ class StabilityCertificate:
 
     def to_frame(self) -> pd.DataFrame:
         """One row per configuration: q1 to qN, then every number of that configuration."""
-        columns = {}
+        columns: dict[str, Tensor] = {}
         for name, value in vars(self).items():
             if isinstance(value, FactorBounds):
                 columns |= {f"{name}_{key}": x for key, x in vars(value).items() if key != "P"}
