@@ -29,6 +29,8 @@ from pinn_dyn.training.sensitivity import rollout_slopes
 log = logging.getLogger(__name__)
 
 _MOST_PARAMETERS = 500
+_CHUNK = 500
+"""Windows whose derivatives are rolled out at once; bounds the memory."""
 _FIRST_NOISE = 0.1
 """Of the normalized residuals at most, before a fit has shown it."""
 REST = 0.05
@@ -67,13 +69,12 @@ class LeastSquares:
         rollouts: whether to take the second stage; without it the result is the identification.
         samples: samples of the inverse dynamics.
         evaluations: most evaluations of the residuals in a stage.
-        chunk: windows whose derivatives are rolled out at once; bounds the memory.
         velocity_weight: weight of the velocity half in the roll-outs, as of the loss.
         changed: bodies and other owners of constants, such as the ``tip`` in ``mass of tip``,
             that are others than in the earlier fit, and free again.
 
     Raises:
-        ValueError: on a cutoff, chunk or weight that is not positive, or fewer than two samples or
+        ValueError: on a cutoff or weight that is not positive, or fewer than two samples or
             evaluations.
     """
 
@@ -84,12 +85,11 @@ class LeastSquares:
         rollouts: bool = True,
         samples: int = 2000,
         evaluations: int = 25,
-        chunk: int = 500,
         velocity_weight: float = 1.0,
         changed: Sequence[str] = (),
     ):
         settings = {"cutoff": cutoff, "samples": samples, "evaluations": evaluations}
-        settings |= {"chunk": chunk, "velocity_weight": velocity_weight}
+        settings["velocity_weight"] = velocity_weight
         for name, value in settings.items():
             if not value > 0:
                 raise ValueError(f"least squares: {name} is {value}, expected a positive number")
@@ -100,7 +100,6 @@ class LeastSquares:
         self.rollouts = rollouts
         self.samples = samples
         self.evaluations = evaluations
-        self.chunk = chunk
         self.velocity_weight = velocity_weight
         self.changed = list(changed)
 
@@ -260,7 +259,7 @@ class LeastSquares:
 
         def residuals(derivative: bool) -> Tensor:
             if derivative:
-                parts = [rollout_slopes(model, part) for part in windows.split(self.chunk)]
+                parts = [rollout_slopes(model, part) for part in windows.split(_CHUNK)]
                 return (torch.cat(parts) / scale.unsqueeze(-1))[:, :, first:]
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]

@@ -34,8 +34,7 @@ class SOAP(Optimizer):
     Args:
         params: the parameters, or groups of them.
         lr: learning rate.
-        betas: decay of the first and the second moments.
-        shampoo_beta: b; None: that of the second moments.
+        betas: decay of the first and the second moments; b is the second.
         weight_decay: d.
         precondition_frequency: steps from one power iteration to the next.
         eps: added to the root of the second moments.
@@ -52,7 +51,6 @@ class SOAP(Optimizer):
         params: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
         lr: float = 3e-3,
         betas: tuple[float, float] = (0.95, 0.95),
-        shampoo_beta: float | None = None,
         weight_decay: float = 1e-2,
         precondition_frequency: int = 10,
         eps: float = 1e-8,
@@ -60,7 +58,7 @@ class SOAP(Optimizer):
         for name, value in (("lr", lr), ("weight_decay", weight_decay), ("eps", eps)):
             if not value >= 0:
                 raise ValueError(f"{name} is {value}, expected at least 0")
-        for beta in (*betas, betas[1] if shampoo_beta is None else shampoo_beta):
+        for beta in betas:
             if not 0 <= beta < 1:
                 raise ValueError(f"a beta is {beta}, expected at least 0 and less than 1")
         if precondition_frequency < 1:
@@ -70,7 +68,6 @@ class SOAP(Optimizer):
         defaults = {
             "lr": lr,
             "betas": tuple(betas),
-            "shampoo_beta": shampoo_beta,
             "weight_decay": weight_decay,
             "precondition_frequency": precondition_frequency,
             "eps": eps,
@@ -96,16 +93,13 @@ class SOAP(Optimizer):
             self._layouts[number] = _Layout(moved, self.leading)
         layout = self._layouts[number]
         beta1, beta2 = group["betas"]
-        shampoo = beta2 if group["shampoo_beta"] is None else group["shampoo_beta"]
         gradient = layout.laid_out([p.grad for p in moved])  # type: ignore[misc]
         # One state for all parameters, kept where the checkpoints find it.
         state = self.state[group["params"][0]]
         if not state:
             state["step"] = 0
             state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(gradient) for _ in range(2))
-            state["averages"] = [
-                batch.averages(gradient, None, shampoo) for batch in layout.batches
-            ]
+            state["averages"] = [batch.averages(gradient, None, beta2) for batch in layout.batches]
             state["bases"] = [
                 batch.eigenvectors(pair)
                 for batch, pair in zip(layout.batches, state["averages"], strict=True)
@@ -124,7 +118,7 @@ class SOAP(Optimizer):
         update.mul_(rate * (decay - 1)).sub_(layout.laid_out(moved), alpha=decay)
         torch._foreach_add_(moved, layout.taken_apart(update))
         for k, batch in enumerate(layout.batches):
-            state["averages"][k] = batch.averages(gradient, state["averages"][k], shampoo)
+            state["averages"][k] = batch.averages(gradient, state["averages"][k], beta2)
             if step % group["precondition_frequency"] == 0:
                 state["bases"][k] = batch.brought_up_to_date(
                     state["averages"][k], state["bases"][k], square
