@@ -83,8 +83,6 @@ def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
     A step that ends at a sample of the input, within rounding, ends at that very number: a held
     input tells the sides apart.
     """
-    if substeps == 1:
-        return t
     fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
     inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
     grid = torch.cat([inner.flatten(), t[-1:]])

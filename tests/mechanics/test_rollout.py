@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.mechanics import RK4, Signal, rollout
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, rollout
 from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
@@ -70,6 +70,20 @@ def test_held_input_in_float32_uses_each_intervals_own_sample(system, substeps):
     expected = exact_solution(system, START, t, u, "hold")
     # One stage with a neighbour's input would be off by du h / 8, about 1e-3.
     torch.testing.assert_close(x.double(), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("integrator", [RK4(1), RK4(2), Rosenbrock(1), Rosenbrock(2)])
+@pytest.mark.parametrize("direction", [-9.0, 9.0])
+def test_times_off_by_a_last_digit_take_the_same_samples_of_a_held_input(
+    system, integrator, direction
+):
+    """As those of a log that another program rounded."""
+    system.integrator = integrator
+    t, u = samples(11, 0.1)
+    towards = torch.tensor(direction, dtype=torch.float64)
+    off = torch.cat([t[:1], torch.nextafter(t[1:], towards)])
+    exact, found = (system.predict(START, x, Signal(t, u, "hold")) for x in (t, off))
+    assert (found - exact).abs().max() < 1e-12
 
 
 def test_a_step_of_the_input_acts_from_its_sample_when_held_and_before_it_when_linear(system):
