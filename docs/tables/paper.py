@@ -213,12 +213,20 @@ def train_commands(group: str) -> str:
     """What trains the rows of a table, in their order."""
     entries, lines = read_entries(), []
     for entry in entries_of(group).values():
-        starts = [
-            f"start_from=runs/sweep/<date>/0_{entries[one]['select']['model']}-seed0"
-            for one in entry.get("runs", ())
-        ]
-        lines.append(" ".join(["python train.py -m", *entry["train"], *map(repr, starts)]))
+        command = " ".join(["python train.py -m", *entry["train"]])
+        # Of each earlier run one: it goes on with the same seed.
+        runs = [(k, entries[name]) for name in entry.get("runs", ()) for k in _seeds(entries[name])]
+        lines += [
+            f"{command} seed={k} "
+            f"'start_from=runs/sweep/<date>/{k}_{earlier['select']['model']}-seed{k}'"
+            for k, earlier in runs
+        ] or [command]
     return commands(lines)
+
+
+def _seeds(entry: Entry) -> list[str]:
+    words = dict(word.split("=", 1) for word in entry["train"])
+    return words["seed"].split(",")
 
 
 def hardware_table() -> str:

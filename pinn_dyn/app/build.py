@@ -16,13 +16,13 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.keys import MOST_MEMBERS
 from pinn_dyn.app.parts import build_part
+from pinn_dyn.app.progress import EpochLines
 from pinn_dyn.app.schema import arguments
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutValidator, RunDescription, ValidationHistory
-from pinn_dyn.evaluation.validation import EpochLines
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
@@ -262,7 +262,7 @@ def build_trainer(
     part = {key: x for key, x in config["trainer"].items() if key not in ours}
     part["enable_progress_bar"] = part.get("enable_progress_bar", True) and sys.stdout.isatty()
     bar = part["enable_progress_bar"]
-    callbacks.append(TQDMProgressBar() if bar else EpochLines())
+    callbacks.append(TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR))
     loggers = [_logger(name, x, folder) for name, x in config["logger"].items()]
     if loggers:
         callbacks.append(LearningRateMonitor())

@@ -18,7 +18,7 @@ from pinn_dyn.app.build import build_law, build_reference, build_source
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.control_results import write_results, write_stability
 from pinn_dyn.app.parts import build_part
-from pinn_dyn.app.provenance import write_origin
+from pinn_dyn.app.provenance import write_provenance
 from pinn_dyn.app.run_folder import load_run, write_config
 from pinn_dyn.app.trust import packages
 from pinn_dyn.control import (
@@ -83,7 +83,9 @@ def control(cfg: DictConfig) -> float:
         )
     learned = double_copy(model)
     source = build_source(run.config)
-    origin = write_origin({run.config["name"]: run}, source, config, {"run": run.config}, folder)
+    origin = write_provenance(
+        {run.config["name"]: run}, source, config, {"run": run.config}, folder
+    )
     if source.system is None:
         return _report_without_truth(learned, source, folder, origin)
 

@@ -28,7 +28,7 @@ from pinn_dyn.app.evaluation_results import (
 )
 from pinn_dyn.app.identification import identified
 from pinn_dyn.app.jobs import find_runs
-from pinn_dyn.app.provenance import write_origin
+from pinn_dyn.app.provenance import write_provenance
 from pinn_dyn.app.run_folder import METRICS, Run, load_run
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
@@ -157,7 +157,7 @@ def evaluate(cfg: DictConfig) -> float:
         write_table(parts, folder, "parts")
     by_label = dict(zip(labels, runs, strict=True))
     beside = {"dataset": runs[plain].config["dataset"]}
-    origin = write_origin(by_label, source, config, beside, folder)
+    origin = write_provenance(by_label, source, config, beside, folder)
     draw(evaluations, best_floor(summary), truth, source, config, folder)
     intervals = write_intervals(trained, source, split, folder)
     comparisons = compare_with_truth(trained, source, folder)

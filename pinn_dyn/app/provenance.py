@@ -40,7 +40,7 @@ def provenance() -> dict[str, str]:
     }
 
 
-def write_origin(
+def write_provenance(
     runs: Mapping[str, Run],
     source: DataSource,
     config: dict[str, Any],

@@ -16,7 +16,8 @@ from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation, Joined
 from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
-from pinn_dyn.data.initial_states import InitialStates, Limits
+from pinn_dyn.data.initial_states import InitialStates
+from pinn_dyn.data.limits import Limits
 from pinn_dyn.data.simulation import SimulationError, check_amount, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory

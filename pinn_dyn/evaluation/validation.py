@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 
 import lightning as L
@@ -23,8 +22,6 @@ from pinn_dyn.evaluation.prediction import (
 from pinn_dyn.evaluation.run_log import log_figures
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
-
-log = logging.getLogger(__name__)
 
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
 _WORST = 10.0
@@ -212,26 +209,6 @@ class ValidationHistory(L.Callback):
 
     def _best(self) -> dict[str, float]:
         return min(self.rows, key=lambda row: row["val/error_windowed"])
-
-
-class EpochLines(L.Callback):
-    """Logs a line per epoch: the training loss, and the error where the epoch was validated."""
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the line of this epoch."""
-        names = {"train/loss": "training loss"}
-        if (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0:
-            names["val/error_mean"] = "validation error"
-        found = [
-            f"{text} {float(trainer.callback_metrics[name]):.4g}"
-            for name, text in names.items()
-            if name in trainer.callback_metrics
-        ]
-        if trainer.is_global_zero:
-            epoch, epochs = trainer.current_epoch + 1, trainer.max_epochs
-            log.info(
-                "epoch %d of %s, step %d: %s", epoch, epochs, trainer.global_step, ", ".join(found)
-            )
 
 
 class RolloutFigures(L.Callback):

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import os
 import tempfile
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,14 +88,11 @@ def _open_world(
 
 
 def connect() -> Any:
-    """PyBullet with its functions bound to a new client, without a display."""
+    """A new client of PyBullet, without a display: its functions, bound to it."""
     bullet = import_bullet()
-    client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
-    bound = {
-        name: functools.partial(item, **client) if inspect.isbuiltin(item) else item
-        for name, item in vars(bullet).items()
-    }
-    return SimpleNamespace(**bound)
+    from pybullet_utils.bullet_client import BulletClient  # of the same wheel
+
+    return BulletClient(bullet.DIRECT)
 
 
 def import_bullet() -> Any:

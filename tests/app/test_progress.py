@@ -3,7 +3,7 @@
 import re
 from types import SimpleNamespace
 
-from pinn_dyn.evaluation.validation import EpochLines
+from pinn_dyn.app.progress import EpochLines
 from tests.app.entry import NO_FIGURES, train
 
 LENGTH = ["trainer.steps=6", "trainer.validations=3", "trainer.enable_progress_bar=true"]
@@ -43,7 +43,7 @@ def test_an_epoch_without_validation_has_no_error(caplog):
         global_step=10,
         is_global_zero=True,
     )
-    lines = EpochLines()
+    lines = EpochLines("val/error_mean")
     lines.on_train_epoch_end(trainer, None)
     trainer.current_epoch = 2
     lines.on_train_epoch_end(trainer, None)

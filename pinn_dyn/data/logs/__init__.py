@@ -1,7 +1,7 @@
 """Logs of robots: columns, units, cleaning steps, checks and the data source."""
 
 from pinn_dyn.data.logs.clock import Deduplicate, Resample, RowClock, SplitGaps
-from pinn_dyn.data.logs.columns import UNITS, Columns
+from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.common import common_motions
 from pinn_dyn.data.logs.delay import DelayCurve, agreed_delays, input_delays
 from pinn_dyn.data.logs.errors import LogError
@@ -20,6 +20,7 @@ from pinn_dyn.data.logs.repeats import repeat_floor
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.step import Step
+from pinn_dyn.data.logs.units import UNITS
 
 __all__ = [
     "UNITS",

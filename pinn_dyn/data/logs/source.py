@@ -25,7 +25,7 @@ from pinn_dyn.data.logs.checks import (
     check_velocities,
     check_velocities_of_runs,
 )
-from pinn_dyn.data.logs.columns import UNITS, Columns, check_columns, check_units
+from pinn_dyn.data.logs.columns import Columns, check_columns, check_units
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.jumps import Rows, check_rows
@@ -53,6 +53,7 @@ from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import Part, split
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.twins import check_twins, check_units_of_runs
+from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
