@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
-import time
 from pathlib import Path
 from typing import Any
 
@@ -242,7 +240,6 @@ def train_in(
     check_processes(trainer, config["data"]["batch_size"])
     batches = EnsembleData(data, model.size) if isinstance(model, Ensemble) else data
 
-    start, start_cpu = time.perf_counter(), _cpu_seconds()
     try:
         trainer.fit(learner, batches, ckpt_path=last, weights_only=True)
     except ValueError as problem:
@@ -256,7 +253,7 @@ def train_in(
         raise
     if last is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, batches, verbose=False)
-    seconds = time.perf_counter() - start
+    seconds, cpu_seconds = description.seconds
     if isinstance(learner, LeastSquaresLearner) and learner.result is not None:
         write_constants(model, learner.result, data.source, folder)
 
@@ -269,7 +266,7 @@ def train_in(
         "pairs": len(data.windows),
         "parameters": parameters,
         "training_seconds": seconds,
-        "training_cpu_seconds": _cpu_seconds() - start_cpu,
+        "training_cpu_seconds": cpu_seconds,
         "steps": trainer.global_step or _saved_steps(folder),
         "validation": metrics,
         **provenance(),
@@ -319,11 +316,6 @@ def _saved_steps(folder: Path) -> int:
     """Training steps of other processes, whose trainers counted them."""
     path = folder / CHECKPOINTS / "last.ckpt"
     return torch.load(path, weights_only=True)["global_step"] if path.is_file() else 0
-
-
-def _cpu_seconds() -> float:
-    """Processor time of this process and of those that it has waited for."""
-    return sum(os.times()[:4])
 
 
 def _write_report(source: LogSource, folder: Path) -> None:

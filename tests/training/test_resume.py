@@ -1,5 +1,6 @@
 """A training that was killed and resumed ends with the weights of one that ran through."""
 
+import json
 import os
 import signal
 
@@ -50,6 +51,10 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
         assert not (killed / "metrics.json").exists()
         cut = torch.load(last, weights_only=True)
         assert cut["global_step"] == KILLED // BATCHES * BATCHES
+        took = cut["callbacks"]["RunDescription"]
+        assert 0 < took["wall_seconds"] < 600
+        took["wall_seconds"] += 1000  # as if it had been long
+        torch.save(cut, last)
         logs = set(killed.rglob("events.out.tfevents.*"))
         process = fork_script("train.py", f"resume={killed}", **at)
         try:
@@ -73,4 +78,5 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
         assert torch.equal(value, second["state_dict"][key]), key
         moved = moved or not torch.equal(value, cut["state_dict"][key])
     assert moved
-    assert (killed / "metrics.json").is_file()
+    # What it took before is of what it took.
+    assert 1000 < json.loads((killed / "metrics.json").read_text())["training_seconds"] < 1600
