@@ -31,7 +31,8 @@ class JaxLoops:
     """Loops of training steps from the weights of a model.
 
     Args:
-        model: the torch network, before its training.
+        models: the torch network before its training, or several, which train side by side, each
+            on batches of its own.
         windows: all windows, which batches are picked from.
         loss: its name in ``conf/loss``.
         scale: of the loss's residuals, ``(2N,)``.
@@ -40,11 +41,19 @@ class JaxLoops:
     """
 
     def __init__(
-        self, model: Any, windows: Windows, loss: str, scale: Any, step: float, rates: list[float]
+        self,
+        models: list[Any],
+        windows: Windows,
+        loss: str,
+        scale: Any,
+        step: float,
+        rates: list[float],
     ):
         jax.config.update("jax_default_matmul_precision", "highest")  # float32 on a GPU, as torch
-        self.parameters = jax_networks.parameters_of(model)
-        self.network = jax_networks.Network(model)
+        each = [jax_networks.parameters_of(model) for model in models]
+        self.alone = len(models) == 1
+        self.parameters = each[0] if self.alone else jax.tree.map(lambda *p: jnp.stack(p), *each)
+        self.network = jax_networks.Network(models[0])
         self.loss, self.scale = jax_networks.LOSSES[loss], scale
         self.step = step
         pairs = {
@@ -71,11 +80,11 @@ class JaxLoops:
             updates, state = self.chain.update(gradient, state, p)
             return (optax.apply_updates(p, updates), state), error
 
-        return step
+        return step if self.alone else jax.vmap(step)
 
     def _carry(self) -> Any:
         p = jax.tree.map(lambda value: value.copy(), self.parameters)
-        return p, self.chain.init(p)
+        return p, (self.chain.init if self.alone else jax.vmap(self.chain.init))(p)
 
     def one_by_one(self, spelling: str) -> Loop:
         """A jitted step, called from Python."""

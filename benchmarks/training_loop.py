@@ -5,11 +5,12 @@ TensorBoard log that the app builds of a configuration, compiled. JAX is a loop 
 is jitted as one: it picks the batch by index, takes loss and gradient, clips by the global norm and
 moves the weights by AdamW (optax); or a scan of such steps, also jitted, whichever is faster. Both
 start from the same network, see the same batches, take the same schedule, and are first checked to
-end with the same weights. SOAP, which optax lacks, is timed alone.
+end with the same weights. SOAP, which optax lacks, is timed alone. An ensemble (``--members``) is
+beside JAX's step under ``jax.vmap``.
 
     python benchmarks/training_loop.py                              # all cells that the file lacks
     python benchmarks/training_loop.py --sizes 3 --batches 256      # some of them
-    python benchmarks/training_loop.py --device gpu --output training_loop_gpu.csv
+    python benchmarks/training_loop.py --device gpu --output gpu.csv   # on a GPU
     python benchmarks/training_loop.py --quick                      # a smoke run, no file
     python benchmarks/training_loop.py --quick --optimizers soap    # without jax and optax
 
@@ -30,7 +31,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from pinn_dyn.app.config import composed
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.train import describe
 from pinn_dyn.data import DataSource, Splits
+from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 
@@ -51,7 +53,7 @@ STEP = 2e-3
 PAIRS = 16_384
 CHECKED = 20
 """Steps after which the weights of both sides are compared."""
-CELL = ("coordinates", "batch", "loss", "optimizer")
+CELL = ("coordinates", "batch", "loss", "optimizer", "members")
 """What a row is of."""
 
 Row = dict[str, Any]
@@ -87,7 +89,7 @@ class Sines(DataSource):
 
 
 def configuration(
-    size: int, batch: int, loss: str, optimizer: str, device: str, compiled: bool
+    size: int, batch: int, loss: str, optimizer: str, members: int, device: str, compiled: bool
 ) -> dict[str, Any]:
     """That of a long training, of which the first epochs are run, up to no validation."""
     words = [
@@ -99,6 +101,7 @@ def configuration(
         "data.stride=1",
         f"data.pairs={PAIRS}",
         f"data.batch_size={batch}",
+        f"ensemble={members}",
         f"trainer.steps={STEPS_FOR_PROGRAM}",
         "trainer.validations=1",
         f"compile={str(compiled).lower()}",
@@ -157,6 +160,7 @@ def run_cell(
     batch: int,
     loss: str,
     optimizer: str,
+    members: int = 1,
     *,
     rounds: int,
     device: str = "cpu",
@@ -169,14 +173,14 @@ def run_cell(
         most = min(max(200_000 // batch, 40), 500)
         steps = next(n for n in range(most, 0, -1) if STEPS_FOR_PROGRAM % n == 0)
     build.LONGEST_EPOCH = steps
-    config = configuration(size, batch, loss, optimizer, device, compiled)
+    config = configuration(size, batch, loss, optimizer, members, device, compiled)
     L.seed_everything(0, verbose=False)
     data = build.build_data(config, Sines(size))
-    model = build.build_model(config, data.statistics)
+    model = build.build_predictor(config, data.statistics)
     validator = build.build_validator(config, data.statistics.step)
     learner = build.build_learner(config, model, data.statistics, validator)
     windows = data.windows.to(torch.device("cpu"), torch.float32)
-    first = windows[next(iter(data.sampler(0)))]
+    first = windows[next(batches(data, members))]
     if device == "gpu":
         first = first.to(torch.device("cuda"))
     clock = 0 if device == "cpu" else 1
@@ -189,9 +193,10 @@ def run_cell(
 
         scale = learner.loss.scale.numpy().reshape(-1)
         rates = schedule(config, learner)
-        loops = jax_loops.JaxLoops(model, windows, loss, scale, STEP, rates)
+        models = [model.member(k) for k in range(members)] if members > 1 else [model]
+        loops = jax_loops.JaxLoops(models, windows, loss, scale, STEP, rates)
         chosen, fastest = rival(loops, config, data, clock)
-        others["jax"] = lambda: fastest(islice(data.sampler(0), steps))
+        others["jax"] = lambda: fastest(islice(batches(data, members), steps))
     turns = Turns(others, rounds)
     fit(config, data, learner, validator, turns)
     times = turns.times[1:]
@@ -199,7 +204,7 @@ def run_cell(
     def milliseconds(name: str, clock: int) -> float:
         return round(1e3 * statistics.median(turn[name][clock] for turn in times) / steps, 3)
 
-    row: Row = dict(zip(CELL, (size, batch, loss, optimizer), strict=True))
+    row: Row = dict(zip(CELL, (size, batch, loss, optimizer, members), strict=True))
     row |= {"ms": milliseconds("ours", 0), "wall_ms": milliseconds("ours", 1)}
     row["loss_and_gradient_ms"] = milliseconds("loss and gradient", clock)
     shares = [1 - turn["loss and gradient"][clock] / turn["ours"][clock] for turn in times]
@@ -217,13 +222,16 @@ def run_cell(
 def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[str, Loop]:
     """The fastest loop of JAX, and its name: of two spellings, step by step or as a scan."""
 
+    def first() -> Iterator[Tensor]:
+        return islice(batches(data, config["ensemble"]), CHECKED)
+
     def checked(make: Callable[[str], Loop], spelling: str) -> tuple[float, str, Loop]:
         run, name = make(spelling), f"{spelling}, {make.__name__}"
-        check_weights(config, data, name, run(islice(data.sampler(0), CHECKED)))
+        check_weights(config, data, name, run(first()))
         took = []
         for _ in range(5):
             start = clocks()
-            run(islice(data.sampler(0), CHECKED))
+            run(first())
             took.append(since(start)[clock])
         print(f"{name}: {1e3 * min(took) / CHECKED:.3f} ms", flush=True)
         return min(took), name, run
@@ -232,6 +240,14 @@ def rival(loops: Any, config: dict[str, Any], data: Any, clock: int) -> tuple[st
     spelling = min(found, key=lambda item: item[0])[1].split(",")[0]
     found.append(checked(loops.scan, spelling))
     return min(found, key=lambda item: item[0])[1:]
+
+
+def batches(data: Any, members: int) -> Iterator[Tensor]:
+    """Positions of an epoch's batches, ``(B,)``, or of each member's, ``(E, B)``."""
+    samplers = [data.sampler(seed) for seed in range(members)]
+    if members == 1:
+        return iter(samplers[0])
+    return map(torch.stack, zip(*samplers, strict=True))
 
 
 def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Callback) -> None:
@@ -243,7 +259,8 @@ def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Call
             config, place, data.source, validator, describe(place, config)
         )
         trainer.callbacks = [*callbacks, *trainer.callbacks]  # type: ignore[attr-defined]
-        trainer.fit(learner, data)
+        members = config["ensemble"]
+        trainer.fit(learner, EnsembleData(data, members) if members > 1 else data)
 
 
 def schedule(config: dict[str, Any], learner: Any) -> list[float]:
@@ -272,13 +289,15 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     build.LONGEST_EPOCH, steps = CHECKED, build.LONGEST_EPOCH
     data = build.build_data(config, data.source)
     L.seed_everything(0, verbose=False)
-    model = build.build_model(config, data.statistics)
+    model = build.build_predictor(config, data.statistics)
     start = {name: p.detach().clone() for name, p in model.named_parameters()}
     validator = build.build_validator(config, data.statistics.step)
     learner = build.build_learner(config, model, data.statistics, validator)
     fit(config, data, learner, validator, Turns({}, 0))
     build.LONGEST_EPOCH = steps
-    ours, theirs = dict(model.cpu().named_parameters()), named(tree)
+    prefix = model.prefix if isinstance(model, Ensemble) else ""
+    ours = dict(model.cpu().named_parameters())
+    theirs = {f"{prefix}{key}": value for key, value in named(tree).items()}
     way = sum(float((ours[key].detach() - start[key]).square().sum()) for key in start)
     apart = sum(
         float((ours[key].detach() - theirs[key]).square().sum()) for key in start if key in theirs
@@ -335,6 +354,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=[256, 1024, 8192])
     parser.add_argument("--losses", nargs="+", default=["increment", "midpoint"])
     parser.add_argument("--optimizers", nargs="+", default=["adamw", "soap"])
+    parser.add_argument("--members", type=int, nargs="+", default=[1], help="of an ensemble")
     parser.add_argument("--device", choices=["cpu", "gpu"], default="cpu")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, help="steps in a round")
@@ -351,31 +371,27 @@ def main(words: list[str] | None = None) -> None:
         os.environ["JAX_PLATFORMS"] = "cpu"
     torch.set_num_threads(1)
     if arguments.quick:
-        for optimizer in arguments.optimizers:
-            print(run_cell(2, 32, "midpoint", optimizer, rounds=1, steps=20, compiled=False))
+        for optimizer, members in product(arguments.optimizers, arguments.members):
+            cell = (2, 32, "midpoint", optimizer, members)
+            print(run_cell(*cell, rounds=1, steps=20, compiled=False))
         return
     rows = rows_of(arguments.output)
     there = {tuple(row[key] for key in CELL) for row in rows}
     record = {key: provenance()[key] for key in ("hardware", "torch", "commit")} | versions()
     if arguments.device == "gpu":
         record["hardware"] = torch.cuda.get_device_name()
-    for optimizer in arguments.optimizers:
-        for loss in arguments.losses:
-            for size in arguments.sizes:
-                for batch in arguments.batches:
-                    cell = (str(size), str(batch), loss, optimizer)
-                    if cell in there:
-                        print(f"{', '.join(cell)}: is in {arguments.output}", flush=True)
-                        continue
-                    row = run_cell(
-                        *(size, batch, loss, optimizer),
-                        rounds=arguments.rounds,
-                        steps=arguments.steps,
-                        device=arguments.device,
-                    )
-                    row |= record
-                    append(row, arguments.output)
-                    print(row, flush=True)
+    order = (arguments.optimizers, arguments.losses, arguments.sizes, arguments.batches)
+    for optimizer, loss, size, batch, members in product(*order, arguments.members):
+        cell = (size, batch, loss, optimizer, members)
+        if tuple(map(str, cell)) in there:
+            print(f"{', '.join(map(str, cell))}: is in {arguments.output}", flush=True)
+            continue
+        row = run_cell(
+            *cell, rounds=arguments.rounds, steps=arguments.steps, device=arguments.device
+        )
+        row |= record
+        append(row, arguments.output)
+        print(row, flush=True)
     print(summary(rows_of(arguments.output)))
 
 

@@ -211,7 +211,7 @@ def named(tree: dict[str, Any]) -> dict[str, Tensor]:
     found = {"potential.stiffness_root": torch.tensor(tree["root"].__array__())}
     for head in ("mass", "potential", "damping", "input"):
         for k, (weight, bias) in enumerate(tree[head]):
-            found[f"{head}.network.layers.{k}.weight"] = torch.tensor(weight.__array__()).T
+            found[f"{head}.network.layers.{k}.weight"] = torch.tensor(weight.__array__()).mT
             found[f"{head}.network.layers.{k}.bias"] = torch.tensor(bias.__array__())
     return found
 

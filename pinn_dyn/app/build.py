@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -197,22 +198,31 @@ def compiles(config: dict[str, Any]) -> bool:
     require_compiler(config)
     if config["compile"] != "auto":
         return config["compile"]
-    on_cpu = config["trainer"]["accelerator"] == "cpu"
     long = config["trainer"]["steps"] >= STEPS_FOR_DERIVATIVE
-    return on_cpu and long and has_cpp_compiler()
+    return long and _lacking_compiler(config) is None
 
 
 def require_compiler(config: dict[str, Any]) -> None:
     """Refuse to compile without a compiler.
 
     Raises:
-        ConfigError: if ``compile`` is true and there is no C++ compiler.
+        ConfigError: if ``compile`` is true and there is no C++ compiler, or no Triton for a GPU.
     """
-    if config["compile"] is True and not has_cpp_compiler():
+    if config["compile"] is True and (lacking := _lacking_compiler(config)):
         raise ConfigError(
-            "compile is true, but there is no C++ compiler (g++ or clang++) on the path: install "
-            "one, or set compile=false"
+            f"compile is true, but there is {lacking}: install one, or set compile=false"
         )
+
+
+def _lacking_compiler(config: dict[str, Any]) -> str | None:
+    """What compiling lacks on the device of a training."""
+    if not has_cpp_compiler():
+        return "no C++ compiler (g++ or clang++) on the path"
+    accelerator = config["trainer"]["accelerator"]
+    on_gpu = torch.cuda.is_available() if accelerator == "auto" else accelerator != "cpu"
+    if on_gpu and find_spec("triton") is None:
+        return "no Triton (pip install triton), which compiles for a GPU"
+    return None
 
 
 def build_validator(config: dict[str, Any], training_step: float) -> RolloutValidator:

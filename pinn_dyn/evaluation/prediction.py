@@ -21,7 +21,7 @@ from pinn_dyn.mechanics import (
     double_copy,
     samples_of,
 )
-from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop
+from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop, RecordedSteps
 
 LONGEST = 5.0
 """Length of a roll-out in s that is taken where the trajectories are longer."""
@@ -179,10 +179,12 @@ def _members(paths: Tensor) -> Tensor | None:
 def model_for_roll_outs(
     model: Predictor, device: torch.device, steps: int, batch: int
 ) -> Predictor:
-    """The model in float64, its RK4 step compiled where that pays and a C++ compiler is there."""
+    """The model in float64, its steps compiled, or recorded on a GPU, where that pays."""
     copy = double_copy(model, device)
     members, inner = (copy.size, copy.stack) if isinstance(copy, Ensemble) else (1, copy)
-    if isinstance(inner, ContinuousPredictor) and device.type == "cpu":
+    if isinstance(inner, ContinuousPredictor) and device.type == "cuda":
+        inner.integrator = RecordedSteps(inner.integrator)
+    elif isinstance(inner, ContinuousPredictor) and device.type == "cpu":
         work = steps * inner.integrator.substeps * (members * batch + 300)
         if work >= WORK_FOR_LOOP and has_cpp_compiler():
             inner.integrator = CompiledLoop(inner.integrator)

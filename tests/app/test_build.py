@@ -36,10 +36,19 @@ def test_auto_compiles_long_trainings_alone(compiler):
     assert not build.compiles(config("auto", STEPS_FOR_DERIVATIVE - 2))
 
 
-def test_auto_compiles_on_a_cpu_with_a_compiler_alone(compiler):
-    assert not build.compiles(config("auto", accelerator="gpu"))
+def test_auto_compiles_where_there_is_a_compiler_alone(compiler):
     compiler(False)
     assert not build.compiles(config("auto"))
+
+
+def test_a_gpu_needs_triton_too(compiler, monkeypatch):
+    monkeypatch.setattr(build, "find_spec", lambda name: None if name == "triton" else name)
+    assert not build.compiles(config("auto", accelerator="gpu"))
+    assert build.compiles(config("auto"))
+    with pytest.raises(ConfigError, match=r"no Triton.*install one, or set compile=false"):
+        build.compiles(config(True, accelerator="gpu"))
+    monkeypatch.setattr(build, "find_spec", lambda name: name)
+    assert build.compiles(config("auto", accelerator="gpu"))
 
 
 def test_true_without_a_compiler_says_what_to_install(compiler):

@@ -36,7 +36,7 @@ def without_jax(monkeypatch):
 
 
 def test_a_cell_of_soap_is_timed_without_jax(script, without_jax, capsys):
-    script.main(["--quick", "--optimizers", "soap"])
+    script.main(["--quick", "--optimizers", "soap", "--members", "1", "2"])
     row = ast.literal_eval(capsys.readouterr().out.splitlines()[-1])
     assert min(row["loss_and_gradient_ms"], row["ms"]) > 0
     assert row["loop_and_optimizer"] == pytest.approx(
@@ -70,7 +70,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(script, monkeypatch, tmp_pa
         assert [row["batch"] for row in csv.DictReader(file)] == ["256", "1024"]
     done, measured = measured, []
     script.main(words)
-    assert done + measured == [(3, batch, "midpoint", "adamw") for batch in (256, 1024, 8192)]
+    assert done + measured == [(3, batch, "midpoint", "adamw", 1) for batch in (256, 1024, 8192)]
     # of 1, 2 and again 1
     assert "1.26 times as long in the geometric mean of 3 cells" in capsys.readouterr().out
 

@@ -7,6 +7,8 @@ import torch
 
 from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
 from pinn_dyn.ensembles.gradients import CompiledMembers
+from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.mechanics import Signal, double_copy
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.training import (
     DynamicsLearner,
@@ -98,6 +100,41 @@ def test_members_end_with_the_weights_that_they_have_on_a_cpu(tmp_path):
         ends.append([p.detach().cpu() for p in ensemble.parameters()])
     for found, expected in zip(*ends, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=2e-4)
+
+
+def start_and_input():
+    """x0 ``(3, 4)``, times of 100 steps, and u ``(3, 101, 2)``."""
+    x0 = 0.3 * torch.randn(3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    t = 0.01 * torch.arange(101, dtype=torch.float64)
+    return x0, t, torch.stack([t.sin(), t.cos()], dim=-1).expand(3, -1, -1)
+
+
+@torch.no_grad()
+def assert_rolls_out_the_same(on_gpu, model):
+    x0, t, u = start_and_input()
+    found = on_gpu.predict(x0.to(GPU), t.to(GPU), Signal(t.to(GPU), u.to(GPU)))
+    expected = double_copy(model).predict(x0, t, Signal(t, u))
+    torch.testing.assert_close(found.cpu(), expected, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["lnn", "hnn"])
+def test_a_roll_out_by_recorded_steps_is_that_of_a_cpu(kind):
+    model = perturb(make_model(kind))
+    on_gpu = model_for_roll_outs(model, GPU, steps=100, batch=3)
+    on_gpu.integrator.inner.path = None  # what would be called, were a step not recorded
+    assert_rolls_out_the_same(on_gpu, model)
+
+
+def test_dynamics_that_wait_for_the_gpu_are_integrated_without_a_record(monkeypatch):
+    model = perturb(make_model("lnn"))
+    derivative = type(model).state_derivative
+
+    def waiting(self, x, u):
+        assert float(x.sum()) < 1e9
+        return derivative(self, x, u)
+
+    monkeypatch.setattr(type(model), "state_derivative", waiting)
+    assert_rolls_out_the_same(model_for_roll_outs(model, GPU, steps=100, batch=3), model)
 
 
 def test_a_loss_that_is_not_a_number_is_found_though_the_steps_run_ahead(tmp_path):

@@ -48,7 +48,7 @@ class Compiled:
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
         evaluations = self.evaluations(windows)
         on_cpu = windows.q.device.type == "cpu"
-        if worth_a_program(evaluations, self.steps):
+        if self._worth_a_program(evaluations, on_cpu):
             part = CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)
             return self._program(windows, part)
         if not on_cpu or len(windows) < 2 * CHUNK:
@@ -57,6 +57,12 @@ class Compiled:
         return weighted_sum(
             [len(part) / len(windows) for part in parts], map(self._loss_and_gradient, parts)
         )
+
+    def _worth_a_program(self, evaluations: int, on_cpu: bool) -> bool:
+        """Whether so many evaluations in a window pay for one program of all."""
+        # On a GPU it takes the place of thousands of launches.
+        long = not on_cpu or self.steps >= STEPS_FOR_PROGRAM
+        return evaluations == 1 or (evaluations <= MOST_EVALUATIONS and long)
 
     def _loss(self, windows: Windows) -> Tensor:
         with integrated_by(self.model, self._integrator):
@@ -68,11 +74,6 @@ class Compiled:
     def _loss_and_gradient(self, windows: Windows) -> tuple[Tensor, Tensor]:
         loss = self._loss(windows)
         return loss.detach(), self.vector.gradient_of(loss)
-
-
-def worth_a_program(evaluations: int, steps: int) -> bool:
-    """Whether so many evaluations in a window, over so many steps, pay for one program."""
-    return evaluations == 1 or (evaluations <= MOST_EVALUATIONS and steps >= STEPS_FOR_PROGRAM)
 
 
 class EvaluationCount:

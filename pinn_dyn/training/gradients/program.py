@@ -57,7 +57,7 @@ class LossProgram:
         """Loss and gradient of each batch at the values ``(P,)`` that go with it."""
         names = _ROWS[self._loss.model.state]
         arguments = [
-            (some, *(getattr(batch, name) for name in names), *_samples(batch))
+            (some, *_contiguous([*(getattr(batch, name) for name in names), *_samples(batch)]))
             for some, batch in zip(values, batches, strict=True)
         ]
         # A program is compiled here, before the threads call it.
@@ -121,6 +121,11 @@ class _Loss(nn.Module):
 def _samples(windows: Windows) -> list[Tensor]:
     u, rate = windows.input.u, windows.input.rate
     return [u] if rate is None else [u, rate]
+
+
+def _contiguous(values: Iterable[Tensor]) -> Iterable[Tensor]:
+    """In the layout that a program is compiled for, also where they are parts of longer windows."""
+    return [value.contiguous() for value in values]
 
 
 def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:
