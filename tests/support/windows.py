@@ -30,6 +30,11 @@ def make_windows(count, size=1, interpolation="linear", seed=0):
     )
 
 
+def spread_out(windows):
+    """The same windows, no number of which lies beside the next, as where longer ones are cut."""
+    return windows._map(lambda values: torch.stack([values, -values], dim=-1)[..., 0])
+
+
 def one_step(size=1):
     scales = make_statistics(size, size)
     return replace(

@@ -22,7 +22,7 @@ from pinn_dyn.training import IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager
 from pinn_dyn.training.gradients.program import LossProgram
 from tests.models.builders import make_model, make_structured, perturb
-from tests.support.windows import for_members, make_windows, one_step
+from tests.support.windows import for_members, make_windows, one_step, spread_out
 
 
 def engine(kind, loss, model, *steps):
@@ -73,7 +73,10 @@ MODELS = {
 def test_loss_and_gradients_are_those_of_the_eager_model(
     request, monkeypatch, kind, interpolation, kind_of_loss, built
 ):
-    """Also of other data with the same program, and of a batch in parts, one thread or three."""
+    """Also of other data with the same program, and of a batch in parts, one thread or three.
+
+    The other data lie in memory otherwise.
+    """
     if not built:
         request.getfixturevalue("traced")
     model = MODELS[kind]()
@@ -82,7 +85,7 @@ def test_loss_and_gradients_are_those_of_the_eager_model(
     loss = kind_of_loss(one_step(), model).double()
     compiled = engine(Compiled, loss, model, STEPS_FOR_PROGRAM)
     eager = engine(Eager, loss, untouched)
-    batches = [windows(8), windows(8, seed=1), windows(24, seed=2)]
+    batches = [windows(8), spread_out(windows(8, seed=1)), windows(24, seed=2)]
     evaluations = compiled.evaluations(batches[0])
     assert evaluations == (1 if kind_of_loss is MidpointLoss else len(model.integrator.nodes))
     parts = 2 * evaluations  # of 8 windows
