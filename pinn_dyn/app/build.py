@@ -202,6 +202,24 @@ def compiles(config: dict[str, Any]) -> bool:
     return long and _lacking_compiler(config) is None
 
 
+def require_device(config: dict[str, Any]) -> None:
+    """Refuse to train on a GPU where there is none.
+
+    Raises:
+        ConfigError: if ``trainer.accelerator`` is a GPU that torch does not see.
+    """
+    accelerator = config["trainer"]["accelerator"]
+    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
+        why = (
+            "no GPU answers (nvidia-smi lists them)"
+            if torch.version.cuda or torch.version.hip
+            else f"torch {torch.__version__} is a build without CUDA (pytorch.org has others)"
+        )
+        raise ConfigError(
+            f"trainer.accelerator is {accelerator}, but {why}: mend that, or take trainer=cpu"
+        )
+
+
 def require_compiler(config: dict[str, Any]) -> None:
     """Refuse to compile without a compiler.
 

@@ -24,6 +24,7 @@ from pinn_dyn.app.build import (
     check_processes,
     epochs,
     require_compiler,
+    require_device,
 )
 from pinn_dyn.app.config import ConfigError, check, checked
 from pinn_dyn.app.constants import write_constants
@@ -191,7 +192,8 @@ def train_in(
     torch.set_num_threads(config["threads"])
     L.seed_everything(config["seed"], verbose=False)
 
-    require_compiler(config)  # before the data are simulated
+    require_device(config)  # before the data are simulated
+    require_compiler(config)
     data = build_data(config, source)
     log.info("%s: loading data", config["name"])
     try:

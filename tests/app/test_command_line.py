@@ -169,6 +169,21 @@ def test_compiling_without_a_compiler_is_refused_before_the_data_are_made(
     assert "compile is true, but there is no C++ compiler" in text
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize(
+    ("cuda", "why"), [(None, "a build without CUDA"), ("13.0", "no GPU answers")]
+)
+def test_a_gpu_that_is_not_there_is_refused_before_the_data_are_made(
+    elsewhere, capsys, monkeypatch, cuda, why
+):
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    monkeypatch.setattr("pinn_dyn.app.train.build_data", lambda *_: pytest.fail("made data"))
+    text = said(fails("train.py", *TINY, NO_FIGURES, "trainer=gpu", "compile=true"), capsys)
+    assert "trainer.accelerator is gpu, but" in text
+    assert why in text
+    assert "take trainer=cpu" in text
+
+
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_folder_without_a_run_cannot_be_resumed(elsewhere, capsys, exists):
     if exists:
