@@ -299,9 +299,7 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     ours = dict(model.cpu().named_parameters())
     theirs = {f"{prefix}{key}": value for key, value in named(tree).items()}
     way = sum(float((ours[key].detach() - start[key]).square().sum()) for key in start)
-    apart = sum(
-        float((ours[key].detach() - theirs[key]).square().sum()) for key in start if key in theirs
-    )
+    apart = sum(float((ours[key].detach() - x).square().sum()) for key, x in theirs.items())
     share = (apart / way) ** 0.5
     if not share < 0.05:
         raise RuntimeError(f"{name}: the weights end {share:.2g} of their way apart")
