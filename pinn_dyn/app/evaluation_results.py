@@ -155,7 +155,6 @@ def compare_with_truth(
                 comparison,
                 configuration=index,
                 title=f"{label}: learned and true terms, {name}",
-                inverse_mass=model.state == "qp",
             )
             save(figure, folder / f"terms_{stem}_{name}.png")
     write_whole(folder / "terms.txt", terms_text(comparisons) + "\n")

@@ -173,10 +173,10 @@ def spread_figure(prediction: Prediction, *, title: str) -> Figure:
     return mean_png(panel, title=title, note=note, lost="diverged")
 
 
-def terms_figure(
-    comparison: TermComparison, *, configuration: int, title: str, inverse_mass: bool = False
-) -> Figure:
+def terms_figure(comparison: TermComparison, *, configuration: int, title: str) -> Figure:
     """M, D, G and A at one configuration: true X, learned X_L, and P X with the best-fit P.
+
+    In place of M its inverse, where the equations of the model are in that.
 
     A model whose terms equal P X moves like the truth: multiplying the equation of motion by P
     does not change it. The three of a term have one colour scale, from minus to plus their largest
@@ -186,10 +186,9 @@ def terms_figure(
         comparison: true and learned terms.
         configuration: which of the K configurations to draw.
         title: data set and model.
-        inverse_mass: draw the inverse of M, which a Hamiltonian model learns, in place of M.
     """
     matrices = comparison.matrices()
-    matrices.pop("M" if inverse_mass else "M_inverse")
+    matrices.pop("M" if comparison.of_inverse_mass else "M_inverse")
     errors = comparison.to_frame().set_index("term")
     rows = comparison.q.shape[-1]
     widths = [max(three[0].shape[-1], 1.6) for three in matrices.values()]

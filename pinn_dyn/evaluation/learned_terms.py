@@ -26,6 +26,7 @@ class TermComparison:
             :func:`pinn_dyn.control.factor.fit_factor`.
         P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``; the paper's controllers
             are proven for a positive one.
+        of_inverse_mass: whether the equations of the model, in (q, p), are in the inverse of M.
     """
 
     names: list[str]
@@ -34,6 +35,7 @@ class TermComparison:
     learned: Terms
     P: Tensor
     P_min_eigenvalue: Tensor
+    of_inverse_mass: bool
 
     def matrices(self) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
         """For M, M_inverse, D, G and A: the true term X, the learned X_L, and P X.
@@ -119,7 +121,7 @@ def compare_terms(
         learned = double_copy(model, q.device).terms(q)
     P = fit_factor(true, learned)
     smallest = torch.linalg.eigvalsh(0.5 * (P + P.transpose(-1, -2)))[..., 0]
-    return TermComparison(names, q, true, learned, P, smallest)
+    return TermComparison(names, q, true, learned, P, smallest, model.state == "qp")
 
 
 def _as_matrices(terms: Terms) -> dict[str, Tensor]:

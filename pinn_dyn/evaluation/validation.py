@@ -278,7 +278,6 @@ class RolloutFigures(L.Callback):
                     comparison,
                     configuration=index,
                     title=f"Learned and true terms at {key}",
-                    inverse_mass=model.state == "qp",
                 )
         # The step at which Lightning logs the errors of the same validation.
         log_figures(trainer.loggers, figures, trainer.global_step - 1)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -136,7 +138,9 @@ def test_no_two_of_many_models_are_drawn_alike(predictions, tmp_path):
 def test_terms_are_annotated(inverse_mass, shown, tmp_path):
     q = torch.tensor([[0.8, 0.2, 0.3], [1.2, -0.2, 0.15]])
     comparison = compare_terms(SoftArm(damping=0.12), SoftArm(), q)
-    figure = terms_figure(comparison, configuration=1, title="fake", inverse_mass=inverse_mass)
+    assert not comparison.of_inverse_mass
+    comparison = replace(comparison, of_inverse_mass=inverse_mass)
+    figure = terms_figure(comparison, configuration=1, title="fake")
     check_picture(figure, tmp_path / "terms.png")
     assert len(figure.axes) == 12
     assert shown in [text.get_text() for text in figure.axes[0].texts]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pinn_dyn.control.factor import fit_factor
-from pinn_dyn.evaluation import compare_terms
+from pinn_dyn.evaluation import compare_terms, terms_figure
 from pinn_dyn.mechanics import MechanicalSystem, Terms
 from pinn_dyn.systems import SoftArm
 
@@ -103,3 +103,12 @@ def test_what_has_no_terms_is_refused():
         compare_terms(SoftArm(), SoftArm(), Q, names=["one"])
     with pytest.raises(ValueError, match=r"q has shape \(3,\)"):
         compare_terms(SoftArm(), SoftArm(), Q[0])
+
+
+@pytest.mark.parametrize("state", ["qv", "qp"])
+def test_the_inverse_of_m_is_shown_of_a_model_of_momenta(state):
+    arm = SoftArm(damping=0.12)
+    arm.state = state
+    comparison = compare_terms(arm, SoftArm(), Q)
+    shown = terms_figure(comparison, configuration=0, title="fake").axes[0].get_title()
+    assert ("{-1}" in shown) is (state == "qp")
