@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,11 +90,15 @@ def _open_world(
 
 
 def connect() -> Any:
-    """A new client of PyBullet, without a display: its functions, bound to it."""
+    """PyBullet with its functions bound to a new client, without a display."""
+    # Not the wheel's own BulletClient: when Python ends, it closes what is closed, and says so.
     bullet = import_bullet()
-    from pybullet_utils.bullet_client import BulletClient  # of the same wheel
-
-    return BulletClient(bullet.DIRECT)
+    client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
+    bound = {
+        name: functools.partial(item, **client) if inspect.isbuiltin(item) else item
+        for name, item in vars(bullet).items()
+    }
+    return SimpleNamespace(**bound)
 
 
 def import_bullet() -> Any:
