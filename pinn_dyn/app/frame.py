@@ -12,7 +12,7 @@ import pandas as pd
 import yaml
 
 from pinn_dyn.data.logs import Columns, LogError
-from pinn_dyn.data.logs.reader import THE_FRAME, column, numbers
+from pinn_dyn.data.logs.table import Table
 from pinn_dyn.data.whole import whole, write_whole
 
 Signals = str | Sequence[str] | Mapping[str, Any]
@@ -46,12 +46,12 @@ def frame_dataset(
         raise LogError(f"run is {run!r}, expected the name of a column, or None")
     described = {name: _described(name, given) for name, given in signals.items()}
     columns = {name: Columns.from_config(name, given) for name, given in described.items()}
-    path = THE_FRAME
-    values = {name: numbers(frame, path, x.columns, name) for name, x in columns.items()}
+    table = Table(frame, "the frame")
+    values = {name: table.numbers(x.columns, name) for name, x in columns.items()}
     if not len(frame):
         raise LogError("the frame has no rows, expected a log")
     t = columns["time"].to_si(values["time"])[:, 0]
-    ids = ["frame"] * len(frame) if run is None else column(frame, path, run, "run")
+    ids = ["frame"] * len(frame) if run is None else table.column(run, "run")
     if pd.isna(np.asarray(ids)).any():
         raise LogError(f"the frame, column '{run}' (run): some rows belong to no run, give it")
     runs = {str(key): x.to_numpy() for key, x in pd.Series(t).groupby(np.asarray(ids), sort=False)}
@@ -86,12 +86,11 @@ def frame_dataset(
 
 def in_frame(said: str, frame: pd.DataFrame, folder: Path) -> str:
     """What an error says of a line in the written file, as of a row by the index of the frame."""
-    said = re.sub(
+    return re.sub(
         rf"{re.escape(str(folder / FRAME))}, line (\d+)",
         lambda line: f"the frame, row {frame.index[int(line[1]) - 2]}",
         said,
     )
-    return said.replace("otherwise repair the file", "otherwise repair the frame")
 
 
 def _described(name: str, given: Signals) -> dict[str, Any]:

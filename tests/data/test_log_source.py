@@ -10,7 +10,7 @@ import scipy.io
 import torch
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps, reader
+from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
@@ -353,15 +353,29 @@ def test_pieces_know_the_input_before_them(folder):
     assert torch.equal(second.past, first.u[-51:-1])
 
 
-@pytest.mark.parametrize("last", ["7.5", "", "text"])
-def test_files_parsed_in_parts_are_those_parsed_at_once(tmp_path, monkeypatch, last):
-    """Whole numbers, then numbers, text or nothing in a later part; names of runs; blank lines."""
-    rows = [f"{k / 100},{k},a{k // 5},{k // 5}" for k in range(20)]
-    rows += ["", f"0.2,{last},b,4", "", ""]
-    path = tmp_path / "run.csv"
-    path.write_text("\n".join(["t,x,run,number", *rows]) + "\n")
-    whole = reader.read_table(path, "t", [], 0.1)
-    assert len(whole) == 22
-    monkeypatch.setattr(reader, "_PART", 6)
-    in_parts = reader.read_table(path, "t", [], 0.1)
-    pd.testing.assert_frame_equal(in_parts, whole)
+@pytest.mark.parametrize("runs", [1, 3, 6])
+def test_frames_in_memory_are_read_as_files(tmp_path, runs):
+    """One frame, frames by run and files give the same trajectories and the same split."""
+    tables = {f"r{k}": motion(4.0, phase=0.7 * k) for k in range(runs)}
+    for name, table in tables.items():
+        write(tmp_path, table, f"{name}.csv")
+    default = dict(validation=None, test=None, root=".")
+    frame = pd.concat([table.assign(run=name) for name, table in tables.items()])
+    sources = [
+        source(tmp_path, files=tables, **default),
+        source(tmp_path, files=frame, trajectory="run", **default),
+        source(tmp_path, validation=None, test=None),
+    ]
+    first, *others = [log.load() for log in sources]
+    for splits in others:
+        for name in ("train", "validation", "test"):
+            for ours, theirs in zip(getattr(first, name), getattr(splits, name), strict=True):
+                torch.testing.assert_close(ours.q, theirs.q, rtol=1e-9, atol=1e-9)
+    assert min(map(len, (first.train, first.validation, first.test))) >= 1
+
+
+def test_messages_name_the_rows_of_a_frame_by_its_index(tmp_path):
+    table = motion().set_index(pd.Index([f"row {k}" for k in range(1001)]))
+    table.loc["row 40", "q1"] = np.nan
+    with pytest.raises(LogError, match=r"the frame, row row 40, column 'q1' \(q\): .*NaN"):
+        source(tmp_path, files=table).load()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.step import Step
+from pinn_dyn.data.logs.table import Table
 
 # Logs of robots are written between 2 Hz and 100 kHz.
 _SAMPLE_TIMES = (1e-5, 0.5)
@@ -43,24 +43,24 @@ _REVERSED = -0.5
 _MOST_ROWS = 50_000
 
 
-def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: list[Step]) -> None:
-    """The times of one run, in s.
+def check_clock(t: np.ndarray, table: Table, name: str, steps: list[Step]) -> None:
+    """Check the times of one run, in s.
 
     Raises:
         LogError: on an implausible sample time, and on times that go back, repeat or jump where no
             step takes care of it; names the line and the step.
     """
     if len(t) < 2:
-        raise LogError(f"{path}, line {lines[0]}: a run of one row, expected at least two")
+        raise LogError(f"{table.place(0)}: a run of one row, expected at least two")
     spacing = np.diff(t)
     kinds = {type(step) for step in steps}
     back = spacing < 0
     if back.any() and SplitGaps not in kinds:
         k = int(back.argmax())
         raise LogError(
-            f"{path}, line {lines[k + 1]}, column {name!r}: the time goes back from {t[k]:.9g} to "
+            f"{table.place(k + 1, name)}: the time goes back from {t[k]:.9g} to "
             f"{t[k + 1]:.9g} s: if a new run starts there, name its column in 'trajectory' "
-            "(run=... of pinn_dyn.fit) or add a SplitGaps step; otherwise repair the file"
+            "(run=... of pinn_dyn.fit) or add a SplitGaps step; otherwise repair the log"
         )
     repeated = spacing == 0
     bursts = burst_share(t) > _BURSTS
@@ -73,18 +73,19 @@ def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: 
                 "from the row number, or Deduplicate, which keeps the first row of a burst"
             )
         raise LogError(
-            f"{path}, line {lines[k + 1]}, column {name!r}: the time {t[k]:.9g} s repeats "
+            f"{table.place(k + 1, name)}: the time {t[k]:.9g} s repeats "
             f"({int(repeated.sum())} rows do): {cure}"
         )
     forward = spacing[spacing > 0]
     if not len(forward):
-        raise LogError(f"{path}, column {name!r}: the time never increases, expected a clock")
+        raise LogError(f"{table.name}, column {name!r}: the time never increases, expected a clock")
     typical = float(spacing.mean() if RowClock in kinds else np.median(forward))
     low, high = _SAMPLE_TIMES
     if not low <= typical <= high:
         raise LogError(
-            f"{path}, column {name!r}: the sample time would be {typical:.6g} s, expected {low:g} "
-            f"to {high:g} s: is the unit of the time wrong ({'ms' if typical > high else 's'}?)"
+            f"{table.name}, column {name!r}: the sample time would be {typical:.6g} s, expected "
+            f"{low:g} to {high:g} s: is the unit of the time wrong "
+            f"({'ms' if typical > high else 's'}?)"
         )
     gaps = spacing > GAP_FACTOR * typical
     if gaps.any() and not kinds & {SplitGaps, Resample, RowClock}:
@@ -93,7 +94,7 @@ def check_clock(t: np.ndarray, lines: np.ndarray, path: Path, name: str, steps: 
         if bursts:
             cure = "a RowClock step: its stamps come in bursts of rows"
         raise LogError(
-            f"{path}, line {lines[k + 1]}, column {name!r}: the time jumps from {t[k]:.9g} to "
+            f"{table.place(k + 1, name)}: the time jumps from {t[k]:.9g} to "
             f"{t[k + 1]:.9g} s, where {typical:.6g} s is usual ({int(gaps.sum())} such gaps): add "
             f"{cure}"
         )
@@ -142,7 +143,7 @@ def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
 
 
 def check_second_clock(
-    t: np.ndarray, other: np.ndarray, lines: np.ndarray, path: Path, names: tuple[str, str]
+    t: np.ndarray, other: np.ndarray, table: Table, names: tuple[str, str]
 ) -> None:
     """Two time columns of one run, in s, which must elapse alike.
 
@@ -154,7 +155,7 @@ def check_second_clock(
     if (apart > typical).any():
         k = int((apart > typical).argmax())
         raise LogError(
-            f"{path}, line {lines[k]}: the clocks {names[0]!r} and {names[1]!r} disagree: "
+            f"{table.place(k)}: the clocks {names[0]!r} and {names[1]!r} disagree: "
             f"{t[k] - t[0]:.9g} and {other[k] - other[0]:.9g} s have passed since the start of the "
             f"run, and {apart.max():.4g} s is the most they are apart: check their units, and "
             "keep the clock of the robot alone"

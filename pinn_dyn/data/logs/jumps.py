@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -12,6 +11,7 @@ from scipy.ndimage import median_filter
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.recording import Report
+from pinn_dyn.data.logs.table import Table
 
 # SI; no signal of a robot is larger, numbers for "no value" are.
 _LARGEST = 1e12
@@ -27,23 +27,20 @@ class Rows:
     """One signal of one run as it was read, in SI units, and where it comes from.
 
     Attributes:
-        path: the file.
-        lines: lines of the rows in the file, ``(T,)``.
+        table: rows of the run.
         signal: q, v or u.
         columns: names and units of the columns.
         values: ``(T, K)``.
     """
 
-    path: Path
-    lines: np.ndarray
+    table: Table
     signal: str
     columns: Columns
     values: np.ndarray
 
     def place(self, row: int, column: int) -> str:
         """File, line and column, for messages."""
-        name = self.columns.columns[column]
-        return f"{self.path}, line {self.lines[row]}, column {name!r} ({self.signal})"
+        return self.table.place(row, self.columns.columns[column], self.signal)
 
 
 def check_rows(rows: Rows, t: np.ndarray, report: Report, *, jumps_are_removed: bool) -> None:

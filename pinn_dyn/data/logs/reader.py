@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import gzip
 import io
-import re
 import warnings
 import zlib
 from collections.abc import Sequence
@@ -19,13 +18,8 @@ from pinn_dyn.data.logs.arrays import ARRAY_SUFFIXES, read_arrays
 from pinn_dyn.data.logs.bags import BAG_SUFFIXES, is_bag, read_bag
 from pinn_dyn.data.logs.errors import LogError, listed, most_bytes, shown
 from pinn_dyn.data.logs.parquet import read_parquet
-from pinn_dyn.spelling import did_you_mean
+from pinn_dyn.data.logs.table import Table
 
-# A run of a table: its name, and which rows are its own.
-Group = tuple[str, slice | np.ndarray]
-
-THE_FRAME = Path("the frame")
-"""In the place of a file: a data frame, whose rows are named by its index."""
 _PART = 200_000  # rows of a CSV file that are parsed together
 _LONGEST_HEADER = 130_000
 _MOST_COLUMNS = 10_000
@@ -121,10 +115,8 @@ def run_name(path: Path, root: str) -> str:
     return (inside.with_suffix("") if inside.suffix == ".gz" else inside).with_suffix("").as_posix()
 
 
-def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) -> pd.DataFrame:
-    """Columns of a file; the index is the line in the file, the row or the message.
-
-    ``attrs`` has ``unusable``, why there is no such column, and ``notes``, what was dropped.
+def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) -> Table:
+    """Read columns of a file.
 
     Args:
         path: the file.
@@ -135,6 +127,12 @@ def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) ->
     Raises:
         LogError: if the file cannot be read or is empty.
     """
+    frame = _read(path, time, columns, max_age)
+    unusable, notes = (frame.attrs.get(key, {}) for key in ("unusable", "notes"))
+    return Table(frame, str(path), "line", unusable, list(notes))
+
+
+def _read(path: Path, time: str, columns: Sequence[str], max_age: float) -> pd.DataFrame:
     if is_bag(path):
         return read_bag(path, time, columns, max_age)
     if path.suffix in ARRAY_SUFFIXES:
@@ -152,75 +150,6 @@ def read_table(path: Path, time: str, columns: Sequence[str], max_age: float) ->
             f"{error}. What is read is {FORMATS}: convert other files, as by pandas, whose tables "
             "have to_csv and to_parquet"
         ) from error
-
-
-def numbers(table: pd.DataFrame, path: Path, columns: Sequence[str], signal: str) -> np.ndarray:
-    """Columns as finite numbers, ``(T, K)``.
-
-    Raises:
-        LogError: on a missing, non-numeric or NaN column; names the closest column, or the line.
-    """
-    return np.column_stack([_number(table, path, name, signal) for name in columns])
-
-
-def column(table: pd.DataFrame, path: Path, name: str, signal: str) -> pd.Series:
-    """One column as it is.
-
-    Raises:
-        LogError: if there is none; names the closest one.
-    """
-    places = [k + 1 for k, known in enumerate(table.columns) if known == name]
-    if len(places) > 1:
-        raise LogError(
-            f"{path}: {len(places)} columns have the name {name!r}, which {signal} asks for: "
-            f"numbers {', '.join(map(str, places))}; give each a name of its own in the file"
-        )
-    unusable = table.attrs.get("unusable", {})
-    matrix = re.sub(r"_\d+$", "", name)  # q_1 is the first column of q
-    for variable in (name, matrix) if not places else ():
-        if variable in unusable:
-            raise LogError(
-                f"{path}, variable {variable!r} ({signal}): {unusable[variable]}, expected a "
-                "matrix of real numbers with as many rows as the time"
-            )
-    if not places:
-        names = [str(known) for known in table.columns]
-        hint = did_you_mean(name, names) or "."
-        raise LogError(
-            f"{path}: no column {name!r}, which {signal} asks for{hint} "
-            f"The file has {listed(names)}"
-        )
-    return table[name]
-
-
-def _number(table: pd.DataFrame, path: Path, name: str, signal: str) -> np.ndarray:
-    raw = column(table, path, name, signal)
-    if raw.dtype == object:
-        # Whole numbers of more than 64 bits, which pandas does not convert; a true among numbers.
-        raw = raw.map(
-            lambda x: float(str(x)) if type(x) is int else str(x) if type(x) is bool else x
-        )
-    values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
-    bad = ~np.isfinite(values)
-    if bad.any():
-        k = int(bad.argmax())
-        line = "row" if path == THE_FRAME else "line"
-        empty = np.ndim(raw.iloc[k]) == 0 and pd.isna(raw.iloc[k])
-        what = "is empty or NaN" if empty else f"is {shown(str(raw.iloc[k]))}"
-        if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", str(raw.iloc[k])):
-            what += ", with a decimal comma: write points (in a file whose columns are separated by"
-            what += " ';', replace every ',' by '.')"
-        cure = "repair or remove these rows"
-        if signal == "time" and bad.all() and re.search(r"\d:\d", str(raw.iloc[k])):
-            cure = (
-                "write seconds instead, as by (t - t.iloc[0]).dt.total_seconds() after "
-                "t = pandas.to_datetime(table[...])"
-            )
-        raise LogError(
-            f"{path}, {line} {table.index[k]}, column {name!r} ({signal}): the value {what}, "
-            f"expected a number ({int(bad.sum())} such rows in this column): {cure}"
-        )
-    return values
 
 
 def _parsed(file: BinaryIO, separator: str) -> pd.DataFrame:
@@ -350,19 +279,3 @@ def _opened(path: Path) -> BinaryIO:
             "table of numbers, which no file shrinks that far: unpack it and look into it"
         )
     return io.BytesIO(content)
-
-
-def runs_of(table: pd.DataFrame, path: Path, name: str) -> list[Group]:
-    """Names of the runs of a table, by a column, in order, and which of its rows are theirs.
-
-    Raises:
-        LogError: on a row without a name.
-    """
-    ids = column(table, path, name, "trajectory")
-    if ids.isna().any():
-        raise LogError(
-            f"{path}, line {table.index[ids.isna()][0]}, column {name!r} (trajectory): is empty, "
-            "expected the name of a run"
-        )
-    ids = ids.astype(str)
-    return [(run, (ids == run).to_numpy()) for run in ids.unique()]

@@ -37,21 +37,13 @@ from pinn_dyn.data.logs.pieces import (
     summary,
     trajectory,
 )
-from pinn_dyn.data.logs.reader import (
-    THE_FRAME,
-    Group,
-    column,
-    find_files,
-    numbers,
-    read_table,
-    run_name,
-    runs_of,
-)
+from pinn_dyn.data.logs.reader import find_files, read_table, run_name
 from pinn_dyn.data.logs.recording import Recording, Report, since_start
 from pinn_dyn.data.logs.repairs import RemoveJumps
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
-from pinn_dyn.data.logs.splits import Part, split
+from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.step import Step
+from pinn_dyn.data.logs.table import Table
 from pinn_dyn.data.logs.twins import check_twins, check_units_of_runs
 from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
@@ -74,8 +66,9 @@ class LogSource(DataSource):
 
     Args:
         name: short name, for tables and titles.
+        files: names or glob patterns in the folder ``root``; or a data frame in memory, or data
+            frames by the name of their run. Messages name the rows of a frame by its index.
         root: folder of the files.
-        files: names or glob patterns in that folder.
         time: column of the time; a second column is a clock that must agree with the first.
         q: columns of the configuration, N.
         u: columns of the input, M.
@@ -85,7 +78,8 @@ class LogSource(DataSource):
         steps: names and steps of the cleaning, in order; None entries are left out.
         validation, test: whole runs, ``{runs: 2, piece: 5.0}``, the ends of runs,
             ``{seconds: 3.0, piece: 3.0}``, or blocks along them, ``{seconds: 3.0, blocks: 4,
-            piece: 3.0}``; pieces in s, or ``whole``. See :class:`Part`.
+            piece: 3.0}``; pieces in s, or ``whole``. See :class:`Part`. Without both,
+            :func:`default_split` chooses them.
         guard: time left out between training, validation and test of one run, s.
         shortest: training stretches shorter than this are dropped, s; at least one window.
         seed: draws the runs where their number is given.
@@ -103,8 +97,8 @@ class LogSource(DataSource):
         self,
         *,
         name: str,
-        root: str,
-        files: str | Sequence[str],
+        files: str | Sequence[str] | pd.DataFrame | Mapping[str, pd.DataFrame],
+        root: str = ".",
         time: Columns | Mapping[str, Any],
         q: Columns | Mapping[str, Any],
         u: Columns | Mapping[str, Any],
@@ -112,8 +106,8 @@ class LogSource(DataSource):
         trajectory: str | None = None,
         max_age: float = 0.1,
         steps: Mapping[str, Step | None] | None = None,
-        validation: Part | Mapping[str, Any],
-        test: Part | Mapping[str, Any],
+        validation: Part | Mapping[str, Any] | None = None,
+        test: Part | Mapping[str, Any] | None = None,
         guard: float = 0.5,
         shortest: float = 0.1,
         seed: int = 0,
@@ -125,7 +119,12 @@ class LogSource(DataSource):
     ):
         self.name = name
         self.root = root
-        self.files = files
+        self._frames: dict[str, pd.DataFrame] | None = None
+        if isinstance(files, pd.DataFrame):
+            self._frames = {"frame": files}
+        elif isinstance(files, Mapping):
+            self._frames = dict(files)
+        self.files = () if self._frames is not None else files
         self.time = Columns.from_config("time", time)
         self.q = Columns.from_config("q", q)
         self.u = Columns.from_config("u", u)
@@ -147,18 +146,14 @@ class LogSource(DataSource):
             raise LogError(f"max_age is {max_age} s, expected more than 0")
         self.max_age = max_age
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
-        self.validation = Part.from_config("validation", validation)
-        self.test = Part.from_config("test", test)
+        if (validation is None) != (test is None):
+            raise LogError("expected both validation and test, or neither for the default split")
+        self.validation = test and Part.from_config("validation", validation)
+        self.test = test and Part.from_config("test", test)
         if not (0 <= guard < math.inf and 0 <= shortest < math.inf):
             raise LogError(f"guard is {guard} and shortest {shortest} s, expected 0 or more")
         self.guard = guard
         self.shortest = shortest
-        self._shortest = {"train": ("shortest", shortest)}
-        for key, part in (("validation", self.validation), ("test", self.test)):
-            piece = part.piece
-            self._shortest[key] = (
-                ("shortest", shortest) if isinstance(piece, str) else ("its piece", piece)
-            )
         self.seed = seed
         self.interpolation = interpolation
         self.labels = labels or self.q.labels
@@ -215,15 +210,14 @@ class LogSource(DataSource):
                     f"steps.{name}: {step} takes something from the training runs, which a frame "
                     "does not have: give it in the configuration, and train again"
                 )
-        path = THE_FRAME
-        groups: list[Group] = [("the frame", slice(None))]
+        table = Table(frame, "the frame")
+        runs = {"the frame": np.ones(len(frame), dtype=bool)}
         if self.trajectory is not None and self.trajectory in frame.columns:
-            groups = runs_of(frame, path, self.trajectory)
-        raws = self._recordings(frame.copy(deep=False), path, groups, Report(self.name))
-        every = np.arange(len(frame))
+            runs = table.runs(self.trajectory)
+        raws = self._recordings(table, runs, Report(self.name))
         return [
-            (every[rows], raw, self._clean_alone(raw))
-            for (_, rows), raw in zip(groups, raws, strict=True)
+            (np.flatnonzero(rows), raw, self._clean_alone(raw))
+            for rows, raw in zip(runs.values(), raws, strict=True)
         ]
 
     def _clean_alone(self, raw: Recording) -> Recording:
@@ -243,6 +237,8 @@ class LogSource(DataSource):
 
     def fingerprint(self) -> dict[str, object]:
         """Files (name, size, SHA-256), rows, columns, cleaning, and the stretches of each split."""
+        if self._frames is not None:
+            return {"files": {}, **super().fingerprint()}
         root = Path(self.root).expanduser()
         files = {
             path.relative_to(root).as_posix(): {
@@ -284,6 +280,9 @@ class LogSource(DataSource):
             measured = {key: x for key, x in self._signals.items() if key != "time"}
             check_twins(recordings, measured, report)
             check_units_of_runs(recordings, measured, report)
+            if self.validation is None or self.test is None:
+                times = {item.run: item.t for item in recordings}
+                self.validation, self.test, self.guard = default_split(times, self.seed)
             parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
             check_copies(parts, report)
             cleaned = self._clean(parts, report)
@@ -314,65 +313,74 @@ class LogSource(DataSource):
         return self._loaded
 
     def _read(self, report: Report) -> list[Recording]:
-        paths = find_files(self.root, self.files)
         recordings: list[Recording] = []
-        stems: dict[str, Path] = {}
-        asked = [name for signal in self._signals.values() for name in signal.columns]
-        asked += [] if self.trajectory is None else [self.trajectory]
-        for path in paths:
-            table = read_table(path, self.time.columns[0], asked, self.max_age)
-            stem = run_name(path, self.root)
-            if (other := stems.setdefault(stem, path)) is not path:
-                raise LogError(
-                    f"{other} and {path} are both the run {stem!r}: rename one of them, or leave "
-                    "it out of 'files'"
-                )
-            for note in table.attrs.get("notes", []):
-                report.warn(f"{path.name}: {note}")
-            groups: list[Group] = [(stem, slice(None))]
+        tables = self._tables()
+        for stem, table in tables.items():
+            for note in table.notes:
+                report.warn(f"{stem}: {note}")
+            runs = {stem: np.ones(len(table), dtype=bool)}
             if self.trajectory is not None:
-                prefix = f"{stem}:" if len(paths) > 1 else ""
-                runs = runs_of(table, path, self.trajectory)
-                groups = [(f"{prefix}{run}", rows) for run, rows in runs]
-            recordings += self._recordings(table, path, groups, report)
+                prefix = f"{stem}:" if len(tables) > 1 else ""
+                of_table = table.runs(self.trajectory)
+                runs = {f"{prefix}{run}": rows for run, rows in of_table.items()}
+            recordings += self._recordings(table, runs, report)
         return recordings
 
+    def _tables(self) -> dict[str, Table]:
+        """Return the frames in memory, or read the files, by the name of their run."""
+        if self._frames is not None:
+            several = len(self._frames) > 1
+            return {
+                name: Table(frame, f"the frame {name!r}" if several else "the frame")
+                for name, frame in self._frames.items()
+            }
+        names = [name for signal in self._signals.values() for name in signal.columns]
+        names += [] if self.trajectory is None else [self.trajectory]
+        paths: dict[str, Path] = {}
+        tables = {}
+        for path in find_files(self.root, self.files):
+            stem = run_name(path, self.root)
+            if (first := paths.setdefault(stem, path)) is not path:
+                raise LogError(
+                    f"{first} and {path} are both the run {stem!r}: rename one of them, or leave "
+                    "it out of 'files'"
+                )
+            tables[stem] = read_table(path, self.time.columns[0], names, self.max_age)
+        return tables
+
     def _recordings(
-        self, table: pd.DataFrame, path: Path, groups: list[Group], report: Report
+        self, table: Table, runs: Mapping[str, np.ndarray], report: Report
     ) -> list[Recording]:
-        """The runs of a table in SI units, checked; the table loses what it gives."""
-        lines = table.index.to_numpy()
-        for signal, columns in self._signals.items():
-            for name in columns.columns:
-                column(table, path, name, signal)
-        values = {}
-        for signal, columns in self._signals.items():
-            values[signal] = columns.to_si(numbers(table, path, columns.columns, signal))
-            for name in columns.columns:  # of a large file there is no room for two copies
-                del table[name]
+        """Convert the runs of a table, masks of its rows, to SI units, and check them."""
+        values = {
+            signal: columns.to_si(table.numbers(columns.columns, signal))
+            for signal, columns in self._signals.items()
+        }
         steps = list(self.steps.values())
-        removed = {signal for x in steps if isinstance(x, RemoveJumps) for signal in x.signals}
+        repaired = {signal for x in steps if isinstance(x, RemoveJumps) for signal in x.signals}
         clock, *clocks = self.time.columns
         recordings = []
-        for run, rows in groups:
+        for run, rows in runs.items():
+            part = table.select(rows)
             times, since = since_start(values["time"][rows])
-            t, *others = times.T
-            check_clock(t, lines[rows], path, clock, steps)
-            for name, other in zip(clocks, others, strict=True):
-                check_second_clock(t, other, lines[rows], path, (clock, name))
+            t, *second_clocks = times.T
+            check_clock(t, part, clock, steps)
+            for name, second in zip(clocks, second_clocks, strict=True):
+                check_second_clock(t, second, part, (clock, name))
             for signal in ("q", "v", "u"):
                 if signal in values:
-                    found = (lines[rows], signal, self._signals[signal], values[signal][rows])
-                    check_rows(Rows(path, *found), t, report, jumps_are_removed=signal in removed)
+                    cells = Rows(part, signal, self._signals[signal], values[signal][rows])
+                    check_rows(cells, t, report, jumps_are_removed=signal in repaired)
             v = values["v"][rows] if "v" in values else None
             recordings.append(Recording(run, t, values["q"][rows], v, values["u"][rows]))
-            read = f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {path.name}{since}"
-            report.add("Read", run, read)
+            source = Path(table.name).name
+            text = f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {source}{since}"
+            report.add("Read", run, text)
         return recordings
 
     def _clean(self, parts: dict[str, list[Recording]], report: Report) -> list[Cleaned]:
         whole = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
-        cleaned = long_enough("splitting", whole, self._shortest, report)
+        cleaned = long_enough("splitting", whole, self._shortest(), report)
         for name, step in self.steps.items():
             fitted = step.fit([x for part in cleaned if part.split == "train" for x in part.clean])
             cleaned = self._apply(name, fitted, cleaned, report)
@@ -396,4 +404,16 @@ class LogSource(DataSource):
         )
         for text in step.losses(before, after):
             report.warn(f"{name}: {step}: {text}")
-        return long_enough(name, result, self._shortest, report)
+        return long_enough(name, result, self._shortest(), report)
+
+    def _shortest(self) -> dict[str, tuple[str, float]]:
+        """Name and length in s of the shortest useful stretch of each split."""
+        least = {"train": ("shortest", self.shortest)}
+        for key, part in (("validation", self.validation), ("test", self.test)):
+            assert part is not None
+            least[key] = (
+                ("shortest", self.shortest)
+                if isinstance(part.piece, str)
+                else ("its piece", part.piece)
+            )
+        return least

@@ -17,6 +17,12 @@ WHOLE: Literal["whole"] = "whole"
 """As a piece: one roll-out of each stretch, as long as it is."""
 
 
+_WHOLE_RUNS = 5  # from this number of runs on, the default split keeps some of them whole
+_SHARE = 0.15  # of the runs, or of each run, for the test, and again for the validation
+_PIECE = 5.0  # s, longest piece of the default split
+_GUARD = 0.5  # s, longest guard of the default split
+
+
 class Part(ShortForm):
     """What is kept from training: whole runs, or seconds at the end of the others or along them.
 
@@ -65,6 +71,43 @@ class Part(ShortForm):
                 raise LogError(f"piece is {piece!r}, expected a time in s, or 'whole'")
         elif not piece > 0 or (seconds is not None and piece > seconds):
             raise LogError(f"piece is {piece} s, expected more than 0 and at most seconds")
+
+
+def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part, float]:
+    """Choose validation, test and guard of a log for which the user chose none.
+
+    Of five runs or more, 15 % are the test and as many the validation: whole runs, drawn among
+    the runs of at least the median length. Of fewer runs, the last 15 % of each are the test and
+    the 15 % before them the validation. Both are cut into pieces of at most 5 s.
+
+    Args:
+        runs: times of each run, s.
+        seed: seed of the choice of runs.
+
+    Returns:
+        Validation, test, and the guard between the parts of one run, s.
+    """
+    spacing = np.concatenate([np.diff(t) for t in runs.values()])
+    step = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
+    lengths = {name: float(np.ptp(t)) for name, t in runs.items()}
+
+    def piece(longest: float) -> float:
+        """Return the longest piece that is a multiple of the sample time."""
+        return round(max(int(min(_PIECE, longest) / step + 1e-6), 1) * step, 9)
+
+    if len(runs) >= _WHOLE_RUNS:
+        median = float(np.median([*lengths.values()]))
+        long = [name for name, length in lengths.items() if length >= median - 0.5 * step]
+        count = max(round(_SHARE * len(runs)), 1)
+        drawn = [long[k] for k in np.random.default_rng(seed).permutation(len(long))]
+        test, validation = sorted(drawn[:count]), sorted(drawn[count : 2 * count])
+        size = piece(median)
+        return Part(size, runs=validation), Part(size, runs=test), _GUARD
+    shortest = min(lengths.values())
+    size = piece(_SHARE * shortest)
+    seconds = max(_SHARE * shortest, size)
+    guard = min(_GUARD, 0.02 * shortest)
+    return Part(size, seconds=seconds), Part(size, seconds=seconds), guard
 
 
 def split(
