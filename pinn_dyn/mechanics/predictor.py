@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TypeVar, final
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import require_last_dim
@@ -34,13 +35,8 @@ class Predictor(nn.Module, abc.ABC):
     penalized: bool = False
     input_history: float = 0.0
 
-    def __init__(self, num_coordinates: int, num_inputs: int, state: State = "qv"):
+    def __init__(self, num_coordinates: PositiveInt, num_inputs: PositiveInt, state: State = "qv"):
         super().__init__()
-        for name, value in (("num_coordinates", num_coordinates), ("num_inputs", num_inputs)):
-            if value < 1:
-                raise ValueError(f"{name} is {value}, expected at least 1")
-        if state not in ("qv", "qp"):
-            raise ValueError(f"state is {state!r}, expected 'qv' for (q, v) or 'qp' for (q, p)")
         self.num_coordinates = num_coordinates
         self.num_inputs = num_inputs
         self.state: State = state

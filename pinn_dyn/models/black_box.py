@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, Predictor, Signal
 from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
-from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
@@ -35,9 +36,9 @@ class NextStateMLP(Predictor):
     def __init__(
         self,
         statistics: Statistics,
-        hidden: Sequence[int],
-        activation: str = "softplus",
-        angles: Sequence[int] = (),
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "softplus",
+        angles: Sequence[NonNegativeInt] = (),
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
@@ -95,9 +96,9 @@ class AccelerationMLP(DelayedPredictor):
     def __init__(
         self,
         statistics: Statistics,
-        hidden: Sequence[int],
-        activation: str = "softplus",
-        angles: Sequence[int] = (),
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "softplus",
+        angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
         delay: Delay | None = None,

@@ -6,10 +6,11 @@ import abc
 from collections.abc import Sequence
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.models.mlp import Tape, columns, rows
+from pinn_dyn.models.mlp import Activation, Tape, columns, rows
 from pinn_dyn.models.positivity import Positive, Positivity
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.triangular import UNROLLED, square
@@ -107,8 +108,8 @@ class NetworkCholesky(CholeskyFactor):
         self,
         scales: Scales,
         *,
-        hidden: Sequence[int],
-        activation: str = "softplus",
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "softplus",
         positivity: Positivity = Positive(),  # noqa: B008, it is frozen
         transposed: bool = False,
         chain: bool = False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 
 import torch
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics import ContinuousPredictor, Signal
@@ -53,15 +54,14 @@ class LearnedDelay(Delay):
         initial: d at the start of the training, s; what ``check.py`` suggests, or 0.
 
     Raises:
-        ValueError: unless 0 <= initial <= longest, and longest > 0.
+        ValueError: if the initial delay is longer than the longest.
     """
 
-    def __init__(self, longest: float = 0.1, initial: float = 0.0):
+    def __init__(self, longest: PositiveFloat = 0.1, initial: NonNegativeFloat = 0.0):
         super().__init__()
-        if not (0 < longest < float("inf") and 0 <= initial <= longest):
+        if initial > longest:
             raise ValueError(
-                f"delay: longest is {longest} and initial {initial} s, expected a longest above 0 "
-                "and an initial delay from 0 to that"
+                f"the initial delay is {initial} s, expected at most the longest, {longest} s"
             )
         self.longest = longest
         self.share = nn.Parameter(torch.tensor(initial / longest))

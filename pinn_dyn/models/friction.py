@@ -6,6 +6,7 @@ import abc
 
 import torch
 import torch.nn.functional as F
+from pydantic import PositiveFloat
 from torch import Tensor, nn
 
 from pinn_dyn.models.known_constants import Named
@@ -68,19 +69,13 @@ class CoulombFriction(Friction):
         level: c starts at this part of the typical forces.
         width: w starts at this part of the typical speeds beyond a hundredth, below which it never
             falls, as a jump in the force could not be integrated.
-
-    Raises:
-        ValueError: if the level or the width is not positive.
     """
 
     force: Tensor
     v_std: Tensor
 
-    def __init__(self, scales: Scales, *, level: float = 0.1, width: float = 0.1):
+    def __init__(self, scales: Scales, *, level: PositiveFloat = 0.1, width: PositiveFloat = 0.1):
         super().__init__()
-        for name, value in (("level", level), ("width", width)):
-            if not value > 0:
-                raise ValueError(f"friction: {name} is {value}, expected a positive number")
         self.raw_force = nn.Parameter(torch.full((scales.size,), level).expm1().log())
         self.raw_width = nn.Parameter(torch.full((scales.size,), width).expm1().log())
         self.register_buffer("force", scales.value.float().clone())

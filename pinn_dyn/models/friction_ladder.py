@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.models.friction import Friction
@@ -26,23 +25,17 @@ class DriveCoulomb(Friction):
         level: c starts at this part of the typical forces.
         width: w starts at this part of the typical speeds.
         spread: standard deviation of the logarithms a priori.
-
-    Raises:
-        ValueError: on a level, width or spread that is not positive.
     """
 
     def __init__(
         self,
         scales: Scales,
         *,
-        level: float = 0.1,
-        width: float = 0.03,
-        spread: float = 1.0,
+        level: PositiveFloat = 0.1,
+        width: PositiveFloat = 0.03,
+        spread: PositiveFloat = 1.0,
     ):
         super().__init__()
-        for key, value in (("level", level), ("width", width), ("spread", spread)):
-            if not 0 < value < math.inf:
-                raise ValueError(f"friction: {key} is {value}, expected a positive number")
         force, v_std = scales.value, scales.statistics.v_std.double()
         self.slowest = _SLOWEST * float(v_std.mean())
         forces = [joint.force for joint in scales.joints]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from pydantic import NonNegativeInt
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, State
@@ -62,7 +63,7 @@ class HamiltonianNetwork(StructuredNetwork):
         damping: CholeskyHead,
         input: InputHead,
         friction: FrictionHead = NoFriction,
-        angles: Sequence[int] = (),
+        angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         state: State = "qp",
         delay: Delay | None = None,

@@ -6,9 +6,10 @@ import abc
 from collections.abc import Callable, Sequence
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
 
@@ -70,7 +71,13 @@ class LearnedVelocity(InitialVelocity):
     learned = True
     scale: Tensor
 
-    def __init__(self, scales: Scales, *, hidden: Sequence[int] = (64,), activation: str = "tanh"):
+    def __init__(
+        self,
+        scales: Scales,
+        *,
+        hidden: Sequence[PositiveInt] = (64,),
+        activation: Activation = "tanh",
+    ):
         super().__init__()
         mean, std = scales.statistics.network_input(repeat_input=1)
         self.network = MLP(len(mean), scales.size, hidden, activation, mean, std, scales.angles)

@@ -6,10 +6,11 @@ import abc
 from collections.abc import Sequence
 
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import matvec
-from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
 
@@ -58,7 +59,9 @@ class NetworkInput(InputMatrix):
 
     scale: Tensor
 
-    def __init__(self, scales: Scales, *, hidden: Sequence[int], activation: str = "softplus"):
+    def __init__(
+        self, scales: Scales, *, hidden: Sequence[PositiveInt], activation: Activation = "softplus"
+    ):
         super().__init__(scales)
         self.network = scales.network(scales.size * scales.inputs, hidden, activation)
         self.register_buffer("scale", scales.value.float())
@@ -97,9 +100,9 @@ class NonlinearInput(InputMatrix):
         self,
         scales: Scales,
         *,
-        hidden: Sequence[int],
-        activation: str = "softplus",
-        linear: Sequence[int] = (),
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "softplus",
+        linear: Sequence[NonNegativeInt] = (),
     ):
         super().__init__(scales)
         size, inputs = self.shape

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, Sum
@@ -49,11 +49,9 @@ class KnownAndNetwork(Sum):
         known: Callable[..., KnownMechanics],
         network: Callable[..., LagrangianNetwork],
         residual: ResidualHead = NoResidual,
-        weight: float = 0.01,
+        weight: NonNegativeFloat = 0.01,
         integrator: Integrator | None = None,
     ):
-        if not 0 <= weight < math.inf:
-            raise ValueError(f"weight is {weight}, expected zero or a positive number")
         first = known(statistics=statistics)
         # The network works on forces: its scales are those of the torques, not of the currents.
         gain = first.drive_gain().detach().to(statistics.u_mean)

@@ -7,7 +7,6 @@ residuals, and a parameter that no data determine stays where it started.
 from __future__ import annotations
 
 import abc
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -64,17 +63,15 @@ class PositiveConstants(Constants):
         units: n units.
 
     Raises:
-        ValueError: unless start and spread are positive.
+        ValueError: if a start is not positive.
     """
 
     start: Tensor
     lower = 0.0
 
     def __init__(self, start: Tensor, spread: float, names: Sequence[str], units: Sequence[str]):
-        if not bool(((start > 0) & start.isfinite()).all()) or not 0 < spread < math.inf:
-            raise ValueError(
-                f"{names[0]} ...: start is {start.tolist()} and spread {spread}, expected positive"
-            )
+        if not bool((start > 0).all()):
+            raise ValueError(f"{names[0]}: start is {start.tolist()}, expected positive numbers")
         super().__init__(start.shape, names, units)
         self.register_buffer("start", start.float().clone())
         self.spread = spread
@@ -123,18 +120,12 @@ class PhysicalBodies(Constants):
         bodies: n names.
 
     Raises:
-        ValueError: on a start that is no body of positive density, naming it, or a spread that is
-            not positive.
+        ValueError: if a start is not a body of positive density; the message names it.
     """
 
     root: Tensor
 
     def __init__(self, start: Tensor, spread: float, bodies: Sequence[str]):
-        if not 0 < spread < math.inf:
-            raise ValueError(
-                f"spread is {spread}, expected a positive number: 0.3 for bodies of a data sheet, "
-                "3 for generic ones"
-            )
         start = start.double()
         for name, body in zip(bodies, start, strict=True):
             smallest = float(torch.linalg.eigvalsh(body)[0])

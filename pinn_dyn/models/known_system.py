@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+from pydantic import PositiveFloat
 from torch import Tensor, nn
 from torch.func import functional_call
 
@@ -64,7 +64,7 @@ class KnownSystem(LearnedConstants):
         self,
         statistics: Statistics,
         structure: MechanicalSystem,
-        spread: float = 1.5,
+        spread: PositiveFloat = 1.5,
         integrator: Integrator | None = None,
     ):
         size, inputs = structure.num_coordinates, structure.num_inputs
@@ -73,11 +73,6 @@ class KnownSystem(LearnedConstants):
                 f"the data have {statistics.num_coordinates} coordinates and "
                 f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
                 f"{size} and {inputs}: take the structure of this robot"
-            )
-        if not 0 < spread < math.inf:
-            raise ValueError(
-                f"spread is {spread}, expected a positive number: 1.5 for guesses that may be "
-                "off by a factor of ten, 0.3 for a data sheet"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from pydantic import NonNegativeInt
 from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator
@@ -59,7 +60,7 @@ class LagrangianNetwork(StructuredNetwork):
         friction: FrictionHead = NoFriction,
         residual: ResidualHead = NoResidual,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
-        angles: Sequence[int] = (),
+        angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         delay: Delay | None = None,
     ):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory, samples_of, stack_until
@@ -57,7 +59,13 @@ class LinearRival(Predictor):
     past_bias: Tensor
 
     def __init__(
-        self, train: Sequence[Trajectory], *, step: float, lags: int, degree: int, ridge: float
+        self,
+        train: Sequence[Trajectory],
+        *,
+        step: float,
+        lags: PositiveInt,
+        degree: Literal[1, 2],
+        ridge: float,
     ):
         super().__init__(train[0].q.shape[-1], train[0].u.shape[-1])
         self.fixed_step = step
@@ -123,7 +131,11 @@ class LinearRival(Predictor):
 
 
 def fit_linear_rival(
-    train: Sequence[Trajectory], validation: Sequence[Trajectory], *, step: float, degree: int
+    train: Sequence[Trajectory],
+    validation: Sequence[Trajectory],
+    *,
+    step: float,
+    degree: Literal[1, 2],
 ) -> LinearRival:
     """The rival whose lags and ridge have the smallest error over the validation trajectories.
 

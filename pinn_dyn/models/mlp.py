@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Literal, cast
 
 import torch
 import torch.nn.functional as F
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 Tape = tuple[Tensor, ...]
@@ -28,12 +29,15 @@ def _silu(z: Tensor) -> tuple[Tensor, Tensor]:
     return z * s, s * (1 + z * (1 - s))
 
 
-ACTIVATIONS: dict[str, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
+Activation = Literal["softplus", "tanh", "silu"]
+"""Name of a smooth activation. Equations of motion need two derivatives, so ReLU is missing."""
+
+ACTIVATIONS: dict[Activation, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
     "softplus": _softplus,
     "tanh": _tanh,
     "silu": _silu,
 }
-"""Smooth activations, each as (value, slope); dynamics need two derivatives, so no ReLU here."""
+"""Functions that return value and slope of each activation."""
 
 
 class MLP(nn.Module):
@@ -64,8 +68,8 @@ class MLP(nn.Module):
         limits: smallest and largest x in the data, ``(inputs,)`` each; no limits if None.
 
     Raises:
-        ValueError: on an unknown activation, widths below 1, a position that x does not have, or
-            hidden layers too narrow for units of every kind that ``after`` asks for.
+        ValueError: if ``angles`` contains a position that x does not have or a position twice, or
+            if ``after`` needs wider hidden layers.
     """
 
     mean: Tensor
@@ -77,21 +81,15 @@ class MLP(nn.Module):
         self,
         inputs: int,
         outputs: int,
-        hidden: Sequence[int],
-        activation: str = "softplus",
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "softplus",
         mean: Tensor | None = None,
         std: Tensor | None = None,
-        angles: Sequence[int] = (),
+        angles: Sequence[NonNegativeInt] = (),
         after: Sequence[int] | None = None,
         limits: tuple[Tensor, Tensor] | None = None,
     ):
         super().__init__()
-        if activation not in ACTIVATIONS:
-            raise ValueError(
-                f"activation is {activation!r}, expected one of {', '.join(ACTIVATIONS)}"
-            )
-        if any(width < 1 for width in hidden):
-            raise ValueError(f"hidden is {list(hidden)}, expected widths of at least 1")
         if any(not 0 <= index < inputs for index in angles) or len({*angles}) < len(angles):
             raise ValueError(
                 f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}, each once"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 
@@ -41,18 +42,10 @@ class Positive(Positivity):
         floor: smallest diagonal entry, in units of the scale; 0 allows a semi-definite matrix.
         initial: what the floor is added to before training; below 1 in the mass matrix of a robot
             that moves almost without inertia.
-
-    Raises:
-        ValueError: on a negative floor, or a start that is not positive.
     """
 
-    floor: float = 1e-3
-    initial: float = 1.0
-
-    def __post_init__(self) -> None:
-        _check_floor(self.floor)
-        if not self.initial > 0:
-            raise ValueError(f"initial is {self.initial}, expected a positive number")
+    floor: NonNegativeFloat = 1e-3
+    initial: PositiveFloat = 1.0
 
     @property
     def start(self) -> float:  # type: ignore[override]
@@ -75,19 +68,11 @@ class Bounded(Positivity):
     Args:
         limit: b, in units of the scale.
         floor: smallest diagonal entry, in units of the scale; 0 allows a semi-definite matrix.
-
-    Raises:
-        ValueError: on a limit that is not positive, or a negative floor.
     """
 
-    limit: float = 3.5
-    floor: float = 1e-3
+    limit: PositiveFloat = 3.5
+    floor: NonNegativeFloat = 1e-3
     start = math.log(math.expm1(1.0))
-
-    def __post_init__(self) -> None:
-        _check_floor(self.floor)
-        if not self.limit > 0:
-            raise ValueError(f"limit is {self.limit}, expected a positive number")
 
     def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:
         share = torch.sigmoid(y)
@@ -96,8 +81,3 @@ class Bounded(Positivity):
     def lower(self, y: Tensor) -> tuple[Tensor, Tensor]:
         share = torch.sigmoid(y)
         return self.limit * (2 * share - 1), 2 * self.limit * share * (1 - share)
-
-
-def _check_floor(floor: float) -> None:
-    if not floor >= 0:
-        raise ValueError(f"floor is {floor}, expected zero or a positive number")

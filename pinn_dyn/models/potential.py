@@ -6,9 +6,10 @@ import abc
 from collections.abc import Sequence
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import columns, rows
+from pinn_dyn.models.mlp import Activation, columns, rows
 from pinn_dyn.models.scales import Scales
 
 
@@ -46,8 +47,8 @@ class NetworkPotential(Potential):
         self,
         scales: Scales,
         *,
-        hidden: Sequence[int],
-        activation: str = "softplus",
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "softplus",
         quadratic: bool = True,
         initial: float = 1.0,
     ):
@@ -100,12 +101,12 @@ class ChainPotential(Potential):
         rank: rows of the vectors w, h and e.
 
     Raises:
-        ValueError: if a coordinate is no angle, or on a rank below 1.
+        ValueError: if a coordinate is not an angle.
     """
 
     scale: Tensor
 
-    def __init__(self, scales: Scales, *, rank: int = 8):
+    def __init__(self, scales: Scales, *, rank: PositiveInt = 8):
         super().__init__()
         size, angles = scales.size, scales.angles
         if set(angles) != set(range(size)):
@@ -113,8 +114,6 @@ class ChainPotential(Potential):
                 f"angles is {list(angles)}, expected all {size} coordinates: the chain potential "
                 "is that of revolute joints; for others take NetworkPotential"
             )
-        if rank < 1:
-            raise ValueError(f"rank is {rank}, expected at least 1")
         self.rank = rank
 
         def normal(rows: int, columns: int) -> nn.Parameter:

@@ -6,9 +6,10 @@ import abc
 from collections.abc import Callable, Sequence
 
 import torch
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
 _REACH = 3.0
@@ -70,9 +71,6 @@ class NetworkResidual(Residual):
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         weight: w; the loss of the prediction is near one before anything is learned.
-
-    Raises:
-        ValueError: on a negative weight.
     """
 
     learned = True
@@ -82,13 +80,11 @@ class NetworkResidual(Residual):
         self,
         scales: Scales,
         *,
-        hidden: Sequence[int],
-        activation: str = "tanh",
-        weight: float = 0.01,
+        hidden: Sequence[PositiveInt],
+        activation: Activation = "tanh",
+        weight: NonNegativeFloat = 0.01,
     ):
         super().__init__()
-        if not weight >= 0:
-            raise ValueError(f"residual: weight is {weight}, expected zero or a positive number")
         self.weight = weight
         data, size = scales.statistics, scales.size
         mean, std = data.network_input(repeat_input=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from pinn_dyn.models.known_constants import PositiveConstants
-from pinn_dyn.models.mlp import MLP
+from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.statistics import Statistics
 
 
@@ -82,7 +82,7 @@ class Scales:
         self,
         outputs: int,
         hidden: Sequence[int],
-        activation: str,
+        activation: Activation,
         after: Sequence[int] | None = None,
     ) -> MLP:
         """A network of q; outside the data what it sees of q saturates, see :class:`MLP`."""

@@ -8,11 +8,12 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import WeightAveraging
+from pydantic import PositiveFloat
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -61,7 +62,7 @@ class DynamicsLearner(L.LightningModule):
         gradient_clip_algorithm: ``"norm"`` or ``"value"``.
 
     Raises:
-        ValueError: on another algorithm, or, in training, a precision that scales the loss.
+        ValueError: in training, if the precision scales the loss.
         NonFiniteLossError: in training, when the loss is NaN or infinite.
     """
 
@@ -76,14 +77,10 @@ class DynamicsLearner(L.LightningModule):
         config: dict[str, Any],
         statistics: Statistics,
         compile: bool,
-        gradient_clip_val: float | None = None,
-        gradient_clip_algorithm: str | None = None,
+        gradient_clip_val: PositiveFloat | None = None,
+        gradient_clip_algorithm: Literal["norm", "value"] | None = None,
     ):
         super().__init__()
-        if gradient_clip_algorithm not in (None, "norm", "value"):
-            raise ValueError(
-                f"gradient_clip_algorithm is {gradient_clip_algorithm!r}, expected norm or value"
-            )
         self.automatic_optimization = False
         # For the checkpoint; what the loggers compare is chosen elsewhere.
         hyperparameters = {"config": config, "statistics": statistics.to_dict()}

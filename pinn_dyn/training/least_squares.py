@@ -6,9 +6,11 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field, PositiveFloat
 from scipy.optimize import least_squares
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
@@ -27,6 +29,9 @@ from pinn_dyn.training.filtered_motion import correlation_length, filtered_motio
 from pinn_dyn.training.sensitivity import rollout_slopes
 
 log = logging.getLogger(__name__)
+
+AtLeastTwo = Annotated[int, Field(ge=2)]
+"""Number of samples or evaluations: one sample has no spread."""
 
 _MOST_PARAMETERS = 500
 _CHUNK = 500
@@ -72,30 +77,18 @@ class LeastSquares:
         velocity_weight: weight of the velocity half in the roll-outs, as of the loss.
         changed: bodies and other owners of constants, such as the ``tip`` in ``mass of tip``,
             that are others than in the earlier fit, and free again.
-
-    Raises:
-        ValueError: on a cutoff or weight that is not positive, or fewer than two samples or
-            evaluations.
     """
 
     def __init__(
         self,
         *,
-        cutoff: float,
+        cutoff: PositiveFloat,
         rollouts: bool = True,
-        samples: int = 2000,
-        evaluations: int = 25,
-        velocity_weight: float = 1.0,
+        samples: AtLeastTwo = 2000,
+        evaluations: AtLeastTwo = 25,
+        velocity_weight: PositiveFloat = 1.0,
         changed: Sequence[str] = (),
     ):
-        settings = {"cutoff": cutoff, "samples": samples, "evaluations": evaluations}
-        settings["velocity_weight"] = velocity_weight
-        for name, value in settings.items():
-            if not value > 0:
-                raise ValueError(f"least squares: {name} is {value}, expected a positive number")
-        for name, value in (("samples", samples), ("evaluations", evaluations)):
-            if value < 2:  # one sample has no spread, and one evaluation is that of the start
-                raise ValueError(f"least squares: {name} is {value}, expected at least 2")
         self.cutoff = cutoff
         self.rollouts = rollouts
         self.samples = samples

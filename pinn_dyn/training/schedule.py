@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import Field
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import OneCycleLR
 
 
-def one_cycle(optimizer: Optimizer, *, total_steps: int, warm_up: float = 0.05) -> OneCycleLR:
+def one_cycle(
+    optimizer: Optimizer, *, total_steps: int, warm_up: Annotated[float, Field(ge=0, le=1)] = 0.05
+) -> OneCycleLR:
     """Half a cosine up to the optimizer's learning rate, then one down to next to nothing.
 
     Smith and Topin 2019, "Super-convergence". The rate starts at a 25th of the peak and ends at a
@@ -16,12 +21,7 @@ def one_cycle(optimizer: Optimizer, *, total_steps: int, warm_up: float = 0.05) 
         optimizer: its learning rate is the peak.
         total_steps: steps of the training.
         warm_up: the part of them that the rate rises in, 0 to 1.
-
-    Raises:
-        ValueError: on a part outside 0 to 1.
     """
-    if not 0 <= warm_up <= 1:
-        raise ValueError(f"warm_up is {warm_up}, expected a part of the training, 0 to 1")
     if warm_up * total_steps == 1:  # the slope of a rise of exactly one step is not defined
         total_steps += 1
     return OneCycleLR(

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 from torch.optim import Optimizer
+
+Beta = Annotated[float, Field(ge=0, lt=1)]
+"""Decay of a moving average."""
 
 SMALLEST = 32
 """Matrices are filled up with zeros to powers of two from this on: the fewer sizes, the fewer
@@ -38,9 +42,6 @@ class SOAP(Optimizer):
         weight_decay: d.
         precondition_frequency: steps from one power iteration to the next.
         eps: added to the root of the second moments.
-
-    Raises:
-        ValueError: on a negative lr, decay or eps, betas outside 0 to 1, or a frequency below 1.
     """
 
     leading = 0
@@ -49,22 +50,12 @@ class SOAP(Optimizer):
     def __init__(
         self,
         params: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
-        lr: float = 3e-3,
-        betas: tuple[float, float] = (0.95, 0.95),
-        weight_decay: float = 1e-2,
-        precondition_frequency: int = 10,
-        eps: float = 1e-8,
+        lr: PositiveFloat = 3e-3,
+        betas: tuple[Beta, Beta] = (0.95, 0.95),
+        weight_decay: NonNegativeFloat = 1e-2,
+        precondition_frequency: PositiveInt = 10,
+        eps: PositiveFloat = 1e-8,
     ):
-        for name, value in (("lr", lr), ("weight_decay", weight_decay), ("eps", eps)):
-            if not value >= 0:
-                raise ValueError(f"{name} is {value}, expected at least 0")
-        for beta in betas:
-            if not 0 <= beta < 1:
-                raise ValueError(f"a beta is {beta}, expected at least 0 and less than 1")
-        if precondition_frequency < 1:
-            raise ValueError(
-                f"precondition_frequency is {precondition_frequency}, expected at least 1"
-            )
         defaults = {
             "lr": lr,
             "betas": tuple(betas),

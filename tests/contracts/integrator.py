@@ -108,7 +108,3 @@ class IntegratorContract:
         steps = h * torch.eye(4, dtype=torch.float64)
         expected = [float(end(START + d) - end(START - d)) / (2 * h) for d in steps]
         np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-    def test_less_than_one_substep_is_refused(self, kind):
-        with pytest.raises(ValueError, match="substeps is 0, expected at least 1"):
-            kind(0)

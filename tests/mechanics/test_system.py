@@ -5,21 +5,12 @@ import torch
 
 from pinn_dyn.mechanics import MechanicalSystem
 from tests.support.cart_pole import CartPole
-from tests.support.linear import LinearSystem, damped_oscillators
+from tests.support.linear import damped_oscillators
 
 
 def test_a_system_without_its_four_terms_cannot_be_built():
     with pytest.raises(TypeError, match=r"abstract.*mass_matrix"):
         MechanicalSystem(num_coordinates=2, num_inputs=1)
-
-
-@pytest.mark.parametrize(
-    ("inputs", "message"),
-    [(torch.zeros(0, 1), "num_coordinates is 0"), (torch.zeros(2, 0), "num_inputs is 0")],
-)
-def test_a_size_below_one_is_refused_by_name(inputs, message):
-    with pytest.raises(ValueError, match=message):
-        LinearSystem(mass=torch.eye(2), stiffness=torch.eye(2), damping=torch.eye(2), inputs=inputs)
 
 
 def test_forward_dynamics_solves_the_linear_equation_of_motion():

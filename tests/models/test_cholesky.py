@@ -208,15 +208,6 @@ def test_the_diagonal_starts_where_it_is_told(builder, initial):
 @pytest.mark.parametrize(
     ("builder", "message"),
     [
-        (lambda: Positive(floor=-1e-3), "floor is -0.001, expected zero or a positive"),
-        (lambda: Positive(floor=float("nan")), "floor is nan"),
-        (lambda: Positive(initial=0.0), "initial is 0.0, expected a positive"),
-        (lambda: Bounded(limit=-1.0), "limit is -1.0"),
-        (lambda: Bounded(limit=0.0), "limit is 0.0"),
-        (lambda: Bounded(limit=float("nan")), "limit is nan"),
-        (lambda: Bounded(floor=-1.0), "floor is -1.0"),
-        (lambda: NetworkCholesky(scales(), hidden=[4], activation="relu"), "activation is 'relu'"),
-        (lambda: NetworkCholesky(scales(), hidden=[0]), r"hidden is \[0\]"),
         (lambda: FixedCholesky(scales(), value=[[1.0, 0.0], [0.0, 1.0]]), r"shape \(2, 2\)"),
         (lambda: FixedCholesky(scales(), value=[1.0, 1.0, 1.0]), r"shape \(3,\)"),
         (

@@ -52,12 +52,6 @@ def test_friction_starts_at_the_level_and_the_width_asked_for():
     torch.testing.assert_close(friction.slope(torch.zeros(2)), 0.05 * force / width)
 
 
-@pytest.mark.parametrize("name", ["level", "width"])
-def test_a_start_of_friction_that_is_not_positive_is_refused(name):
-    with pytest.raises(ValueError, match=f"friction: {name} is 0.0, expected a positive"):
-        CoulombFriction(make_scales(1, 1, [1.0]), **{name: 0.0})
-
-
 def test_friction_is_odd_and_reaches_its_level():
     friction = make_friction()
     _, v, _, _ = random_batch(3, 3)

@@ -115,7 +115,6 @@ def test_a_fixed_input_matrix_is_the_given_one(q):
 @pytest.mark.parametrize(
     ("builder", "message"),
     [
-        (partial(NetworkInput, hidden=[4], activation="step"), "activation is 'step'"),
         (FixedInput, r"shape \(2, 2\), expected \(3, 2\)"),
         (partial(FixedInput, value=[[1.0, 0.0, 0.0]]), r"shape \(1, 3\), expected \(3, 2\)"),
     ],

@@ -85,8 +85,6 @@ def test_the_loss_of_training_adds_its_penalty(weight):
     share = model.residual_force(q, v, u) / model.residual.scale
     expected = loss(model, windows) + weight * (share**2).mean()
     assert_near(Penalized(loss)(model, windows), expected, 1e-9)
-    with pytest.raises(ValueError, match="residual: weight is -1, expected zero"):
-        structured(residual=partial(RESIDUAL, weight=-1))
 
 
 def test_its_share_of_the_force_is_reported():

@@ -154,7 +154,6 @@ def test_what_each_part_contributes():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: both(weight=-1.0), "weight is -1.0, expected zero"),
         (
             lambda: with_network(input=partial(NetworkInput, hidden=[4])),
             r"network.input is a head .* take model/input@model.network.input=none",

@@ -187,15 +187,6 @@ def test_the_filter_keeps_the_motion_and_takes_its_derivative(runs):
     assert (a - expected)[inner].norm() < 0.1 * expected[inner].norm()
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [({"cutoff": 0.0}, "cutoff is 0.0"), ({"cutoff": 5.0, "samples": 0}, "samples is 0")],
-)
-def test_settings_are_checked(settings, message):
-    with pytest.raises(ValueError, match=message):
-        LeastSquares(**settings)
-
-
 def test_data_that_do_not_fit_the_filter_are_refused(runs):
     with pytest.raises(ValueError, match="less than half the sample rate"):
         filtered_motion(runs, 50.0, samples=10)

@@ -112,16 +112,3 @@ def test_a_training_goes_on_from_its_saved_state():
     steps(halves, alone, [second], 6, seed=2)
     for one, other in zip(whole, halves, strict=True):
         assert torch.equal(one, other)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"lr": -1.0}, "lr is -1.0, expected at least 0"),
-        ({"betas": (0.9, 1.0)}, "a beta is 1.0, expected at least 0 and less than 1"),
-        ({"precondition_frequency": 0}, "precondition_frequency is 0, expected at least 1"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        SOAP(parameters(), **setting)

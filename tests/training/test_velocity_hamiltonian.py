@@ -123,8 +123,3 @@ def test_its_mass_starts_where_that_of_a_lagrangian_network_does():
     ratio = ours.mass_matrix(q)[0].diagonal() / other.mass_matrix(q)[0].diagonal()
     torch.testing.assert_close(ratio, ratio[:1].expand(3))
     assert float(ratio[0].detach()) == pytest.approx(1, rel=0.1)
-
-
-def test_other_coordinates_are_refused():
-    with pytest.raises(ValueError, match=r"state is 'speed', expected 'qv'.*or 'qp'"):
-        make_network("speed")

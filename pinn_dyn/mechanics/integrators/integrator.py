@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from pinn_dyn.mechanics.signal import Signal
@@ -47,18 +48,13 @@ class Integrator(abc.ABC):
         order: of the error, O(h^order).
         mean_input: shift the inputs at the nodes so that their mean is that of the input over the
             step, for a method whose steps are longer than a sample.
-
-    Raises:
-        ValueError: on fewer than one substep.
     """
 
     nodes: tuple[float, ...]
     order: int
     mean_input: bool = False
 
-    def __init__(self, substeps: int = 1):
-        if substeps < 1:
-            raise ValueError(f"substeps is {substeps}, expected at least 1")
+    def __init__(self, substeps: PositiveInt = 1):
         self.substeps = substeps
 
     @abc.abstractmethod

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.data.windows import Windows
@@ -53,8 +54,7 @@ class IncrementLoss(WindowLoss):
         huber: d, in units of the spread of the increments; None: the squared error.
 
     Raises:
-        ValueError: on a curriculum that does not increase from at least 1 to H, or a weight or a
-            ``huber`` that is not positive.
+        ValueError: if the curriculum does not increase to H.
     """
 
     scale: Tensor
@@ -63,17 +63,11 @@ class IncrementLoss(WindowLoss):
         self,
         statistics: Statistics,
         model: Predictor,
-        curriculum: Sequence[int] | None = None,
-        velocity_weight: float = 1.0,
-        huber: float | None = None,
+        curriculum: Sequence[PositiveInt] | None = None,
+        velocity_weight: PositiveFloat = 1.0,
+        huber: PositiveFloat | None = None,
     ):
         super().__init__()
-        if not velocity_weight > 0:
-            raise ValueError(f"velocity_weight is {velocity_weight}, expected a positive number")
-        if huber is not None and not huber > 0:
-            raise ValueError(
-                f"huber is {huber}, expected a positive number, or null for the squared error"
-            )
         self.huber = huber
         scale = statistics.increment_std(model.state).float().clone()
         scale[:, model.num_coordinates :] /= velocity_weight**0.5
