@@ -24,7 +24,8 @@ help:  ## list the targets
 	@grep -hE '^[a-z][a-z-]*:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{ printf "make %-14s %s\n", $$1, $$2 }'
 
 demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, compare them, control it
-	$(BIN)/python train.py -m 'experiment=soft_arm_1/demo/hnn,soft_arm_1/demo/lnn,soft_arm_1/demo/mlp' hydra.sweep.dir=runs/demo
+	$(BIN)/python train.py -m experiment=demo model=hnn,lnn hydra.sweep.dir=runs/demo
+	$(BIN)/python train.py experiment=demo model=mlp loss=increment hydra.run.dir=runs/demo/2_mlp-seed0
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' step=0.01 hydra.run.dir=runs/demo-evaluation
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' dataset=soft_arm_1_beyond step=0.01 hydra.run.dir=runs/demo-beyond
 	$(BIN)/python control.py experiment=soft_arm_1/demo run=runs/demo/0_hnn-seed0 hydra.run.dir=runs/demo-control

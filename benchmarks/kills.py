@@ -63,7 +63,14 @@ LOG = [  # pieces of a log, a learned delay and a residual torque
     *("~callbacks.figures", "compile=false"),
 ]
 FIT = [  # one step of the trainer that is a whole fit
-    *("experiment=logs/double_pendulum/known", "data.pairs=20", "data.batch_size=20"),
+    *(
+        "experiment=known",
+        "dataset=double_pendulum",
+        "model.start=prior",
+        f"model.structure.urdf={ROOT / 'examples/double_pendulum.urdf'}",
+        "data.pairs=20",
+        "data.batch_size=20",
+    ),
     *("data.steps=2", "~callbacks.figures"),
 ]
 ONCE = ["reference.q=[0.05,0.05,0.2]", "duration=0.02", "settled_after=0.01", "animate=false"]

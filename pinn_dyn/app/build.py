@@ -216,7 +216,8 @@ def require_device(config: dict[str, Any]) -> None:
             else f"torch {torch.__version__} is a build without CUDA (pytorch.org has others)"
         )
         raise ConfigError(
-            f"trainer.accelerator is {accelerator}, but {why}: mend that, or take trainer=cpu"
+            f"trainer.accelerator is {accelerator}, but {why}: mend that, or take "
+            "trainer.accelerator=cpu"
         )
 
 
@@ -344,7 +345,7 @@ def check_processes(trainer: L.Trainer, batch_size: int) -> None:
     if isinstance(trainer.strategy.launcher, _SubprocessScriptLauncher):
         raise ConfigError(
             "trainer: on several devices this strategy starts the whole program again, a sweep "
-            "included: take trainer.strategy=ddp_spawn_find_unused_parameters_true, as trainer=ddp"
+            "included: take trainer.strategy=ddp_spawn_find_unused_parameters_true"
         )
     if batch_size % trainer.world_size:
         raise ConfigError(

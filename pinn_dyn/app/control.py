@@ -73,13 +73,13 @@ def control(cfg: DictConfig) -> float:
     if not model.input_affine:
         raise ConfigError(
             f"run: {run.folder} has a force that is not linear in the input (model/input=nonlinear "
-            "or model/friction=load_dependent), and the control laws invert A(q): train with "
+            "or a load-dependent friction), and the control laws invert A(q): train with "
             "model/input=network, or another friction"
         )
     if model.has_residual:
         raise ConfigError(
             f"run: {run.folder} has a residual force (model/residual=network), which the "
-            "control laws cannot invert: train with model/residual=none"
+            "control laws cannot invert: train without it"
         )
     learned = double_copy(model)
     source = build_source(run.config)

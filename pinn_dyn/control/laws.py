@@ -108,7 +108,7 @@ class ModelBasedLaw(StateFeedback):
                 f"{type(self).__name__}: the model has a learned input delay "
                 f"({model.learned_figures()}), and the law acts as if its input acted at once: "
                 "lower the gains until the delay does not matter and set "
-                "model.delay = pinn_dyn.models.NoDelay(), or train with model/delay=none"
+                "model.delay = pinn_dyn.models.NoDelay(), or train with ~model/delay"
             )
         if not (inverse_damping >= 0 and math.isfinite(inverse_damping)):
             raise ValueError(f"inverse_damping is {inverse_damping}, expected 0 or more, finite")

@@ -185,7 +185,7 @@ def draw_windows(
         raise ValueError(
             f"history is {history} s, for a learned delay, but the input is held between its "
             "samples, and has no slope to learn by: set dataset.interpolation=linear, or find the "
-            "delay by check.py, shift the input by the step InputDelay and take model/delay=none"
+            "delay by check.py, shift the input by the step InputDelay and take ~model/delay"
         )
     past = math.ceil(history / sample - 1e-6)
     starts = torch.tensor([max(item.t.shape[0] - span - past, 0) for item in trajectories])

@@ -59,7 +59,7 @@ class ContinuousStack(ContinuousPredictor):
             raise ValueError(
                 "the members learn an input delay (model/delay=learned), and all members take one "
                 "input: train the seeds one by one (train.py -m seed=0,1,2), or with "
-                "model/delay=none on an input that is shifted before (the step InputDelay)"
+                "~model/delay on an input that is shifted before (the step InputDelay)"
             )
         super().__init__(first.num_coordinates, first.num_inputs, first.state)
         self.integrator = first.integrator

@@ -49,7 +49,7 @@ class Sum(MechanicalSystem):
             if part.input_history:
                 raise ValueError(
                     f"the part {name} of a sum learns a delay of the input, which all parts share: "
-                    f"take {name}.delay=none, and shift the input by the step InputDelay"
+                    f"take ~{name}.delay, and shift the input by the step InputDelay"
                 )
         super().__init__(*next(iter(sizes.values())))
         self.integrator = integrator or RK4()

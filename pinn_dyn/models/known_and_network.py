@@ -58,15 +58,14 @@ class KnownAndNetwork(Sum):
         forces = replace(statistics, u_mean=gain * statistics.u_mean, u_std=gain * statistics.u_std)
         second = network(statistics=forces)
         drives = second.input(statistics.q_mean[None].float()).any()
-        for head, there, choice, reason in (
-            ("input", drives, "none", "the known part drives the robot"),
-            ("residual", second.has_residual, "none", "the sum has it (model/residual=network)"),
-            ("initial_velocity", second.learns_initial_state, "measured", "a sum learns no start"),
+        for head, there, reason in (
+            ("input", drives, "the known part drives the robot"),
+            ("residual", second.has_residual, "the sum has it (model/residual=network)"),
+            ("initial_velocity", second.learns_initial_state, "a sum learns no start"),
         ):
             if there:
                 raise ValueError(
-                    f"network.{head} is a head that a sum leaves out, as {reason}: take "
-                    f"model/{head}@model.network.{head}={choice}"
+                    f"network.{head} is a head that a sum leaves out, as {reason}: remove it"
                 )
         super().__init__({"known": first, "network": second}, integrator)
         self.weight = weight

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from tests.app.entry import fails, run_script
+from tests.app.entry import ROOT, fails, run_script
 from tests.support.delayed_robots import log
 
 COLUMNS = [
@@ -16,6 +16,10 @@ COLUMNS = [
     "+dataset.test.seconds=2.0",
     "dataset.test.piece=1.0",
 ]
+
+
+def structure(name):
+    return ["model/structure=urdf", f"model.structure.urdf={ROOT / 'examples' / name}.urdf"]
 
 
 def arguments(folder, **columns):
@@ -48,13 +52,13 @@ def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):
 
 
 def test_a_structure_of_another_robot_is_refused_by_name(tmp_path):
-    error = fails("check.py", *arguments(tmp_path), "model/structure=emps")
+    error = fails("check.py", *arguments(tmp_path), *structure("emps"))
     assert "dataset.q.columns has 2 entries, q1, q2" in str(error.code)
     assert "model.structure has the joints screw" in str(error.code)
 
 
 def test_known_kinematics_add_what_the_motion_tells_of_the_bodies(tmp_path, capsys):
-    run_script("check.py", *arguments(tmp_path), "model/structure=double_pendulum")
+    run_script("check.py", *arguments(tmp_path), *structure("double_pendulum"))
     text = capsys.readouterr().out
     assert "Rigid bodies" in text
     assert "condition number of the rigid-body regressor (13 base parameters" in text

@@ -96,9 +96,9 @@ def test_an_option_given_to_the_key_of_its_group_is_told_how_to_be_chosen(elsewh
 
 
 def test_a_missing_value_is_asked_for_by_name(elsewhere, capsys):
-    text = said(fails("train.py", *TINY, "model=lnn", "model/damping=fixed"), capsys)
-    assert "no value for model.damping.value" in text
-    assert "'model.damping.value=...'" in text
+    text = said(fails("train.py", *TINY, "model=known"), capsys)
+    assert "no value for model.structure.urdf" in text
+    assert "'model.structure.urdf=...'" in text
     assert "Traceback" not in text
     assert not list(elsewhere.rglob("*.ckpt"))
 
@@ -116,7 +116,6 @@ def test_missing_runs_are_asked_for_by_name(capsys):
         (["dataset.system.mass=-1"], ["dataset.system.mass is -1", "from 0 to"]),
         (["data.batch_size=65"], ["data", "batch_size is 65", "64"]),
         (["model=mlp", "model.activation=gelu"], ["model", "gelu", "softplus"]),
-        (["model=lnn", "model/damping=fixed", "model.damping.value=[[1,2],[3,4]]"], ["model"]),
         (["validator.step=0.2"], ["validator: step is 0.2 s and horizon 0.1 s"]),
         (["validator.window=0.2"], ["validator: window is 0.2 s", "horizon 0.1 s"]),
         (["+data.nonsense=1"], ["data", "nonsense"]),
@@ -178,10 +177,12 @@ def test_a_gpu_that_is_not_there_is_refused_before_the_data_are_made(
 ):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr("pinn_dyn.app.train.build_data", lambda *_: pytest.fail("made data"))
-    text = said(fails("train.py", *TINY, NO_FIGURES, "trainer=gpu", "compile=true"), capsys)
+    text = said(
+        fails("train.py", *TINY, NO_FIGURES, "trainer.accelerator=gpu", "compile=true"), capsys
+    )
     assert "trainer.accelerator is gpu, but" in text
     assert why in text
-    assert "take trainer=cpu" in text
+    assert "take trainer.accelerator=cpu" in text
 
 
 @pytest.mark.parametrize("exists", [False, True])

@@ -18,7 +18,6 @@ from tests.app.entry import (
     run_script,
     train,
 )
-from tests.app.hardware_logs import write_neck, write_panda
 from tests.support.processes import fork
 from tests.support.recorded_logs import LOGS, needs_logs
 
@@ -30,6 +29,7 @@ EXPERIMENTS = sorted(
     str(path.relative_to(CONF / "experiment").with_suffix(""))
     for path in (CONF / "experiment").rglob("*.yaml")
 )
+LOG_EXPERIMENTS = ("double_pendulum", "known", "soft_neck", "trunk", "ur10e")
 HEADS = {
     folder.name: sorted(path.stem for path in folder.glob("*.yaml"))
     for folder in sorted((CONF / "model").iterdir())
@@ -37,8 +37,6 @@ HEADS = {
 }
 # Configurations that leave a value to the user.
 VALUES = {
-    "model/mass=fixed": "model.mass.value=[[0.01,0,0],[0,0.01,0],[0,0,0.1]]",
-    "model/damping=fixed": "model.damping.value=[[0.1,0,0],[0,0.1,0],[0,0,0.1]]",
     "model/potential=chain": "model.angles=[0,1,2]",
 }
 
@@ -71,18 +69,20 @@ def of_logs(folder):
     return []
 
 
+def of_emps(folder):
+    return ["dataset=emps", f"model.structure.urdf={ROOT / 'examples' / 'emps.urdf'}"]
+
+
 # How to make the data set that an experiment is named after small, or to write a stand-in for it.
 DATA = {
     "soft_arm_1": of_arm_1,
     "soft_arm_1_wide": of_arm_1_wide,
     "soft_arm_2": of_arm_2,
     "panda": of_panda,
-    "neck": write_neck,
-    "panda_real": write_panda,
+    "demo": of_arm_1,
     "example_log": of_logs,
+    "known": of_emps,
     "double_pendulum": of_logs,
-    "emps": of_logs,
-    "panda_gaz": of_logs,
     "soft_neck": of_logs,
     "trunk": of_logs,
     "ur10e": of_logs,
@@ -96,23 +96,22 @@ SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200", "data.steps=2"]
 @pytest.mark.parametrize(
     "experiment",
     [
-        pytest.param(x, marks=[needs_logs, pytest.mark.slow] if x.startswith("logs/") else ())
+        pytest.param(x, marks=[needs_logs, pytest.mark.slow] if x in LOG_EXPERIMENTS else ())
         for x in EXPERIMENTS
     ],
 )
 def test_every_experiment_trains(tmp_path, monkeypatch, experiment):
     monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))
     monkeypatch.chdir(ROOT)  # from where the example log is found
-    if experiment not in ("logs/trunk/lnn", "neck/lnn"):  # drawing takes longer than training
+    if experiment != "trunk":  # drawing takes longer than training
         monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
-    data = experiment.removeprefix("logs/").split("/")[0]
     folder = tmp_path / "run"
     run_script(
         "train.py",
         f"experiment={experiment}",
         *TINY_TRAINING,
-        *DATA[data](tmp_path),
-        *(SHORT_FIT if experiment.endswith("/known") else ()),
+        *DATA[experiment](tmp_path),
+        *(SHORT_FIT if experiment in ("known", "ur10e") else ()),
         NO_FIGURES,
         "compile=false",
         f"hydra.run.dir={folder}",
@@ -181,7 +180,7 @@ def test_a_loss_that_does_not_fit_ends_with_its_name(tmp_path, capsys, mistake, 
     assert words in said(error, capsys)
 
 
-HNN_ON_A_LOG = ["experiment=example_log/lnn", "model=hnn", "compile=false", *TINY_TRAINING]
+HNN_ON_A_LOG = ["experiment=example_log", "model=hnn", "compile=false", *TINY_TRAINING]
 
 
 def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypatch):
@@ -204,19 +203,17 @@ def test_there_are_models_heads_and_experiments_to_test():
     """The lists above come from globs: an empty one would test nothing."""
     assert {"hnn", "lnn", "mlp"} <= set(MODELS)
     assert {"increment", "midpoint"} <= set(LOSSES)
-    some = {"mass": "network", "damping": "fixed", "input": "network", "friction": "coulomb"}
+    some = {"mass": "network", "damping": "constant", "input": "network", "friction": "coulomb"}
     assert all(option in HEADS[group] for group, option in some.items())
-    assert {"soft_arm_1", "soft_arm_2", "panda", "logs", "example_log", "neck", "panda_real"} <= {
-        x.split("/")[0] for x in EXPERIMENTS
-    }
+    assert {"soft_arm_1", "soft_arm_2", "panda", "trunk", "example_log"} <= {*EXPERIMENTS}
 
 
 def test_what_the_tests_compose_faster_is_what_hydra_composes(tmp_path, kept_compositions):
     """:mod:`tests.support.compositions` replaces parts of Hydra; a copy of this process has all."""
     choices = [
         [],
-        ["experiment=soft_arm_2/lnn_wide", "model/integrator=rosenbrock", "trainer=gpu"],
-        ["experiment=logs/ur10e/known", "optimizer.rollouts=false", "~callbacks.figures"],
+        ["experiment=soft_arm_2", "model/integrator=rosenbrock", "trainer.accelerator=gpu"],
+        ["experiment=ur10e", "optimizer.rollouts=false", "~callbacks.figures"],
         ["model=hnn", "model.integrator.substeps=2", "search=equal", "search.draw=3"],
     ]
     choices = [[*words, "model_name=any"] for words in choices]

@@ -209,7 +209,7 @@ def test_a_run_of_measured_data_gets_a_report_of_the_model_alone(tmp_path, monke
     run = tmp_path / "run"
     run_script(
         "train.py",
-        "experiment=example_log/lnn",
+        "experiment=example_log",
         *TINY_TRAINING,
         NO_FIGURES,
         "compile=false",
@@ -223,9 +223,7 @@ def test_a_run_of_measured_data_gets_a_report_of_the_model_alone(tmp_path, monke
 
 
 def test_there_are_control_experiments():
-    assert {"soft_arm_2/regulation", "soft_arm_2/stability", "panda/tracking", "panda/helix"} <= {
-        *EXPERIMENTS
-    }
+    assert {"soft_arm_2/regulation", "panda/tracking", "panda/helix"} <= {*EXPERIMENTS}
 
 
 @pytest.mark.panda
@@ -259,7 +257,7 @@ def panda_run(tmp_path_factory):
     counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1", "dataset.workers=1"]
     run_script(
         "train.py",
-        "experiment=panda/lnn",
+        "experiment=panda",
         *TINY_TRAINING,
         "dataset.duration=0.2",
         *counts,
@@ -272,4 +270,4 @@ def panda_run(tmp_path_factory):
 
 
 def test_an_experiment_of_training_is_none_of_control(capsys, lnn_run):
-    assert "experiment/soft_arm_1/hnn" in refused(capsys, lnn_run, "experiment=soft_arm_1/hnn")
+    assert "experiment/soft_arm_1" in refused(capsys, lnn_run, "experiment=soft_arm_1")

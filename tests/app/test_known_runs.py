@@ -14,10 +14,16 @@ import torch
 import pinn_dyn
 from pinn_dyn.app.constants import read_constants
 from tests.app.entry import NO_FIGURES, fork_script, refused_text, run_script
-from tests.support.recorded_logs import LOGS, needs_logs
+from tests.support.recorded_logs import LOGS, ROOT, needs_logs
 
 pytestmark = needs_logs
-KNOWN = "experiment=logs/double_pendulum/known"
+WINDOWS_OF_PENDULUM = ["dataset=double_pendulum", "data=multi_step", "validator.horizon=1"]
+URDF = f"structure.urdf={ROOT / 'examples' / 'double_pendulum.urdf'}"
+KNOWN = [
+    *WINDOWS_OF_PENDULUM,
+    *("model=known", "model/friction=stribeck", f"model.{URDF}", "model.start=prior"),
+    *("optimizer=least_squares", "data.pairs=150", "data.batch_size=150", "data.stride=10"),
+]
 WINDOWS = ["data.pairs=20", "data.batch_size=20", "data.steps=2", "validator.horizon=0.1"]
 WINDOWS += [NO_FIGURES]
 SMALL = [*WINDOWS, "optimizer.rollouts=false"]
@@ -34,7 +40,7 @@ def quick():
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory, quick):
     folder = tmp_path_factory.mktemp("runs") / "known"
-    run_script("train.py", KNOWN, *SMALL, f"hydra.run.dir={folder}")
+    run_script("train.py", *KNOWN, *SMALL, f"hydra.run.dir={folder}")
     return folder
 
 
@@ -91,7 +97,9 @@ def test_a_network_starts_on_the_constants_of_a_fit(tmp_path, fitted):
     folder = tmp_path / "both"
     run_script(
         "train.py",
-        "experiment=logs/double_pendulum/known_and_network",
+        *WINDOWS_OF_PENDULUM,
+        *("model=known_and_network", "model/friction@model.known.friction=stribeck"),
+        *(f"model.known.{URDF}", "model.known.start=prior", "data.stride=5", "data.pairs=10000"),
         *WINDOWS,
         f"start_from={fitted}",
         "optimizer.lr=1e-9",
@@ -110,11 +118,11 @@ def test_a_network_starts_on_the_constants_of_a_fit(tmp_path, fitted):
 def test_a_fit_that_starts_from_another_keeps_what_it_found(tmp_path, fitted):
     folder = tmp_path / "again"
     short = ["optimizer.samples=40", f"start_from={fitted}"]
-    run_script("train.py", KNOWN, *SMALL, *short, f"hydra.run.dir={folder}")
+    run_script("train.py", *KNOWN, *SMALL, *short, f"hydra.run.dir={folder}")
     before, after = constants(fitted), constants(folder)
     apart = max(float((after[key] - before[key]).abs().max()) for key in before)
     alone = tmp_path / "alone"
-    run_script("train.py", KNOWN, *SMALL, short[0], f"hydra.run.dir={alone}")
+    run_script("train.py", *KNOWN, *SMALL, short[0], f"hydra.run.dir={alone}")
     else_where = constants(alone)
     assert apart < 0.5 * max(float((else_where[k] - before[k]).abs().max()) for k in before)
 
@@ -146,7 +154,7 @@ def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
 def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path, fitted, capsys):
     """It is what a run without roll-outs finds, which is not shown twice."""
     rolled = tmp_path / "rolled"
-    run_script("train.py", KNOWN, *WINDOWS, f"hydra.run.dir={rolled}")
+    run_script("train.py", *KNOWN, *WINDOWS, f"hydra.run.dir={rolled}")
     rows = {}
     for name, runs in {"rolled": [rolled], "both": [rolled, fitted]}.items():
         words = ["windows=[0.1]", "horizon=0.2", f"hydra.run.dir={tmp_path / name}"]
@@ -180,7 +188,7 @@ def test_a_covariance_that_is_none_is_no_prior(tmp_path, fitted, capsys):
     for change, message in FORGED.values():
         torch.save({**whole, "covariance": change(whole["covariance"])}, path)
         start = [f"start_from={forged}", f"hydra.run.dir={tmp_path / 'no'}"]
-        text = refused_text(capsys, "train.py", KNOWN, *SMALL, *start)
+        text = refused_text(capsys, "train.py", *KNOWN, *SMALL, *start)
         assert re.search(message, text, re.DOTALL)
 
 
@@ -193,7 +201,7 @@ def test_a_covariance_that_is_none_is_no_prior(tmp_path, fitted, capsys):
 )
 def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, setting, message):
     place = f"hydra.run.dir={tmp_path / 'no'}"
-    assert re.search(message, refused_text(capsys, "train.py", KNOWN, *SMALL, setting, place))
+    assert re.search(message, refused_text(capsys, "train.py", *KNOWN, *SMALL, setting, place))
 
 
 @pytest.mark.parametrize(
@@ -211,7 +219,7 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, stop, sta
     with log.open("w") as output, monkeypatch.context() as patch:
         patch.setattr("pinn_dyn.training.least_squares.rollout_slopes", endless)
         short = ["optimizer.samples=200", "optimizer.evaluations=5"]
-        words = [KNOWN, *WINDOWS, *short, f"hydra.run.dir={folder}"]
+        words = [*KNOWN, *WINDOWS, *short, f"hydra.run.dir={folder}"]
         process = fork_script("train.py", *words, folder=tmp_path, output=output)
         try:
             while not begun.exists() and process.is_alive():
@@ -249,14 +257,14 @@ def test_a_fit_that_is_finished_is_not_done_again(tmp_path, fitted, monkeypatch)
 
 
 def test_fewer_windows_than_constants_end_in_a_sentence(tmp_path, capsys):
-    few = [KNOWN, NO_FIGURES, "data.pairs=1", "data.batch_size=1", "data.steps=2"]
+    few = [*KNOWN, NO_FIGURES, "data.pairs=1", "data.batch_size=1", "data.steps=2"]
     text = refused_text(capsys, "train.py", *few, f"hydra.run.dir={tmp_path / 'no'}")
     assert re.search(r"optimizer: .*1 windows of 2 steps give 8 residuals for \d+ constants", text)
 
 
 def test_currents_without_gains_end_in_a_sentence(tmp_path, capsys):
     currents = "dataset.u.unit=A"
-    text = refused_text(capsys, "train.py", KNOWN, *SMALL, currents, f"hydra.run.dir={tmp_path}")
+    text = refused_text(capsys, "train.py", *KNOWN, *SMALL, currents, f"hydra.run.dir={tmp_path}")
     assert "tau_cmd1 in A, tau_cmd2 in A, and model.drive_gain is 1" in text
 
 

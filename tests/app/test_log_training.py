@@ -10,13 +10,11 @@ import torch
 from matplotlib.image import imread
 
 from pinn_dyn import fit
-from pinn_dyn.models import Bounded
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
     TINY_TRAINING,
     assert_trained,
-    compose,
     fails,
     run_script,
 )
@@ -24,7 +22,7 @@ from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
 
 EXAMPLES = ROOT / "examples"
-TINY = ["experiment=example_log/lnn", "compile=false", *TINY_TRAINING, NO_FIGURES]
+TINY = ["experiment=example_log", "compile=false", *TINY_TRAINING, NO_FIGURES]
 
 
 @pytest.fixture
@@ -171,29 +169,9 @@ def test_a_mistake_about_a_log_ends_with_its_name_and_place(
     assert not list(tmp_path.rglob("*.ckpt"))
 
 
-@pytest.mark.parametrize("experiment", ["neck/lnn", "neck/polynomial", "panda_real/lnn"])
-def test_presets_of_hardware_ask_for_the_log(tmp_path, capsys, experiment):
-    error = fails("train.py", f"experiment={experiment}", f"hydra.run.dir={tmp_path / 'run'}")
-    assert "no value for dataset.files" in said(error, capsys)
-
-
-def test_presets_of_hardware_have_the_structure_of_the_paper():
-    neck, fit, panda = (
-        compose(f"experiment={name}") for name in ("neck/lnn", "neck/polynomial", "panda_real/lnn")
-    )
-    assert neck.dataset.steps.smooth.window == "5 s"  # 50 samples of 10 Hz
-    assert "fit" not in neck.dataset.steps
-    assert fit.dataset.steps.smooth is None
-    assert fit.dataset.steps.fit.degree == 7
-    assert len(neck.dataset.u.columns) == 4
-    assert neck.model.input._target_.endswith("NetworkInput")
-    # The class's own limit is the paper's.
-    assert panda.model.mass.positivity._target_.endswith("Bounded")
-    assert Bounded().limit == 3.5
-    assert panda.model.input._target_.endswith("FixedInput")
-    assert len(panda.model.angles) == len(panda.dataset.q.columns) == 7
-    for preset in (neck, fit, panda):
-        assert preset.model.friction._target_.endswith("CoulombFriction")
+def test_the_preset_of_the_neck_asks_for_the_log(tmp_path, capsys):
+    words = ["dataset=neck", "data=multi_step", "model=lnn", f"hydra.run.dir={tmp_path / 'run'}"]
+    assert "no value for dataset.files" in said(fails("train.py", *words), capsys)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -121,7 +121,6 @@ def test_settings_are_those_of_the_command_line_with_their_resolved_values():
         "model/damping=constant",
         "model.hidden=[16,16]",
         "++trainer.precision=null",
-        "+debug=fast",
         "seed=3",
         "threads=1",
         "name=arm/lnn",

@@ -31,7 +31,7 @@ MODELS = ["lnn", "hnn", "mlp", "acceleration"]
 def drawn(experiment, draw, *words):
     config = composed(
         "train",
-        ["search=equal", f"search.draw={draw}", f"experiment={experiment}", "model_name=x", *words],
+        ["search=equal", f"search.draw={draw}", *experiment.split(), "model_name=x", *words],
     )
     before = {**config, "search": {"draw": draw}}
     return before, build_part("search", config["search"]).applied(config)
@@ -46,13 +46,13 @@ def values(part, key):
 
 
 def test_the_first_draw_is_the_experiment():
-    before, after = drawn("soft_arm_1/lnn", 0)
+    before, after = drawn("experiment=soft_arm_1 model=lnn", 0)
     assert after == before
 
 
 @pytest.mark.parametrize("draw", [1, 2, 7, 30])
 def test_every_model_gets_the_same_draw(draw):
-    found = [drawn(f"soft_arm_1/{model}", draw) for model in MODELS]
+    found = [drawn(f"experiment=soft_arm_1 model={model}", draw) for model in MODELS]
     optimizers = [
         (after["optimizer"]["lr"], after["optimizer"]["weight_decay"]) for _, after in found
     ]
@@ -69,7 +69,7 @@ def test_every_model_gets_the_same_draw(draw):
 
 
 def test_heads_of_a_structured_model_are_drawn_and_nothing_else():
-    before, after = drawn("logs/trunk/lnn", 1)
+    before, after = drawn("experiment=trunk", 1)
     assert before["model"]["input"]["linear"] == after["model"]["input"]["linear"]
     assert set(map(str, values(after["model"], "activation"))) != set(
         map(str, values(before["model"], "activation"))
@@ -79,7 +79,7 @@ def test_heads_of_a_structured_model_are_drawn_and_nothing_else():
 
 
 def test_a_larger_budget_goes_on_from_a_smaller_one_and_covers_the_range():
-    rates = [drawn("soft_arm_1/mlp", k)[1]["optimizer"]["lr"] for k in range(1, 17)]
+    rates = [drawn("model=mlp", k)[1]["optimizer"]["lr"] for k in range(1, 17)]
     assert len(set(rates)) == 16
     assert min(rates) < 1e-3
     assert max(rates) > 5e-3
@@ -144,6 +144,6 @@ def test_ranges_that_are_none(settings, said):
 
 def test_a_fit_without_a_learning_rate_is_the_same_at_every_draw(caplog):
     caplog.set_level("INFO")
-    before, after = drawn("logs/emps/known", 1)
+    before, after = drawn("experiment=known dataset=emps model.structure.urdf=x", 1)
     assert after == before
     assert "draw 1 changes nothing, as the optimizer has no learning rate" in caplog.text

@@ -18,6 +18,8 @@ from tests.app.entry import (
     run_script,
 )
 
+DDP = ["trainer.devices=2", "trainer.strategy=ddp_spawn_find_unused_parameters_true"]
+
 
 @pytest.fixture
 def sweep(tmp_path, monkeypatch, capsys):
@@ -217,7 +219,7 @@ def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         at = dict(folder=tmp_path, output=output)
-        process = fork_script("train.py", *words, "trainer=ddp", "hydra.sweep.dir=ddp", **at)
+        process = fork_script("train.py", *words, *DDP, "hydra.sweep.dir=ddp", **at)
         try:
             run_script("train.py", *words, f"hydra.sweep.dir={tmp_path / 'cpu'}")
         finally:
@@ -242,8 +244,8 @@ def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["trainer.devices=2"], ["starts the whole program again", "trainer=ddp"]),
-        (["trainer=ddp", "data.batch_size=31"], ["batch_size is 31", "multiple of the 2"]),
+        (["trainer.devices=2"], ["starts the whole program again", DDP[1]]),
+        ([*DDP, "data.batch_size=31"], ["batch_size is 31", "multiple of the 2"]),
     ],
 )
 def test_what_goes_wrong_on_several_devices_is_refused(tmp_path, monkeypatch, overrides, words):

@@ -112,7 +112,7 @@ def test_every_command_teaches(installed, tmp_path):
         installed,
         tmp_path,
         *[[f"pinn-dyn-{name}", "--help"] for name in names],
-        ["pinn-dyn-train", "experiment=soft_arm_1/lnn", "--cfg", "job"],
+        ["pinn-dyn-train", "experiment=soft_arm_1", "--cfg", "job"],
         ["pinn-dyn-train", "-sc", "install=bash"],
     )
     for name, text in zip(names, helps, strict=True):

@@ -103,13 +103,19 @@ def test_neck_with_polynomials_instead(neck):
     assert "MovingAverage" not in source.report
 
 
-def test_panda_real(tmp_path):
+def test_panda(tmp_path):
     table = motion(15.0, rate=500.0)
     for k in range(1, 8):
         table[f"q{k}"], table[f"qd{k}"] = table["q1"], table["v1"]
         table[f"tau{k}"] = table["u1"]
     write(tmp_path, table, "panda.csv")
-    splits = preset("panda_real", f"dataset.root='{tmp_path}'", "dataset.files=panda.csv").load()
+    splits = preset(
+        "panda_gaz",
+        f"dataset.root='{tmp_path}'",
+        "dataset.files=panda.csv",
+        "dataset.test.seconds=4.0",
+        "dataset.test.piece=2.0",
+    ).load()
     assert [len(x) for x in (splits.train, splits.validation, splits.test)] == [1, 1, 2]
     assert float(splits.train[0].t[1]) == pytest.approx(0.002)
 

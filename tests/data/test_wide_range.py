@@ -6,6 +6,7 @@ import torch
 from omegaconf import OmegaConf
 
 from pinn_dyn.app.build import build_source
+from reproduce import read_entries
 from tests.support.composing import compose
 
 T = np.linspace(0, 5, 501)
@@ -23,7 +24,8 @@ def wide():
 
 @pytest.fixture(scope="module")
 def beyond():
-    return build("soft_arm_1_wide_beyond")
+    entry = read_entries()["study/beyond"]
+    return build("soft_arm_1_wide", *(word for word in entry["evaluate"] if "dataset." in word))
 
 
 def drawn(source, split, count):

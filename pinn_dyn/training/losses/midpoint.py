@@ -65,7 +65,7 @@ class MidpointLoss(WindowLoss):
         if model.learns_initial_state:
             raise ValueError(
                 "the model learns the velocity at which roll-outs start, and this loss rolls "
-                "nothing out: take loss=increment, or model/initial_velocity=measured"
+                "nothing out: take loss=increment, or ~model/initial_velocity"
             )
         scale = statistics.increment_std(model.state)
         if scale.shape[0] != 1:
