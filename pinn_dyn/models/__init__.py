@@ -8,12 +8,13 @@ from pinn_dyn.models.cholesky import (
     NetworkCholesky,
 )
 from pinn_dyn.models.delay import Delay, LearnedDelay, NoDelay
-from pinn_dyn.models.friction import CoulombFriction, Friction, NoFriction
-from pinn_dyn.models.friction_ladder import (
+from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
-    DriveCoulomb,
+    CoulombFriction,
+    Friction,
     LoadDependent,
     LoadDependentStribeck,
+    NoFriction,
     Stribeck,
 )
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
@@ -49,7 +50,6 @@ __all__ = [
     "ConstantInput",
     "CoulombFriction",
     "Delay",
-    "DriveCoulomb",
     "FixedCholesky",
     "FixedInput",
     "Friction",

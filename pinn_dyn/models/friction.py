@@ -1,49 +1,54 @@
-"""Heads for dry friction: none, or a smooth Coulomb law for each coordinate."""
+"""Heads for dry friction. Each law adds one effect to the law before it, and all are passive."""
 
 from __future__ import annotations
 
 import abc
 
 import torch
-import torch.nn.functional as F
 from pydantic import PositiveFloat
 from torch import Tensor, nn
 
-from pinn_dyn.models.known_constants import Named
+from pinn_dyn.models.known_constants import Constants, Named
 from pinn_dyn.models.scales import Scales
+
+_SMALLEST_WIDTH = 0.01
+"""In units of the typical speed. A jump in the force could not be integrated."""
 
 
 class Friction(nn.Module, abc.ABC):
-    """A dissipative force F(v) ``(*batch, N)`` beside D(q) v, with v^T F(v) >= 0.
+    """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
 
     Attributes:
-        by_load: whether a drive loses more under load, see :meth:`transmitted`.
+        by_load: true if transmission losses depend on the drive force, see :meth:`transmitted`.
     """
 
     by_load: bool = False
 
     @abc.abstractmethod
     def forward(self, v: Tensor) -> Tensor:
-        """F(v), ``(*batch, N)``, at v ``(*batch, N)``."""
-
-    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """What of the force of a drive arrives at the joint, ``(*batch, N)``; here all of it."""
-        return force
-
-    def physical_constants(self) -> list[Named]:
-        """The constants as they act, of a law whose parameters are such; here none."""
-        return []
+        """Return F(v), ``(*batch, N)``, at v ``(*batch, N)``."""
 
     @abc.abstractmethod
     def slope(self, v: Tensor) -> Tensor:
-        """dF_i/dv_i >= 0, ``(*batch, N)``; F_i depends on v_i alone."""
+        """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends on v_i alone."""
+
+    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
+        """Return the joint force after transmission losses, ``(*batch, N)``.
+
+        The default transmits the full drive force.
+        """
+        return force
+
+    def physical_constants(self) -> list[Named]:
+        """Return the learned constants in physical units. The default has none."""
+        return []
 
 
 class NoFriction(Friction):
-    """F = 0: dissipation is viscous, as in the paper.
+    """F = 0: all dissipation is viscous, as in the paper.
 
     Args:
-        scales: of the data.
+        scales: scales of the data.
     """
 
     def __init__(self, scales: Scales):
@@ -57,41 +62,177 @@ class NoFriction(Friction):
 
 
 class CoulombFriction(Friction):
-    """F_i(v) = c_i tanh(v_i / w_i), a smooth Coulomb law with learned c_i > 0 and w_i > 0.
+    """Smooth Coulomb law F_i(v) = c_i tanh(v_i / w_i) with learned c_i > 0 and w_i > 0.
 
-    c_i is the friction force of coordinate i (N or Nm), w_i the speed at which it has mostly set
-    in. Passive by construction: v_i F_i(v) >= 0 for every v. See Armstrong-Helouvry, Dupont and
-    Canudas de Wit (1994), "A survey of models, analysis tools and compensation methods for the
-    control of machines with friction", for the law and what it leaves out (stiction).
+    c_i is the friction level of coordinate i (N or Nm). At the speed w_i (m/s or rad/s) the force
+    has reached 76 % of the level. The law is passive: v_i F_i(v) >= 0 for every v. It has no
+    stiction. Source: Armstrong-Helouvry, Dupont and Canudas de Wit (1994), "A survey of models,
+    analysis tools and compensation methods for the control of machines with friction".
 
     Args:
-        scales: of the data; the value is a typical generalized force, ``(N,)``.
-        level: c starts at this part of the typical forces.
-        width: w starts at this part of the typical speeds beyond a hundredth, below which it never
-            falls, as a jump in the force could not be integrated.
+        scales: scales of the data. The value is a typical generalized force, ``(N,)``.
+        level: initial c in units of the typical forces.
+        width: initial w in units of the typical speeds. A hundredth of the typical speed is added
+            to it. The default is 0.1 for a network, and 0.03 for known mechanics.
+        spread: prior standard deviation of log c and log w, for known mechanics only.
     """
 
-    force: Tensor
-    v_std: Tensor
-
-    def __init__(self, scales: Scales, *, level: PositiveFloat = 0.1, width: PositiveFloat = 0.1):
+    def __init__(
+        self,
+        scales: Scales,
+        *,
+        level: PositiveFloat = 0.1,
+        width: PositiveFloat | None = None,
+        spread: PositiveFloat = 1.0,
+    ):
         super().__init__()
-        self.raw_force = nn.Parameter(torch.full((scales.size,), level).expm1().log())
-        self.raw_width = nn.Parameter(torch.full((scales.size,), width).expm1().log())
-        self.register_buffer("force", scales.value.float().clone())
-        self.register_buffer("v_std", scales.statistics.v_std.float().clone())
+        if width is None:
+            width = 0.03 if scales.prior else 0.1
+        forces = [joint.force for joint in scales.joints]
+        speeds = [joint.speed for joint in scales.joints]
+        v_std = scales.statistics.v_std
+        self.level = scales.positive("Coulomb friction", level, scales.value, spread, forces)
+        self.width = scales.positive(
+            "friction width", width, v_std, spread, speeds, floor=_SMALLEST_WIDTH
+        )
+        self._add_constants(scales)
+
+    def _add_constants(self, scales: Scales) -> None:
+        """Add the constants that a subclass has in addition to level and width."""
+
+    def physical_constants(self) -> list[Named]:
+        """Return level and width."""
+        return [*self._levels(), self.width.named()]
 
     def forward(self, v: Tensor) -> Tensor:
-        force, width = self._constants()
-        return force * torch.tanh(v / width)
+        return self._level(v)[0] * torch.tanh(v / self.width())
 
     def slope(self, v: Tensor) -> Tensor:
-        """c_i (1 - tanh(v_i / w_i)^2) / w_i."""
-        force, width = self._constants()
-        return force / width * (1 - torch.tanh(v / width) ** 2)
+        """Return c_i (1 - tanh(v_i / w_i)^2) / w_i + dc_i/dv_i tanh(v_i / w_i)."""
+        level, level_slope = self._level(v)
+        width = self.width()
+        sign = torch.tanh(v / width)
+        slope = level / width * (1 - sign**2)
+        return slope if level_slope is None else slope + level_slope * sign
 
-    def _constants(self) -> tuple[Tensor, Tensor]:
-        """c and w, ``(N,)`` each."""
-        force = self.force * F.softplus(self.raw_force)
-        width = self.v_std * (F.softplus(self.raw_width) + 0.01)
-        return force, width
+    def _levels(self) -> list[Named]:
+        return [self.level.named()]
+
+    def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the level at v and its slope in v, or None where the slope is zero."""
+        return self.level(), None
+
+
+class AsymmetricCoulomb(CoulombFriction):
+    """Coulomb law with a level for each direction, as worn and preloaded gears have::
+
+        F_i(v) = c+_i tanh(v_i / w_i) for v_i > 0,    c-_i tanh(v_i / w_i) for v_i < 0
+
+    The arguments are those of :class:`CoulombFriction`.
+    """
+
+    def _add_constants(self, scales: Scales) -> None:
+        # c+ is the level times the asymmetry, c- is the level divided by the asymmetry.
+        self.ratio = _dimensionless(scales, "friction asymmetry", 1.0, spread=0.5)
+
+    def _levels(self) -> list[Named]:
+        level, ratio = self.level(), self.ratio()
+        constants = []
+        for sign, values in ((">", level * ratio), ("<", level / ratio)):
+            names = [name.replace(" of ", f" (v {sign} 0) of ", 1) for name in self.level.names]
+            constants.append(Named(names, self.level.units, values, lower=0.0))
+        return constants
+
+    def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
+        level, ratio = self.level(), self.ratio()
+        return torch.where(v > 0, level * ratio, level / ratio), None
+
+
+class Stribeck(AsymmetricCoulomb):
+    """Stribeck law F_i(v) = (c_i + s_i exp(-(v_i / b_i)^2)) tanh(v_i / w_i), with c_i by direction.
+
+    Friction is larger by s_i > 0 near rest, where lubrication is not yet established, and decreases
+    at the Stribeck speed b_i. Source: Armstrong-Helouvry, Dupont and Canudas de Wit (1994), sec. 2.
+    The arguments are those of :class:`CoulombFriction`.
+    """
+
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        v_std = scales.statistics.v_std
+        self.rise = scales.positive("Stribeck rise", 0.03, scales.value, 1.0, self.level.units)
+        self.speed = scales.positive("Stribeck speed", 0.3, v_std, 1.0, self.width.units)
+
+    def physical_constants(self) -> list[Named]:
+        """Return the levels, the width, the rise and the Stribeck speed."""
+        return [*super().physical_constants(), self.rise.named(), self.speed.named()]
+
+    def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
+        level, _ = super()._level(v)
+        speed = self.speed()
+        rise = self.rise() * torch.exp(-((v / speed) ** 2))
+        return level + rise, -2 * v / speed**2 * rise
+
+
+class LoadDependent(Stribeck):
+    """Stribeck law, and a transmission loss that grows with the drive force f_i::
+
+        transmitted_i = f_i - l_i |f_i| tanh(v_i / w_i),      0 < l_i < 1
+
+    Gear teeth that transmit a larger force have more friction. l_i is the share of the drive force
+    that is lost while the drive moves the joint; if the joint moves the drive, the same share is
+    added. The loss is passive: v_i l_i |f_i| tanh(v_i / w_i) >= 0. Source: model M3 of Duclusaud et
+    al. (2025), "Extended friction models for the physics simulation of servo actuators" (BAM), with
+    the rise of M2. Their load is the difference of the drive force and the force of the arm; here
+    it is the drive force. The arguments are those of :class:`CoulombFriction`.
+    """
+
+    by_load = True
+
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        self.odds = _dimensionless(scales, "loss by load", 0.05)
+
+    def physical_constants(self) -> list[Named]:
+        """Return the constants of the Stribeck law and the loss l."""
+        loss = self.odds.named()._replace(values=_share(self.odds()))
+        return [*super().physical_constants(), loss]
+
+    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
+        """Return f - l |f| tanh(v / w)."""
+        return force - self._loss(v) * force.abs() * torch.tanh(v / self.width())
+
+    def _loss(self, v: Tensor) -> Tensor:
+        """Return l at v."""
+        return _share(self.odds())
+
+
+class LoadDependentStribeck(LoadDependent):
+    """Load-dependent friction with a loss that is larger near rest::
+
+        l_i(v) = o_i / (1 + o_i),     o_i = odds_i + rise_i exp(-(v_i / b_i)^2)
+
+    b_i is the Stribeck speed. The law is passive, since 0 < l_i < 1 at every v. Source: model M4 of
+    the source of :class:`LoadDependent`. The arguments are those of :class:`CoulombFriction`.
+    """
+
+    def _add_constants(self, scales: Scales) -> None:
+        super()._add_constants(scales)
+        self.odds_rise = _dimensionless(scales, "loss by load near rest", 0.02)
+
+    def physical_constants(self) -> list[Named]:
+        """Return the constants of the Stribeck law, the loss l, and l at rest."""
+        at_rest = _share(self.odds() + self.odds_rise())
+        return [*super().physical_constants(), self.odds_rise.named()._replace(values=at_rest)]
+
+    def _loss(self, v: Tensor) -> Tensor:
+        return _share(self.odds() + self.odds_rise() * torch.exp(-((v / self.speed()) ** 2)))
+
+
+def _dimensionless(scales: Scales, label: str, start: float, spread: float = 1.0) -> Constants:
+    ones = torch.ones(scales.size, dtype=scales.value.dtype)
+    return scales.positive(label, start, ones, spread, ["1"] * scales.size)
+
+
+def _share(odds: Tensor) -> Tensor:
+    """Convert odds to a share between 0 and 1."""
+    return odds / (1 + odds)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.known_constants import Named, PhysicalBodies, PositiveConstants, RealConstants
+from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.scales import Joint, Scales
@@ -131,13 +131,13 @@ class KnownMechanics(LearnedConstants):
         joints = tuple(map(Joint, structure.joint_names, structure.turning))
         bodies = structure.generic_inertia() if start == "generic" else structure.inertia
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
-        damping = 0.1 * force / statistics.v_std.double()
-        scales = Scales(statistics, force, named=joints)
+        scales = Scales(statistics, force, named=joints, prior=True)
+        inertia, damping = force / acceleration, force / statistics.v_std.double()
         self.armature = scales.positive(
-            "armature", 0.03 * force / acceleration, 1.5, [joint.inertia for joint in joints]
+            "armature", 0.03, inertia, 1.5, [joint.inertia for joint in joints]
         )
         self.viscous = scales.positive(
-            "viscous friction", damping, 1.5, [joint.damping for joint in joints]
+            "viscous friction", 0.1, damping, 1.5, [joint.damping for joint in joints]
         )
         self.offset = RealConstants(
             0.3 * force,
@@ -146,10 +146,10 @@ class KnownMechanics(LearnedConstants):
         )
         self.friction = friction(scales)
         self.input_affine = not self.friction.by_load
-        self.gain: PositiveConstants | None = None
+        self.gain: Constants | None = None
         if gain_spread > 0:
             units = [f"{joint.force}/u" for joint in joints]
-            self.gain = scales.positive("drive gain", gain, gain_spread, units)
+            self.gain = scales.positive("drive gain", 1.0, gain, gain_spread, units)
         self.register_buffer("fixed_gain", gain.clone())
         self.fixed_gain: Tensor
         self.float()

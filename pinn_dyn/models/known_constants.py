@@ -1,7 +1,7 @@
-"""Learned physical constants; every parameter is a standard normal variate a priori.
+"""Learned physical constants, as functions of unconstrained parameters z.
 
-So the prior is the same for all of them, ``|z|^2 / 2``: a least-squares fit adds z to its
-residuals, and a parameter that no data determine stays where it started.
+For a least-squares fit every z is a standard normal variate a priori. The prior is then
+``|z|^2 / 2`` for all of them, and a parameter that no data determine stays at its initial value.
 """
 
 from __future__ import annotations
@@ -11,80 +11,127 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
+
+_NO_LIMIT = -float("inf")
 
 
 class Named(NamedTuple):
-    """Constants in physical units: n names, their units, values ``(n,)``, and what none is below.
+    """Constants in physical units: n names, n units, values ``(n,)``, and their lower limit.
 
-    A drive gain has the unit of its force by u, such as ``Nm/u``: no model knows that of its input.
+    A drive gain has the unit of its force by u, such as ``Nm/u``, since no model knows the unit of
+    its input.
     """
 
     names: list[str]
     units: list[str]
     values: Tensor
-    lower: float = -float("inf")
+    lower: float = _NO_LIMIT
 
 
 class Constants(nn.Module, abc.ABC):
-    """Constants of one kind, made of the standardized parameters ``z``.
+    """Constants of one kind, made from the parameters ``z``.
 
     Attributes:
-        z: the parameters, zero at the start.
-        names: of the entries of z, flattened: what a direction in them means.
-        units: of what these names stand for.
-        lower: no constant is below it.
+        z: the parameters.
+        names: meaning of each entry of z, flattened.
+        units: unit of the constant with each name.
+        lower: lower limit of the constants.
     """
 
-    lower = -float("inf")
+    lower: float = _NO_LIMIT
 
-    def __init__(self, shape: Sequence[int], names: Sequence[str], units: Sequence[str]):
+    def __init__(self, start: Tensor, names: Sequence[str], units: Sequence[str]):
         super().__init__()
-        self.z = nn.Parameter(torch.zeros(tuple(shape)))
+        self.z = nn.Parameter(start)
         self.names = list(names)
         self.units = list(units)
 
     @abc.abstractmethod
     def forward(self) -> Tensor:
-        """The constants in SI units."""
+        """Return the constants in SI units."""
 
     def named(self) -> Named:
-        """The constants with their names and units."""
+        """Return the constants with their names and units."""
         return Named(self.names, self.units, self().flatten(), self.lower)
 
 
 class PositiveConstants(Constants):
-    """start exp(spread z), elementwise: log-normal, so that no step leaves the positive numbers.
+    """Log-normal constants start exp(spread z) + floor. z is zero at the start.
 
     Args:
-        start: the median a priori, ``(n,)``.
-        spread: standard deviation of the logarithm; 0.7 is a factor of two.
+        start: prior median, ``(n,)``.
+        spread: prior standard deviation of the logarithm; 0.7 is a factor of two.
         names: n names.
         units: n units.
+        floor: lower limit of the constants.
 
     Raises:
         ValueError: if a start is not positive.
     """
 
     start: Tensor
-    lower = 0.0
 
-    def __init__(self, start: Tensor, spread: float, names: Sequence[str], units: Sequence[str]):
+    def __init__(
+        self,
+        start: Tensor,
+        spread: float,
+        names: Sequence[str],
+        units: Sequence[str],
+        floor: float = 0.0,
+    ):
         if not bool((start > 0).all()):
             raise ValueError(f"{names[0]}: start is {start.tolist()}, expected positive numbers")
-        super().__init__(start.shape, names, units)
+        super().__init__(torch.zeros(start.shape), names, units)
         self.register_buffer("start", start.float().clone())
         self.spread = spread
+        self.lower = floor
 
     def forward(self) -> Tensor:
-        return self.start * torch.exp(self.spread * self.z)
+        values = self.start * torch.exp(self.spread * self.z)
+        return values + self.lower if self.lower else values
+
+
+class SoftplusConstants(Constants):
+    """Positive constants scale (softplus(z) + floor), for training by gradients.
+
+    Far from zero a step of z changes the constant by a similar amount, where an exponential would
+    multiply it.
+
+    Args:
+        scale: typical size, ``(n,)``.
+        ratio: initial softplus(z).
+        names: n names.
+        units: n units.
+        floor: lower limit of the constants, in units of the scale.
+    """
+
+    scale: Tensor
+    lower = 0.0
+
+    def __init__(
+        self,
+        scale: Tensor,
+        ratio: float,
+        names: Sequence[str],
+        units: Sequence[str],
+        floor: float = 0.0,
+    ):
+        super().__init__(torch.full((len(scale),), ratio).expm1().log(), names, units)
+        self.register_buffer("scale", scale.float().clone())
+        self.floor = floor
+
+    def forward(self) -> Tensor:
+        values = F.softplus(self.z)
+        return self.scale * (values + self.floor if self.floor else values)
 
 
 class RealConstants(Constants):
-    """spread * z: normal around zero.
+    """Normal constants spread * z around zero.
 
     Args:
-        spread: standard deviation a priori, ``(n,)``.
+        spread: prior standard deviation, ``(n,)``.
         names: n names.
         units: n units.
     """
@@ -92,7 +139,7 @@ class RealConstants(Constants):
     spread: Tensor
 
     def __init__(self, spread: Tensor, names: Sequence[str], units: Sequence[str]):
-        super().__init__(spread.shape, names, units)
+        super().__init__(torch.zeros(spread.shape), names, units)
         self.register_buffer("spread", spread.float().clone())
 
     def forward(self) -> Tensor:
@@ -100,7 +147,7 @@ class RealConstants(Constants):
 
 
 class PhysicalBodies(Constants):
-    """Pseudo-inertias of n bodies, each that of a body of positive density for every z::
+    """Pseudo-inertias of n bodies. For every z each body has a positive density::
 
         J = B U U^T B^T,    J_start = B B^T,    B = sqrt(m) [[S^(1/2), c], [0, 1]]
 
@@ -109,18 +156,18 @@ class PhysicalBodies(Constants):
               | 0     0     e^d3  t3 |
               | 0     0     0     1  |
 
-    m, c and S are mass, centre of mass and covariance of the mass at the start, so a is half the
-    logarithm of the relative mass, d and s stretch and shear the body, and t shifts its centre, in
-    units of its own extent. Source: Rucker and Wensing 2022, "Smooth parameterization of rigid-body
-    inertia", eq. (9), here relative to a start.
+    m, c and S are the mass, the centre of mass and the covariance of the mass at the start. So a is
+    half the logarithm of the relative mass, d and s stretch and shear the body, and t shifts its
+    centre in units of its extent. Source: Rucker and Wensing (2022), "Smooth parameterization of
+    rigid-body inertia", eq. (9), here relative to a start.
 
     Args:
         start: pseudo-inertias, ``(n, 4, 4)``, kg, kg m, kg m^2.
-        spread: standard deviation of (a, d, s, t) a priori.
+        spread: prior standard deviation of (a, d, s, t).
         bodies: n names.
 
     Raises:
-        ValueError: if a start is not a body of positive density; the message names it.
+        ValueError: if a start is not a body of positive density. The message names the body.
     """
 
     root: Tensor
@@ -138,7 +185,7 @@ class PhysicalBodies(Constants):
         parts = ["mass", "x extent", "y extent", "z extent", "xy shear", "xz shear", "yz shear"]
         parts += ["x centre", "y centre", "z centre"]
         names = [f"{part} of {body}" for body in bodies for part in parts]
-        super().__init__((len(start), 10), names, ["1"] * len(names))
+        super().__init__(torch.zeros(len(start), 10), names, ["1"] * len(names))
         mass = start[:, 3, 3, None, None]
         centre = start[:, :3, 3:] / mass
         root = torch.zeros_like(start)
@@ -148,14 +195,14 @@ class PhysicalBodies(Constants):
         self.spread = spread
 
     def forward(self) -> Tensor:
-        """J, ``(n, 4, 4)``; for z ``(*batch, n, 10)`` there are as many."""
+        """Return J, ``(n, 4, 4)``, or ``(*batch, n, 4, 4)`` for z ``(*batch, n, 10)``."""
         a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * self.z).unbind(-1)
-        zero, one = torch.zeros_like(a), torch.ones_like(a)
+        zero, unit = torch.zeros_like(a), torch.ones_like(a)
         rows = [
             [torch.exp(d1), s12, s13, t1],
             [zero, torch.exp(d2), s23, t2],
             [zero, zero, torch.exp(d3), t3],
-            [zero, zero, zero, one],
+            [zero, zero, zero, unit],
         ]
         stretch = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
         root = torch.exp(a)[..., None, None] * (self.root @ stretch)

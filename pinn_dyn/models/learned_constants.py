@@ -27,8 +27,18 @@ class LearnedConstants(MechanicalSystem):
     """
 
     def parameter_names(self) -> list[str]:
-        """What each standardized parameter means, in the order of ``parameters()``."""
-        return [name for part in self._constants() for name in part.names]
+        """Return the meaning of each parameter, in the order of ``parameters()``.
+
+        A parameter outside :class:`~.known_constants.Constants` has the name of its attribute.
+        """
+        names: list[str] = []
+        for path, module in self.named_modules():
+            if isinstance(module, Constants):
+                names += module.names
+                continue
+            for name, parameter in module.named_parameters(path, recurse=False):
+                names += [f"{name} {k + 1}" for k in range(parameter.numel())]
+        return names
 
     def physical_constants(self) -> list[Named]:
         """All constants in their units."""

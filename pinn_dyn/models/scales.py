@@ -1,4 +1,4 @@
-"""What a head is told of the data before it learns."""
+"""Scales of the data that a head is built on."""
 
 from __future__ import annotations
 
@@ -7,58 +7,65 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from pinn_dyn.models.known_constants import PositiveConstants
+from pinn_dyn.models.known_constants import Constants, PositiveConstants, SoftplusConstants
 from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.statistics import Statistics
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Name of a joint, and the units of what acts along it, by whether it turns or slides."""
+    """Name of a joint, and the units of forces and motions along it.
+
+    Attributes:
+        name: name of the joint.
+        turns: true for a revolute joint, false for a prismatic one.
+    """
 
     name: str
     turns: bool = True
 
     @property
     def force(self) -> str:
-        """Of a torque or force."""
+        """Unit of a torque or force."""
         return "Nm" if self.turns else "N"
 
     @property
     def speed(self) -> str:
-        """Of its velocity."""
+        """Unit of the velocity."""
         return "rad/s" if self.turns else "m/s"
 
     @property
     def inertia(self) -> str:
-        """Of an armature."""
+        """Unit of an armature."""
         return "kg m^2" if self.turns else "kg"
 
     @property
     def damping(self) -> str:
-        """Of viscous friction."""
+        """Unit of viscous friction."""
         return "Nms/rad" if self.turns else "Ns/m"
 
 
 @dataclass(frozen=True)
 class Scales:
-    """The scales that a head is built on, so that its network works on numbers near one.
+    """Scales that a head is built on, so that its network works on numbers near one.
 
     Attributes:
         statistics: means and standard deviations of q, v and u, in SI units.
-        value: typical size of what the head gives, in the shape that its docstring names.
-        angles: which coordinates are angles, and enter a network as sine and cosine.
-        named: the joint of each coordinate, where the model knows it.
+        value: typical size of the output of the head, in the shape that its docstring states.
+        angles: coordinates that are angles and enter a network as sine and cosine.
+        named: the joint of each coordinate, if the model knows it.
+        prior: true if learned constants need a standard normal prior, for a least-squares fit.
     """
 
     statistics: Statistics
     value: Tensor
     angles: tuple[int, ...] = ()
     named: tuple[Joint, ...] = ()
+    prior: bool = False
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """The joint of each coordinate, by its number without a name."""
+        """The joint of each coordinate. Unnamed joints are numbered."""
         return self.named or tuple(Joint(f"joint {k + 1}") for k in range(self.size))
 
     @property
@@ -72,11 +79,30 @@ class Scales:
         return self.statistics.num_inputs
 
     def positive(
-        self, what: str, start: Tensor, spread: float, units: Sequence[str]
-    ) -> PositiveConstants:
-        """A learned positive constant of each joint, called "<what> of <joint>"."""
-        names = [f"{what} of {joint.name}" for joint in self.joints]
-        return PositiveConstants(start, spread, names, units)
+        self,
+        label: str,
+        ratio: float,
+        scale: Tensor,
+        spread: float,
+        units: Sequence[str],
+        floor: float = 0.0,
+    ) -> Constants:
+        """Build a learned positive constant of each joint, named "<label> of <joint>".
+
+        Args:
+            label: meaning of the constant.
+            ratio: initial value in units of the scale.
+            scale: typical size, ``(N,)``.
+            spread: prior standard deviation of the logarithm.
+            units: N units.
+            floor: lower limit in units of the scale; with a prior, of the mean scale.
+        """
+        names = [f"{label} of {joint.name}" for joint in self.joints]
+        if self.prior:
+            scale = scale.double()
+            lower = floor * float(scale.mean())
+            return PositiveConstants(ratio * scale, spread, names, units, lower)
+        return SoftplusConstants(scale, ratio, names, units, floor)
 
     def network(
         self,
@@ -85,7 +111,7 @@ class Scales:
         activation: Activation,
         after: Sequence[int] | None = None,
     ) -> MLP:
-        """A network of q; outside the data what it sees of q saturates, see :class:`MLP`."""
+        """Build a network of q. Its input saturates outside the data, see :class:`MLP`."""
         data = self.statistics
         limits = (data.q_low, data.q_high)
         mean, std = data.q_mean, data.q_std

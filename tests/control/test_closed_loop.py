@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from pinn_dyn.control import Controller, Plant
 from pinn_dyn.control.closed_loop import close_loop_continuous
 from pinn_dyn.control.effects import Actuator, Sensor
+from pinn_dyn.testing import LinearSystem
 from tests.support.closed_loops import K_D, K_P, PD, Q0, V0, Wave, double, sampled, spring
-from tests.support.linear import LinearSystem
 
 
 def feedback(x, t, amplitude):

@@ -11,7 +11,7 @@ pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda ext
 from pinn_dyn.control.helix import Helix
 from pinn_dyn.control.references import check_limits
 from pinn_dyn.systems import BulletArm
-from tests.support.finite_differences import assert_near, slope
+from pinn_dyn.testing import assert_near, slope
 
 pytestmark = pytest.mark.panda
 

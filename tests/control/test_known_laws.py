@@ -7,8 +7,8 @@ from torch import nn
 from pinn_dyn.control.export import export_law, load_law
 from pinn_dyn.control.laws import ComputedTorque, ProportionalDerivative, Regulation, Tracking
 from pinn_dyn.data.simulation import has_cpp_compiler
-from tests.contracts.controller import ControllerContract, states
-from tests.support.finite_differences import assert_near
+from pinn_dyn.testing import ControllerContract, assert_near
+from pinn_dyn.testing.controller import states
 from tests.support.known import known_model
 
 LAWS = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]

@@ -18,11 +18,11 @@ from pinn_dyn.control.laws import (
 )
 from pinn_dyn.models import NetworkCholesky, Positive
 from pinn_dyn.systems import SoftArm
-from tests.contracts.controller import ControllerContract, states
+from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
+from pinn_dyn.testing.controller import states
 from tests.models.builders import InverseOf, make_model, make_structured
 from tests.support.cart_pole import CartPole
-from tests.support.finite_differences import assert_near
-from tests.support.linear import LinearSystem, unit_masses
+from tests.support.linear import unit_masses
 
 MODEL_BASED = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]
 

@@ -16,10 +16,10 @@ from pinn_dyn.control.laws import Regulation, Tracking
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.plants import SystemPlant
 from pinn_dyn.control.references import SetPoint, Sines
-from tests.contracts.controller import ControllerContract, states
+from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
+from pinn_dyn.testing.controller import states
 from tests.support.cart_pole import CartPole
-from tests.support.finite_differences import assert_near
-from tests.support.linear import LinearSystem, unit_masses
+from tests.support.linear import unit_masses
 
 ZERO = np.zeros((2, 2))
 MASS = np.array([[2.0, 0.5], [0.5, 1.0]])

@@ -4,8 +4,7 @@ import pytest
 
 from pinn_dyn.control.plants import BulletPlant, SystemPlant
 from pinn_dyn.systems import SoftArm
-from tests.contracts.plant import PlantContract
-from tests.support.linear import damped_oscillators
+from pinn_dyn.testing import PlantContract, damped_oscillators
 
 
 class TestSystemPlant(PlantContract):

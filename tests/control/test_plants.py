@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from pinn_dyn.control import plants
 from pinn_dyn.control.plants import BulletPlant, SystemPlant
 from pinn_dyn.systems import SoftArm
-from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
+from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
 from tests.support.vanishing import Vanishing
 
 PANDA = "franka_panda/panda.urdf"

@@ -14,7 +14,7 @@ from pinn_dyn.control.references import (
     Sines,
     check_limits,
 )
-from tests.support.finite_differences import assert_near, slope
+from pinn_dyn.testing import assert_near, slope
 
 PAIR = [[0.1, -0.4, 1.0], [0.5, 0.2, -1.0]]
 

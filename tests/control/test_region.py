@@ -9,9 +9,10 @@ import torch
 from pinn_dyn.control import Controller, Motion
 from pinn_dyn.control.laws import ProportionalDerivative, Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
-from tests.contracts.controller import ControllerContract, states
+from pinn_dyn.testing import ControllerContract, LinearSystem
+from pinn_dyn.testing.controller import states
 from tests.support.cart_pole import CartPole
-from tests.support.linear import LinearSystem, unit_masses
+from tests.support.linear import unit_masses
 
 LOGGER = "pinn_dyn.control.region"
 

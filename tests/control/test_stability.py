@@ -12,8 +12,8 @@ from pinn_dyn.control.stability_report import check_without_truth, model_report,
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
+from pinn_dyn.testing import LinearSystem
 from tests.support.cart_pole import CartPole
-from tests.support.linear import LinearSystem
 
 P = torch.tensor([[2.0, 0.3], [-0.1, 1.5]], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)

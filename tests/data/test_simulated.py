@@ -14,7 +14,7 @@ from pinn_dyn.data import (
 from pinn_dyn.mechanics import RK4, Signal
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
-from tests.support.linear import damped_oscillators
+from pinn_dyn.testing import damped_oscillators
 
 SINE = dict(offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.1], frequency=[1.0, 4.0])
 STEPS = dict(offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.1], hold=[0.06, 0.1])

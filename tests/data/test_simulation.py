@@ -9,7 +9,8 @@ from pinn_dyn.data import Mixture, MultiSine, SimulationError, Steps, simulate
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
-from tests.support.linear import damped_oscillators, exact_solution, exact_solution_under_sine
+from pinn_dyn.testing import damped_oscillators, exact_solution
+from tests.support.linear import exact_solution_under_sine
 
 ARM_INPUTS = Mixture(
     [

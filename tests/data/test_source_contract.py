@@ -17,7 +17,7 @@ from pinn_dyn.data import (
 )
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
-from tests.contracts.data_source import DataSourceContract
+from pinn_dyn.testing import DataSourceContract
 from tests.data.logs_files import motion, source, write
 
 

@@ -5,9 +5,8 @@ And the closed formulas of the linear system, which many tests move.
 
 import pytest
 
-from tests.contracts.mechanical_system import MechanicalSystemContract
+from pinn_dyn.testing import MechanicalSystemContract, damped_oscillators
 from tests.support.cart_pole import CartPole
-from tests.support.linear import damped_oscillators
 
 
 class TestLinearSystem(MechanicalSystemContract):

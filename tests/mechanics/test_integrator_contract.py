@@ -3,7 +3,7 @@
 import pytest
 
 from pinn_dyn.mechanics import RK4, Rosenbrock
-from tests.contracts.integrator import IntegratorContract
+from pinn_dyn.testing import IntegratorContract
 
 
 class TestIntegrators(IntegratorContract):

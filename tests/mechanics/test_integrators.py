@@ -15,8 +15,8 @@ from pinn_dyn.mechanics.compilation import (
 )
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkCholesky, NetworkPotential
+from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
 from tests.models.builders import make_model, make_structured, perturb
-from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
 
 
 def samples(batch, count, size, seed=0):

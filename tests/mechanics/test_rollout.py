@@ -11,14 +11,9 @@ from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, rollout
 from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
+from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution, slope
 from tests.support.cart_pole import CartPole
-from tests.support.finite_differences import slope
-from tests.support.linear import (
-    LinearSystem,
-    damped_oscillators,
-    exact_solution,
-    exact_solution_under_sine,
-)
+from tests.support.linear import exact_solution_under_sine
 
 START = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
 

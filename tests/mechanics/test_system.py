@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.testing import damped_oscillators
 from tests.support.cart_pole import CartPole
-from tests.support.linear import damped_oscillators
 
 
 def test_a_system_without_its_four_terms_cannot_be_built():

@@ -15,8 +15,8 @@ def dissipation(model, q, v):
     head = model.friction
     if not isinstance(head, CoulombFriction):
         return force
-    level = head.force * torch.log(1 + torch.exp(head.raw_force))
-    width = head.v_std * (torch.log(1 + torch.exp(head.raw_width)) + 0.01)
+    level = head.level.scale * torch.log(1 + torch.exp(head.level.z))
+    width = head.width.scale * (torch.log(1 + torch.exp(head.width.z)) + 0.01)
     return force + level * (1 - 2 / (torch.exp(2 * v / width) + 1))
 
 

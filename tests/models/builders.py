@@ -53,7 +53,7 @@ def make_statistics(n, m, step=STEP):
     )
 
 
-def make_scales(n, m, value=1.0, angles=(), **statistics):
+def make_scales(n, m, value=1.0, angles=(), prior=False, **statistics):
     """Scales of a head; the value is one number or a list, ``statistics`` replace the usual."""
     value = torch.as_tensor(value, dtype=torch.float64)
     data = make_statistics(n, m)
@@ -64,7 +64,7 @@ def make_scales(n, m, value=1.0, angles=(), **statistics):
             "q_high": statistics["q_mean"] + reach,
         }
     data = replace(data, **statistics)
-    return Scales(data, value, tuple(angles))
+    return Scales(data, value, tuple(angles), prior=prior)
 
 
 def perturb(model, seed=0, spread=0.3):

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from pinn_dyn.mechanics import Signal
+from pinn_dyn.testing import assert_near
 from tests.models.builders import STEP, make_model, make_statistics, random_batch
-from tests.support.finite_differences import assert_near
 
 T = STEP * torch.arange(5, dtype=torch.float64)
 

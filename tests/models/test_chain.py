@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pinn_dyn.models import MLP, ChainPotential, LagrangianNetwork, NetworkCholesky
+from pinn_dyn.testing import assert_near, partial_derivatives
 from tests.models.builders import CHAIN, make_scales, make_structured, perturb
-from tests.support.finite_differences import assert_near, partial_derivatives
 
 GRAVITY = torch.tensor([0.3, -0.4, 9.7], dtype=torch.float64)
 JOINTS = 4

@@ -14,9 +14,8 @@ from pinn_dyn.models import (
     Positive,
     cholesky,
 )
-from tests.contracts.cholesky_head import CholeskyHeadContract
+from pinn_dyn.testing import CholeskyHeadContract, assert_near
 from tests.models.builders import make_scales, perturb, positive_matrix
-from tests.support.finite_differences import assert_near
 
 SIZE = 3
 SCALE = torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)

@@ -21,12 +21,12 @@ from pinn_dyn.models import (
     NetworkPotential,
     NoDelay,
 )
+from pinn_dyn.testing import assert_near
 from pinn_dyn.training.gradients.program import LossProgram
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss
 from pinn_dyn.training.parameter_vector import ParameterVector
 from tests.models.builders import STEP, make_statistics, perturb
 from tests.support.delayed_robots import log
-from tests.support.finite_differences import assert_near
 
 PAST, AHEAD = 8, 6
 CLOCK = STEP * torch.arange(-PAST, AHEAD + 1, dtype=torch.float64)

@@ -14,6 +14,7 @@ from pinn_dyn.models import (
     NetworkPotential,
     Positive,
 )
+from pinn_dyn.testing import LinearSystem, assert_near, exact_solution
 from tests.models.builders import (
     InverseOf,
     input_values,
@@ -22,8 +23,6 @@ from tests.models.builders import (
     positive_matrix,
     random_batch,
 )
-from tests.support.finite_differences import assert_near
-from tests.support.linear import LinearSystem, exact_solution
 
 T = torch.linspace(0, 0.6, 31, dtype=torch.float64)
 

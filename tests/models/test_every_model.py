@@ -11,8 +11,8 @@ import torch
 from pinn_dyn.mechanics import Signal
 from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
 from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential, Positive
+from pinn_dyn.testing import assert_near
 from tests.models.builders import STEP, make_model, make_structured, perturb, random_batch
-from tests.support.finite_differences import assert_near
 
 KINDS = ["lnn", "hnn", "next_state", "acceleration"]
 CONTINUOUS = ["lnn", "hnn", "acceleration"]

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from pinn_dyn.mechanics import Signal
+from pinn_dyn.testing import assert_near, slope
 from tests.models.autodiff import autodiff_derivative, rk4_increment
 from tests.models.builders import CHAIN, TRANSPOSED, VARIANTS, make_structured, random_batch
-from tests.support.finite_differences import assert_near, slope
 
 MODELS = pytest.mark.parametrize("kind", ["lnn", "hnn"])
 STEP = 0.05

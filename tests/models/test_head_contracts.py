@@ -1,4 +1,4 @@
-"""Every head of potential, input, friction and residual keeps the contract of its kind."""
+"""Every head of potential, input and residual keeps the contract of its kind."""
 
 from functools import partial
 
@@ -6,24 +6,16 @@ import pytest
 import torch
 
 from pinn_dyn.models import (
-    AsymmetricCoulomb,
     ChainPotential,
     ConstantInput,
-    CoulombFriction,
-    DriveCoulomb,
     FixedInput,
-    LoadDependent,
-    LoadDependentStribeck,
     NetworkInput,
     NetworkPotential,
     NetworkResidual,
-    NoFriction,
     NonlinearInput,
     NoResidual,
-    Stribeck,
 )
-from tests.contracts.heads import (
-    FrictionContract,
+from pinn_dyn.testing import (
     InputMatrixContract,
     PotentialContract,
     ResidualContract,
@@ -69,24 +61,6 @@ class TestInput(InputMatrixContract):
     @pytest.fixture
     def head(self, name):
         return make(INPUTS[name], [0.5, 3.0])
-
-
-FRICTIONS = {
-    "none": NoFriction,
-    "Coulomb": CoulombFriction,
-    "drive Coulomb": DriveCoulomb,
-    "asymmetric": AsymmetricCoulomb,
-    "Stribeck": Stribeck,
-    "by load": LoadDependent,
-    "by load, Stribeck": LoadDependentStribeck,
-}
-
-
-@pytest.mark.parametrize("name", FRICTIONS)
-class TestFriction(FrictionContract):
-    @pytest.fixture
-    def head(self, name):
-        return make(FRICTIONS[name], FORCE)
 
 
 RESIDUALS = {"none": NoResidual, "network": partial(NetworkResidual, hidden=[5])}

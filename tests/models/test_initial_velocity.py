@@ -9,9 +9,9 @@ from pinn_dyn.data import draw_windows
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory, rollout
 from pinn_dyn.models import AccelerationMLP, LearnedVelocity, Scales
+from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
 from pinn_dyn.training import IncrementLoss, MidpointLoss
 from tests.models.builders import STEP, make_scales, make_statistics, make_structured, perturb
-from tests.support.linear import LinearSystem, damped_oscillators, exact_solution
 
 
 class Started(LinearSystem):

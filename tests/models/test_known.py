@@ -6,22 +6,14 @@ import pytest
 import torch
 
 from pinn_dyn.models import (
-    AsymmetricCoulomb,
-    DriveCoulomb,
     KnownMechanics,
-    LoadDependent,
-    LoadDependentStribeck,
-    Stribeck,
 )
 from pinn_dyn.models.known_constants import PhysicalBodies, PositiveConstants, RealConstants
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters
-from tests.contracts.mechanical_system import MechanicalSystemContract
-from tests.support.known import known_model, statistics, unit_scales
+from pinn_dyn.testing import MechanicalSystemContract
+from tests.support.known import known_model, statistics
 from tests.support.rigid_chains import TREE
-
-BY_LOAD = [LoadDependent, LoadDependentStribeck]
-LADDER = [DriveCoulomb, AsymmetricCoulomb, Stribeck, *BY_LOAD]
 
 
 def anywhere(module, std=1.0, seed=0):
@@ -119,87 +111,6 @@ def test_standardized_constants():
     assert real().tolist() == [-8.0]
     with pytest.raises(ValueError, match=r"start is .* expected positive"):
         PositiveConstants(torch.tensor([0.0]), 0.5, ["a"], ["kg"])
-
-
-@pytest.mark.parametrize("law", LADDER)
-def test_friction_is_passive_for_every_parameter(law):
-    for seed in range(20):
-        friction = anywhere(law(unit_scales(3)), std=1.5, seed=seed)
-        v = torch.linspace(-3, 3, 301).double()[:, None].expand(-1, 3)
-        assert (v * friction(v) >= 0).all()
-        assert not friction(0 * v).any()
-
-
-@pytest.mark.parametrize("law", LADDER)
-def test_the_slope_of_friction_is_its_derivative(law):
-    friction = anywhere(law(unit_scales(2), width=0.3), std=0.3)
-    v = torch.tensor([[-1.0, 0.4], [0.2, -0.1], [0.02, 2.0]]).double()
-    expected = torch.func.jvp(friction, (v,), (torch.ones_like(v),))[1]
-    assert torch.allclose(friction.slope(v), expected, rtol=1e-9)
-
-
-def test_each_rung_has_what_its_name_says():
-    fast = torch.tensor([[50.0], [-50.0]]).double()
-    asymmetric = anywhere(AsymmetricCoulomb(unit_scales(1)))
-    forward, back = asymmetric(fast).flatten().tolist()
-    assert forward > 0 > back
-    assert abs(forward) != pytest.approx(abs(back))
-    stribeck = Stribeck(unit_scales(1), width=0.001).double()
-    slow = torch.tensor([[0.05]]).double()
-    assert float(stribeck(slow)) > float(stribeck(fast[:1]))
-
-
-def test_a_loaded_gear_transmits_less_forwards_and_takes_more_backwards():
-    friction = LoadDependent(unit_scales(1), width=0.001).double()
-    share = 0.05 / 1.05
-    driven = friction.transmitted(torch.tensor([[5.0], [-5.0], [0.0]]).double(), torch.ones(3, 1))
-    assert driven.flatten().tolist() == pytest.approx([1 - share, 1 + share, 1.0])
-
-
-@pytest.mark.parametrize("law", BY_LOAD)
-@pytest.mark.parametrize("seed", range(5))
-def test_load_only_takes_energy(law, seed):
-    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.7, seed=seed)
-    q, v, u = (5 * torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(seed))).double()
-    entering = (v * model.drive_gain() * u).sum(-1)
-    lost = (v * model.dissipative_force(q, v)).sum(-1)
-    assert (model.power(q, v, u) <= entering - lost).all()
-    assert not model.input_affine
-
-
-@pytest.mark.parametrize("law", BY_LOAD)
-def test_the_motion_obeys_the_equation_with_load(law):
-    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.3)
-    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(1)).double()
-    a = model.forward_dynamics(q, v, u)
-    bodies = model.structure.regressor(q, v, a) @ model.body_parameters().flatten()
-    left = bodies + model.drive_force(v, a, u)
-    assert float(left.abs().max()) < 1e-9 * float(bodies.abs().max())
-
-
-def test_reported_friction_is_what_acts():
-    """Level of each direction, width and loss, against forces of the law itself."""
-    model = anywhere(known_model(friction=LoadDependentStribeck), std=0.4)
-    found = {n: x for c in model.physical_constants() for n, x in zip(*c[::2], strict=True)}
-    law, slide = model.friction, model.structure.joint_names.index("slide")
-    fast = torch.full((4,), 1e3).double()
-    assert float(law(fast)[slide]) == pytest.approx(
-        float(found["Coulomb friction (v > 0) of slide"])
-    )
-    assert float(law(-fast)[slide]) == pytest.approx(
-        -float(found["Coulomb friction (v < 0) of slide"])
-    )
-    lost = 1 - law.transmitted(fast, torch.ones(4).double())
-    assert float(lost[slide]) == pytest.approx(float(found["loss by load of slide"]))
-    # Near rest F = (c + s) v / w, with c of the direction, and a unit of force loses l v / w.
-    slow = torch.full((4,), 1e-9).double()
-    slope = law.slope(slow)[slide]
-    level = found["Coulomb friction (v > 0) of slide"] + found["Stribeck rise of slide"]
-    width = float(found["friction width of slide"])
-    assert width == pytest.approx(float(level / slope), rel=1e-6)
-    assert width > law.slowest
-    lost = (1 - law.transmitted(slow, torch.ones(4).double()))[slide] / 1e-9 * width
-    assert float(lost) == pytest.approx(float(found["loss by load near rest of slide"]), rel=1e-4)
 
 
 def test_names_and_units_of_all_constants():

@@ -6,7 +6,7 @@ from torch import nn
 
 from pinn_dyn.models import KnownMechanics, KnownSystem
 from pinn_dyn.systems import RigidChain, SoftArm
-from tests.contracts.mechanical_system import MechanicalSystemContract
+from pinn_dyn.testing import MechanicalSystemContract
 from tests.support.cart_pole import CartPole
 from tests.support.known import known_arm, known_cart_pole, statistics
 from tests.support.rigid_chains import TREE

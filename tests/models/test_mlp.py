@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from pinn_dyn.models import MLP
+from pinn_dyn.testing import assert_near, slope
 from tests.models.builders import perturb
-from tests.support.finite_differences import assert_near, slope
 
 LIMITS = torch.tensor([[-0.5, -1.0, -3.0], [1.0, 0.4, 2.0]])
 PLAIN = {"softplus": F.softplus, "tanh": torch.tanh, "silu": F.silu}

@@ -12,8 +12,8 @@ from pinn_dyn.models import (
     NetworkPotential,
     NonlinearInput,
 )
+from pinn_dyn.testing import assert_near
 from tests.models.builders import make_scales, perturb
-from tests.support.finite_differences import assert_near
 
 SIZE = 3
 MEAN = torch.tensor([0.5, -0.25, 0.125], dtype=torch.float64)

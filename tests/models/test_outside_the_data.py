@@ -28,7 +28,6 @@ from pinn_dyn.models.output_limits import (
     set_output_limits,
 )
 from pinn_dyn.systems import RigidChain
-from tests.contracts.outside_the_data import OutsideTheDataContract
 from tests.models.builders import (
     CHAIN,
     TRANSPOSED,
@@ -38,6 +37,7 @@ from tests.models.builders import (
     positive_matrix,
 )
 from tests.support.known import statistics as unit_statistics
+from tests.support.outside_the_data import OutsideTheDataContract
 from tests.support.rigid_chains import TREE
 
 N = 2

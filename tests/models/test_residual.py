@@ -9,9 +9,9 @@ from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.evaluation import RolloutValidator, residual_share
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from pinn_dyn.models import NetworkResidual, NoResidual
+from pinn_dyn.testing import assert_near
 from pinn_dyn.training import IncrementLoss, Penalized
 from tests.models.builders import make_statistics, make_structured, perturb, random_batch
-from tests.support.finite_differences import assert_near
 
 RESIDUAL = partial(NetworkResidual, hidden=[6])
 

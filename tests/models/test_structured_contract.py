@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.contracts.mechanical_system import MechanicalSystemContract
+from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from tests.models.builders import (
     NONLINEAR,
     TRANSPOSED,
@@ -11,7 +11,6 @@ from tests.models.builders import (
     make_structured,
     random_batch,
 )
-from tests.support.finite_differences import assert_near
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -9,7 +9,6 @@ from pinn_dyn.evaluation import part_shares
 from pinn_dyn.mechanics import Sum, stack
 from pinn_dyn.models import (
     CoulombFriction,
-    DriveCoulomb,
     KnownAndNetwork,
     KnownMechanics,
     LagrangianNetwork,
@@ -23,9 +22,8 @@ from pinn_dyn.models import (
     Positive,
 )
 from pinn_dyn.systems import RigidChain
-from tests.contracts.mechanical_system import MechanicalSystemContract
+from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from tests.models.builders import make_structured, perturb, random_batch
-from tests.support.finite_differences import assert_near
 from tests.support.known import motion, statistics
 from tests.support.rigid_chains import TREE
 
@@ -45,7 +43,7 @@ def network(input=NoInput, **heads):
 
 def known(**settings):
     chain = RigidChain(TREE, locked_joints=["wrist"])
-    return partial(KnownMechanics, structure=chain, friction=DriveCoulomb, **settings)
+    return partial(KnownMechanics, structure=chain, friction=CoulombFriction, **settings)
 
 
 def both(**settings):

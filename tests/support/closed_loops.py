@@ -6,7 +6,7 @@ import torch
 from pinn_dyn.control import Controller, Motion, Reference
 from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.plants import SystemPlant
-from tests.support.linear import LinearSystem
+from pinn_dyn.testing import LinearSystem
 
 K_P, K_D = 30.0, 4.0
 

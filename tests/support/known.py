@@ -30,9 +30,9 @@ def statistics(size):
     )
 
 
-def unit_scales(size):
+def unit_scales(size, prior=True):
     """Typical speeds and forces of one."""
-    return Scales(statistics(size), torch.ones(size, dtype=torch.float64))
+    return Scales(statistics(size), torch.ones(size, dtype=torch.float64), prior=prior)
 
 
 def known_model(urdf=TREE, locked_joints=("wrist",), friction=Stribeck, **settings):

@@ -18,7 +18,7 @@ from pinn_dyn.models import (
     NextStateMLP,
     Positive,
 )
-from tests.support.linear import damped_oscillators
+from pinn_dyn.testing import damped_oscillators
 
 HEADS = dict(
     potential=partial(NetworkPotential, hidden=[8]),

@@ -16,10 +16,14 @@ import pybullet_data  # noqa: E402
 
 from pinn_dyn.evaluation.learned_terms import compare_terms  # noqa: E402
 from pinn_dyn.systems import BulletArm  # noqa: E402
-from tests.contracts.mechanical_system import Configurations, MechanicalSystemContract  # noqa: E402
+from pinn_dyn.testing import (  # noqa: E402  # noqa: E402
+    Configurations,
+    MechanicalSystemContract,
+    assert_near,
+    partial_derivatives,
+)
 from tests.support.arm_urdf import ARM, changed  # noqa: E402
 from tests.support.bullet_arms import FINGERS, PANDA, states  # noqa: E402
-from tests.support.finite_differences import assert_near, partial_derivatives  # noqa: E402
 
 pytestmark = pytest.mark.panda
 

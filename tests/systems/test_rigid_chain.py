@@ -10,7 +10,7 @@ import torch
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia, rod
-from tests.contracts.mechanical_system import MechanicalSystemContract
+from pinn_dyn.testing import MechanicalSystemContract
 from tests.support.rigid_chains import TREE, joint, link, robot
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")

@@ -10,7 +10,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
 from pinn_dyn.systems import SoftArm
-from tests.support.finite_differences import assert_near
+from pinn_dyn.testing import assert_near
 
 # Table "Mathematical model matrices of one-segment soft manipulator" of the paper, as printed.
 PRINTED = [

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pinn_dyn.systems import SoftArm
-from tests.contracts.mechanical_system import Configurations, MechanicalSystemContract
+from pinn_dyn.testing import Configurations, MechanicalSystemContract
 
 
 def arm_configurations(segments, bending):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
-from tests.support.finite_differences import slope
+from pinn_dyn.testing import slope
 
 FULL_CIRCLE = 4 * math.pi**2
 

@@ -12,7 +12,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.models import DriveCoulomb
+from pinn_dyn.models import CoulombFriction
 from pinn_dyn.training import LeastSquares, StoppedFit, least_squares
 from pinn_dyn.training.constants_fit import Fit, Prior, far_from_start
 from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
@@ -29,7 +29,7 @@ PENDULUM = robot(
 
 
 def robot_model(start, seed=None):
-    model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, start=start)
+    model = known_model(PENDULUM, locked_joints=(), friction=CoulombFriction, start=start)
     if seed is not None:
         generator = torch.Generator().manual_seed(seed)
         for parameter in model.parameters():
@@ -135,7 +135,7 @@ def test_a_fit_that_knew_much_for_certain_can_be_started_from(runs):
 
 def test_the_information_is_that_of_the_inputs_that_are_missed(truth, runs):
     """Gauss-Newton's matrix, by central differences of r = k^-1 (M a + ... - o) - u."""
-    model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, gain_spread=0.3)
+    model = known_model(PENDULUM, locked_joints=(), friction=CoulombFriction, gain_spread=0.3)
     found = LeastSquares(cutoff=20.0, rollouts=False, samples=100).fit(model, runs, None)
     q, v, a, u = filtered_motion(runs, 20.0, 100)
     moves = v.abs() > 0.05 * v.std(0)  # at rest dry friction may have any value
@@ -303,7 +303,7 @@ def test_a_constant_far_from_its_start_is_named():
 def test_gains_of_the_wrong_unit_are_warned_of(runs, caplog):
     """Inputs in mNm taken for Nm, whose gains are known within some 10 %."""
     wrong = [Trajectory(run.q, run.v, Signal(run.t, 1000 * run.u)) for run in runs]
-    model = known_model(PENDULUM, locked_joints=(), friction=DriveCoulomb, gain_spread=0.1)
+    model = known_model(PENDULUM, locked_joints=(), friction=CoulombFriction, gain_spread=0.1)
     with caplog.at_level(logging.WARNING):
         LeastSquares(cutoff=20.0, rollouts=False).fit(model, wrong, None)
     assert "prior deviations from its start" in caplog.text

@@ -4,8 +4,8 @@ from functools import partial
 
 import pytest
 
+from pinn_dyn.testing import WindowLossContract
 from pinn_dyn.training import IncrementLoss, MidpointLoss
-from tests.contracts.loss import WindowLossContract
 
 LOSSES = {
     "increment": IncrementLoss,

@@ -17,10 +17,10 @@ from pinn_dyn.models import (
     NetworkPotential,
     Positive,
 )
+from pinn_dyn.testing import assert_near, slope
 from pinn_dyn.training import IncrementLoss
 from tests.models.autodiff import lagrangian_derivative, rk4_increment
 from tests.models.builders import make_statistics, perturb, random_batch
-from tests.support.finite_differences import assert_near, slope
 
 STEP = 0.05
 HEADS = dict(

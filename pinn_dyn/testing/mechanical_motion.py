@@ -1,31 +1,32 @@
-"""What motions of every mechanical system must satisfy: the balance of energy, and gradients."""
+"""Suite for motions of mechanical systems: the balance of energy, and gradients."""
 
 import torch
 from scipy.integrate import simpson
 
 from pinn_dyn.mechanics import Signal, rollout
-from tests.support.finite_differences import assert_near, partial_derivatives, slope
-
-
-def product(matrix, vector):
-    return torch.einsum("...ij,...j->...i", matrix, vector)
+from pinn_dyn.testing.finite_differences import (
+    assert_near,
+    partial_derivatives,
+    product,
+    slope,
+)
 
 
 class MotionContract:
-    """A part of :class:`tests.contracts.mechanical_system.MechanicalSystemContract`."""
+    """The part of :class:`~.mechanical_system.MechanicalSystemContract` about motions."""
 
     difference_tolerance = 1e-7
-    """Between a derivative and the five-point stencil with ``difference_step``."""
+    """Tolerance between a derivative and the five-point stencil with ``difference_step``."""
     difference_step = 1e-3
     gradient_tolerance = 5e-9
-    """The same for a gradient through a step: measured at most 7e-10, so that a hundredth of the
-    gradient of one weight among many is seen."""
+    """Tolerance for a gradient through a step. The error is at most 7e-10, so that an error of 1 %
+    in the gradient by a single weight is visible."""
     steps = 10
-    """Even number of integrator steps in a roll-out."""
+    """Number of integrator steps in a roll-out, even."""
     step_times_rate = 0.02
     """Step of a roll-out times the largest eigenvalue of the dynamics at its start."""
     rollout_tolerance = 1e-5
-    """Between roll-outs: fourth order in the step, measured at most 5e-6 for the energies."""
+    """Tolerance between roll-outs. The error is of fourth order, and at most 5e-6 in the energy."""
 
     # Energy.
 
@@ -42,10 +43,10 @@ class MotionContract:
     def test_rollouts_keep_the_balance_of_energy_and_are_the_same_in_both_forms(
         self, system, configurations
     ):
-        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F), by velocity and by momentum.
+        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F).
 
-        The input is one straight line over the whole roll-out, so the power is smooth, and both
-        the integrator and Simpson's rule are of fourth order in the step.
+        The input is linear over the roll-out, so the power is smooth, and both the integrator and
+        Simpson's rule are of fourth order in the step.
         """
         end = self.steps * self._step(system, configurations)
         t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
@@ -65,7 +66,7 @@ class MotionContract:
         assert_near(change, work, self.rollout_tolerance, scale=turnover)
 
     def _step(self, system, configurations):
-        """A step that resolves the fastest motion of the linearized dynamics."""
+        """Return a step that resolves the fastest motion of the linearized dynamics."""
         q, v, _, u = configurations
         x = torch.cat([q, v], -1)
         jacobian = partial_derivatives(
@@ -76,7 +77,7 @@ class MotionContract:
         return self.step_times_rate / float(torch.linalg.eigvals(jacobian).abs().max())
 
     def _input(self, configurations, t):
-        """From u to -u on a straight line, ``(8, T, M)``."""
+        """Return an input that changes linearly from u to -u, ``(8, T, M)``."""
         return (1 - 2 * t / t[-1])[:, None] * configurations.u[:, None, :]
 
     def _rollout(self, system, configurations, derivative, t):
@@ -88,9 +89,9 @@ class MotionContract:
     # Gradients.
 
     def test_gradients_through_an_rk4_step_match_finite_differences(self, system, configurations):
-        """Of a scalar of the increments, by the initial state, the input and all parameters.
+        """Compare the slopes of a scalar of the increments along random directions.
 
-        Along one random direction each: of the parameters a unit step in every one of them.
+        The directions are in the initial state, in the input and in the parameters.
         """
         q, v, a, u = configurations
         second = v if system.state == "qv" else system.momentum(q, v)
@@ -107,8 +108,8 @@ class MotionContract:
             for leaf in leaves:
                 leaf.requires_grad_(True)
             value = loss()
-            found = torch.autograd.grad(value, leaves, materialize_grads=True)
-        gradients = dict(zip(leaves, found, strict=True))
+            slopes = torch.autograd.grad(value, leaves, materialize_grads=True)
+        gradients = dict(zip(leaves, slopes, strict=True))
         generator = torch.Generator().manual_seed(1)
         for name, group in groups.items():
             directions = [

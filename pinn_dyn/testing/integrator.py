@@ -1,47 +1,47 @@
-"""What every integrator must satisfy.
-
-Inherit :class:`IntegratorContract` in a test class and override the ``kind`` fixture.
-"""
+"""Suite for integrators. Inherit it and override the ``kind`` fixture."""
 
 import copy
 import itertools
 
-import numpy as np
 import pytest
 import torch
 
 from pinn_dyn.mechanics import Signal
 from pinn_dyn.mechanics.compilation import Unrolled
-from tests.support.linear import damped_oscillators, exact_solution
+from pinn_dyn.testing.finite_differences import assert_near, partial_derivatives
+from pinn_dyn.testing.linear_system import damped_oscillators, exact_solution
 
 START = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
 
 
 def samples(count, step, seed=0):
-    """An input that jumps to an independent value at every sample."""
+    """Return times and an input that jumps to an independent value at every sample."""
     generator = torch.Generator().manual_seed(seed)
     t = step * torch.arange(count, dtype=torch.float64)
     return t, torch.randn(count, 1, generator=generator, dtype=torch.float64)
 
 
 def increments(system, integrator, x0, t, signal):
-    """Of the system, by the integrator."""
+    """Return the increments of the system by the integrator."""
     system.integrator = integrator
     return system.increments(x0, t, signal)
 
 
 class IntegratorContract:
+    """Suite for a one-step method, on a linear system with an exact solution."""
+
     @pytest.fixture
     def kind(self):
-        """The class of the integrator."""
+        """Return the class of the integrator."""
         raise NotImplementedError("override the fixture 'kind'")
 
     @pytest.fixture
     def system(self):
+        """Return two damped oscillators."""
         return damped_oscillators().requires_grad_(False)
 
     @pytest.mark.parametrize("interpolation", ["hold", "linear"])
-    def test_it_has_its_order_against_matrix_exponentials(self, kind, system, interpolation):
+    def test_order_against_matrix_exponentials(self, kind, system, interpolation):
         t, u = samples(count=11, step=0.1)
         expected = exact_solution(system, START, t, u, interpolation) - START
         signal = Signal(t, u, interpolation)
@@ -53,32 +53,31 @@ class IntegratorContract:
         order = kind(1).order
         assert all(0.7 * 2**order < ratio < 1.4 * 2**order for ratio in ratios), (errors, ratios)
 
-    def test_the_nodes_run_from_the_start_of_a_step_to_its_end(self, kind):
+    def test_nodes_increase_from_0_to_1(self, kind):
         nodes = kind(1).nodes
-        assert nodes[0] == 0
-        assert nodes[-1] == 1
+        assert (nodes[0], nodes[-1]) == (0, 1)
         assert list(nodes) == sorted(nodes)
 
-    def test_the_path_is_made_of_the_steps(self, kind, system):
-        """Whatever takes the steps, such as torchdiffeq; more of them than a block."""
+    def test_path_equals_the_single_steps(self, kind, system):
+        """The path is longer than a block of steps."""
         t, u = samples(count=90, step=0.02)
         signal = Signal(t, u)
-        found = increments(system, kind(1), START, t, signal)
+        path = increments(system, kind(1), START, t, signal)
         unrolled = increments(system, Unrolled(kind(1)), START, t, signal)
-        torch.testing.assert_close(found, unrolled, rtol=0, atol=1e-12)
-        assert torch.equal(found[0], torch.zeros_like(START))
+        torch.testing.assert_close(path, unrolled, rtol=0, atol=1e-12)
+        assert torch.equal(path[0], torch.zeros_like(START))
 
     @pytest.mark.parametrize("interpolation", ["hold", "linear", "cubic"])
     def test_substeps_are_shorter_steps(self, kind, system, interpolation):
         t, u = samples(count=6, step=0.1)
         fine = torch.linspace(0, 0.5, 21, dtype=torch.float64)
-        fine[::4] = t  # to the last digit: a held input tells the sides apart
+        fine[::4] = t  # to the last digit, since a held input jumps at its samples
         signal = Signal(t, u, interpolation)
         divided = increments(system, kind(4), START, t, signal)
         short = increments(system, kind(1), START, fine, signal)[::4]
         torch.testing.assert_close(divided, short, rtol=0, atol=1e-13)
 
-    def test_every_trajectory_of_a_batch_has_its_own_start_and_input(self, kind, system):
+    def test_a_batch_gives_the_path_of_each_trajectory(self, kind, system):
         t, first = samples(count=6, step=0.1)
         _, second = samples(count=6, step=0.1, seed=1)
         starts, inputs = torch.stack([START, -2 * START]), torch.stack([first, second])
@@ -87,24 +86,23 @@ class IntegratorContract:
             alone = increments(system, kind(2), starts[row], t, Signal(t, inputs[row]))
             torch.testing.assert_close(both[row], alone, rtol=0, atol=1e-13)
 
-    def test_increments_keep_float32_precision_where_the_state_swallows_them(self, kind, system):
-        single = copy.deepcopy(system).float()
+    def test_small_increments_keep_the_precision_of_float32(self, kind, system):
+        """The increment is below the resolution of the state in float32."""
         x0 = torch.tensor([1000.3, -1000.7, 1.5, -2.5])
         t = torch.tensor([0.0, 1e-5], dtype=torch.float64)
         u = torch.ones(2, 1, dtype=torch.float64)
         exact = increments(system, kind(1), x0.double(), t, Signal(t, u))[-1]
+        single = copy.deepcopy(system).float()
         rounded = increments(single, kind(1), x0, t, Signal(t, u.float()))[-1]
         assert ((rounded - exact) / exact).abs().max() < 1e-5
 
-    def test_its_gradient_is_that_of_finite_differences(self, kind, system):
+    def test_gradient_matches_finite_differences(self, kind, system):
         t, u = samples(count=4, step=0.1)
 
         def end(x):
-            return increments(system, kind(1), x, t, Signal(t, u))[-1].square().sum()
+            signal = Signal(t, u.expand(*x.shape[:-1], 4, 1))
+            return increments(system, kind(1), x, t, signal)[..., -1, :].square().sum(-1)
 
         x = START.clone().requires_grad_()
-        (found,) = torch.autograd.grad(end(x), x)
-        h = 1e-6
-        steps = h * torch.eye(4, dtype=torch.float64)
-        expected = [float(end(START + d) - end(START - d)) / (2 * h) for d in steps]
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
+        (gradient,) = torch.autograd.grad(end(x), x)
+        assert_near(gradient, partial_derivatives(end, START), 1e-6)

@@ -1,0 +1,124 @@
+"""Suite for losses. Inherit it and override the ``make`` fixture."""
+
+from dataclasses import fields, replace
+from functools import partial
+
+import pytest
+import torch
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from pinn_dyn.data import Windows
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.mechanics import RK4, Signal
+from pinn_dyn.mechanics.compilation import Unrolled
+from pinn_dyn.mechanics.signal import stacked
+from pinn_dyn.models import (
+    LagrangianNetwork,
+    NetworkCholesky,
+    NetworkInput,
+    NetworkPotential,
+)
+
+STEP = 0.02
+
+
+def random_windows(count, seed=0):
+    """Return windows of one step of two coordinates, with an input that jumps within the step."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return 0.3 * torch.randn(count, *shape, generator=generator, dtype=torch.float64)
+
+    t = torch.linspace(0, STEP, 3, dtype=torch.float64)
+    q, v, p = normal(2), normal(2), normal(2)
+    dq, dv, dp = (STEP * normal(1, 2) for _ in range(3))
+    input = Signal(t, normal(3, 2))
+    return Windows(t=t[[0, 2]], q=q, v=v, p=p, dq=dq, dv=dv, dp=dp, input=input)
+
+
+def small_model(seed=0):
+    """Return a small Lagrangian network in float64."""
+    torch.manual_seed(seed)
+    return LagrangianNetwork(
+        random_windows(50).statistics(),
+        mass=partial(NetworkCholesky, hidden=[6, 5]),
+        potential=partial(NetworkPotential, hidden=[6, 5]),
+        damping=partial(NetworkCholesky, hidden=[5]),
+        input=partial(NetworkInput, hidden=[5]),
+    ).double()
+
+
+class WindowLossContract:
+    """Suite for a loss of a model on a batch of windows."""
+
+    @pytest.fixture
+    def make(self):
+        """Return a function that builds the loss from ``statistics`` and ``model``."""
+        raise NotImplementedError("override the fixture 'make'")
+
+    @pytest.fixture
+    def model(self):
+        """Return the model that the loss is built for."""
+        return small_model()
+
+    @pytest.fixture
+    def loss(self, make, model):
+        """Return the loss in float64."""
+        return make(statistics=random_windows(50).statistics(), model=model).double()
+
+    def test_loss_is_a_positive_number_with_a_gradient(self, loss, model):
+        value = loss(model, random_windows(6))
+        assert value.shape == ()
+        assert value > 0
+        gradients = torch.autograd.grad(value, list(model.parameters()), allow_unused=True)
+        assert max(float(g.abs().max()) for g in gradients if g is not None) > 0
+
+    def test_loss_is_the_mean_over_windows(self, loss, model):
+        windows = random_windows(6)
+        alone = [loss(model, windows[torch.tensor([k])]) for k in range(6)]
+        torch.testing.assert_close(loss(model, windows), torch.stack(alone).mean())
+
+    def test_loss_grows_with_the_error(self, loss, model):
+        windows = random_windows(6)
+        values = [
+            float(loss(model, replace(windows, dv=windows.dv + shift)).detach())
+            for shift in (1.0, 10.0, 100.0)
+        ]
+        assert values == sorted(values)
+        assert values[2] > 3 * values[1]
+
+    def test_stacked_members_have_their_own_losses(self, loss):
+        members = [small_model(seed) for seed in range(3)]
+        batches = [random_windows(4, seed) for seed in range(3)]
+        names = [item.name for item in fields(Windows) if item.name not in ("t", "input", "past")]
+        rows = {name: torch.stack([getattr(batch, name) for batch in batches]) for name in names}
+        inputs = stacked([batch.input for batch in batches], batches[0].input.t)
+        losses = loss(Ensemble(members).stack, replace(batches[0], **rows, input=inputs))
+        alone = torch.stack([loss(m, batch) for m, batch in zip(members, batches, strict=True)])
+        torch.testing.assert_close(losses, alone, rtol=1e-10, atol=0)
+        assert len(set(alone.tolist())) == 3
+
+    def test_loss_can_be_traced(self, loss, model):
+        """The traced function is called on different windows than it was traced with."""
+        model.integrator = Unrolled(RK4())
+        windows, different = random_windows(4), random_windows(4, seed=1)
+
+        def function(q, v, dq, dv, u):
+            batch = replace(windows, q=q, v=v, dq=dq, dv=dv, input=windows.input.with_samples(u))
+            return loss(model, batch)
+
+        rows = [(w.q, w.v, w.dq, w.dv, w.u) for w in (windows, different)]
+        traced = make_fx(function)(*rows[0])
+        torch.testing.assert_close(traced(*rows[1]), loss(model, different), rtol=1e-10, atol=0)
+
+    def test_selected_windows_are_the_beginning_of_the_windows(self, loss):
+        windows = random_windows(4)
+        for progress in (0.0, 0.5, 0.999):
+            part = loss.selected(windows, progress)
+            steps = len(part.t) - 1
+            assert 1 <= steps <= len(windows.t) - 1
+            assert torch.equal(part.dq, windows.dq[:, :steps])
+
+    def test_loss_has_no_parameters_and_no_state(self, loss):
+        assert not list(loss.parameters())
+        assert not loss.state_dict()

@@ -1,0 +1,263 @@
+"""Suite for mechanical systems, analytic or learned. Inherit it and override ``system``.
+
+Derivatives are compared with finite differences of M and V in float64, and the dynamics with the
+balance of energy. No test repeats the computation that it checks.
+"""
+
+import copy
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics import MechanicalSystem, Signal
+from pinn_dyn.testing.finite_differences import (
+    assert_near,
+    partial_derivatives,
+    product,
+    slope,
+)
+from pinn_dyn.testing.mechanical_motion import MotionContract
+
+
+class Configurations(NamedTuple):
+    """A batch of eight states to test at, float64."""
+
+    q: Tensor  # (8, N)
+    v: Tensor  # (8, N)
+    a: Tensor  # (8, N)
+    u: Tensor  # (8, M)
+
+
+# The arguments of each public function of a mechanical system.
+FUNCTIONS = {
+    "mass_matrix": "q",
+    "damping_matrix": "q",
+    "input_matrix": "q",
+    "potential_energy": "q",
+    "potential_force": "q",
+    "coriolis_matrix": "qv",
+    "dissipative_force": "qv",
+    "forward_dynamics": "qvu",
+    "inverse_dynamics": "qva",
+    "momentum": "qv",
+    "velocity": "qp",
+    "kinetic_energy": "qv",
+    "total_energy": "qv",
+    "power": "qvu",
+}
+
+
+def values_of(system, at):
+    """Return the value of every function by name."""
+    arguments = {**at._asdict(), "p": at.a}
+    values = {
+        name: getattr(system, name)(*(arguments[key] for key in keys))
+        for name, keys in FUNCTIONS.items()
+    }
+    x = torch.cat([at.q, at.v], -1)
+    values["velocity_derivative"] = system.velocity_derivative(x, at.u)
+    values["momentum_derivative"] = system.momentum_derivative(x, at.u)
+    return values
+
+
+class MechanicalSystemContract(MotionContract):
+    """Suite for M, V, D, A and the dynamics.
+
+    Tolerances are relative to the largest entry of the expected value.
+    """
+
+    exact_tolerance = 1e-9
+    """Tolerance between two float64 computations of the same quantity."""
+    float32_tolerance = 1e-3
+    """Tolerance of float32. Accelerations lose the condition number of M."""
+
+    @pytest.fixture
+    def system(self) -> MechanicalSystem:
+        """Return the implementation, in float64."""
+        raise NotImplementedError("override the fixture 'system'")
+
+    @pytest.fixture
+    def configurations(self, system) -> Configurations:
+        """Return the states to test at. Override it for a range other than [-1, 1]."""
+        generator = torch.Generator().manual_seed(0)
+        n, m = system.num_coordinates, system.num_inputs
+        values = (
+            2 * torch.rand(8, size, generator=generator, dtype=torch.float64) - 1
+            for size in (n, n, n, m)
+        )
+        return Configurations(*values)
+
+    @pytest.fixture(autouse=True)
+    def _no_graph(self):
+        """Record no graph, as in a deployed controller. Gradients have their own test."""
+        with torch.no_grad():
+            yield
+
+    # Shapes and types.
+
+    def test_any_batch_shape_gives_the_same_numbers(self, system, configurations):
+        expected = values_of(system, configurations)
+        n, m = system.num_coordinates, system.num_inputs
+        assert expected["mass_matrix"].shape == expected["damping_matrix"].shape == (8, n, n)
+        assert expected["input_matrix"].shape == (8, n, m)
+        assert expected["potential_energy"].shape == expected["power"].shape == (8,)
+        assert expected["forward_dynamics"].shape == (8, n)
+        blocks = Configurations(*(x.reshape(2, 4, -1) for x in configurations))
+        last = Configurations(*(x[7] for x in configurations))
+        for at, batch, index in ((blocks, (2, 4), slice(None)), (last, (), 7)):
+            for name, value in values_of(system, at).items():
+                part = expected[name][index]
+                assert value.shape == (*batch, *expected[name].shape[1:]), (name, batch)
+                scale = 1e-12 + part.abs().max()
+                assert_near(value.reshape(part.shape), part, self.exact_tolerance, scale)
+
+    def test_float32_is_close_to_float64(self, system, configurations):
+        exact = values_of(system, configurations)
+        at = Configurations(*(x.float() for x in configurations))
+        for name, value in values_of(copy.deepcopy(system).float(), at).items():
+            assert value.dtype == torch.float32, name
+            scale = max(1e-6, float(exact[name].abs().max()))
+            assert_near(value.double(), exact[name], self.float32_tolerance, scale)
+
+    def test_a_wrong_shape_is_refused_by_name(self, system, configurations):
+        arguments = {**configurations._asdict(), "p": configurations.a}
+        for function in ("potential_force", "forward_dynamics", "inverse_dynamics", "velocity"):
+            for name in FUNCTIONS[function]:
+                longer = torch.cat([arguments[name], arguments[name][..., :1]], -1)
+                changed = {**arguments, name: longer}
+                with pytest.raises(ValueError, match=rf"^{name} has shape"):
+                    getattr(system, function)(*(changed[key] for key in FUNCTIONS[function]))
+        q, v, _, u = configurations
+        x0, u = torch.cat([q, v], -1), torch.stack([u, u], -2)
+        t = torch.tensor([0.0, 0.1], dtype=torch.float64)
+        with pytest.raises(ValueError, match=r"^x0 has shape"):
+            system.predict(x0[..., :-1], t, Signal(t, u))
+        with pytest.raises(ValueError, match=r"^u has shape"):
+            system.predict(x0, t, Signal(t, u[..., :-1]))
+
+    # The terms.
+
+    def test_mass_matrix_is_symmetric_positive_definite(self, system, configurations):
+        mass = system.mass_matrix(configurations.q)
+        assert_near(mass, mass.mT, self.exact_tolerance)
+        assert torch.linalg.eigvalsh(mass).min() > 0
+
+    def test_damping_matrix_is_symmetric_positive_semidefinite(self, system, configurations):
+        damping = system.damping_matrix(configurations.q)
+        scale = 1e-12 + damping.abs().max()
+        assert_near(damping, damping.mT, self.exact_tolerance, scale)
+        assert torch.linalg.eigvalsh(damping).min() >= -self.exact_tolerance * scale
+
+    def test_potential_force_is_the_slope_of_the_potential_energy(self, system, configurations):
+        q = configurations.q
+        expected = partial_derivatives(system.potential_energy, q, self.difference_step)
+        assert_near(system.potential_force(q), expected, self.difference_tolerance)
+        assert_near(system.terms(q).G, expected, self.difference_tolerance)
+
+    def test_dissipation_is_viscous_damping_and_a_passive_friction(self, system, configurations):
+        q, v, _, _ = configurations
+        friction = system.dissipative_force(q, v) - product(system.damping_matrix(q), v)
+        power = (friction * v).sum(-1)
+        assert (power >= -self.exact_tolerance * (1 + power.abs().max())).all()
+        assert_near(system.dissipative_force(q, 0 * v), 0 * v, self.exact_tolerance, scale=1)
+
+    def test_mass_rate_minus_twice_coriolis_is_skew_symmetric(self, system, configurations):
+        q, v, _, _ = configurations
+        mass_rate = slope(lambda e: system.mass_matrix(q + e * v), self.difference_step)
+        difference = mass_rate - 2 * system.coriolis_matrix(q, v)
+        scale = self._coriolis_scale(system, configurations)
+        assert_near(difference, -difference.mT, self.difference_tolerance, scale)
+
+    def test_coriolis_force_is_that_of_the_lagrangian(self, system, configurations):
+        q, v, _, _ = configurations
+        slopes = partial_derivatives(system.mass_matrix, q, self.difference_step)
+        # d/dt (dT/dv) - dT/dq at a = 0, with slopes[i, j, k] = dM_ij / dq_k.
+        expected = torch.einsum("bijk,bk,bj->bi", slopes, v, v)
+        expected -= 0.5 * torch.einsum("bjki,bj,bk->bi", slopes, v, v)
+        scale = self._coriolis_scale(system, configurations)
+        force = product(system.coriolis_matrix(q, v), v)
+        assert_near(force, expected, self.difference_tolerance, scale)
+        lost = system.dissipative_force(q, v)
+        force = system.inverse_dynamics(q, v, 0 * v) - system.potential_force(q) - lost
+        assert_near(force, expected, self.difference_tolerance, scale + lost.abs().max())
+
+    def _coriolis_scale(self, system, configurations):
+        """Return the size of (dM/dq) v v if M changes by its own size over one unit of q."""
+        speed = configurations.v.abs().max()
+        return system.mass_matrix(configurations.q).abs().max() * (speed + speed**2)
+
+    # The dynamics.
+
+    def test_inverse_dynamics_undoes_forward_dynamics(self, system, configurations):
+        q, v, _, u = configurations
+        a = system.forward_dynamics(q, v, u)
+        tau = product(system.input_matrix(q), u)
+        assert_near(system.inverse_dynamics(q, v, a), tau, self.exact_tolerance)
+
+    def test_momentum_and_kinetic_energy_are_those_of_the_mass_matrix(self, system, configurations):
+        q, v, _, _ = configurations
+        p = product(system.mass_matrix(q), v)
+        assert_near(system.momentum(q, v), p, self.exact_tolerance)
+        assert_near(system.velocity(q, p), v, self.exact_tolerance)
+        assert_near(system.kinetic_energy(q, v), 0.5 * (p * v).sum(-1), self.exact_tolerance)
+
+    def test_hamiltonian_and_lagrangian_form_agree(self, system, configurations):
+        q, v, _, u = configurations
+        mass = system.mass_matrix(q)
+        mass_rate = slope(lambda e: system.mass_matrix(q + e * v), self.difference_step)
+        a = system.forward_dynamics(q, v, u)
+        x = torch.cat([q, product(mass, v)], -1)
+        q_rate, p_rate = system.momentum_derivative(x, u).chunk(2, -1)
+        assert_near(q_rate, v, self.exact_tolerance)
+        expected = product(mass_rate, v) + product(mass, a)
+        assert_near(p_rate, expected, self.difference_tolerance)
+        if system.state == "qp":
+            expected = torch.cat([q_rate, p_rate], -1)
+        else:
+            x, expected = torch.cat([q, v], -1), torch.cat([v, a], -1)
+        assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
+
+    def test_implicit_solver_solves_for_the_dissipation(self, system, configurations):
+        """(1 - s J) k = r, with J built from M and the slope of the dissipative force."""
+        q, v, _, _ = configurations
+        n = q.shape[-1]
+        generator = torch.Generator().manual_seed(2)
+        rate = torch.randn(8, 2 * n, generator=generator, dtype=q.dtype)
+        mass = system.mass_matrix(q)
+        # One column of the slope by v_i at a time.
+        unit = torch.eye(n, dtype=q.dtype)
+        columns = [
+            torch.func.jvp(lambda x: system.dissipative_force(q, x), (v,), (e.expand_as(v),))[1]
+            for e in unit
+        ]
+        damping, inverse = torch.stack(columns, dim=-1), torch.linalg.inv(mass)
+        if system.state == "qv":
+            second, upper, lower = v, unit.expand_as(mass), inverse @ damping
+        else:
+            second, upper, lower = system.momentum(q, v), inverse, damping @ inverse
+        zero = torch.zeros_like(mass)
+        jacobian = torch.cat([torch.cat([zero, upper], -1), torch.cat([zero, -lower], -1)], -2)
+        step = torch.tensor(0.01, dtype=q.dtype)
+        k = system.implicit_solver(torch.cat([q, second], -1), step)(rate)
+        assert_near(k - step * product(jacobian, k), rate, self.exact_tolerance)
+
+    def test_closed_formulas_agree_with_automatic_differentiation(self, system, configurations):
+        q, v, a, _ = configurations
+        arguments = {
+            "_potential_force": (q,),
+            "_inertial_force": (q, v, a),
+            "_acceleration": (q, v, a),
+            "_hamiltonian_gradient": (q, a),
+            "_momentum": (q, v),
+            "_velocity": (q, a),
+            "_kinetic_gradient": (q, v),
+        }
+        for name, values in arguments.items():
+            actual = getattr(system, name)(*values)
+            expected = getattr(MechanicalSystem, name)(system, *values)
+            if isinstance(actual, tuple):
+                actual, expected = torch.cat(actual), torch.cat(expected)
+            scale = max(1e-12, float(expected.abs().max()))
+            assert_near(actual, expected, self.exact_tolerance, scale)

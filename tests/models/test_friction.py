@@ -1,0 +1,230 @@
+"""Dry friction is passive for every parameter, and reports the constants that act."""
+
+from functools import partial
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from pinn_dyn.mechanics import Rosenbrock, Signal
+from pinn_dyn.models import (
+    AsymmetricCoulomb,
+    CoulombFriction,
+    LoadDependent,
+    LoadDependentStribeck,
+    NoFriction,
+    Stribeck,
+)
+from pinn_dyn.testing import FrictionContract, assert_near
+from tests.models.builders import make_scales, make_structured, perturb
+from tests.support.known import known_model, unit_scales
+
+BY_LOAD = [LoadDependent, LoadDependentStribeck]
+LAWS = [CoulombFriction, AsymmetricCoulomb, Stribeck, *BY_LOAD]
+FORCE = torch.tensor([0.5, 2.0, 3.0], dtype=torch.float64)
+
+
+def anywhere(module, std=1.0, seed=0):
+    """The module with parameters far from their start."""
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter, std=std, generator=generator)
+    return module.double()
+
+
+@pytest.mark.parametrize("prior", [False, True], ids=["network", "known mechanics"])
+@pytest.mark.parametrize("law", [NoFriction, *LAWS])
+class TestFriction(FrictionContract):
+    @pytest.fixture
+    def head(self, law, prior):
+        scales = unit_scales(3, prior=True) if prior else make_scales(3, 2, FORCE)
+        return perturb(law(scales).double(), spread=0.4)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    std=st.floats(0.1, 3),
+    v=st.floats(-1e6, 1e6),
+    force=st.floats(-1e4, 1e4),
+    prior=st.booleans(),
+)
+def test_friction_takes_energy_whatever_its_parameters(law, seed, std, v, force, prior):
+    friction = anywhere(law(unit_scales(2, prior=prior)), std=std, seed=seed)
+    v, force = (torch.full((2,), x, dtype=torch.float64) for x in (v, force))
+    with torch.no_grad():
+        assert (v * friction(v) >= 0).all()
+        assert (v * friction.transmitted(v, force) <= v * force + 1e-12 * (v * force).abs()).all()
+
+
+@pytest.mark.parametrize("prior", [False, True])
+def test_friction_starts_at_its_level_and_width(prior):
+    """c = level times the force and w = (width + 0.01) times the speed."""
+    force, v_std = torch.tensor([2.0, 30.0]), torch.tensor([0.5, 0.5])
+    scales = make_scales(2, 1, force, v_std=v_std, prior=prior)
+    friction = CoulombFriction(scales, level=0.05, width=0.03)
+    torch.testing.assert_close(friction(1e3 * v_std), 0.05 * force)
+    width = 0.04 * v_std
+    torch.testing.assert_close(friction(-width), -0.05 * force * torch.tanh(torch.ones(2)))
+    torch.testing.assert_close(friction.slope(torch.zeros(2)), 0.05 * force / width)
+
+
+def test_the_default_width_is_larger_for_networks():
+    scales = {prior: unit_scales(1, prior=prior) for prior in (False, True)}
+    widths = {prior: float(CoulombFriction(x).width().detach()) for prior, x in scales.items()}
+    assert widths == pytest.approx({False: 0.11, True: 0.04})
+
+
+def sliding_mass():
+    """A free mass with friction alone: the model, m, c and w."""
+    model = make_structured("lnn", n=1, m=1, friction=CoulombFriction)
+    with torch.no_grad():
+        for head in (model.potential, model.mass, model.damping):
+            for parameter in head.parameters():
+                parameter.zero_()
+    model.damping.network.linears[-1].bias.data.fill_(-80.0)
+    mass = float(model.mass_matrix(torch.zeros(1, 1, dtype=torch.float64)).detach())
+    level, width = (float(x().detach()) for x in (model.friction.level, model.friction.width))
+    return model, mass, level, width
+
+
+def test_the_rosenbrock_method_takes_steps_far_longer_than_friction():
+    """Near rest the speed decays at c/(m w): steps of 20 of its times come to rest all the same."""
+    model, mass, level, width = sliding_mass()
+    model.integrator = Rosenbrock()
+    t = 20 * mass * width / level * torch.arange(21, dtype=torch.float64)
+    x0 = torch.tensor([[0.0, 0.2 * width]], dtype=torch.float64)
+    with torch.no_grad():
+        v = model.predict(x0, t, Signal(t, torch.zeros(1, 21, 1, dtype=torch.float64)))[0, :, 1]
+    assert (v.abs() <= x0[0, 1]).all()
+    assert v[-1].abs() < 1e-6 * x0[0, 1]
+
+
+def test_friction_alone_stops_a_free_mass_and_takes_its_energy():
+    """m v' = -c tanh(v/w): sinh(v/w) = sinh(v0/w) exp(-c t/(m w)), a closed form."""
+    model, mass, level, width = sliding_mass()
+    t = torch.linspace(0, mass * width / level, 101, dtype=torch.float64)
+    v0 = 2 * width
+    x0 = torch.tensor([[0.0, v0]], dtype=torch.float64)
+    with torch.no_grad():
+        x = model.predict(x0, t, Signal(t, torch.zeros(1, 101, 1, dtype=torch.float64)))
+    expected = width * torch.asinh(
+        torch.sinh(x0[:, 1:] / width) * torch.exp(-level * t / (mass * width))
+    )
+    assert_near(x[..., 1], expected, 1e-8)
+    # What the mass lost is the work of the friction along the way.
+    work, _ = quad(lambda v: mass * v, float(x[0, -1, 1]), v0)
+    energy = model.total_energy(x[..., :1], x[..., 1:]).detach()
+    assert_near(energy[:, 0] - energy[:, -1], torch.tensor([work], dtype=torch.float64), 1e-8)
+
+
+# The other laws.
+
+
+def test_each_law_has_the_effect_of_its_name():
+    fast = torch.tensor([[50.0], [-50.0]]).double()
+    asymmetric = anywhere(AsymmetricCoulomb(unit_scales(1)))
+    forward, back = asymmetric(fast).flatten().tolist()
+    assert forward > 0 > back
+    assert abs(forward) != pytest.approx(abs(back))
+    stribeck = Stribeck(unit_scales(1), width=0.001).double()
+    slow = torch.tensor([[0.05]]).double()
+    assert float(stribeck(slow)) > float(stribeck(fast[:1]))
+
+
+def test_a_loaded_gear_transmits_less_forwards_and_takes_more_backwards():
+    friction = LoadDependent(unit_scales(1), width=0.001).double()
+    share = 0.05 / 1.05
+    driven = friction.transmitted(torch.tensor([[5.0], [-5.0], [0.0]]).double(), torch.ones(3, 1))
+    assert driven.flatten().tolist() == pytest.approx([1 - share, 1 + share, 1.0])
+
+
+@pytest.mark.parametrize("law", BY_LOAD)
+def test_a_network_transmits_its_input_through_the_gear(law):
+    model = make_structured("lnn", n=2, m=2, friction=partial(law, width=0.3))
+    q, v, u = torch.randn(3, 20, 2, generator=torch.Generator().manual_seed(1)).double()
+    a = model.forward_dynamics(q, v, u)
+    drive = (model.input_matrix(q) @ u.unsqueeze(-1)).squeeze(-1)
+    arrives = model.friction.transmitted(v, drive)
+    assert_near(model.inverse_dynamics(q, v, a), arrives, 1e-9)
+    assert float((arrives - drive).detach().abs().max()) > 1e-3
+    assert not model.input_affine
+
+
+@pytest.mark.parametrize("law", BY_LOAD)
+@pytest.mark.parametrize("seed", range(3))
+def test_known_mechanics_gain_no_energy_from_a_loaded_gear(law, seed):
+    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.7, seed=seed)
+    q, v, u = (5 * torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(seed))).double()
+    entering = (v * model.drive_gain() * u).sum(-1)
+    lost = (v * model.dissipative_force(q, v)).sum(-1)
+    assert (model.power(q, v, u) <= entering - lost).all()
+    assert not model.input_affine
+
+
+@pytest.mark.parametrize("law", BY_LOAD)
+def test_the_motion_of_known_mechanics_obeys_the_equation_with_load(law):
+    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.3)
+    q, v, u = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(1)).double()
+    a = model.forward_dynamics(q, v, u)
+    bodies = model.structure.regressor(q, v, a) @ model.body_parameters().flatten()
+    left = bodies + model.drive_force(v, a, u)
+    assert float(left.abs().max()) < 1e-9 * float(bodies.abs().max())
+
+
+# The constants in the table of a fit.
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_law_is_in_the_table_of_known_mechanics(law):
+    """Each parameter has a name, and every constant of the law a row with a value and a unit."""
+    model = known_model(friction=law)
+    names = model.parameter_names()
+    assert len(names) == len(set(names)) == sum(p.numel() for p in model.parameters())
+    rows = [name for item in model.physical_constants() for name in item.names]
+    assert len(rows) == len(names)
+    assert [name for name in rows if name.startswith("Coulomb friction")]
+    assert "friction width of slide" in rows
+
+
+def test_parameters_of_an_own_head_have_names_too():
+    """So a fit with a head that is no law of the package ends in a table, not in an error."""
+
+    class Cubic(NoFriction):
+        def __init__(self, scales):
+            super().__init__(scales)
+            self.factor = torch.nn.Parameter(torch.zeros(scales.size))
+
+    model = known_model(friction=None)
+    model.friction = Cubic(unit_scales(4))
+    names = model.parameter_names()
+    assert names[-4:] == [f"friction.factor {k}" for k in range(1, 5)]
+    assert len(names) == sum(p.numel() for p in model.parameters())
+
+
+def test_reported_friction_is_what_acts():
+    """Level of each direction, width and loss, against forces of the law itself."""
+    model = anywhere(known_model(friction=LoadDependentStribeck), std=0.4)
+    found = {n: x for c in model.physical_constants() for n, x in zip(*c[::2], strict=True)}
+    law, slide = model.friction, model.structure.joint_names.index("slide")
+    fast = torch.full((4,), 1e3).double()
+    assert float(law(fast)[slide]) == pytest.approx(
+        float(found["Coulomb friction (v > 0) of slide"])
+    )
+    assert float(law(-fast)[slide]) == pytest.approx(
+        -float(found["Coulomb friction (v < 0) of slide"])
+    )
+    lost = 1 - law.transmitted(fast, torch.ones(4).double())
+    assert float(lost[slide]) == pytest.approx(float(found["loss by load of slide"]))
+    # Near rest F = (c + s) v / w, with c of the direction, and a unit of force loses l v / w.
+    slow = torch.full((4,), 1e-9).double()
+    slope = law.slope(slow)[slide]
+    level = found["Coulomb friction (v > 0) of slide"] + found["Stribeck rise of slide"]
+    width = float(found["friction width of slide"])
+    assert width == pytest.approx(float(level / slope), rel=1e-6)
+    assert width > 0.01
+    lost = (1 - law.transmitted(slow, torch.ones(4).double()))[slide] / 1e-9 * width
+    assert float(lost) == pytest.approx(float(found["loss by load near rest of slide"]), rel=1e-4)
