@@ -60,7 +60,8 @@ def main(command: str) -> None:
         from pinn_dyn.data import SimulationError
         from pinn_dyn.training import NonFiniteLossError
 
-        task = getattr(importlib.import_module(f"pinn_dyn.app.{command}"), command)
+        module = importlib.import_module(f"pinn_dyn.app.{command}")
+        task = getattr(module, "main", None) or getattr(module, command)
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.FileHandler):
                 handler.handleError = partial(_raise, handler)  # type: ignore[method-assign]

@@ -10,7 +10,7 @@ import pandas as pd
 
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.drawing import units
+from pinn_dyn.evaluation.plots import units
 from pinn_dyn.evaluation.identification import (
     COLUMNS,
     constants_table,

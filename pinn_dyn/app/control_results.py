@@ -31,14 +31,16 @@ from pinn_dyn.evaluation import (
     closed_loop_metrics,
     comparison_table,
     controller_comparison_figure,
-    format_table,
     pose_strip,
     save,
     steady_state_figure,
     tip_path_figure,
+    to_text,
     write_table,
 )
+from pinn_dyn.evaluation.control_figures import ERROR, control_errors
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
+from pinn_dyn.evaluation.plots import with_unit
 from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
 from pinn_dyn.evaluation.report.control_page import shown_columns
 from pinn_dyn.mechanics import MechanicalSystem
@@ -72,27 +74,25 @@ def write_results(
         )
         for name, record in records.items()
     }
-    table = comparison_table(metrics)
-    write_table(table, folder, "summary")
+    summary = comparison_table(metrics)
     coordinates = _together({name: m.per_coordinate() for name, m in metrics.items()})
-    write_table(coordinates, folder, "coordinates")
     inputs = _together({name: m.per_input() for name, m in metrics.items()})
-    write_table(inputs, folder, "inputs")
-
+    tables = {"summary": summary, "coordinates": coordinates, "inputs": inputs}
+    for stem, table in tables.items():
+        write_table(table, folder, stem)
     figures = _figures(records, source, robot, reference, config)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
     with SummaryWriter(str(folder / "tensorboard")) as writer:
-        # A row per figure of merit, to be read without scrolling.
-        text = table.set_index("controller").T.to_string(float_format="{:.4g}".format)
+        # One row per metric, which needs no scrolling.
+        text = summary.set_index("controller").T.to_string(float_format="{:.4g}".format)
         writer.add_text("closed_loop/summary", f"<pre>{text}</pre>")
         configuration = (folder / CONFIG).read_text(encoding="utf-8")
         writer.add_text("run/configuration", f"```yaml\n{configuration}\n```")
         for name in figures:
-            # The saved picture: to draw a figure of seven joints again takes seconds.
+            # Drawing a figure of seven joints again takes seconds; the saved image is at hand.
             picture = imread(folder / f"{name}.png")
-            tag = f"closed_loop/{name.removeprefix('closed_loop_')}"
-            writer.add_image(tag, picture, dataformats="HWC")
+            writer.add_image(f"closed_loop/{name}", picture, dataformats="HWC")
     first = next(iter(records))
     animation = folder / f"animation_{first}.gif"
     if config["animate"]:
@@ -100,26 +100,21 @@ def write_results(
 
     duration, runs = f"{config['duration']:g} s", len(records[first].stopped)
     print(f"\n{source.name}: closed loop of {duration}, {runs} run{'s' if runs > 1 else ''}")
-    print(format_table(table[[*shown_columns(table)]]))
+    print(to_text(summary, shown_columns(summary)))
     report = control_report(
         title=f"{source.name}: closed loop on a learned model",
-        summary=table,
+        summary=summary,
         coordinates=coordinates,
         inputs=inputs,
         records=records,
-        run=config["trajectory"],
-        held=config["rate"] is not None,
+        figures=figures,
         labels=source.labels,
-        input_labels=source.input_labels,
-        animation=animation if config["animate"] and animation.is_file() else None,
+        animation=animation if animation.is_file() else None,
         stability=stability,
         origin=origin,
     )
     write_whole(folder / "report.html", report)
-    print(
-        f"\ntables, figures and recorded motions are in {folder}; open report.html there in a "
-        "browser"
-    )
+    print(f"\ntables, figures and records are in {folder}; open report.html in a browser")
     return metrics[first].rms_error
 
 
@@ -177,18 +172,22 @@ def _figures(
 ) -> dict[str, Figure]:
     run = config["trajectory"]
     figures = {
-        f"closed_loop_{name}": closed_loop_figure(
-            record,
-            run,
-            title=f"{source.name}, {name} controller, run {run}",
+        "comparison": controller_comparison_figure(
+            records,
+            title=f"{source.name}: error of the closed loop",
+            label=with_unit(ERROR, source.labels),
+        ),
+    }
+    worst = {int(control_errors(x).nan_to_num(torch.inf).mean(1).argmax()) for x in records.values()}
+    for k in dict.fromkeys([run, *sorted(worst)]):
+        figures["closed_loop" if k == run else f"closed_loop_run_{k}"] = closed_loop_figure(
+            records,
+            k,
+            title=f"{source.name}, run {k}" + ("" if k == run else " (the worst of a law)"),
             labels=source.labels,
             input_labels=source.input_labels,
+            held=config["rate"] is not None,
         )
-        for name, record in records.items()
-    }
-    figures["comparison"] = controller_comparison_figure(
-        records, title=f"{source.name}: error of the closed loop"
-    )
     first = next(iter(records.values()))
     if isinstance(robot, Drawable):
         end = float(first.t[samples_before_stop(first, run) - 1])

@@ -24,7 +24,7 @@ from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.trust import read_foreign
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, posterior_draws
-from pinn_dyn.evaluation.sweep_table import flatten
+from pinn_dyn.app.settings import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import expect_output_limits

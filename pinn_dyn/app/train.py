@@ -52,7 +52,7 @@ from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
-from pinn_dyn.evaluation.sweep_table import Cell, flatten
+from pinn_dyn.app.settings import Cell, flatten
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits

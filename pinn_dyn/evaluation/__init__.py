@@ -1,6 +1,7 @@
-"""How good a model is: roll-out errors, learned terms against true ones, tables and figures."""
+"""Accuracy of models: rollout errors, learned terms beside true terms, tables and figures."""
 
 from pinn_dyn.evaluation.animation import animate, pose_strip
+from pinn_dyn.evaluation.baselines import ConstantVelocity, HoldPosition, build_baselines
 from pinn_dyn.evaluation.calibration import (
     Calibration,
     calibration,
@@ -20,13 +21,14 @@ from pinn_dyn.evaluation.control_metrics import (
     closed_loop_metrics,
     comparison_table,
 )
+from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
 from pinn_dyn.evaluation.figures import (
     error_figure,
     spread_figure,
+    sweep_figure,
     terms_figure,
     trajectory_figure,
 )
-from pinn_dyn.evaluation.floors import KeepsVelocity, StandsStill, build_floors
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import (
@@ -37,7 +39,7 @@ from pinn_dyn.evaluation.metrics import (
     rollout_metrics,
     state_squared_error,
 )
-from pinn_dyn.evaluation.png import save
+from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import (
     Prediction,
     common_stride,
@@ -48,12 +50,13 @@ from pinn_dyn.evaluation.prediction import (
 )
 from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.evaluation.tables import (
-    RunResult,
-    beaten_by_floors,
-    best_floor,
-    format_table,
-    grouped_table,
-    summary_table,
+    best,
+    best_baseline,
+    configuration_names,
+    over_seeds,
+    to_text,
+    unbeaten_baselines,
+    varied_settings,
     write_table,
 )
 from pinn_dyn.evaluation.torque import (
@@ -67,21 +70,22 @@ from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator, Val
 __all__ = [
     "Calibration",
     "ClosedLoopMetrics",
-    "KeepsVelocity",
+    "ConstantVelocity",
+    "Entry",
+    "Evaluation",
+    "HoldPosition",
     "Prediction",
     "RolloutFigures",
     "RolloutMetrics",
     "RolloutValidator",
     "RunDescription",
-    "RunResult",
-    "StandsStill",
     "TermComparison",
     "TorqueError",
     "ValidationHistory",
     "animate",
-    "beaten_by_floors",
-    "best_floor",
-    "build_floors",
+    "best",
+    "best_baseline",
+    "build_baselines",
     "calibration",
     "calibration_figure",
     "calibration_table",
@@ -91,17 +95,18 @@ __all__ = [
     "common_stride",
     "compare_terms",
     "comparison_table",
+    "configuration_names",
     "controller_comparison_figure",
     "default_horizon",
     "default_windows",
     "diverged_trajectories",
     "error_figure",
-    "format_table",
-    "grouped_table",
+    "evaluate_models",
     "half_widths",
     "interval_lines",
     "left_data",
     "member_metrics",
+    "over_seeds",
     "part_shares",
     "pose_strip",
     "predict_trajectories",
@@ -112,10 +117,13 @@ __all__ = [
     "spread_figure",
     "state_squared_error",
     "steady_state_figure",
-    "summary_table",
+    "sweep_figure",
     "terms_figure",
     "tip_path_figure",
+    "to_text",
     "torque_error",
     "trajectory_figure",
+    "unbeaten_baselines",
+    "varied_settings",
     "write_table",
 ]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
-from pinn_dyn.evaluation.drawing import COLOURS, TRUTH
+from pinn_dyn.evaluation.plots import COLORS, TRUTH
 from pinn_dyn.systems import Drawable, Rendered
 
 _TIP = "#CC0000"
@@ -195,7 +195,7 @@ def _legend(figure: Figure, ax: Axes3D) -> None:
 def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor, sample: int) -> None:
     ax.plot(*wanted[sample].flatten(0, 1).T.numpy(), color=TRUTH, linewidth=7, label="reference")
     for index, segment in enumerate(shape[sample]):
-        colour = COLOURS[(0, 5)[index % 2]]
+        colour = COLORS[(0, 5)[index % 2]]
         name = "arm" if index == 0 else None
         ax.plot(*segment.T.numpy(), color=colour, linewidth=4, solid_capstyle="butt", label=name)
     ax.plot([0], [0], [0], "s", color="black", markersize=7)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from scipy.stats import t as student
 from torch import Tensor
 
-from pinn_dyn.evaluation.drawing import look
+from pinn_dyn.evaluation.plots import model_style
 from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.prediction import Prediction
 
@@ -156,7 +156,7 @@ def calibration_figure(found: Mapping[str, Mapping[float, Calibration]], *, titl
         for index, (run, item) in enumerate(found.items()):
             if window not in item:
                 continue
-            one, colour = item[window], look(index)[0]
+            one, colour = item[window], model_style(index)["color"]
             ax.plot(100 * one.level, 100 * one.share, "o-", color=colour, markersize=4, label=run)
             if one.corrected is not None:
                 label = f"{run}, width from validation"

@@ -1,13 +1,11 @@
-"""A figure of a log before and after its cleaning."""
+"""Figure of a log before and after its cleaning."""
 
 from __future__ import annotations
 
-import torch
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import Cleaned
-from pinn_dyn.evaluation.drawing import COLOURS, TRUTH, Line, Panel, names
-from pinn_dyn.evaluation.png import motion_png
+from pinn_dyn.evaluation.plots import COLORS, TRUTH, default_labels, legend_below, panels
 
 
 def cleaning_figure(
@@ -17,36 +15,33 @@ def cleaning_figure(
     labels: list[str],
     input_labels: list[str],
 ) -> Figure:
-    """Raw dots and cleaned lines of one stretch: a column each for q, v and u.
+    """Draw raw samples as dots and cleaned signals as lines: a column each for q, v and u.
 
     A velocity or an input rate that the log does not have has lines only.
 
     Args:
         cleaned: the stretch, one of ``LogSource.cleaned``.
-        title: data set; the run is added to it.
+        title: data set; the name of the run is appended.
         labels: name and unit of each coordinate.
         input_labels: name and unit of each input.
 
     Raises:
-        ValueError: on labels that do not fit.
+        ValueError: if the number of labels does not fit.
     """
     raw = cleaned.raw
     inputs = [raw, *cleaned.clean][-1].u.shape[1]
-    labels = names(labels, "q", raw.q.shape[1], "labels")
-    input_labels = names(input_labels, "u", inputs, "input_labels")
+    labels = default_labels(labels, "q", raw.q.shape[1])
+    input_labels = default_labels(input_labels, "u", inputs)
     speeds = [f"d/dt {label.replace(']', '/s]')}" for label in labels]
-    looks = [(raw, "log", TRUTH, True)]
-    looks += [(part, "cleaned", COLOURS[0], False) for part in cleaned.clean]
-    columns = []
-    for signal, titles in (("q", labels), ("v", speeds), ("u", input_labels)):
-        panels = []
-        for k, label in enumerate(titles):
-            lines = []
-            for part, name, colour, dots in looks:
-                values = getattr(part, signal)
+    title = f"{title}: {raw.run}, {cleaned.split}"
+    figure, axes = panels([labels, speeds, input_labels], raw.t, title=title)
+    dots = {"color": TRUTH, "linestyle": "none", "marker": ".", "markersize": 3}
+    styles = [(raw, dots | {"label": "log"})]
+    styles += [(x, {"color": COLORS[0], "linewidth": 1.0, "label": "cleaned"}) for x in cleaned.clean]
+    for part, style in styles:
+        for column, values in zip(axes, (part.q, part.v, part.u), strict=True):
+            for k, ax in enumerate(column):
                 if values is not None and k < values.shape[1]:
-                    t, y = (torch.from_numpy(x.copy()) for x in (part.t, values[:, k]))
-                    lines.append(Line(name, t, y[None], colour, width=1.0, dots=dots))
-            panels.append(Panel(label, lines))
-        columns.append(panels)
-    return motion_png(columns, 0, title=f"{title}: {raw.run}, {cleaned.split}")
+                    ax.plot(part.t, values[:, k], **style)
+    legend_below(figure)
+    return figure

@@ -1,267 +1,228 @@
-"""Tables over runs: one row per run, one row per model, on the terminal and in files."""
+"""Tables over runs: what differs between runs, means over seeds, the best entries, CSV files."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from pinn_dyn.data.whole import write_whole
 
-# A column is recognized by how its name ends, so that prefixes (windowed_, mean_) may be added.
+MAX_COLUMNS = 9
+"""Number of columns that a page and the terminal show of a summary. The CSV file has all."""
+
+# Columns are recognized by the end of their names, as in window_0.1s_error_mean.
 _LOWER_IS_BETTER = (
-    "squared_error_mean",
-    "error_first_half",
-    "error_second_half",
-    "error_mean",
-    "error_median",
-    "error_worst",
-    "torque_error",
-    "torque_share",
-    "diverged",
+    *("error_mean", "error_median", "error_worst", "error_first_half", "error_second_half"),
+    *("diverged", "torque_error", "torque_share"),
 )
-_HIGHER_IS_BETTER = "valid_time_"
-_NOT_AVERAGED = ("worst_trajectory", "error_std", "squared_error_variance")
-_COUNTS = ("diverged", "left_data", "left_data_after")  # say nothing where nothing went wrong
-_ONLY_IN_FILES = (
-    "squared_error_mean",
-    "squared_error_variance",
-    "error_first_half",
-    "error_second_half",
-    "error_std",
-    "worst_trajectory",
-    "trajectories",
-    "horizon",
-)
+_NAMES = ["dataset.name", "model_name", "search.draw"]
+_HEADERS = {
+    "run": "run",
+    "error_mean": "mean error ± std",
+    "error_worst": "worst trajectory",
+    "diverged": "diverged",
+    "left_data": "left the data",
+    "valid_time": "valid time [s]",
+    "window": "error, reset",
+    "torque_share": "torque error / spread",
+    "residual_share": "residual force, share",
+    "spread_over_error": "spread / error",
+    "input_delay_seconds": "input delay [s]",
+    "pairs": "training pairs",
+    "training_seconds": "training [s]",
+}
 
 
-@dataclass(frozen=True)
-class RunResult:
-    """What one run reached, or a floor.
+def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return the settings in which runs differ, one row per run and one dotted column per setting.
 
-    Attributes:
-        run: name of the run.
-        model: name of the model; runs of one model differ by their seed.
-        seed: seed of the run; None for a floor.
-        metrics: named figures, such as ``RolloutMetrics.to_dict()``.
-        extra: what else belongs in the row: training pairs, training seconds, parameters.
-        floor: whether this is no trained model but what one has to beat.
+    Left out are the seed and all keys that follow it, keys that vary together with an earlier key,
+    and keys that the names of the model and of the data set, or the draw of a search, determine.
+
+    Args:
+        configs: nested configurations of the runs.
     """
+    settings = pd.json_normalize(list(configs))
+    text = settings.map(str)
+    names = [name for name in _NAMES if name in text and text[name].nunique() > 1]
+    partitions = {tuple(pd.factorize(text["seed"])[0])} if text["seed"].nunique() > 1 else set()
+    columns = []
+    for column in [*names, *text.columns.difference(names, sort=False)]:
+        partition = tuple(pd.factorize(text[column])[0])
+        if column in ("seed", "dataset.cache") or max(partition) == 0 or partition in partitions:
+            continue
+        if names and column not in names and text.groupby(names)[column].nunique().max() == 1:
+            continue
+        partitions.add(partition)
+        columns.append(column)
+    return settings[columns]
 
-    run: str
-    model: str
-    seed: int | None
-    metrics: dict[str, float]
-    extra: dict[str, float] = field(default_factory=dict)
-    floor: bool = False
 
+def configuration_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a name for the configuration of each run, equal for runs that differ in the seed only.
 
-def summary_table(results: list[RunResult]) -> pd.DataFrame:
-    """One row per run: run, model, seed, floor, the extras, the metrics.
-
-    Raises:
-        ValueError: on an empty list, or a name that is an extra and a metric at once.
+    The name of a model is followed by the settings in which runs of this model differ.
     """
-    if not results:
-        raise ValueError("results is empty: expected at least one run")
-    for result in results:
-        twice = {"run", "model", "seed", "floor"} & (result.metrics.keys() | result.extra.keys())
-        twice |= result.metrics.keys() & result.extra.keys()
-        if twice:
-            raise ValueError(f"run {result.run!r} names {sorted(twice)} twice: rename one of each")
-    extras = list(dict.fromkeys(name for result in results for name in result.extra))
-    metrics = list(dict.fromkeys(name for result in results for name in result.metrics))
-    first = ("run", "model", "seed", "floor")
-    rows = [{name: getattr(r, name) for name in first} | r.extra | r.metrics for r in results]
-    frame = pd.DataFrame(rows, columns=[*first, *extras, *metrics])
-    return frame.astype({"seed": "Int64"})  # whole numbers, although a floor has none
+    settings = varied_settings(configs).map(str)
+    labels = []
+    for name, (_, row) in zip(names, settings.iterrows(), strict=True):
+        same = settings[[other == name for other in names]]
+        differing = [f"{key}={row[key]}" for key in same if same[key].nunique() > 1]
+        labels.append(" ".join([name, *differing]))
+    return labels
 
 
-def grouped_table(summary: pd.DataFrame) -> pd.DataFrame:
-    """One row per model, in order of appearance: mean and worst over its seeds.
+def over_seeds(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Return one row per configuration, in order of appearance: means over its seeds.
 
-    A metric x becomes ``mean_x`` and ``worst_x``; other numbers only get their mean. The worst is
-    the largest error or the shortest valid time. A mean over a diverged seed may be infinite.
+    ``seeds`` is the number of runs. A figure x keeps its name for the mean, and ``x_std`` is the
+    sample standard deviation: missing for a single seed, and if the mean is infinite.
+
+    Args:
+        runs: one row per run, with a column ``seed``.
+        by: columns that tell configurations apart.
     """
-    rows = []
-    for model, group in summary.groupby("model", sort=False):
-        row: dict[str, object] = {"model": model, "seeds": len(group)}
-        if "floor" in group:
-            row["floor"] = bool(group["floor"].iloc[0])
-        for column in summary.columns:
-            # Neither an index nor a spread over times has a meaning when averaged over seeds.
-            if column in ("seed", "floor") or column.endswith(_NOT_AVERAGED):
-                continue
-            if not pd.api.types.is_numeric_dtype(summary[column]):
-                continue
-            row[f"mean_{column}"] = group[column].mean()
-            if _rank(column) > 0:
-                row[f"worst_{column}"] = group[column].max()
-            elif _rank(column) < 0:
-                row[f"worst_{column}"] = group[column].min()
-        rows.append(row)
-    return pd.DataFrame(rows)
+    left_out = ["seed", "worst_trajectory", "error_std", *by]
+    figures = runs.select_dtypes("number").columns.difference(left_out, sort=False)
+    groups = runs.groupby(list(by) or (lambda _: 0), sort=False, dropna=False)
+    table = groups.size().rename("seeds").to_frame()
+    for name in figures:
+        table[name] = groups[name].mean()
+        finite = table[name].abs() < math.inf
+        table[f"{name}_std"] = groups[name].std(ddof=1).where(finite)
+    return table.reset_index(drop=not by)
 
 
-def format_table(frame: pd.DataFrame, headers: Mapping[str, str] | None = None) -> str:
-    """The table as aligned text, the best figure of a column marked with ``*``, see :func:`best`.
+def summary_columns(summary: pd.DataFrame) -> dict[str, str]:
+    """Return the columns of a summary that a page and the terminal show, with their headings.
 
-    The mean of a run comes as mean ± standard deviation over its times and trajectories; the
-    squared errors, the halves of the horizon and the like are in the files only. A column that
-    counts what went wrong is left out where nothing did. A floor has its name in brackets. Columns
-    that are in ``headers`` go by another name.
+    Columns without information are left out, as a count of diverged rollouts that is 0. From the
+    windowed errors the longest window is taken, from the valid times the largest threshold.
     """
-    frame = bracketed(frame)
-    shown = [
-        name
-        for name in frame.columns
-        if not name.endswith(("floor", *_ONLY_IN_FILES))
-        and not (name.endswith(_COUNTS) and frame[name].isin([0, math.inf]).all())
-    ]
-    texts = [_column_text(frame, name) for name in shown]
-    titles = [(headers or {}).get(name, name) for name in shown]
-    widths = [max(map(len, [title, *text])) for title, text in zip(titles, texts, strict=True)]
-    left = [not pd.api.types.is_numeric_dtype(frame[name]) for name in shown]
-
-    def line(cells: list[str]) -> str:
-        padded = [
-            cell.ljust(width) if is_left else cell.rjust(width)
-            for cell, width, is_left in zip(cells, widths, left, strict=True)
-        ]
-        return "  ".join(padded).rstrip()
-
-    rows = [line(list(cells)) for cells in zip(*texts, strict=True)]
-    return "\n".join([line(titles), "  ".join("-" * width for width in widths), *rows])
+    headers = {}
+    for key, header in _HEADERS.items():
+        names = [key]
+        if key == "valid_time":
+            names = [name for name in summary if name.startswith("valid_time_")]
+        elif key == "window":
+            names = [name for name in summary if _is_windowed(name)]
+            header = f"error, reset every {_span(names[-1])}" if names else ""
+        name = names[-1] if names else ""
+        counted = key in ("diverged", "left_data")
+        if name in summary and not (summary[name].isna() | (counted & (summary[name] == 0))).all():
+            headers[name] = header
+    return dict(list(headers.items())[:MAX_COLUMNS])
 
 
-def bracketed(frame: pd.DataFrame) -> pd.DataFrame:
-    """The same table, the names of floors in brackets."""
-    if "floor" not in frame:
-        return frame
-    name = "run" if "run" in frame else "model"
-    return frame.assign(**{name: frame[name].where(~frame["floor"], "[" + frame[name] + "]")})
+def _is_windowed(name: str) -> bool:
+    return name.startswith("window_") and name.endswith("_error_mean")
 
 
-def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> tuple[Path, Path]:
-    """Write ``<stem>.csv`` and ``<stem>.json`` (a list of records); returns both paths.
+def _span(name: str) -> str:
+    return name.removeprefix("window_").removesuffix("s_error_mean") + " s"
 
-    JSON knows no infinity: an infinite figure is the string "inf" there, a missing one null.
+
+def formatted(
+    frame: pd.DataFrame, headers: Mapping[str, str] | None = None, star: str = ""
+) -> pd.DataFrame:
+    """Return a table as text under its headings, numbers with three significant digits.
+
+    A mean is followed by ± and its standard deviation. Names of baselines are in brackets.
+
+    Args:
+        frame: table.
+        headers: columns to show and their headings; None shows all columns under their names.
+        star: mark behind the best entry of each column, see :func:`best`.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    csv, records = folder / f"{stem}.csv", folder / f"{stem}.json"
-    write_whole(csv, frame.to_csv(index=False))
-    rows = [
-        {name: _json_value(value) for name, value in row.items()}
-        for row in frame.astype(object).to_dict(orient="records")
-    ]
-    write_whole(records, json.dumps(rows, indent=2, allow_nan=False) + "\n")
-    return csv, records
+    text = {}
+    for name, header in (headers or {name: str(name) for name in frame}).items():
+        column = frame[name].map(number)
+        deviation = f"{name}_std"
+        if name == "error_mean" and deviation not in frame:
+            deviation = "error_std"
+        if deviation in frame:
+            column += " ± " + frame[deviation].map(number)
+        if star:
+            column += best(frame, name).map({True: star, False: ""})
+        if name in ("run", "configuration") and "baseline" in frame:
+            column = column.where(~frame["baseline"], "[" + column + "]")
+        text[header] = column
+    return pd.DataFrame(text)
 
 
-def _json_value(value: object) -> object:
-    if value is pd.NA:
-        return None
-    if not isinstance(value, float) or math.isfinite(value):
-        return value
-    return None if math.isnan(value) else str(value)
+def to_text(frame: pd.DataFrame, headers: Mapping[str, str] | None = None) -> str:
+    """Return a table for the terminal; a star marks the best entry of each column."""
+    text = formatted(frame, headers, star="*")
+    return text.set_index(text.columns[0]).rename_axis(None).to_string()
 
 
-def _rank(column: str) -> int:
-    """1 if a lower figure is better, -1 if a higher one is, 0 if neither."""
-    if _HIGHER_IS_BETTER in column:
-        return -1
-    return 1 if column.endswith(_LOWER_IS_BETTER) else 0
-
-
-def _column_text(frame: pd.DataFrame, name: str) -> list[str]:
-    spread = None
-    if name.endswith("error_mean"):
-        sibling = name.removesuffix("error_mean") + "error_std"
-        spread = frame[sibling] if sibling in frame.columns else None
-    marks = best(frame, name)
-    ranked = marks.any()
-    cells = []
-    for index, value in enumerate(frame[name]):
-        never = name.endswith("left_data_after") and value == math.inf
-        text = "never" if never else number(value)
-        if spread is not None and text != "-":
-            text += f" ± {number(spread.iloc[index])}"
-        cells.append(text + ("*" if marks.iloc[index] else " " if ranked else ""))
-    return cells
+def number(value: object) -> str:
+    """Return a number as text with three significant digits; "-" if it is missing."""
+    if value is None or value is pd.NA or value != value:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.3g}"
+    return str(value)
 
 
 def best(frame: pd.DataFrame, name: str) -> pd.Series:
-    """Which rows hold the best figure of a column.
+    """Return which rows have the best entry of a column, bool.
 
-    Among errors only rows with the fewest diverged trajectories compete, since the mean leaves
-    the diverged ones out. A floor is never marked, and a model only if it beats every floor. None
-    is marked in a column that does not tell rows apart.
+    Among errors, only the rows with the fewest diverged trajectories compete, since a mean leaves
+    diverged trajectories out. No row is best unless it beats all baselines.
     """
     none = pd.Series(False, index=frame.index)
-    rank = _rank(name)
-    if rank == 0 or frame[name].nunique() < 2:
+    valid_time = "valid_time_" in name
+    if not (valid_time or name.endswith(_LOWER_IS_BETTER)) or frame[name].nunique() < 2:
         return none
-    figures = rank * frame[name].astype(float).where(_competes(frame, name), math.inf)
-    floor = frame["floor"].astype(bool) if "floor" in frame else none
-    smallest = figures[~floor].min()
-    if not math.isfinite(smallest) or (figures[floor] <= smallest).any():
+    figures = _competing(frame, name) * (-1 if valid_time else 1)
+    baseline = frame["baseline"].astype(bool) if "baseline" in frame else none
+    smallest = figures[~baseline].min()
+    if not math.isfinite(smallest) or (figures[baseline] <= smallest).any():
         return none
-    return (figures == smallest) & ~floor
+    return (figures == smallest) & ~baseline
 
 
-def beaten_by_floors(frame: pd.DataFrame) -> list[str]:
-    """A sentence for each error column in which no model beats every floor.
+def _competing(frame: pd.DataFrame, name: str) -> pd.Series:
+    """Return a column, infinite where more trajectories diverged than in the best row."""
+    figures = frame[name].astype(float)
+    start, separator, _ = name.rpartition("error_")
+    diverged = f"{start}diverged"
+    if separator and "torque" not in name and diverged in frame:
+        figures = figures.where(frame[diverged] == frame[diverged].min(), math.inf)
+    return figures
 
-    Args:
-        frame: what :func:`summary_table` returns, floors among its rows.
-    """
+
+def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
+    """Return a sentence for each mean error in which no model beats all baselines."""
     sentences = []
-    for name in frame:
-        others = ("squared_", "state_squared_", "member_")
-        if not name.endswith("error_mean") or name.startswith(others):
-            continue
-        figures = frame[name].astype(float).where(_competes(frame, name), math.inf)
-        floor = frame["floor"].astype(bool)
-        if floor.any() and not figures[~floor].min() < figures[floor].min():
-            lowest = frame.loc[figures[floor].idxmin()]
+    baseline = summary["baseline"].astype(bool)
+    for name in (name for name in summary if name == "error_mean" or _is_windowed(name)):
+        figures = _competing(summary, name)
+        if baseline.any() and not figures[~baseline].min() < figures[baseline].min():
+            row = summary.loc[figures[baseline].idxmin()]
+            error = "mean error" if name == "error_mean" else f"error, reset every {_span(name)}"
             sentences.append(
-                f"No model beats every floor in {name}: '{lowest['run']}' has "
-                f"{number(lowest[name])}."
+                f"No model is more accurate than the baseline '{row['run']}' "
+                f"({error}: {number(row[name])})."
             )
     return sentences
 
 
-def best_floor(summary: pd.DataFrame) -> str | None:
-    """The floor that errs least of those with the fewest diverged trajectories; None without any.
-
-    Args:
-        summary: what :func:`summary_table` returns.
-    """
-    floors = summary[summary["floor"].astype(bool)]
-    return None if floors.empty else floors.sort_values(["diverged", "error_mean"])["run"].iloc[0]
+def best_baseline(summary: pd.DataFrame) -> str | None:
+    """Return the name of the most accurate baseline with the fewest diverged trajectories."""
+    baselines = summary[summary["baseline"].astype(bool)]
+    ranked = baselines.sort_values(["diverged", "error_mean"])
+    return None if ranked.empty else str(ranked["run"].iloc[0])
 
 
-def _competes(frame: pd.DataFrame, name: str) -> pd.Series:
-    """Rows whose figure compares: of roll-out errors those with the fewest that diverged."""
-    everyone = pd.Series(True, index=frame.index)
-    suffix = next((end for end in _LOWER_IS_BETTER if name.endswith(end)), None)
-    if suffix is None or "torque" in suffix:  # which comes without a roll-out
-        return everyone
-    diverged = name.removesuffix(suffix) + "diverged"
-    return frame[diverged] == frame[diverged].min() if diverged in frame else everyone
-
-
-def number(value: object) -> str:
-    """A figure as text with three significant digits; "-" where there is none."""
-    if value is pd.NA:
-        return "-"
-    if isinstance(value, float):
-        if math.isnan(value):
-            return "-"
-        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.3g}"
-    return str(value)
+def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> Path:
+    """Write a table as ``<stem>.csv``, and create its folder."""
+    path = Path(folder) / f"{stem}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, frame.to_csv(index=False))
+    return path

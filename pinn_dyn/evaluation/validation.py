@@ -9,7 +9,7 @@ import torch
 from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
-from pinn_dyn.evaluation.floors import StandsStill
+from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.learned_terms import compare_terms
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import (
@@ -131,7 +131,7 @@ class RolloutValidator:
         truth = truth.until(self.horizon)
         span = self.window or self.horizon
         steps = {max(1, round(part * span / step)) for part in _PARTS} - {round(span / step)}
-        still = StandsStill(model.num_coordinates, model.num_inputs)
+        still = HoldPosition(model.num_coordinates, model.num_inputs)
         found, floors = [longest], [self.predict(still, truth)]
         for n in steps:
             found.append(predict_windows(model, truth, window=n * step, step=step))

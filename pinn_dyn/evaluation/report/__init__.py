@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of an evaluation, a control run and a log, with interactive figures."""
+"""Self-contained HTML pages of an evaluation, a control run and a log check."""
 
 from pinn_dyn.evaluation.report.check_page import check_report
 from pinn_dyn.evaluation.report.control_page import (
@@ -7,7 +7,6 @@ from pinn_dyn.evaluation.report.control_page import (
     measured_model_report,
 )
 from pinn_dyn.evaluation.report.page import Origin
-from pinn_dyn.evaluation.report.prediction_page import prediction_report
 
 __all__ = [
     "Origin",
@@ -15,5 +14,4 @@ __all__ = [
     "check_report",
     "control_report",
     "measured_model_report",
-    "prediction_report",
 ]

@@ -7,9 +7,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import LogSource
-from pinn_dyn.evaluation.drawing import look
 from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_figures import cleaning_figure
+from pinn_dyn.evaluation.plots import model_style
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
@@ -35,7 +35,7 @@ def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
     facts = pd.DataFrame({"what": check.figures.keys(), "value": check.figures.values()})
     parts = [paragraph(text) for text in verdict]
     parts += [paragraph(f"Warning: {text}") for text in check.warnings]
-    parts.append(table(facts, headers={"what": "", "value": ""}))
+    parts.append(table(facts, headers={"what": "", "value": " "}))
     parts += [
         paragraph("To copy into the configuration, and to run; each line with its reason:"),
         preformatted(check.suggestion),
@@ -122,7 +122,7 @@ def _clock(source: LogSource) -> Figure:
     figure = Figure(figsize=(9, 2.6), layout="constrained")
     ax = figure.subplots()
     for index, part in enumerate(source.cleaned[:6]):
-        ax.plot(part.raw.t[1:], 1e3 * np.diff(part.raw.t), ".", color=look(index)[0], markersize=2)
+        ax.plot(part.raw.t[1:], 1e3 * np.diff(part.raw.t), ".", color=model_style(index)["color"], markersize=2)
     ax.set(xlabel="time (s)", ylabel="time between rows (ms)")
     return figure
 
@@ -131,7 +131,7 @@ def _delays(check: LogCheck) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     ax = figure.subplots()
     for index, (name, curve) in enumerate(zip(check.inputs["input"], check.delays, strict=True)):
-        colour = look(index)[0]
+        colour = model_style(index)["color"]
         ax.plot(1e3 * curve.candidates, 100 * curve.residual, color=colour, label=name)
         if curve.delay is not None:
             ax.axvline(1e3 * curve.delay, color=colour, linewidth=0.8, linestyle="--")
@@ -146,7 +146,7 @@ def _coverage(check: LogCheck, source: LogSource) -> Figure:
     splits = source.load()
     for name, colour, items in (
         ("training", "0.7", splits.train),
-        ("test", look(0)[0], splits.test),
+        ("test", model_style(0)["color"], splits.test),
     ):
         q = np.vstack([np.hstack([item.q[:, :2].numpy(), item.v[:, :1].numpy()]) for item in items])
         if len(source.labels) > 1:
@@ -155,6 +155,6 @@ def _coverage(check: LogCheck, source: LogSource) -> Figure:
         left.plot(q[:, 0], q[:, -1], ".", color=colour, markersize=2, label=name)
     left.set(xlabel=source.labels[0], ylabel=[*source.labels, "its velocity"][1])
     left.legend(fontsize="small")
-    right.hist(check.distance, bins=40, color=look(0)[0])
+    right.hist(check.distance, bins=40, color=model_style(0)["color"])
     right.set(xlabel="distance of a test sample from the training", ylabel="samples")
     return figure

@@ -1,4 +1,4 @@
-"""The frame of a report: sections of text, tables and figures, in one HTML file."""
+"""The frame of a report: sections of text, tables and figures in one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ import html
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import markdown
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
-from matplotlib import figure as figures
-from plotly.graph_objects import Figure
+from matplotlib.figure import Figure
+from plotly import graph_objects
 from plotly.offline import get_plotlyjs
 
-from pinn_dyn.evaluation.tables import number
+from pinn_dyn.evaluation.tables import best, formatted
 
-# Whatever is put into a template is escaped, unless it is Markup that was made here.
+# Text is escaped when it enters the template, unless it is Markup that this module made.
 _TEMPLATES = Environment(
     loader=PackageLoader("pinn_dyn.evaluation.report"),
     autoescape=True,
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_FIGURE_OPTIONS = {
+_PLOTLY_OPTIONS = {
     "displaylogo": False,
     "responsive": True,
-    # Nothing on the page may send it anywhere.
+    # A report sends nothing to a server.
     "modeBarButtonsToRemove": ["sendChartToCloud", "lasso2d", "select2d"],
 }
 # Patterns of Markdown that make links and load pictures.
@@ -40,12 +41,20 @@ _LINKS = (
 
 
 @dataclass(frozen=True)
+class Section:
+    """A part of a page under its own heading. The functions below make its parts."""
+
+    title: str
+    parts: Sequence[Markup]
+
+
+@dataclass(frozen=True)
 class Origin:
-    """Where the numbers of a page come from.
+    """The origin of the numbers of a page.
 
     Attributes:
-        provenance: what was run, on which commit, data and hardware: names and values.
-        runs: one row per trained model: its name, seed, folder and so on.
+        provenance: names and values: command, commit, data and hardware.
+        runs: one row per trained model: name, seed, folder and so on.
         configurations: names and resolved configurations as text.
     """
 
@@ -54,52 +63,45 @@ class Origin:
     configurations: Mapping[str, str]
 
     def section(self) -> Section:
-        """The last section of a page."""
-        facts = pd.DataFrame({"what": self.provenance.keys(), "value": self.provenance.values()})
-        parts = [table(facts, headers={"what": "", "value": ""})]
-        parts.append(table(self.runs))
+        """Return the last section of a page."""
+        facts = pd.DataFrame({"fact": self.provenance.keys(), "value": self.provenance.values()})
+        parts = [table(facts, headers={"fact": "", "value": " "}), table(self.runs)]
         parts += [details(name, preformatted(text)) for name, text in self.configurations.items()]
         return Section("Configuration and provenance", parts)
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of a page under its own heading; the parts are what the functions below return."""
-
-    title: str
-    parts: Sequence[Markup]
-
-
 def page(title: str, subtitle: str, sections: Sequence[Section]) -> str:
-    """The whole page; plotly.js is inside, nothing is loaded from anywhere."""
+    """Return the page. It loads nothing; plotly.js is embedded where a figure needs it."""
+    interactive = any("plotly-graph-div" in part for item in sections for part in item.parts)
     return _TEMPLATES.get_template("page.html").render(
         title=title,
         subtitle=subtitle,
         date=datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         sections=sections,
-        plotly=Markup(get_plotlyjs()),
+        plotly=Markup(get_plotlyjs()) if interactive else "",
     )
 
 
 def paragraph(text: str) -> Markup:
-    """A paragraph of plain text."""
+    """Return a paragraph of plain text."""
     return Markup("<p>{}</p>").format(text)
 
 
 def preformatted(text: str) -> Markup:
-    """Text as it is, in a monospaced font."""
+    """Return text in a monospaced font, with its line breaks."""
     return Markup("<pre>{}</pre>").format(text)
 
 
-def details(summary: str, content: Markup) -> Markup:
-    """Content that a click unfolds."""
-    return Markup("<details><summary>{}</summary>{}</details>").format(summary, content)
+def details(summary: str, *content: Markup) -> Markup:
+    """Return content that a click unfolds."""
+    parts = Markup("").join(content)
+    return Markup("<details><summary>{}</summary>{}</details>").format(summary, parts)
 
 
 def from_markdown(text: str) -> Markup:
-    """A Markdown report with its tables; its headings become the third level and below.
+    """Return a Markdown report with its tables; its headings start at the third level.
 
-    HTML and links stay the text that they are: names in it come from files of others.
+    HTML and links remain plain text, since names in a report come from files of other people.
     """
     reader = markdown.Markdown(
         extensions=["tables", "toc"], extension_configs={"toc": {"baselevel": 3}}
@@ -112,78 +114,65 @@ def from_markdown(text: str) -> Markup:
     )
 
 
-def picture(content: bytes, kind: str, text: str) -> Markup:
-    """A ``gif`` or ``png``, embedded."""
-    data = base64.b64encode(content).decode()
-    return Markup('<img src="data:image/{};base64,{}" alt="{}">').format(kind, data, text)
-
-
-def drawing(drawn: figures.Figure, text: str) -> Markup:
-    """A figure of matplotlib, embedded."""
-    file = io.BytesIO()
-    drawn.savefig(file, format="png", dpi=110)
-    return picture(file.getvalue(), "png", text)
-
-
-def table(
-    frame: pd.DataFrame,
-    *,
-    headers: Mapping[str, str] | None = None,
-    best: pd.DataFrame | None = None,
-    spread: Mapping[str, str] | None = None,
-) -> Markup:
-    """A table; a number has three digits, and all of them in its tooltip.
+def picture(content: bytes, kind: str, text: str, width: float | None = None) -> Markup:
+    """Return an embedded image.
 
     Args:
-        frame: what to show.
-        headers: columns to show and their headings; None takes all by their names.
-        best: which cells to mark, with columns of ``frame``.
-        spread: columns whose cells get ``± x``, and the columns of ``frame`` that hold it.
+        content: bytes of the file.
+        kind: ``gif`` or ``png``.
+        text: description of the image.
+        width: width on a wide screen, px.
     """
-    headers = {name: str(name) for name in frame} if headers is None else headers
-    rows = []
-    for index in range(len(frame)):
-        cells = []
-        for name in headers:
-            value = frame[name].iloc[index]
-            text = _cell(value)
-            if spread and spread.get(name) in frame and text != "-":
-                text += f" ± {_cell(frame[spread[name]].iloc[index])}"
-            marked = best is not None and name in best and bool(best[name].iloc[index])
-            exact = repr(float(value)) if isinstance(value, float) else ""  # as of numpy too
-            cells.append((text, exact, marked, isinstance(value, str)))
-        rows.append(cells)
+    data = base64.b64encode(content).decode()
+    style = Markup("") if width is None else Markup(' style="width: {:.0f}px"').format(width)
     return Markup(
-        _TEMPLATES.get_template("table.html").render(
-            headers=[(text, _is_text(frame[name])) for name, text in headers.items()], rows=rows
-        )
-    )
+        '<div class="figure"><img src="data:image/{};base64,{}" alt="{}"{}></div>'
+    ).format(kind, data, text, style)
 
 
-def turned(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Rows and columns exchanged, under headings from the column ``name``."""
-    return frame.set_index(name).T.rename_axis(None, axis=1).reset_index(names="figure")
+def drawing(figure: Figure, text: str) -> Markup:
+    """Return a matplotlib figure, embedded as PNG."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=140)
+    return picture(file.getvalue(), "png", text, width=96 * figure.get_figwidth())
 
 
-def figure(drawn: Figure, name: str) -> Markup:
-    """An interactive figure; the name is its id on the page."""
+def interactive(figure: graph_objects.Figure, name: str) -> Markup:
+    """Return an interactive plotly figure with an id."""
     return Markup(
-        drawn.to_html(
+        figure.to_html(
             full_html=False,
             include_plotlyjs=False,
             auto_play=False,
             div_id=name,
-            config=_FIGURE_OPTIONS,
-            default_height=f"{drawn.layout.height}px",
+            config=_PLOTLY_OPTIONS,
+            default_height=f"{figure.layout.height}px",
         )
     )
 
 
-def _is_text(column: pd.Series) -> bool:
-    return len(column) > 0 and all(isinstance(value, str) for value in column)
+def table(frame: pd.DataFrame, *, headers: Mapping[str, str] | None = None) -> Markup:
+    """Return a table, numbers with three significant digits and the best entries in bold.
+
+    Args:
+        frame: table, see :func:`pinn_dyn.evaluation.tables.best` for its best entries.
+        headers: columns to show and their headings; None shows all columns under their names.
+    """
+    headers = headers or {name: str(name) for name in frame}
+    text = formatted(frame.reset_index(drop=True), headers)
+    marks = pd.DataFrame({header: best(frame, name) for name, header in headers.items()})
+    marks = marks.reset_index(drop=True).astype(object)
+    is_text = [frame[name].map(lambda value: isinstance(value, str)).all() for name in headers]
+    styles: list[Any] = [
+        {"selector": f".col{k}", "props": "text-align: left; white-space: normal"}
+        for k, left in enumerate(is_text)
+        if left
+    ]
+    styler = text.style.hide(axis="index").format(escape="html").format_index(escape="html", axis=1)
+    styler.set_td_classes(marks.replace({True: "best", False: ""})).set_table_styles(styles)
+    return Markup('<div class="table">{}</div>').format(Markup(styler.to_html()))
 
 
-def _cell(value: object) -> str:
-    if value is pd.NA:
-        return "-"
-    return number(float(value)) if isinstance(value, float) else str(value)
+def turned(frame: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Return a table with rows and columns exchanged, under headings from the column ``name``."""
+    return frame.set_index(name).T.rename_axis(None, axis=1).reset_index(names="figure")

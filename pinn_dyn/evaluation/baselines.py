@@ -1,0 +1,59 @@
+"""Baselines: predictors that a learned model has to beat."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.mechanics import Predictor, Signal, Trajectory
+from pinn_dyn.models.linear_rival import fit_linear_rival
+
+log = logging.getLogger(__name__)
+
+
+class HoldPosition(Predictor):
+    """q(t) = q(0), the prediction of a model that has learned nothing."""
+
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
+        return torch.zeros_like(x0).unsqueeze(-2).expand(*x0.shape[:-1], len(t), x0.shape[-1])
+
+
+class ConstantVelocity(Predictor):
+    """q(t) = q(0) + v(0) t, which is hard to beat over a short time."""
+
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
+        v = x0[..., None, self.num_coordinates :]
+        distance = v * (t - t[0]).to(x0)[:, None]
+        return torch.cat([distance, torch.zeros_like(distance)], dim=-1)
+
+
+def build_baselines(
+    train: Sequence[Trajectory], validation: Sequence[Trajectory], *, step: float
+) -> dict[str, Predictor]:
+    """Build all baselines: hold position, constant velocity, ARX, and EDMDc of degree 2.
+
+    The linear models are fitted to the training trajectories. The validation trajectories select
+    their number of lags. A linear model that cannot be fitted, because the training trajectories
+    are too short or unevenly sampled, is left out with a warning.
+
+    Args:
+        train, validation: trajectories of the data source, q ``(T, N)`` each.
+        step: step of the linear models, s.
+    """
+    size, inputs = train[0].q.shape[-1], train[0].u.shape[-1]
+    baselines: dict[str, Predictor] = {
+        "hold position": HoldPosition(size, inputs),
+        "constant velocity": ConstantVelocity(size, inputs),
+    }
+    for name, degree in (("ARX", 1), ("EDMDc degree 2", 2)):
+        try:
+            model = fit_linear_rival(train, validation, step=step, degree=degree)
+        except ValueError as error:
+            log.warning("no row '%s': %s", name, error)
+            continue
+        baselines[name] = model
+        log.info("%s: %d lags of %g s, selected on the validation data", name, model.lags, step)
+    return baselines

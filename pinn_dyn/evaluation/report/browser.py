@@ -1,0 +1,153 @@
+"""The interactive figure of a prediction page: a browser of trajectories and their errors."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+from torch import Tensor
+
+from pinn_dyn.evaluation.figures import ERROR
+from pinn_dyn.evaluation.plots import DARK, TRUTH, limits, log_limits, model_style, with_unit
+from pinn_dyn.evaluation.prediction import Prediction
+from pinn_dyn.mechanics import Trajectory
+
+MAX_TRAJECTORIES = 24
+"""Number of trajectories that the browser offers."""
+
+_POINTS = 400  # of one curve
+_PANEL, _ABOVE, _BELOW = 140, 110, 90  # heights of a panel and of the margins, px
+_DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
+_JUMP = {"duration": 0, "redraw": True}
+
+
+class _Curve(NamedTuple):
+    """A curve of each trajectory: row of its panel, times ``(T,)`` and values ``(K, T)``."""
+
+    row: int
+    name: str
+    line: dict[str, Any]
+    t: Tensor
+    values: Tensor
+
+    def samples(self, trajectory: int) -> np.ndarray:
+        """Return the values of one trajectory in single precision; a gap where they overflow."""
+        y = _thinned(self.values[trajectory])
+        return np.where(np.abs(y) < 1e6, y, np.nan).astype(np.float32)
+
+
+def trajectory_browser(
+    truth: Trajectory,
+    predictions: Mapping[str, Prediction],
+    baselines: Mapping[str, Prediction],
+    *,
+    labels: Sequence[str],
+    input_labels: Sequence[str],
+    trajectories: Sequence[int],
+) -> go.Figure:
+    """Return a figure of one trajectory at a time: configuration, error and input over time.
+
+    A slider selects the trajectory. The truth sets the range of the panels of the configuration.
+
+    Args:
+        truth: K trajectories stacked, q ``(K, T, N)``.
+        predictions, baselines: names and rollouts of the same trajectories.
+        labels, input_labels: name and unit of each coordinate and input.
+        trajectories: indices of the trajectories to offer; the first is shown at first.
+    """
+    styles = {name: _line(model_style(k)) for k, name in enumerate(predictions)}
+    styles |= {name: {"color": "#9aa5ae", "dash": "dash", "width": 1.0} for name in baselines}
+    rollouts = {**predictions, **baselines}
+    curves = []
+    for k in range(len(labels)):
+        real = {"color": TRUTH, "width": 4}
+        curves.append(_Curve(k, "truth", real, truth.t, truth.q[..., k]))
+        for name, item in rollouts.items():
+            curves.append(_Curve(k, name, styles[name], item.t, item.q_hat[..., k]))
+    size = len(labels)
+    for name, item in rollouts.items():
+        curves.append(_Curve(size, name, styles[name], item.t, item.error()))
+    shape = "hv" if truth.input.interpolation == "hold" else "linear"
+    for k in range(len(input_labels)):
+        line = {"color": DARK, "width": 1.2, "shape": shape}
+        curves.append(_Curve(size + 1 + k, "input", line, truth.t, truth.u[..., k]))
+
+    titles = [*labels, with_unit(ERROR, labels), *input_labels]
+    drawn = make_subplots(len(titles), 1, shared_xaxes=True, vertical_spacing=0.2 / len(titles))
+    first, names = trajectories[0], set()
+    for row, name, line, t, _ in curves:
+        drawn.add_scatter(
+            x=_thinned(t).astype(np.float32),
+            name=html.escape(name),
+            legendgroup=name,
+            showlegend=name not in names,
+            mode="lines",
+            line=line,
+            hovertemplate="%{y:.4g}",
+            row=row + 1,
+            col=1,
+        )
+        names.add(name)
+    frames = {}
+    for k in sorted(trajectories):
+        ranges = {f"yaxis{row + 1}": {"range": _range(truth, rollouts, row, k)}
+                  for row in range(size + 1)}
+        frames[k] = go.Frame(
+            name=str(k), data=[{"y": curve.samples(k)} for curve in curves], layout=ranges
+        )
+    drawn.frames = list(frames.values())
+    for trace, start in zip(drawn.data, frames[first].data, strict=True):
+        trace.y = start.y
+    for row, title in enumerate(titles):
+        text = {"text": html.escape(title), "font": {"size": 12}}
+        drawn.update_yaxes(title=text, nticks=5, row=row + 1, col=1)
+    drawn.update_yaxes(type="log", exponentformat="power", row=size + 1, col=1)
+    drawn.update_xaxes(title="time [s]", row=len(titles), col=1)
+    plot = _PANEL * len(titles)
+    steps = [
+        {"label": str(k), "method": "animate", "args": [[str(k)], {"frame": _JUMP}]} for k in frames
+    ]
+    slider = {
+        "active": list(frames).index(first),
+        "currentvalue": {"prefix": "trajectory ", "font": {"size": 14}},
+        "pad": {"t": 0, "b": 0},
+        "y": 1 + 75 / plot,
+        "yanchor": "middle",
+        "steps": steps,
+    }
+    drawn.update_layout(
+        frames[first].layout,
+        template="plotly_white",
+        height=plot + _ABOVE + _BELOW,
+        margin={"t": _ABOVE, "b": _BELOW, "l": 70, "r": 15},
+        font={"family": "system-ui, sans-serif", "size": 12, "color": DARK},
+        legend={"orientation": "h", "x": 0, "y": -45 / plot, "yanchor": "top"},
+        hovermode="x unified",
+        hoverlabel={"namelength": -1},
+        sliders=[slider] if len(frames) > 1 else [],
+    )
+    return drawn
+
+
+def _line(style: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a line style of matplotlib in the terms of plotly."""
+    return {"color": style["color"], "dash": _DASHES[style["linestyle"]], "width": 1.5}
+
+
+def _thinned(values: Tensor) -> np.ndarray:
+    """Return at most 400 equally spaced samples."""
+    return values.detach()[:: -(-len(values) // _POINTS)].double().numpy()
+
+
+def _range(
+    truth: Trajectory, rollouts: Mapping[str, Prediction], row: int, k: int
+) -> tuple[float, ...]:
+    """Return the ends of the vertical axis of a panel for one trajectory."""
+    if row < truth.q.shape[-1]:
+        return limits(truth.q[k, :, row])
+    ends = log_limits([item.error()[k] for item in rollouts.values()])
+    return tuple(float(np.log10(end)) for end in ends)
