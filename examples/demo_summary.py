@@ -1,31 +1,31 @@
 """Three sentences on what the demo has shown: python examples/demo_summary.py runs"""
 
-import json
 import sys
 from pathlib import Path
+
+import pandas as pd
 
 
 def rows(folder: Path, table: str = "summary") -> dict[str, dict]:
     """A table that evaluate.py or control.py wrote, by its first column."""
-    found = json.loads((folder / f"{table}.json").read_text())
-    return {next(iter(row.values())): row for row in found}
+    return pd.read_csv(folder / f"{table}.csv", index_col=0).to_dict("index")
 
 
 def errors(folder: Path) -> str:
     """Mean errors, the models before what they have to beat."""
     found = rows(folder)
-    models = {k: row for k, row in found.items() if not row["floor"]}
+    models = {k: row for k, row in found.items() if not row["baseline"]}
     parts = [f"{name} {row['error_mean']:.3g}" for name, row in models.items()]
-    floor = found["keeps its velocity"]["error_mean"]
+    baseline = found["constant velocity"]["error_mean"]
     lost = [f"{name} {row['diverged']}" for name, row in models.items() if row["diverged"]]
-    return f"{', '.join(parts)}; q + v t {floor:.3g}" + (
+    return f"{', '.join(parts)}; q + v t {baseline:.3g}" + (
         f" (diverged: {', '.join(lost)})" if lost else ""
     )
 
 
 def main(runs: Path) -> None:
     """Print them."""
-    pairs = {row["pairs"] for row in rows(runs / "demo-evaluation").values() if row["pairs"]}
+    pairs = {row["pairs"] for row in rows(runs / "demo-evaluation").values() if row["pairs"] > 0}
     control = rows(runs / "demo-control")
     reached = {name: row["step_error_after_1_s_mean_percent"] for name, row in control.items()}
     peak = control["learned"]["input_peak"]

@@ -60,7 +60,7 @@ def undrawn(monkeypatch):
     monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
     monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
     monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
-    monkeypatch.setattr("pinn_dyn.app.evaluate.draw", lambda *_: None)
-    monkeypatch.setattr("pinn_dyn.app.evaluate.prediction_report", lambda **_: "")
-    for name in ("terms_figure", "calibration_figure", "save"):
-        monkeypatch.setattr(f"pinn_dyn.app.evaluation_results.{name}", lambda *_, **__: None)
+    evaluation = "pinn_dyn.evaluation"
+    monkeypatch.setattr(f"{evaluation}.Evaluation.figures", lambda *_: iter(()))
+    page = f"{evaluation}.report.prediction_page.prediction_report"
+    monkeypatch.setattr(page, lambda *_: "")

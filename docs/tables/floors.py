@@ -21,7 +21,7 @@ import pandas as pd
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import composed
 from pinn_dyn.evaluation import (
-    build_floors,
+    build_baselines,
     predict_trajectories,
     predict_windows,
     rollout_metrics,
@@ -58,7 +58,7 @@ def floors(name: str) -> list[dict[str, object]]:
     models: dict[str, tuple[Predictor, float]] = {}
     if not name.endswith("_beyond"):
         own = max(step, _LINEAR_STEP)
-        built = build_floors(splits.train, splits.validation, step=own)
+        built = build_baselines(splits.train, splits.validation, step=own)
         models |= {label: (floor, own) for label, floor in built.items()}
     if source.system is not None:
         models[GROUND] = source.system, step

@@ -303,8 +303,7 @@ def _errors(row: pd.Series, lowest: float | None = None) -> str:
 
 def draw(path: Path) -> None:
     """The error against the pairs, a line for each model."""
-    from pinn_dyn.evaluation import save
-    from pinn_dyn.evaluation.sweep_figures import sweep_figure
+    from pinn_dyn.evaluation import save, sweep_figure
 
     names = {"pairs": "training pairs", "error_mean": "mean error over 5 s, unseen trajectories"}
     runs = sample_efficiency().rename(columns=names)

@@ -10,13 +10,13 @@ import pandas as pd
 
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.plots import units
 from pinn_dyn.evaluation.identification import (
     COLUMNS,
     constants_table,
     determined_together,
     undetermined,
 )
+from pinn_dyn.evaluation.plots import units
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import LearnedConstants
 from pinn_dyn.training import Fit

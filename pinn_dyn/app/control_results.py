@@ -178,7 +178,9 @@ def _figures(
             label=with_unit(ERROR, source.labels),
         ),
     }
-    worst = {int(control_errors(x).nan_to_num(torch.inf).mean(1).argmax()) for x in records.values()}
+    worst = {
+        int(control_errors(x).nan_to_num(torch.inf).mean(1).argmax()) for x in records.values()
+    }
     for k in dict.fromkeys([run, *sorted(worst)]):
         figures["closed_loop" if k == run else f"closed_loop_run_{k}"] = closed_loop_figure(
             records,

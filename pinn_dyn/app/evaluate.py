@@ -27,10 +27,10 @@ from pinn_dyn.evaluation import (
     Evaluation,
     build_baselines,
     common_stride,
-    configuration_names,
     default_horizon,
     default_windows,
     evaluate_models,
+    model_names,
 )
 from pinn_dyn.mechanics import stack_until
 
@@ -87,9 +87,12 @@ def evaluate(
     grid = stride * truth.duration / (len(truth.t) - 1)
     windows = default_windows(horizon, grid) if windows is None else windows
 
-    models = [f"{r.config['model_name']} {d.preparation}".rstrip() for r, d in zip(runs, data)]
-    configurations = configuration_names(models, [run.config for run in runs])
-    names = _run_names(runs, configurations)
+    models = [
+        f"{run.config['model_name']} {item.preparation}".rstrip()
+        for run, item in zip(runs, data, strict=True)
+    ]
+    models = model_names(models, [run.config for run in runs])
+    names = _run_names(runs, models)
     entries = []
     for k, run in enumerate(runs):
         figures = {name: run.metrics[name] for name in _COLUMNS if name in run.metrics}
@@ -101,7 +104,7 @@ def evaluate(
                 truths[k],
                 data[k].training,
                 steps[k],
-                configurations[k],
+                models[k],
                 seed=run.config["seed"],
                 figures=figures,
                 members=run.members(),
@@ -129,11 +132,11 @@ def evaluate(
     return evaluation
 
 
-def _run_names(runs: Sequence[Run], configurations: Sequence[str]) -> list[str]:
-    """Return short names: the configuration, with seed and folder where these tell runs apart."""
-    pairs = zip(runs, configurations, strict=True)
+def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
+    """Return short names: the model, with seed and folder where these tell runs apart."""
+    pairs = zip(runs, models, strict=True)
     seeds = [f"{name} seed {run.config['seed']}" for run, name in pairs]
-    for names in (configurations, seeds):
+    for names in (models, seeds):
         if len(set(names)) == len(names):
             return list(names)
     return [f"{name} {run.folder.name}" for run, name in zip(runs, seeds, strict=True)]

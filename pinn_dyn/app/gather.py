@@ -17,13 +17,21 @@ from omegaconf import DictConfig
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.run_folder import CONFIG, METRICS
 from pinn_dyn.app.sweep import ERROR, first_line
-from pinn_dyn.evaluation import over_seeds, save, sweep_figure, to_text, varied_settings, write_table
+from pinn_dyn.evaluation import (
+    over_seeds,
+    save,
+    sweep_figure,
+    to_text,
+    varied_settings,
+    write_table,
+)
 from pinn_dyn.spelling import did_you_mean
 
 log = logging.getLogger(__name__)
 
 _EVALUATIONS = "runs/evaluation/*"
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")
+_COUNTS = ("val/diverged", "test/diverged")
 _SHOWN = ("val/error_mean", "val/diverged", "test/error_mean", "test/diverged", "training_seconds")
 
 
@@ -47,6 +55,8 @@ def read_runs(patterns: Sequence[str] | str) -> tuple[pd.DataFrame, list[dict], 
                 config = yaml.safe_load((folder / CONFIG).read_text())
                 if "trainer" not in config:
                     continue  # the results of another command
+                if not (folder / METRICS).is_file():
+                    raise FileNotFoundError("it has not finished")
                 record = json.loads((folder / METRICS).read_text())
                 rows[folder] = {
                     "folder": str(folder),
@@ -56,9 +66,9 @@ def read_runs(patterns: Sequence[str] | str) -> tuple[pd.DataFrame, list[dict], 
                 }
                 configs.append(config)
             except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
-                failed, finished = folder / ERROR, (folder / METRICS).is_file()
-                message = f"cannot be read: {error!r}" if finished else "has not finished"
-                problems[str(folder)] = first_line(failed) if failed.is_file() else message
+                failed = (folder / ERROR).is_file()
+                text = first_line(folder / ERROR) if failed else f"no result: {error}"
+                problems[str(folder)] = text
     return pd.DataFrame(rows.values()), configs, problems
 
 
@@ -91,12 +101,16 @@ def test_errors(folders: Sequence[str], patterns: Sequence[str] | None) -> pd.Da
     Raises:
         ConfigError: if the evaluations have different horizons, so that errors do not compare.
     """
-    patterns_ = patterns or [_EVALUATIONS]
-    paths = [Path(p, "summary.csv") for pattern in patterns_ for p in glob.glob(pattern)]
+    searched = patterns or [_EVALUATIONS]
+    paths = [Path(p, "summary.csv") for pattern in searched for p in glob.glob(pattern)]
     paths = [path for path in paths if path.is_file()]
     tables = []
     for path in sorted(paths, key=lambda path: -path.stat().st_mtime):
-        table = pd.read_csv(path)
+        try:
+            table = pd.read_csv(path)
+        except ValueError as error:
+            log.warning("left out: %s cannot be read: %s", path, error)
+            continue
         if "folder" in table and (known := table["folder"].isin(folders)).any():
             tables.append(table[known])
             if patterns is None:
@@ -108,7 +122,9 @@ def test_errors(folders: Sequence[str], patterns: Sequence[str] | None) -> pd.Da
     table = pd.concat(tables).drop_duplicates("folder").set_index("folder")
     if table["horizon"].nunique() > 1:
         raise ConfigError(f"evaluations: horizons differ: {sorted(set(table['horizon']))} s")
-    names = [n for n in table if n.endswith(("error_mean", "error_median", "error_worst", "diverged"))]
+    names = [
+        n for n in table if n.endswith(("error_mean", "error_median", "error_worst", "diverged"))
+    ]
     return table[names].add_prefix("test/")
 
 
@@ -129,6 +145,8 @@ def gather(cfg: DictConfig) -> None:
         settings = varied_settings([c for c, kept in zip(configs, chosen, strict=True) if kept])
         runs = runs.join(settings.set_index(runs.index))
         runs = runs.join(test_errors([*runs["folder"]], config["evaluations"]), on="folder")
+        repeated = runs.duplicated([*settings, "seed"], keep="last")
+        runs = runs[~repeated]
         table = over_seeds(runs, [*settings])
         for key in ("sort", "plot", "plot_column"):
             if config[key] not in (None, *runs, *table):
@@ -136,13 +154,16 @@ def gather(cfg: DictConfig) -> None:
         table = table.sort_values(config["sort"], kind="stable", ignore_index=True)
         write_table(runs, folder, "runs")
         write_table(table, folder, "sweep")
-        shown = [*settings, "seeds", *(name for name in _SHOWN if name in table)]
+        figures = [k for k in _SHOWN if k in table and (k not in _COUNTS or table[k].any())]
+        shown = [*settings, "seeds", *figures]
         print(f"\n{len(runs)} runs: mean ± standard deviation over seeds")
         print(to_text(table, {name: name for name in shown}))
         if config["plot"] is not None:
             lines = [name for name in settings if name != config["plot"]]
             figure = sweep_figure(runs, x=config["plot"], lines=lines, y=config["plot_column"])
             save(figure, folder / "sweep.png")
+        if repeated.any():
+            print(f"\nleft out: {repeated.sum()} runs that were repeated with the same seed")
         print(f"\ntables are in {folder}")
     if problems:
         print(f"\n{len(problems)} jobs have no result:")

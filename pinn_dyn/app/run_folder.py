@@ -21,10 +21,10 @@ from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.schema import check_value
+from pinn_dyn.app.settings import flatten
 from pinn_dyn.app.trust import read_foreign
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, posterior_draws
-from pinn_dyn.app.settings import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import expect_output_limits

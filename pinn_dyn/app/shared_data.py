@@ -9,9 +9,9 @@ from typing import Any
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run_folder import Run
+from pinn_dyn.app.settings import flatten
 from pinn_dyn.data import DataSource, LogSource, Splits
 from pinn_dyn.data.logs import common_motions
-from pinn_dyn.app.settings import flatten
 from pinn_dyn.mechanics import Trajectory
 
 # Keys of a data set that say how its signals are prepared, and how long the pieces are.

@@ -46,13 +46,13 @@ from pinn_dyn.app.run_folder import (
     write_json,
 )
 from pinn_dyn.app.schema import check_value
+from pinn_dyn.app.settings import Cell, flatten
 from pinn_dyn.app.trust import check_name, packages
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
-from pinn_dyn.app.settings import Cell, flatten
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits

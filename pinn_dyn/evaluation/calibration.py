@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from scipy.stats import t as student
 from torch import Tensor
 
-from pinn_dyn.evaluation.plots import model_style
 from pinn_dyn.evaluation.metrics import diverged_trajectories
+from pinn_dyn.evaluation.plots import model_style
 from pinn_dyn.evaluation.prediction import Prediction
 
 LEVEL = 0.95

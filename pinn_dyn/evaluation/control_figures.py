@@ -18,10 +18,10 @@ from pinn_dyn.evaluation.plots import (
     default_labels,
     legend_below,
     limits,
-    log_limits,
     mean_error_figure,
     model_style,
     panels,
+    set_log_axis,
     with_unit,
 )
 
@@ -73,8 +73,7 @@ def closed_loop_figure(
         ax.plot(first.t, goal, ":", color=DARK, label="reference", zorder=3)
     for k, ax in enumerate(inputs):
         ax.set_ylim(limits(torch.cat([x.u[run, :, k] for x in laws.values()]), 0.08))
-    error_panel.set_yscale("log")
-    error_panel.set_ylim(log_limits([control_errors(x)[run] for x in laws.values()]))
+    set_log_axis(error_panel, [control_errors(x)[run] for x in laws.values()])
     for index, (name, record) in enumerate(laws.items()):
         style = model_style(index)
         for k, ax in enumerate(coordinates):

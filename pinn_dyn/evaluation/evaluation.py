@@ -62,7 +62,7 @@ log = logging.getLogger(__name__)
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 """Names of the splits of the data in tables and figures."""
 SEEDS_COLUMNS = {
-    "configuration": "configuration",
+    "model": "model",
     "seeds": "seeds",
     "error_mean": "mean error ± std over seeds",
     "error_worst": "worst trajectory ± std over seeds",
@@ -81,7 +81,7 @@ class Entry:
         truth: test trajectories stacked, with the inputs as prepared for this model.
         training: the data that the model was trained on.
         step: step of the rollouts, s.
-        configuration: name of the configuration; rows of one configuration differ in the seed.
+        name: name of the model and of its settings; rows of one name differ in the seed.
         seed: seed of the run; None for a baseline.
         figures: other columns of the row, such as training pairs and training seconds.
         members: ensemble that gives prediction intervals, or None.
@@ -92,7 +92,7 @@ class Entry:
     truth: Trajectory
     training: Splits
     step: float
-    configuration: str
+    name: str
     seed: int | None = None
     figures: Mapping[str, Any] = field(default_factory=dict)
     members: Ensemble | None = None
@@ -107,7 +107,7 @@ class Evaluation:
         split: ``test`` or ``validation``.
         truth: the K trajectories stacked, q ``(K, T, N)``.
         summary: one row per run and baseline, with all metrics.
-        by_configuration: mean and standard deviation over seeds, one row per configuration.
+        by_model: mean and standard deviation over seeds, one row per model and settings.
         torque: torque errors, one row per run and joint; empty without mechanical models.
         parts: contributions of the parts of sums, one row per run, part and term.
         predictions: rollouts by name of the row, baselines included.
@@ -122,7 +122,7 @@ class Evaluation:
     split: str
     truth: Trajectory
     summary: pd.DataFrame
-    by_configuration: pd.DataFrame
+    by_model: pd.DataFrame
     torque: pd.DataFrame
     parts: pd.DataFrame
     predictions: dict[str, Prediction]
@@ -173,8 +173,8 @@ class Evaluation:
         lines.append(to_text(self.summary, summary_columns(self.summary)))
         lines.append("* best in its column, and better than all baselines (in brackets)")
         lines += self.remarks()
-        if len(self.by_configuration) < len(self.summary):
-            lines += ["", "over seeds:", to_text(self.by_configuration, SEEDS_COLUMNS)]
+        if len(self.by_model) < len(self.summary):
+            lines += ["", "over seeds:", to_text(self.by_model, SEEDS_COLUMNS)]
         return "\n".join(lines)
 
     def figures(self, trajectory: int = 0) -> Iterator[tuple[str, Figure]]:
@@ -184,14 +184,17 @@ class Evaluation:
             trajectory: index of the trajectory to draw.
         """
         title = f"{self.source.name}, {self.trajectories}"
-        yield "trajectory", trajectory_figure(
-            self.truth,
-            self.models,
-            trajectory=trajectory,
-            title=f"{self.source.name}, {self.split} trajectory {trajectory}, open loop",
-            labels=self.source.labels,
-            input_labels=self.source.input_labels,
-            baselines=self.best_baseline,
+        yield (
+            "trajectory",
+            trajectory_figure(
+                self.truth,
+                self.models,
+                trajectory=trajectory,
+                title=f"{self.source.name}, {self.split} trajectory {trajectory}, open loop",
+                labels=self.source.labels,
+                input_labels=self.source.input_labels,
+                baselines=self.best_baseline,
+            ),
         )
         yield "error", self.error_figure(title)
         for run, prediction in self.models.items():
@@ -223,7 +226,7 @@ class Evaluation:
         folder = Path(folder)
         tables = {
             "summary": self.summary,
-            "by_configuration": self.by_configuration,
+            "by_model": self.by_model,
             "torque": self.torque,
             "parts": self.parts,
             "calibration": calibration_table(self.intervals),
@@ -273,7 +276,7 @@ def evaluate_models(
     for index, entry in enumerate(tqdm([*entries, *baselines], desc="evaluating", disable=None)):
         row = {
             "run": entry.run,
-            "configuration": entry.configuration,
+            "model": entry.name,
             "seed": entry.seed,
             "baseline": index >= len(entries),
             **entry.figures,
@@ -303,7 +306,7 @@ def evaluate_models(
         split=split,
         truth=entries[0].truth,
         summary=summary,
-        by_configuration=over_seeds(summary, ["configuration", "baseline"]),
+        by_model=over_seeds(summary, ["model", "baseline"]),
         torque=pd.concat(torque, ignore_index=True) if torque else pd.DataFrame(),
         parts=pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(),
         predictions=predictions,

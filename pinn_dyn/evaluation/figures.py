@@ -21,10 +21,10 @@ from pinn_dyn.evaluation.plots import (
     default_labels,
     legend_below,
     limits,
-    log_limits,
     mean_error_figure,
     model_style,
     panels,
+    set_log_axis,
     with_unit,
 )
 from pinn_dyn.evaluation.prediction import Prediction
@@ -79,8 +79,7 @@ def trajectory_figure(
             ax.plot(item.t, q_hat, label=name + lost, **{"linewidth": 1.3} | style)
     for _, item, style in curves:
         error_panel.plot(item.t, item.error()[trajectory], **{"linewidth": 1.3} | style)
-    error_panel.set_yscale("log")
-    error_panel.set_ylim(log_limits([item.error()[trajectory] for _, item, _ in curves]))
+    set_log_axis(error_panel, [item.error()[trajectory] for _, item, _ in curves])
     held = truth.input.interpolation == "hold"
     for k, ax in enumerate(inputs):
         drawstyle = "steps-post" if held else "default"

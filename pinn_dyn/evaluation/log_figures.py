@@ -37,7 +37,9 @@ def cleaning_figure(
     figure, axes = panels([labels, speeds, input_labels], raw.t, title=title)
     dots = {"color": TRUTH, "linestyle": "none", "marker": ".", "markersize": 3}
     styles = [(raw, dots | {"label": "log"})]
-    styles += [(x, {"color": COLORS[0], "linewidth": 1.0, "label": "cleaned"}) for x in cleaned.clean]
+    styles += [
+        (x, {"color": COLORS[0], "linewidth": 1.0, "label": "cleaned"}) for x in cleaned.clean
+    ]
     for part, style in styles:
         for column, values in zip(axes, (part.q, part.v, part.u), strict=True):
             for k, ax in enumerate(column):

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from torch import Tensor
 
 from pinn_dyn.data.whole import whole
@@ -95,7 +96,7 @@ def panels(
             ax.set_ylabel(label)
             ax.grid(True, alpha=0.3)
         for ax in column[len(labels) :]:
-            ax.remove()
+            ax.set_axis_off()
         last = column[len(labels) - 1]
         last.set_xlabel("time [s]")
         last.tick_params(labelbottom=True)
@@ -113,9 +114,7 @@ def legend_below(figure: Figure, columns: int = 4, **settings: Any) -> None:
         handles, names = ax.get_legend_handles_labels()
         entries |= dict(zip(names, handles, strict=True))
     columns = min(len(entries), columns)
-    figure.legend(
-        entries.values(), entries, loc="outside lower center", ncols=columns, **settings
-    )
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=columns, **settings)
 
 
 def limits(values: Tensor, margin: float = 0.3) -> tuple[float, float]:
@@ -144,6 +143,15 @@ def log_limits(curves: Sequence[Tensor]) -> tuple[float, float]:
     low = min(float(curve.min()) for curve in positive)
     high = max(float(curve.max()) for curve in positive)
     return max(low, 1e-3 * best) / 1.5, 1.5 * min(high, 1e3 * best)
+
+
+def set_log_axis(ax: Axes, curves: Sequence[Tensor]) -> None:
+    """Make a vertical axis logarithmic, with ends that fit the curves."""
+    ax.set_yscale("log")
+    low, high = log_limits(curves)
+    ax.set_ylim(low, high)
+    if high > 10 * low:
+        ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def mean_error_figure(

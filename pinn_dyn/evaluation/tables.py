@@ -62,10 +62,10 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return settings[columns]
 
 
-def configuration_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a name for the configuration of each run, equal for runs that differ in the seed only.
+def model_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a name for each run, equal for runs whose configurations differ in the seed only.
 
-    The name of a model is followed by the settings in which runs of this model differ.
+    The name of the model is followed by the settings in which runs of this model differ.
     """
     settings = varied_settings(configs).map(str)
     labels = []
@@ -145,10 +145,10 @@ def formatted(
         if name == "error_mean" and deviation not in frame:
             deviation = "error_std"
         if deviation in frame:
-            column += " ± " + frame[deviation].map(number)
+            column += frame[deviation].map(lambda x: "" if pd.isna(x) else f" ± {number(x)}")
         if star:
             column += best(frame, name).map({True: star, False: ""})
-        if name in ("run", "configuration") and "baseline" in frame:
+        if name in ("run", "model") and "baseline" in frame:
             column = column.where(~frame["baseline"], "[" + column + "]")
         text[header] = column
     return pd.DataFrame(text)
@@ -198,19 +198,19 @@ def _competing(frame: pd.DataFrame, name: str) -> pd.Series:
 
 
 def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
-    """Return a sentence for each mean error in which no model beats all baselines."""
-    sentences = []
+    """Return a sentence for each baseline that is more accurate than all models in some error."""
+    errors: dict[str, list[str]] = {}
     baseline = summary["baseline"].astype(bool)
     for name in (name for name in summary if name == "error_mean" or _is_windowed(name)):
         figures = _competing(summary, name)
         if baseline.any() and not figures[~baseline].min() < figures[baseline].min():
             row = summary.loc[figures[baseline].idxmin()]
-            error = "mean error" if name == "error_mean" else f"error, reset every {_span(name)}"
-            sentences.append(
-                f"No model is more accurate than the baseline '{row['run']}' "
-                f"({error}: {number(row[name])})."
-            )
-    return sentences
+            error = "mean error" if name == "error_mean" else f"reset every {_span(name)}"
+            errors.setdefault(row["run"], []).append(f"{error} {number(row[name])}")
+    return [
+        f"No model is more accurate than the baseline '{name}': {', '.join(texts)}."
+        for name, texts in errors.items()
+    ]
 
 
 def best_baseline(summary: pd.DataFrame) -> str | None:

@@ -277,7 +277,7 @@ def test_a_source_made_in_python_can_be_evaluated_and_controlled_from_its_folder
     pinn_dyn.fit(Still(), model="lnn", steps=1, overrides=short, folder=run)
     run_script("evaluate.py", f"runs=[{run}]", f"hydra.run.dir={tmp_path / 'evaluation'}")
     rows = pd.read_csv(tmp_path / "evaluation" / "summary.csv")
-    assert {"lnn", "stands still", "keeps its velocity"} <= set(rows["model"])
+    assert {"lnn", "hold position", "constant velocity"} <= set(rows["model"])
     wanted = ["reference.q=[0.1]", f"hydra.run.dir={tmp_path / 'control'}"]
     run_script("control.py", f"run={run}", *wanted)
     assert (tmp_path / "control" / "report.html").is_file()

@@ -77,13 +77,13 @@ def test_the_motions_are_recorded(results):
 
 
 def test_figures_animation_log_and_provenance_are_written(results):
-    for name in ("closed_loop_learned", "closed_loop_pd", "comparison", "strip"):
+    for name in ("closed_loop", "comparison", "strip"):
         assert (results / f"{name}.png").stat().st_size > 10_000
     with Image.open(results / "animation_learned.gif") as animation:
         assert animation.is_animated
     log = EventAccumulator(str(results / "tensorboard")).Reload()
-    shown = ("learned", "truth", "pd", "comparison", "strip")
-    assert set(log.Tags()["images"]) == {f"closed_loop/{name}" for name in shown}
+    images = {f"closed_loop/{name}" for name in ("closed_loop", "comparison", "strip")}
+    assert images <= set(log.Tags()["images"])
     (table,) = log.Tensors("closed_loop/summary/text_summary")[0].tensor_proto.string_val
     summary = pd.read_csv(results / "summary.csv")
     (row,) = [line for line in table.decode().splitlines() if line.startswith("rms_error")]
@@ -96,12 +96,13 @@ def test_figures_animation_log_and_provenance_are_written(results):
 def test_the_page_has_the_numbers_of_its_files(results, lnn_run):
     page, summary = page_of(results), pd.read_csv(results / "summary.csv")
     rows = page.table("RMS error")
-    assert [row["law"][0] for row in rows] == ["learned", "truth", "pd"]
+    assert [row["law"] for row in rows] == ["learned", "truth", "pd"]
     for row, value in zip(rows, summary["rms_error"], strict=True):
-        assert float(row["RMS error"][1]) == value
+        assert float(row["RMS error"]) == pytest.approx(value, rel=5e-3)
     coordinates = pd.read_csv(results / "coordinates.csv")
     shown = page.table("coordinate")
-    assert [float(row["max_error"][1]) for row in shown] == coordinates["max_error"].tolist()
+    errors = [float(row["max_error"]) for row in shown]
+    assert errors == pytest.approx(coordinates["max_error"].tolist(), rel=5e-3)
     assert_says_how_it_came_about(results, "control.py", lnn_run)
 
 
@@ -137,7 +138,7 @@ def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, 
     words += ["settled_after=0.2", "~controllers.truth", "~controllers.pd"]
     folder = control(tmp_path / "out", lnn_run, *words)
     assert pd.read_csv(folder / "summary.csv").set_index("controller").loc["learned", "stopped"]
-    assert (folder / "closed_loop_learned.png").is_file()
+    assert (folder / "closed_loop.png").is_file()
     assert not (folder / "strip.png").exists()  # one pose is no motion
     assert "the plant diverged" in (folder / "report.html").read_text()
 

@@ -75,8 +75,9 @@ def test_a_run_on_a_log_keeps_the_report_and_a_picture_of_the_cleaning(run):
 def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, capsys):
     run_script("evaluate.py", *evaluation_of(run, tmp_path / "out"))
     assert "example_log: 2 unseen test trajectories, 5 s open loop" in capsys.readouterr().out
-    row, *floors = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert all(one["floor"] for one in floors)
+    table = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert table["baseline"].tolist() == [False] + [True] * (len(table) - 1)
+    row = table.iloc[0]
     assert row["model"] == "lnn"
     # q wanders by some tenths of a rad; an untrained model is no better than that.
     assert 0 < row["error_mean"] < 2
@@ -87,7 +88,6 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
 
 def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
     monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
-    monkeypatch.setattr("pinn_dyn.app.evaluate.draw", lambda *_: None)
     run_script(
         "train.py",
         *TINY,
@@ -102,10 +102,10 @@ def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
     assert seconds != 0.02
     short = ["horizon=1", "windows=[0.2]"]
     run_script("evaluate.py", *evaluation_of(tmp_path / "run", tmp_path / "out"), *short)
-    row, *floors = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert row["input_delay_seconds"] == pytest.approx(seconds, abs=1e-3)
-    assert all(one["input_delay_seconds"] is None for one in floors)
-    assert "learned input delay [s]" in (tmp_path / "out" / "report.html").read_text()
+    delays = pd.read_csv(tmp_path / "out" / "summary.csv")["input_delay_seconds"]
+    assert delays[0] == pytest.approx(seconds, abs=1e-3)
+    assert delays[1:].isna().all()
+    assert "input delay [s]" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):

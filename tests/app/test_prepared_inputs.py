@@ -60,13 +60,13 @@ def evaluate(runs, names, folder, *words):
 
 def test_runs_with_and_without_a_delay_are_one_table(runs, tmp_path, capsys):
     table = evaluate(runs, ["plain", "late"], tmp_path)
-    assert table.index.tolist()[:3] == ["mlp", "mlp with delay", "stands still"]
+    assert table.index.tolist()[:3] == ["mlp", "mlp with delay", "hold position"]
     assert table["model"].tolist()[:2] == ["mlp", "mlp with delay"]  # no seeds of one model
     # The first piece of 1 s lost its first 0.05 s, and steps are 0.02 s.
     np.testing.assert_allclose(table["horizon"], 0.94)
     assert (table["trajectories"] == 3).all()
     assert table["error_mean"].iloc[0] != table["error_mean"].iloc[1]
-    note = "with delay: trained and predicting on inputs as their own data sets prepare them"
+    note = "with delay: trained and tested on inputs as prepared in its own data set"
     assert note in capsys.readouterr().out
     record = json.loads((tmp_path / "provenance.json").read_text())
     assert not record["dataset"]["steps"]

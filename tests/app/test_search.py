@@ -1,15 +1,10 @@
 """The equal search: the same draws for every model."""
 
-import math
-import re
-
 import pandas as pd
 import pytest
 import yaml
 
 from pinn_dyn.app.config import composed
-from pinn_dyn.app.gather import best_draws
-from pinn_dyn.app.jobs import Job
 from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.schema import ConfigError
 from pinn_dyn.app.search import EqualSearch
@@ -95,38 +90,6 @@ def test_runs_of_a_search_are_ordinary_ones_told_apart_by_their_draw(tmp_path, m
     table = pd.read_csv(tmp_path / "gathered" / "sweep.csv")
     assert sorted(table["search.draw"]) == [0, 3]
     assert "optimizer.lr" not in table
-    best = table.loc[table["val/error_windowed"].idxmin()]
-    (line,) = re.findall(r"^  soft_arm_1/mlp: draw .*", capsys.readouterr().out, re.MULTILINE)
-    assert f"draw {best['search.draw']:.0f} has {best['val/error_windowed']:.4g}" in line
-    command = line.split("python train.py ")[1]
-    assert f"search.draw={best['search.draw']:.0f}" in command
-    assert "model=mlp" in command
-
-
-def test_the_best_draw_of_each_model_is_the_least_mean_over_seeds(tmp_path):
-    errors = {
-        ("a", 0, 0): 0.3,
-        ("a", 1, 0): 0.1,
-        ("a", 1, 1): 0.2,
-        ("a", 2, 0): 0.05,  # of the other seed it diverged
-        ("a", 2, 1): math.inf,
-        ("b", 0, 0): 0.5,
-        ("b", 1, 0): 0.5,  # a fit that no draw changes
-        ("c", 1, 0): math.nan,
-    }
-    jobs = []
-    for (name, draw, seed), error in errors.items():
-        config = {"name": name, "search.draw": draw, "seed": seed}
-        record = {"validation": {"val/error_windowed": error}}
-        folder = tmp_path / f"{name}{draw}{seed}"
-        jobs.append(Job(folder, config, frozenset(), record, ""))
-    plain = Job(tmp_path / "plain", {"name": "a", "seed": 0}, frozenset(), record, "")
-    (folder := jobs[1].folder / ".hydra").mkdir(parents=True)
-    (folder / "overrides.yaml").write_text("[search.draw=1, 'data.hidden=[8, 8]']")
-    first, second = best_draws([*jobs, plain])
-    assert first == "a: draw 1 has 0.15: python train.py search.draw=1 'data.hidden=[8, 8]'"
-    assert second == f"b: draw 0 has 0.5: {jobs[5].folder}"
-    assert best_draws([plain]) == []
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,12 @@
 """Run folders of which one file is that of another run, or was edited after the training."""
 
-import json
 import shutil
 
 import pytest
 import yaml
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.jobs import find_jobs, find_runs
+from pinn_dyn.app.evaluate import find_runs
 from pinn_dyn.app.run_folder import load_run
 from tests.app.entry import NO_FIGURES, refused_text, train
 
@@ -63,19 +62,8 @@ def test_a_record_of_another_seed(run, other_seed):
     exchange(run, other_seed, "metrics.json")
     with pytest.raises(ConfigError, match=r"metrics.json is of another run: its seed is 1"):
         load_run(run, "best")
-    (job,) = find_jobs(str(run))
-    assert job.record is None
-    assert "metrics.json is of seed 1" in job.problem
 
 
 def test_a_run_that_is_linked_or_named_twice_counts_once(run, tmp_path):
     (tmp_path / "again").symlink_to(run)
     assert find_runs([str(run), str(tmp_path / "*"), f"{run}/../run"]) == [run]
-
-
-def test_a_folder_with_the_letters_of_a_pattern(run, tmp_path):
-    odd = tmp_path / "lr[0.1]*"
-    run.rename(odd)
-    assert find_runs(str(odd)) == [odd]
-    assert [job.folder for job in find_jobs(str(odd))] == [odd]
-    assert json.loads((odd / "metrics.json").read_text())["seed"] == 0

@@ -10,8 +10,8 @@ from pinn_dyn.evaluation.report import page as pages
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
-    figure,
     from_markdown,
+    interactive,
     page,
     paragraph,
     preformatted,
@@ -81,7 +81,7 @@ def test_a_name_is_text_wherever_it_stands(monkeypatch, name):
     drawn = graph_objects.Figure(graph_objects.Scatter(x=[1], y=[1], name=name))
     drawn.update_layout(height=300, title=name)
     parts = [paragraph(name), preformatted(name), details(name, paragraph(name)), table(frame)]
-    sections = [Section(name, [*parts, figure(drawn, "drawn")])]
+    sections = [Section(name, [*parts, interactive(drawn, "drawn")])]
     text = page(name, name, sections)
     assert_harmless(text, name)
     # Nothing ends the script of the figure but its end.

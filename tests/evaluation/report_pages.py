@@ -1,4 +1,4 @@
-"""Small pages of both kinds for the tests, and what a page holds, read without a browser."""
+"""Small pages of an evaluation and of a control run for the tests, and a parser of pages."""
 
 from html.parser import HTMLParser
 
@@ -7,24 +7,19 @@ import torch
 
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
+from pinn_dyn.data import Splits
 from pinn_dyn.evaluation import (
-    Prediction,
-    RunResult,
+    Entry,
+    HoldPosition,
+    closed_loop_figure,
     closed_loop_metrics,
-    compare_terms,
     comparison_table,
-    grouped_table,
-    rollout_metrics,
-    summary_table,
+    controller_comparison_figure,
+    evaluate_models,
 )
-from pinn_dyn.evaluation.report import (
-    Origin,
-    StabilityResult,
-    control_report,
-    prediction_report,
-)
-from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.systems import SoftArm
+from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
+from pinn_dyn.evaluation.report.prediction_page import prediction_report
+from pinn_dyn.mechanics import Predictor, Signal, Trajectory
 
 ODD = "<img src=x onerror=alert(1)></script> & 'co'"
 LABELS = ["Δx [rad]", "Δy [rad]", "δℓ [m]"]
@@ -37,12 +32,11 @@ class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.tags, self.tables, self.words = [], [], []
-        self.quiet = self.cell = None
+        self.quiet, self.cell = None, False
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        attributes = dict(attrs)
-        self.tags.append((tag, attributes))
+        self.tags.append((tag, dict(attrs)))
         if tag in ("script", "style"):
             self.quiet = tag
         elif tag == "table":
@@ -50,37 +44,54 @@ class Page(HTMLParser):
         elif tag == "tr":
             self.tables[-1].append([])
         elif tag in ("td", "th"):
-            self.cell = ["", attributes.get("title")]
-            self.tables[-1][-1].append(self.cell)
+            self.cell = True
+            self.tables[-1][-1].append("")
 
     def handle_endtag(self, tag):
         if tag == self.quiet:
             self.quiet = None
         elif tag in ("td", "th"):
-            self.cell = None
+            self.cell = False
 
     def handle_data(self, data):
         if self.quiet is None:
             self.words.append(data)
-            if self.cell is not None:
-                self.cell[0] += data
+            if self.cell:
+                self.tables[-1][-1][-1] += data
 
     @property
     def text(self):
         return " ".join(" ".join(self.words).split())
 
     def table(self, heading):
-        """The first table that has this heading: rows as dicts of (text, all digits)."""
-        for first, *rows in self.tables:
-            names = [text for text, _ in first]
+        """Return the first table with this heading: rows as dicts of texts."""
+        for names, *rows in self.tables:
             if heading in names:
                 return [dict(zip(names, row, strict=True)) for row in rows]
         raise AssertionError(f"no table has the heading {heading}")
 
 
-def origin(runs=("hnn", "lnn")):
-    rows = pd.DataFrame({"run": list(runs), "seed": range(len(runs)), "folder": "runs/x"})
-    return Origin({"command": "python evaluate.py", "commit": "abc1234"}, rows, {"Config": "a: 1"})
+class Source:
+    """A data set with names only."""
+
+    name, labels, input_labels = "an arm", LABELS, INPUTS
+    system, configurations = None, {}
+
+
+class Replay(Predictor):
+    """The truth with an error of ``rate`` t; the second trajectory breaks down if told so."""
+
+    def __init__(self, truth, rate, broken=False):
+        super().__init__(3, 3)
+        self.truth, self.rate, self.broken = truth, rate, broken
+
+    def increments(self, x0, t, input):
+        if len(t) < len(self.truth.t):  # a window
+            return (self.rate * t[:, None]).expand(*x0.shape[:-1], len(t), 6)
+        q = self.truth.q - self.truth.q[:, :1] + self.rate * t[:, None]
+        if self.broken:
+            q[1, 100:] = torch.nan
+        return torch.cat([q, torch.zeros_like(q)], dim=-1)
 
 
 def truth(count=5):
@@ -90,69 +101,50 @@ def truth(count=5):
     return Trajectory(q, torch.zeros_like(q), Signal(t, torch.cos(3 * q), "hold"))
 
 
-def predictions(real, names=("hnn", "lnn")):
-    """Of each name another error, which the second name loses on trajectory 1."""
-    found = {}
-    for k, name in enumerate(names):
-        q_hat = real.q + 0.01 * (k + 1) * real.t[:, None]
-        if k == 1:
-            q_hat[1, 100:] = torch.nan
-        found[name] = Prediction(real.t[::2], q_hat[:, ::2], real.q[:, ::2])
-    return found
+def origin(runs):
+    rows = pd.DataFrame({"run": list(runs), "seed": range(len(runs)), "folder": "runs/x"})
+    return Origin({"command": "python evaluate.py", "commit": "abc1234"}, rows, {"Config": "a: 1"})
 
 
-def summary_of(found, floors=()):
-    return summary_table(
-        [
-            RunResult(
-                name,
-                name,
-                0,
-                rollout_metrics(item.q_hat, item.q, item.t, thresholds={"small": 0.01}).to_dict(),
-                {"pairs": 8000},
-                floor=name in floors,
-            )
-            for name, item in found.items()
-        ]
-    )
-
-
-def comparisons_of(names):
-    arm, heavier = SoftArm(segments=1).double(), SoftArm(segments=1, mass=0.36).double()
-    q = torch.tensor([[0.8, 0.2, 0.3], [1.2, -0.2, 0.15]], dtype=torch.float64)
-    return {name: compare_terms(heavier, arm, q, names=["bent", "more"]) for name in names}
-
-
-def prediction_page(names=("hnn", "lnn"), floors=(), **changes):
-    """The page, without figures of the terms, and the summary that it was made of."""
+def evaluation(names=("hnn", "lnn"), source=Source):
+    """Evaluate models whose errors are known; the second breaks down on trajectory 1."""
     real = truth()
-    found = predictions(real, (*names, *floors))
-    summary = summary_of(found, floors)
-    arguments = {
-        "title": "an arm",
-        "trajectories": f"{real.q.shape[0]} unseen test trajectories",
-        "summary": summary,
-        "grouped": grouped_table(summary),
-        "notes": [],
-        "truth": real,
-        "predictions": found,
-        "trajectory": 0,
-        "labels": LABELS,
-        "input_labels": INPUTS,
-        "comparisons": {},
-        "joints": pd.DataFrame(),
-        "constants": {},
-        "parts": pd.DataFrame(),
-        "intervals": {},
-        "origin": origin(names),
-    }
-    return prediction_report(**arguments | changes), summary
+    data = Splits(
+        *(
+            [Trajectory(real.q[k], real.v[k], Signal(real.t, real.u[k])) for k in range(5)]
+            for _ in range(3)
+        )
+    )
+    entries = [
+        Entry(name, Replay(real, 0.01 * (k + 1), broken=k == 1), real, data, 0.01, name, seed=0)
+        for k, name in enumerate(names)
+    ]
+    baselines = [Entry("hold position", HoldPosition(3, 3), real, data, 0.01, "hold position")]
+    item = evaluate_models(
+        entries,
+        baselines,
+        source,
+        split="test",
+        stride=1,
+        windows=[0.5],
+        thresholds={"large": 0.1},
+    )
+    item.origin = origin(names)
+    return item
+
+
+def prediction_page(names=("hnn", "lnn"), source=Source, **changes):
+    """Return the page, and the evaluation that it was made of."""
+    item = evaluation(names, source)
+    for name, value in changes.items():
+        setattr(item, name, value)
+    return prediction_report(item, dict(item.figures()), 0), item
 
 
 def records(names=("learned", "pd"), runs=4):
     """Each law and run settles at another speed; the second law is stopped in run 2."""
     t = torch.linspace(0, 2, 101, dtype=torch.float64)
-    found = {}
+    laws = {}
     for k, name in enumerate(names):
         goal = torch.tensor([0.5, -0.5, 0.8]) + torch.arange(runs)[:, None, None] / 10
         q_ref = goal.double().expand(runs, len(t), 3)
@@ -165,14 +157,14 @@ def records(names=("learned", "pd"), runs=4):
             q[2, 60:], u[2, 60:] = torch.nan, torch.nan
             stopped[2] = "1.20 s: A is singular"
         zero = torch.zeros_like(q)
-        found[name] = ClosedLoopRecord(t, q, zero, u, u, Motion(q_ref, zero, zero), stopped)
-    return found
+        laws[name] = ClosedLoopRecord(t, q, zero, u, u, Motion(q_ref, zero, zero), stopped)
+    return laws
 
 
-def control_page(names=("learned", "pd"), **changes):
-    """The page, and the summary that it was made of."""
-    found = records(names)
-    metrics = {name: closed_loop_metrics(r, settled_after=1.0) for name, r in found.items()}
+def control_page(names=("learned", "pd"), title="a loop", animation=None):
+    """Return the page, and the summary that it was made of."""
+    laws = records(names)
+    metrics = {name: closed_loop_metrics(item, settled_after=1.0) for name, item in laws.items()}
     first = next(iter(metrics.values()))
     points = pd.DataFrame(
         {
@@ -182,18 +174,19 @@ def control_page(names=("learned", "pd"), **changes):
         }
     )
     summary = comparison_table(metrics)
-    arguments = {
-        "title": "a loop",
-        "summary": summary,
-        "coordinates": first.per_coordinate(),
-        "inputs": first.per_input(),
-        "records": found,
-        "run": 0,
-        "held": True,
-        "labels": LABELS,
-        "input_labels": INPUTS,
-        "animation": None,
-        "stability": StabilityResult("# Stability\n\n| a | b |\n|---|---|\n| A_L | 2 |\n", points),
-        "origin": origin(names),
-    }
-    return control_report(**arguments | changes), summary
+    page = control_report(
+        title=title,
+        summary=summary,
+        coordinates=first.per_coordinate(),
+        inputs=first.per_input(),
+        records=laws,
+        figures={
+            "comparison": controller_comparison_figure(laws, title=title),
+            "closed_loop": closed_loop_figure(laws, 2, title=title, labels=LABELS),
+        },
+        labels=LABELS,
+        animation=animation,
+        stability=StabilityResult("# Stability\n\n| a | b |\n|---|---|\n| A_L | 2 |\n", points),
+        origin=origin(names),
+    )
+    return page, summary

@@ -1,21 +1,31 @@
-from dataclasses import replace
+"""Figures show the numbers that they are made of, in a range that a runaway does not set."""
+
+import dataclasses
+import math
 
 import matplotlib.image
 import numpy as np
+import pandas as pd
 import pytest
 import torch
-from matplotlib.figure import Figure
 
+from pinn_dyn.control.contracts import Motion
+from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import (
     Prediction,
+    closed_loop_figure,
     compare_terms,
+    controller_comparison_figure,
     error_figure,
     save,
     spread_figure,
+    steady_state_figure,
+    sweep_figure,
     terms_figure,
+    tip_path_figure,
     trajectory_figure,
 )
-from pinn_dyn.evaluation.drawing import GREY
+from pinn_dyn.evaluation.plots import BASELINE, units
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 
@@ -33,130 +43,198 @@ def predictions(truth):
     def prediction(q_hat):
         return Prediction(truth.t[::2], q_hat[:, ::2], truth.q[:, ::2])
 
-    away = truth.q + torch.exp(8 * truth.t)[:, None] - 1
     broken = truth.q.clone()
     broken[1] = torch.nan
     return {
         "good": prediction(truth.q + 0.01 * truth.t[:, None]),
-        "runaway": prediction(away),
+        "runaway": prediction(truth.q + torch.exp(8 * truth.t)[:, None] - 1),
         "fragile": prediction(broken + 0.02),
     }
 
 
-def check_picture(figure, path):
-    assert isinstance(figure, Figure)
-    save(figure, path)
-    pixels = matplotlib.image.imread(path)
-    assert pixels.shape[1] == pytest.approx(150 * figure.get_figwidth(), abs=1)
-    assert np.ptp(pixels[..., :3]) > 0.5
+def panels(figure):
+    """Return the panels of a figure by the label of the vertical axis."""
+    return {ax.get_ylabel(): ax for ax in figure.axes if ax.axison}
 
 
-def test_trajectories_keep_the_range_of_the_truth(truth, predictions, tmp_path):
+def lines(ax):
+    """Return the lines of a panel by their names."""
+    return {line.get_label(): line for line in ax.lines}
+
+
+def test_a_trajectory_keeps_the_range_of_the_truth(truth, predictions, tmp_path):
+    baselines = {"ARX": predictions["good"]}
     figure = trajectory_figure(
-        truth, predictions, trajectory=1, title="fake", labels=["x (m)", "y (rad)"]
+        truth,
+        predictions,
+        trajectory=1,
+        title="t",
+        labels=["x (m)", "y (rad)"],
+        baselines=baselines,
     )
-    check_picture(figure, tmp_path / "new" / "trajectories.png")
-    drawn = {ax.get_ylabel(): ax for ax in figure.axes if ax.axison}
-    first, inputs = drawn["x (m)"], drawn["u1"]
-    assert first.get_ylim()[1] < 2 * float(truth.q.max())
-    notes = first.get_title(loc="right")
-    # exp(8 t) - 1 leaves a margin of some 0.4 within the first 0.1 s.
-    assert "runaway leaves the panel at 0.1 s" in notes
-    assert "fragile broke down at 0 s" in notes
-    assert "good" not in notes
-    assert list(drawn) == ["x (m)", "u1", "y (rad)", "‖q̂ − q‖₂ [m, rad]"]
-    assert drawn["‖q̂ − q‖₂ [m, rad]"].get_yscale() == "log"
-    assert inputs.get_xlabel() == "time [s]"
-    assert inputs.lines[0].get_drawstyle() == "steps-post"
-    assert figure.get_suptitle() == "fake"
+    save(figure, tmp_path / "new" / "trajectory.png")
+    assert np.ptp(matplotlib.image.imread(tmp_path / "new" / "trajectory.png")[..., :3]) > 0.5
+    axes = panels(figure)
+    assert set(axes) == {"x (m)", "y (rad)", "‖q̂ − q‖₂ [m, rad]", "u1"}
+    drawn = lines(axes["y (rad)"])
+    assert axes["y (rad)"].get_ylim()[1] < 2 * float(truth.q.max())
+    assert {"truth", "good", "runaway (diverged)", "fragile (diverged)", "ARX"} == set(drawn)
+    np.testing.assert_array_equal(drawn["truth"].get_ydata(), truth.q[1, :, 1])
+    np.testing.assert_array_equal(drawn["ARX"].get_ydata(), predictions["good"].q_hat[1, :, 1])
+    assert drawn["ARX"].get_color() == BASELINE
+    assert axes["u1"].lines[0].get_drawstyle() == "steps-post"
+    with pytest.raises(ValueError, match="1 labels for q, expected 2"):
+        trajectory_figure(truth, predictions, trajectory=0, title="t", labels=["x"])
 
 
-def test_labels_must_fit_the_coordinates(truth, predictions):
-    with pytest.raises(ValueError, match="labels has 1 entries, expected 2"):
-        trajectory_figure(truth, predictions, trajectory=0, title="fake", labels=["x"])
-
-
-def test_error_over_time_counts_the_diverged(predictions, tmp_path):
-    figure = error_figure(predictions, title="fake", label="error (m)")
-    check_picture(figure, tmp_path / "error.png")
-    ax = figure.axes[0]
-    assert ax.get_yscale() == "log"
-    assert ax.get_ylabel() == "error (m)"
-    labels = [line.get_label() for line in ax.lines]
-    assert labels == ["good", "runaway (3 of 3 diverged)", "fragile (1 of 3 diverged)"]
-    good, _, fragile = ax.lines
-    prediction = predictions["good"]
-    np.testing.assert_allclose(good.get_ydata(), 0.01 * 2**0.5 * prediction.t[1:])
-    np.testing.assert_allclose(fragile.get_ydata(), 0.02 * 2**0.5)
-
-
-def test_floors_are_thin_grey_lines_without_a_band(predictions, tmp_path):
-    models = {"good": predictions["good"]}
-    floors = {name: predictions["good"] for name in ("stands still", "ARX")}
-    figure = error_figure(models, floors=floors, title="fake")
-    check_picture(figure, tmp_path / "error.png")
+def test_errors_over_time_leave_out_and_count_the_diverged(predictions):
+    models = {**predictions, **{f"run {k}": predictions["good"] for k in range(9)}}
+    figure = error_figure(models, baselines={"ARX": predictions["good"]}, title="t", label="e (m)")
     (ax,) = figure.axes
-    model, *below = ax.lines
-    assert [line.get_label() for line in below] == ["stands still", "ARX"]
-    assert {line.get_color() for line in below} == {GREY}
-    assert all(line.get_linewidth() < model.get_linewidth() for line in below)
-    assert len({line.get_linestyle() for line in below}) == 2
-    assert len(ax.collections) == 1  # the band of the model
+    assert (ax.get_yscale(), ax.get_ylabel()) == ("log", "e (m)")
+    drawn = lines(ax)
+    names = list(drawn)
+    assert names[:3] == ["good", "runaway (3 of 3 diverged)", "fragile (1 of 3 diverged)"]
+    t = predictions["good"].t[1:].numpy()
+    np.testing.assert_allclose(drawn["good"].get_ydata(), 0.01 * math.sqrt(2) * t)
+    np.testing.assert_allclose(drawn[names[2]].get_ydata(), 0.02 * math.sqrt(2))
+    looks = {(line.get_color(), line.get_linestyle()) for line in drawn.values()}
+    assert len(looks) == len(drawn)  # no two models look alike
+    assert len(ax.collections) == len(models) - 1  # bands: no finite error, no band; no baseline
 
 
-def test_one_motion_has_its_floor_as_a_thin_grey_line(truth, predictions):
-    models = {"good": predictions["good"]}
-    floors = {"ARX": predictions["fragile"]}
-    figure = trajectory_figure(truth, models, trajectory=0, title="fake", floors=floors)
-    drawn = [ax.lines for ax in figure.axes if len(ax.lines) > 1]
-    assert len(drawn) == truth.q.shape[-1] + 1  # coordinates and the error
-    for *_, model, floor in drawn:
-        assert [model.get_label(), floor.get_label()] == ["good", "ARX"]
-        assert floor.get_color() == GREY
-        assert floor.get_linewidth() < model.get_linewidth()
-    np.testing.assert_array_equal(drawn[0][-1].get_ydata(), floors["ARX"].q_hat[0, :, 0])
+def test_the_spread_of_an_ensemble_is_drawn_beside_its_error(truth):
+    members = torch.stack([truth.q + c * truth.t[:, None] for c in (0.0, 0.1, 0.5)])
+    members[:, 2] = torch.nan
+    (ax,) = spread_figure(Prediction(truth.t, members.mean(0), truth.q, members), title="t").axes
+    error, spread = (line.get_ydata() for line in ax.lines)
+    t = truth.t[1:].numpy()
+    # Both coordinates are off by c t; the third trajectory broke down.
+    np.testing.assert_allclose(error, math.sqrt(2) * 0.2 * t)
+    np.testing.assert_allclose(spread, np.sqrt(2 * np.var([0.0, 0.1, 0.5], ddof=1)) * t)
 
 
-def test_colours_follow_the_order_of_the_models(truth, predictions):
-    lines = trajectory_figure(truth, predictions, trajectory=0, title="fake").axes[0].lines
-    errors = error_figure(predictions, title="fake").axes[0].lines
-    colours = [line.get_color() for line in errors]
-    assert [line.get_color() for line in lines[1:]] == colours
-    assert len(set(colours)) == 3
-
-
-def test_no_two_of_many_models_are_drawn_alike(predictions, tmp_path):
-    many = {f"run {k}": predictions["good"] for k in range(9)}
-    figure = error_figure(many, title="fake")
-    check_picture(figure, tmp_path / "error.png")
-    looks = [(line.get_color(), line.get_linestyle()) for line in figure.axes[0].lines]
-    assert len(set(looks)) == 9
-    assert {line for _, line in looks[:6]} == {"-"}
-
-
-@pytest.mark.parametrize(("inverse_mass", "shown"), [(False, "0.00173"), (True, "593")])
-def test_terms_are_annotated(inverse_mass, shown, tmp_path):
+@pytest.mark.parametrize(("inverse_mass", "entry"), [(False, "0.00173"), (True, "593")])
+def test_terms_are_annotated_with_their_numbers(inverse_mass, entry):
     q = torch.tensor([[0.8, 0.2, 0.3], [1.2, -0.2, 0.15]])
     comparison = compare_terms(SoftArm(damping=0.12), SoftArm(), q)
-    assert not comparison.of_inverse_mass
-    comparison = replace(comparison, of_inverse_mass=inverse_mass)
-    figure = terms_figure(comparison, configuration=1, title="fake")
-    check_picture(figure, tmp_path / "terms.png")
+    comparison = dataclasses.replace(comparison, of_inverse_mass=inverse_mass)
+    figure = terms_figure(comparison, configuration=1, title="t")
     assert len(figure.axes) == 12
-    assert shown in [text.get_text() for text in figure.axes[0].texts]
+    assert entry in [text.get_text() for text in figure.axes[0].texts]
     assert len(figure.axes[2].texts) == 3  # G is one column
     assert figure.axes[5].get_xlabel() == "error 20 %"
 
 
-def test_the_spread_of_an_ensemble_is_drawn_beside_its_error(truth, tmp_path):
-    members = torch.stack([truth.q + c * truth.t[:, None] for c in (0.0, 0.1, 0.5)])
-    members[:, 2] = torch.nan
-    prediction = Prediction(truth.t, members.mean(0), truth.q, members)
-    figure = spread_figure(prediction, title="fake")
-    check_picture(figure, tmp_path / "spread.png")
-    (ax,) = figure.axes
-    error, spread = (line.get_ydata() for line in ax.lines)
-    t = truth.t[1:].numpy()
-    # Two coordinates, all off by c t; the third trajectory broke down.
-    np.testing.assert_allclose(error, np.sqrt(2) * 0.2 * t)
-    np.testing.assert_allclose(spread, np.sqrt(2 * np.var([0.0, 0.1, 0.5], ddof=1)) * t)
+def record(coordinates=3, decay=3.0, runs=4):
+    """Steps that decay exponentially, with the input q_ref cos(t)."""
+    t = torch.linspace(0, 2, 101, dtype=torch.float64)
+    goal = torch.arange(1, coordinates + 1) + torch.arange(runs)[:, None, None] / 10
+    q_ref = goal.double().expand(runs, len(t), coordinates)
+    q = q_ref * (1 - torch.exp(-decay * t)[:, None])
+    u = q_ref * torch.cos(t)[:, None]
+    zero = torch.zeros_like(q)
+    return ClosedLoopRecord(t, q, zero, u, u, Motion(q_ref, zero, zero), [None] * runs)
+
+
+def stop(closed_loop, run, sample):
+    """Stop one run: NaN from a sample on."""
+    names = ("q", "v", "u", "u_wanted")
+    values = {name: getattr(closed_loop, name).clone() for name in names}
+    for value in values.values():
+        value[run, sample:] = torch.nan
+    stopped = list(closed_loop.stopped)
+    stopped[run] = "0.80 s: too fast"
+    return dataclasses.replace(closed_loop, stopped=stopped, **values)
+
+
+def test_a_closed_loop_shows_states_references_errors_and_inputs():
+    slow, fast = record(), record(decay=5.0)
+    figure = closed_loop_figure({"slow": slow, "fast": fast}, 1, title="t", labels=["x", "y", "z"])
+    axes = panels(figure)
+    assert set(axes) == {"x", "y", "z", "‖q_ref − q‖₂", "u1", "u2", "u3"}
+    drawn = lines(axes["z"])
+    np.testing.assert_array_equal(drawn["slow"].get_ydata(), slow.q[1, :, 2])
+    np.testing.assert_array_equal(drawn["reference"].get_ydata(), slow.reference.q[1, :, 2])
+    _, error = axes["‖q_ref − q‖₂"].lines
+    size = np.linalg.norm([1.1, 2.1, 3.1])
+    np.testing.assert_allclose(error.get_ydata(), size * np.exp(-5 * slow.t.numpy()))
+    assert {line.get_drawstyle() for line in axes["u1"].lines} == {"steps-post"}
+
+
+def test_a_stop_is_marked_and_a_runaway_does_not_set_the_range():
+    lost = record(2)
+    lost.q[2, 39:], lost.u[2, 39:] = 1e3, -1e5
+    figure = closed_loop_figure(stop(lost, 2, 41), 2, title="t")
+    assert "stopped: 0.80 s: too fast" in figure.get_suptitle()
+    for name, ax in panels(figure).items():
+        assert any(np.allclose(line.get_xdata(), 0.8) for line in ax.lines)
+        assert name.startswith("‖") or np.abs(ax.get_ylim()).max() < 2 * 7.2
+    at_once = stop(record(2), 0, 1)
+    at_once.u[0, 0] = torch.nan
+    closed_loop_figure(at_once, 0, title="t").draw_without_rendering()
+
+
+def test_control_laws_are_compared_by_their_mean_errors():
+    fast, slow = record(1, decay=5.0), stop(record(1, decay=1.0), 3, 50)
+    (ax,) = controller_comparison_figure({"fast": fast, "slow": slow}, title="t").axes
+    drawn = lines(ax)
+    t = fast.t[1:].numpy()
+    # Steps of 1.0, 1.1, 1.2 and 1.3; the last of the slow ones was stopped.
+    np.testing.assert_allclose(drawn["fast"].get_ydata(), 1.15 * np.exp(-5 * t))
+    np.testing.assert_allclose(drawn["slow (1 of 4 stopped)"].get_ydata(), 1.10 * np.exp(-t))
+    band = ax.collections[1].get_paths()[0].vertices
+    start = band[band[:, 0] == t[0], 1] / np.exp(-t[0])
+    assert (start.min(), start.max()) == pytest.approx((1.02, 1.18))  # 10 and 90 % of 1 to 1.2
+
+
+def test_the_tip_path_shows_the_distance_in_millimetres():
+    t = torch.linspace(0, 3, 61, dtype=torch.float64)
+    helix = torch.stack([t.cos(), t.sin(), 0.1 * t], -1)
+    near = helix + 0.001 * torch.tensor([2.0, 3.0, 6.0])
+    short = helix + 0.02 * t[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    short[30:] = torch.nan
+    _, ax = tip_path_figure(t, {"near": near, "short": short}, helix, title="t").axes
+    near_line, short_line, cross = ax.lines
+    np.testing.assert_allclose(near_line.get_ydata(), 7.0)
+    np.testing.assert_allclose(short_line.get_ydata()[:30], 20 * t[:30])
+    assert cross.get_label() == "short stopped"
+    assert cross.get_xdata()[0] == t[29]
+
+
+def test_bounds_that_fail_are_counted_and_drawn_as_crosses():
+    inf = math.inf
+    bound = torch.tensor([1e-2, 1e-2, 1e-3, 0.0, inf, 1e-2])
+    measured = torch.tensor([1e-3, 1e-2, 2e-3, 1e-6, 1e-3, inf])
+    figure = steady_state_figure(bound, measured, title="t")
+    below, above = (np.asarray(points.get_offsets()) for points in figure.axes[0].collections)
+    np.testing.assert_allclose(below, [[1e-2, 1e-3], [1e-2, 1e-2]])
+    np.testing.assert_allclose(above, [[1e-3, 2e-3], [1e-12, 1e-6]])
+    _, counts, left_out = figure.get_suptitle().splitlines()
+    assert counts == "2 of 5 bounds hold"
+    assert left_out == "not drawn: 1 without a bound, 1 without a finite error"
+
+
+def test_a_sweep_has_a_line_through_the_means_over_seeds():
+    runs = pd.DataFrame(
+        [
+            {"x": x, "model": model, "seed": seed, "error": scale / x * (1 + 2 * seed)}
+            for model, scale in (("lnn", 1.0), ("mlp", 10.0))
+            for x in (1, 10, 100)
+            for seed in (0, 1)
+        ]
+    )
+    runs.loc[0, "error"] = math.inf
+    (ax,) = sweep_figure(runs, x="x", lines=["model"], y="error").axes
+    drawn = lines(ax)
+    np.testing.assert_allclose(drawn["lnn (1 of 6 diverged)"].get_ydata(), [3.0, 0.2, 0.02])
+    np.testing.assert_allclose(drawn["mlp"].get_ydata(), [20.0, 2.0, 0.2])
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    words = runs.assign(x=runs["x"].map({1: "relu", 10: "elu", 100: "tanh"}))
+    sweep_figure(words, x="x", lines=[], y="error").draw_without_rendering()
+
+
+def test_units_are_read_from_the_labels():
+    assert units(["Δx [rad]", "Δy [rad]", "δℓ [m]"]) == "rad, m"
+    assert units(["q1 (deg)", "arm"]) == "deg"
+    assert units(["q1", "q2"]) == ""

@@ -94,8 +94,9 @@ def trajectory_browser(
         names.add(name)
     frames = {}
     for k in sorted(trajectories):
-        ranges = {f"yaxis{row + 1}": {"range": _range(truth, rollouts, row, k)}
-                  for row in range(size + 1)}
+        ranges = {
+            f"yaxis{row + 1}": {"range": _range(truth, rollouts, row, k)} for row in range(size + 1)
+        }
         frames[k] = go.Frame(
             name=str(k), data=[{"y": curve.samples(k)} for curve in curves], layout=ranges
         )

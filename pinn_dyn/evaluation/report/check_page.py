@@ -122,7 +122,13 @@ def _clock(source: LogSource) -> Figure:
     figure = Figure(figsize=(9, 2.6), layout="constrained")
     ax = figure.subplots()
     for index, part in enumerate(source.cleaned[:6]):
-        ax.plot(part.raw.t[1:], 1e3 * np.diff(part.raw.t), ".", color=model_style(index)["color"], markersize=2)
+        ax.plot(
+            part.raw.t[1:],
+            1e3 * np.diff(part.raw.t),
+            ".",
+            color=model_style(index)["color"],
+            markersize=2,
+        )
     ax.set(xlabel="time (s)", ylabel="time between rows (ms)")
     return figure
 

@@ -104,8 +104,8 @@ def _summary(item: Evaluation) -> Iterator[Markup]:
     )
     yield table(item.summary, headers=summary_columns(item.summary))
     yield from map(paragraph, item.remarks())
-    if len(item.by_configuration) < len(item.summary):
-        yield table(item.by_configuration, headers=SEEDS_COLUMNS)
+    if len(item.by_model) < len(item.summary):
+        yield table(item.by_model, headers=SEEDS_COLUMNS)
     yield details("All columns (summary.csv)", table(turned(item.summary, "run")))
 
 
@@ -185,7 +185,7 @@ def _terms(item: Evaluation, figures: Mapping[str, Figure]) -> Iterator[Markup]:
         )
         return
     yield paragraph(
-        "The equation of motion does not change when it is multiplied by a matrix P(q). A model may "
+        "Multiplying the equation of motion by a matrix P(q) does not change it. A model may "
         "therefore learn P X instead of the true X. Where the second and third rows of a figure "
         "agree, the model moves like the truth. Each column has one color scale, red for positive "
         "and blue for negative entries. The color follows the square root of an entry."

@@ -1,4 +1,4 @@
-"""Floors, their common grid, and the horizon and windows that are taken where none are given."""
+"""Baselines, the common grid of several models, default horizon and windows."""
 
 import logging
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.evaluation import (
-    build_floors,
+    build_baselines,
     common_stride,
     default_horizon,
     default_windows,
@@ -32,15 +32,15 @@ def swings(count, seed=0, samples=81):
 
 
 @pytest.fixture(scope="module")
-def floors():
-    return build_floors(swings(4), swings(2, seed=1), step=0.1)
+def baselines():
+    return build_baselines(swings(4), swings(2, seed=1), step=0.1)
 
 
-def test_the_floors_are_what_their_names_say(floors):
+def test_baselines_predict_what_their_names_say(baselines):
     truth = stack(swings(3, seed=2))
-    assert list(floors) == ["stands still", "keeps its velocity", "ARX", "EDMDc degree 2"]
+    assert list(baselines) == ["hold position", "constant velocity", "ARX", "EDMDc degree 2"]
     still, moving, arx, _ = (
-        predict_trajectories(model, truth, step=0.1).q_hat for model in floors.values()
+        predict_trajectories(model, truth, step=0.1).q_hat for model in baselines.values()
     )
     torch.testing.assert_close(still, truth.q[:, :1].expand_as(still))
     expected = truth.q[:, :1] + truth.v[:, :1] * T[::2, None]
@@ -48,9 +48,9 @@ def test_the_floors_are_what_their_names_say(floors):
     torch.testing.assert_close(arx, truth.q[:, ::2], rtol=0, atol=1e-5)
 
 
-def test_windowed_floors_start_again_from_the_measured_state(floors):
+def test_windowed_baselines_restart_from_the_measured_state(baselines):
     truth = stack(swings(1, seed=2))
-    found = predict_windows(floors["keeps its velocity"], truth, window=1.0, step=0.1)
+    found = predict_windows(baselines["constant velocity"], truth, window=1.0, step=0.1)
     samples = torch.arange(81)
     start = ((samples - 1).clamp(min=0) // 20) * 20
     expected = truth.q[0, start] + truth.v[0, start] * (T - T[start])[:, None]
@@ -59,8 +59,8 @@ def test_windowed_floors_start_again_from_the_measured_state(floors):
 
 def test_a_rival_that_cannot_be_fitted_is_left_out_with_a_reason(caplog):
     with caplog.at_level(logging.WARNING):
-        found = build_floors(swings(2, samples=3), swings(1), step=0.2)
-    assert list(found) == ["stands still", "keeps its velocity"]
+        found = build_baselines(swings(2, samples=3), swings(1), step=0.2)
+    assert list(found) == ["hold position", "constant velocity"]
     assert "no row 'ARX': no linear model can be fitted: no training trajectory" in caplog.text
 
 
