@@ -37,7 +37,7 @@ from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.predictor import double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.systems import BulletArm
-from pinn_dyn.systems.bullet_world import open_world
+from pinn_dyn.systems.bullet_client import connect
 
 RESULTS = Path(__file__).parent / "results"
 PANDA = "franka_panda/panda.urdf"
@@ -72,10 +72,13 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     except ImportError as error:
         print(error)
         return {}
-    world = open_world(arm.urdf.text, arm.inertia, arm.gravity)
+    client = connect()
+    body = client.loadURDF(str(arm.path), flags=client.URDF_USE_INERTIA_FROM_FILE)
+    fingers = [0.0] * len(FINGERS)
 
     def bullet(q: list[float], v: list[float], a: list[float]) -> Any:
-        return world.bullet.calculateInverseDynamics(world.body, q, v, a)
+        at = (q + fingers, v + fingers, a + fingers)
+        return client.calculateInverseDynamics(body, *at)[:JOINTS]
 
     desired = states[:, 2:].numpy()
     rivals: dict[str, Call] = {"PyBullet inverse dynamics": (bullet, desired.tolist())}
@@ -84,7 +87,7 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     except ImportError:
         print("Pinocchio is not installed (pip install pin)")
         return rivals
-    full = pinocchio.buildModelFromUrdf(str(arm.urdf.path))
+    full = pinocchio.buildModelFromUrdf(str(arm.path))
     locked = [full.getJointId(name) for name in FINGERS]
     model = pinocchio.buildReducedModel(full, locked, pinocchio.neutral(full))
     data = model.createData()

@@ -1,6 +1,7 @@
 """Control on a mechanical system, true or learned: laws, references, closed loop, stability."""
 
-from pinn_dyn.control.closed_loop import close_loop, close_loop_continuous
+from pinn_dyn.control.closed_loop import close_loop
+from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Delay, Sensor
 from pinn_dyn.control.export import export_law, load_law
@@ -14,7 +15,7 @@ from pinn_dyn.control.laws import (
     Tracking,
 )
 from pinn_dyn.control.observer import DisturbanceObserver
-from pinn_dyn.control.plants import BulletPlant, SystemPlant
+from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.references import (
     PointToPoint,
@@ -34,7 +35,6 @@ from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 
 __all__ = [
     "Actuator",
-    "BulletPlant",
     "ClosedLoopRecord",
     "ComputedTorque",
     "Controller",
@@ -53,6 +53,7 @@ __all__ = [
     "Regulation",
     "Sensor",
     "SetPoint",
+    "SimulatorPlant",
     "Sines",
     "SystemPlant",
     "Tracking",

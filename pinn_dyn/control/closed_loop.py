@@ -1,8 +1,7 @@
-"""Run a closed loop: a control law on a plant, at control instants or in continuous time."""
+"""Run a sampled closed loop: a control law on a plant, at control instants."""
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -11,7 +10,6 @@ from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Delay, Sensor
 from pinn_dyn.control.plants import check_start
 from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.control.stiff_loop import StiffLoop, finite_rows, motion_of_copies
 from pinn_dyn.mechanics import MechanicalSystem
 
 
@@ -36,17 +34,16 @@ def close_loop(
         u(t_k) = actuator(u_wanted(t_k-d)),    t_k = k / rate,  k = 0 ... duration * rate
 
     A copy is stopped, and the others go on, once its state is not finite or q leaves its bound,
-    the sensor or the law give something that is not finite, or the controller reports a fault.
-    What was known at that instant is recorded: all of the plant after it is NaN. The law sees a
-    stopped copy at rest where it was last measured, and the plant is started afresh without it.
-    Ctrl-C ends the run early and gives the record so far.
+    the sensor or the law return a number that is not finite, or the controller reports a fault.
+    The record of a stopped copy is NaN after that instant. The law sees a stopped copy at the
+    state that was measured last, and the plant is started again without it. Ctrl-C ends the run
+    early and returns the record up to then.
 
     Args:
-        plant: what is controlled.
+        plant: the plant that is controlled.
         controller: the law; it is reset first.
         reference: the desired motion.
-        q0: initial configurations, ``(K, N)``, float64.
-        v0: initial velocities, ``(K, N)``, float64.
+        q0, v0: initial configurations and velocities, ``(K, N)`` each.
         duration: length of the run in s, an integer multiple of 1 / rate.
         rate: control instants per second, 1/s.
         actuator: limits of the input; none if None.
@@ -57,9 +54,10 @@ def close_loop(
 
     Raises:
         ValueError: on sizes that do not agree, initial states that are not finite, a duration that
-            is no multiple of 1 / rate, or a delay that is longer.
+            is no multiple of 1 / rate, or a delay longer than the duration.
     """
-    run = _Run(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)
+    q0, v0 = q0.double(), v0.double()
+    run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)
     queue = Delay(delay)
     if delay >= len(run.t):
         raise ValueError(
@@ -91,76 +89,8 @@ def close_loop(
     return run.record(len(run.t))
 
 
-def close_loop_continuous(
-    system: MechanicalSystem,
-    controller: Controller,
-    reference: Reference,
-    q0: Tensor,
-    v0: Tensor,
-    *,
-    duration: float,
-    samples_rate: float,
-    actuator: Actuator | None = None,
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
-    q_bound: float = 1e3,
-    progress: str | None = None,
-) -> ClosedLoopRecord:
-    """Run a closed loop whose law acts in continuous time, K copies at once::
-
-        M(q) dv/dt + C(q, v) v + G(q) + D(q) v = A(q) u,   u = limits(law(t, q, v, reference(t)))
-
-    High gains on small inertias make it stiff, so the solver is SciPy's BDF, implicit and of order
-    1 to 5 (Shampine, Reichelt 1997), with a block-diagonal Jacobian by finite differences. The
-    copies share its steps, whose error is controlled in each of them. A copy that the solver
-    cannot follow is stopped there, the others go on. Inputs, diagnostics and faults are those of
-    the samples.
-
-    Args:
-        system: what is controlled.
-        controller: the law; it must not remember what it was called with.
-        reference, q0, v0, q_bound, progress: as of :func:`close_loop`.
-        duration: length of the run in s, an integer multiple of 1 / samples_rate.
-        samples_rate: samples of the record per second, 1/s.
-        actuator: limits of the input, without a rate; none if None.
-        rtol: relative tolerance of the solver.
-        atol: absolute tolerance of the solver, in the units of q and v.
-
-    Raises:
-        ValueError: as :func:`close_loop`, or on an actuator with a rate limit.
-    """
-    if actuator is not None and actuator.rate is not None:
-        raise ValueError(
-            f"actuator has rate = {actuator.rate}, but in continuous time there is no instant "
-            "before to limit the rate from: leave it out, or use close_loop"
-        )
-    run = _Run(system, controller, reference, q0, v0, duration, samples_rate, actuator, q_bound)
-
-    def law_and_system(t: float, x: Tensor, *motion: Tensor) -> Tensor:
-        q, v = x.chunk(2, dim=-1)
-        u = controller(t, q, v, Motion(*motion))
-        return system.velocity_derivative(x, u if actuator is None else actuator.limit(u))
-
-    with torch.no_grad():
-        x0 = torch.cat([q0, v0], dim=-1)
-        loop = StiffLoop(law_and_system, reference, x0, run.t, q_bound)
-        loop.solve(rtol, atol, progress)
-        controller.reset()
-        for k in range(len(run.t)):
-            for copy, (time, reason) in enumerate(loop.ends):
-                if time <= float(run.t[k]):
-                    run.stop(torch.arange(len(q0)) == copy, time, reason)
-            q, v = loop.states[:, k].chunk(2, dim=-1)
-            run.observe(k, q, v)
-            run.measure(k, q, v)
-            run.apply(k, run.ask(k))
-            if not run.running.any():
-                break
-    return run.record(len(run.t))
-
-
-class _Run:
-    """The state of a run: who is still running, what the law sees, and the record so far."""
+class LoopRun:
+    """The state of a run: the copies that still run, the law's measurements, and the record."""
 
     def __init__(
         self,
@@ -177,9 +107,6 @@ class _Run:
         n, m = plant.num_coordinates, plant.num_inputs
         _check_sizes(plant, controller, reference)
         check_start(q0, v0, n)
-        for name, value in (("q0", q0), ("v0", v0)):
-            if value.dtype != torch.float64:
-                raise ValueError(f"{name} is {value.dtype}, expected float64: {name}.double()")
         self.t = _instants(duration, rate)
         self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
         self._shape_of_u = (len(q0), m)
@@ -196,14 +123,14 @@ class _Run:
         if actuator is not None:
             actuator.reset()
 
-    def stop(self, who: Tensor, time: float, reason: str) -> None:
-        """Stop those of ``who`` that still run."""
-        for copy in (who & self.running).nonzero()[:, 0].tolist():
+    def stop(self, mask: Tensor, time: float, reason: str) -> None:
+        """Stop the copies of a mask ``(K,)`` that still run."""
+        for copy in (mask & self.running).nonzero()[:, 0].tolist():
             self._stopped[copy] = f"{reason} at t = {time:.6g} s"
-        self.running &= ~who
+        self.running &= ~mask
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
-        """Take note of the true state at instant k; stops who has diverged."""
+        """Record the true state at instant k; stop the copies that have diverged."""
         finite = finite_rows(q) & finite_rows(v)
         self.stop(~finite, float(self.t[k]), "the plant diverged: its state is not finite")
         self._q[self.running, k] = q[self.running]
@@ -213,14 +140,14 @@ class _Run:
         self.stop(beyond, float(self.t[k]), reason)
 
     def measure(self, k: int, q: Tensor, v: Tensor) -> None:
-        """Take what the sensor says at instant k; stops whose measurement is not finite."""
+        """Store the measurement at instant k; stop the copies where it is not finite."""
         lost = ~(finite_rows(q) & finite_rows(v))
         self.stop(lost, float(self.t[k]), "the measurement is not finite")
         for seen, new in zip(self._seen, (q, v), strict=True):
             seen[self.running] = new[self.running]
 
     def ask(self, k: int) -> Tensor:
-        """The input that the law wants at instant k; it means nothing for who has stopped."""
+        """Return the law's input at instant k; meaningless for a stopped copy."""
         time = float(self.t[k])
         q, v = self._seen
         u = self._controller(time, q, v, self._motions[k])
@@ -230,13 +157,13 @@ class _Run:
             )
         self._u_wanted[self.running, k] = u[self.running]
         self._diagnose(k, self._controller.diagnostics())
-        for reason, who in self._controller.faults().items():
-            self.stop(who, time, reason)
+        for reason, mask in self._controller.faults().items():
+            self.stop(mask, time, reason)
         self.stop(~finite_rows(u), time, "the law's input is not finite")
         return u
 
     def apply(self, k: int, u: Tensor) -> Tensor:
-        """The input that the actuator lets through at instant k."""
+        """Return the input that passes the actuator at instant k."""
         if self._actuator is not None:
             u, changed = self._actuator(u, self._interval)
             self._diagnose(k, {"saturated_inputs": changed.sum(-1)})
@@ -244,7 +171,7 @@ class _Run:
         return u
 
     def record(self, samples: int) -> ClosedLoopRecord:
-        """What happened at the first instants."""
+        """Return the record of the first instants."""
         motions = self._motions[:samples]
         q_ref, v_ref, a_ref = (torch.stack(values, 1) for values in zip(*motions, strict=True))
         q, v, u, u_wanted = (x[:, :samples] for x in (self._q, self._v, self._u, self._u_wanted))
@@ -277,10 +204,6 @@ def _check_sizes(
 
 
 def _instants(duration: float, rate: float) -> Tensor:
-    if not (0 < rate < np.inf and 0 < duration < np.inf):
-        raise ValueError(
-            f"duration is {duration} s and the rate {rate} 1/s, expected positive numbers"
-        )
     steps = round(duration * rate)
     if steps < 1 or abs(duration * rate - steps) > 1e-6:
         raise ValueError(
@@ -288,3 +211,25 @@ def _instants(duration: float, rate: float) -> Tensor:
             f"between instants at {rate:g} Hz"
         )
     return torch.arange(steps + 1, dtype=torch.float64) / rate
+
+
+def finite_rows(x: Tensor) -> Tensor:
+    """Return true for each row of ``(*batch, n)`` with finite numbers only, ``(*batch,)``."""
+    return x.isfinite().all(-1)
+
+
+def motion_of_copies(reference: Reference, time: float, like: Tensor) -> Motion:
+    """Return the reference at one time for each copy: ``(K, N)`` like another tensor.
+
+    Raises:
+        ValueError: if it is neither one motion for all copies nor one for each.
+    """
+    motion = reference(time)
+    for name, value in zip(Motion._fields, motion, strict=True):
+        if value.shape not in (like.shape, like.shape[1:]):
+            raise ValueError(
+                f"the reference's {name} has shape {tuple(value.shape)}, expected "
+                f"{tuple(like.shape[1:])} or {tuple(like.shape)}: one motion for all copies, or "
+                "one for each"
+            )
+    return Motion(*(value.to(like).expand_as(like) for value in motion))

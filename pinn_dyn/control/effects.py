@@ -1,4 +1,4 @@
-"""What stands between a control law and its plant: actuator limits, sensor noise, dead time."""
+"""Actuator limits, sensor noise and dead time between a control law and its plant."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from torch import Tensor
 
 _Values = float | Sequence[float] | None
+_Deviation = NonNegativeFloat | Sequence[NonNegativeFloat]
 
 
 @dataclass
@@ -19,8 +21,8 @@ class Actuator:
 
         low <= u <= high,    |u(t_k) - u(t_k-1)| <= rate (t_k - t_k-1)
 
-    Before the first instant the input was zero, so the rate limits the first one too; where a
-    range excludes what the rate allows, the range wins.
+    The input is zero before the first instant, so the rate limits the first input too. Where the
+    range excludes all inputs that the rate allows, the range wins.
 
     Args:
         low: lower limit, one number or M, in the units of u; None for no limit.
@@ -28,43 +30,34 @@ class Actuator:
         rate: largest rate of change, one number or M, in the units of u per s; likewise.
 
     Raises:
-        ValueError: on NaN, low above high, or a rate that is not positive.
+        ValueError: if low exceeds high.
     """
 
     low: _Values = None
     high: _Values = None
-    rate: _Values = None
+    rate: PositiveFloat | Sequence[PositiveFloat] | None = None
     _previous: Tensor | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         low, high = self._bounds()
-        for name, values in (("low", low), ("high", high)):
-            if np.isnan(values).any():
-                raise ValueError(f"Actuator: {name} is {getattr(self, name)}, expected numbers")
-        if low.ndim and high.ndim and low.shape != high.shape:
-            raise ValueError(
-                f"Actuator: low has {low.size} entries and high {high.size}, expected as many"
-            )
         if (low > high).any():
             raise ValueError(f"Actuator: low is {self.low} and high {self.high}: low exceeds high")
-        if self.rate is not None and not (np.asarray(self.rate, dtype=float) > 0).all():
-            raise ValueError(f"Actuator: rate is {self.rate}, expected positive numbers")
 
     def reset(self) -> None:
-        """Back to an input of zero, before a new run."""
+        """Return to an input of zero, before a new run."""
         self._previous = None
 
     def limit(self, u: Tensor) -> Tensor:
-        """u within [low, high], ``(*batch, M)``, whatever came before; NaN stays NaN."""
+        """Clip u ``(*batch, M)`` to [low, high]; NaN stays NaN."""
         low, high = (_per_entry("Actuator: limits", values, u) for values in self._bounds())
         return torch.minimum(torch.maximum(u, low), high)
 
     def __call__(self, u: Tensor, interval: float) -> tuple[Tensor, Tensor]:
-        """The input that gets through, and a mask of the entries that were changed.
+        """Return the input that passes the limits, and a mask of the entries that were changed.
 
         Args:
-            u: input asked for, ``(*batch, M)``.
-            interval: time since the call before, s.
+            u: input of the law, ``(*batch, M)``.
+            interval: time since the previous call, s.
         """
         applied = u
         if self.rate is not None:
@@ -90,22 +83,13 @@ class Sensor:
         v_noise: standard deviation of the noise on v, likewise.
         seed: seed of the noise; the same one gives the same noise after each reset.
 
-    Raises:
-        ValueError: on a standard deviation that is negative or not finite.
     """
 
-    q_noise: float | Sequence[float] = 0.0
-    v_noise: float | Sequence[float] = 0.0
-    seed: int = 0
+    q_noise: _Deviation = 0.0
+    v_noise: _Deviation = 0.0
+    seed: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
-        for name in ("q_noise", "v_noise"):
-            values = np.asarray(getattr(self, name), dtype=float)
-            if not (np.isfinite(values).all() and (values >= 0).all()):
-                raise ValueError(
-                    f"Sensor: {name} is {getattr(self, name)}, expected standard deviations of at "
-                    "least 0"
-                )
         self.reset()
 
     def reset(self) -> None:
@@ -113,7 +97,7 @@ class Sensor:
         self._generator = torch.Generator().manual_seed(self.seed)
 
     def __call__(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Measured q and v, ``(*batch, N)`` each, from the true ones."""
+        """Return the measured q and v, ``(*batch, N)`` each."""
         return self._measured("q_noise", q), self._measured("v_noise", v)
 
     def _measured(self, name: str, value: Tensor) -> Tensor:
@@ -124,28 +108,24 @@ class Sensor:
 
 @dataclass
 class Delay:
-    """A dead time: the input of ``samples`` instants ago, and zero before there was any.
+    """A dead time: the input of ``samples`` instants before, zero at the beginning.
 
     Args:
         samples: dead time in control instants, at least 0.
 
-    Raises:
-        ValueError: on a number of samples that is negative or not whole.
     """
 
-    samples: int
+    samples: NonNegativeInt
 
     def __post_init__(self) -> None:
-        if not (self.samples >= 0 and self.samples == int(self.samples)):
-            raise ValueError(f"Delay: samples is {self.samples}, expected a whole number from 0")
         self.reset()
 
     def reset(self) -> None:
-        """Forget the inputs on their way."""
+        """Forget the inputs that have not arrived."""
         self._queue: deque[Tensor] = deque()
 
     def __call__(self, u: Tensor) -> Tensor:
-        """The input that arrives now, ``(*batch, M)``, as ``u`` sets out."""
+        """Return the input that arrives at the instant when ``u`` is sent, ``(*batch, M)``."""
         self._queue.append(u)
         if len(self._queue) <= self.samples:
             return torch.zeros_like(u)
@@ -153,7 +133,7 @@ class Delay:
 
 
 def _per_entry(what: str, values: np.ndarray, like: Tensor) -> Tensor:
-    """One number, or one for each entry of the last dimension, as a tensor like another."""
+    """Convert one number, or one for each entry of the last dimension, to a tensor."""
     if values.ndim and values.shape != like.shape[-1:]:
         raise ValueError(
             f"{what} have {values.size} entries, expected one number or {like.shape[-1]}"

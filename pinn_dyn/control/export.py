@@ -24,8 +24,6 @@ INPUTS = ("q", "v", "q_ref", "v_ref", "a_ref")
 TOLERANCE = 1e-5
 _CHECKS = 10  # states that travel with the file
 _KEY = "pinn_dyn_law"
-_INFO = frozenset(("law", "num_coordinates", "num_inputs", "torch", "check"))
-_MOST_BYTES = 10_000_000  # of what a file says about itself
 
 
 class CompiledLaw:
@@ -145,22 +143,15 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
         sha256: the 64 hexadecimal digits of ``<path>.sha256``, compared before anything is loaded.
 
     Raises:
-        TypeError: if the path is none.
         FileNotFoundError: if there is no such file.
-        ValueError: if sha256 is no checksum, the file has another one, holds entries that lead out
-            of the folder that it is unpacked in, or was not written by :func:`export_law`.
+        ValueError: if the file has another checksum, holds entries that lead out of the folder that
+            it is unpacked in, or was not written by :func:`export_law`.
         RuntimeError: if it was exported by another version of PyTorch, or misses the values that
             travel with it by more than 1e-5 of their norm.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise TypeError(f"path is {path!r}, expected that of a file that export_law wrote")
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file, expected one that export_law wrote")
-    if sha256 is not None and not re.fullmatch(r"\s*[0-9a-fA-F]{64}\s*", str(sha256)):
-        raise ValueError(
-            f"sha256 is {sha256!r}, expected the 64 hexadecimal digits in {path.name}.sha256"
-        )
     if sha256 is not None and (digest := _digest(path)) != sha256.strip().lower():
         raise ValueError(
             f"{path} has the SHA-256 {digest}, expected {sha256}: it is not the file that was "
@@ -176,20 +167,20 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
     law = CompiledLaw(loader.run, info)
     states = torch.tensor(info["check"]["states"], dtype=torch.float64)
     expected = torch.tensor(info["check"]["u"], dtype=torch.float64)
-    found = torch.stack([law(*state) for state in states])
-    error = ((found - expected).norm(dim=-1) / expected.norm(dim=-1)).max()
+    u = torch.stack([law(*state) for state in states])
+    error = ((u - expected).norm(dim=-1) / expected.norm(dim=-1)).max()
     if not error <= TOLERANCE:
         raise RuntimeError(
             f"{path} misses the law it was exported from by {float(error):.1e} (relative), "
             f"expected at most {TOLERANCE:g}. Export it on the machine that runs it; if that does "
-            "not help, look at the condition numbers of M(q) and A(q): where one of them is nearly "
-            "singular, u hangs on rounding"
+            "not help, look at the condition numbers of M(q) and A(q): if one is large, the "
+            "computed input is dominated by rounding errors"
         )
     return law
 
 
 class _LawModule(nn.Module):
-    """The formula of a law as the module that torch.export asks for."""
+    """The formula of a law as a module for torch.export."""
 
     def __init__(self, controller: StateFeedback):
         super().__init__()
@@ -216,7 +207,7 @@ def _describe(controller: StateFeedback, states: Tensor, u: Tensor) -> dict[str,
 
 
 def _read_info(path: Path) -> dict[str, Any]:
-    """What the file says about itself, read before any of its code is loaded."""
+    """Read the description of the law before any code of the file is loaded."""
     try:
         with zipfile.ZipFile(path) as archive:
             for entry in archive.infolist():
@@ -226,24 +217,23 @@ def _read_info(path: Path) -> dict[str, Any]:
             described = [
                 archive.read(entry)
                 for entry in archive.infolist()
-                if entry.filename.endswith("_metadata.json") and entry.file_size <= _MOST_BYTES
+                if entry.filename.endswith("_metadata.json")
             ]
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:  # or encrypted
         raise ValueError(f"{path} is no exported law, or it is cut short: {error}") from error
     for text in described:
         try:
-            info = json.loads(json.loads(text)[_KEY])
-        except (ValueError, TypeError, KeyError, RecursionError):
+            info: dict[str, Any] = json.loads(json.loads(text)[_KEY])
+        except (ValueError, TypeError, KeyError):
             continue
-        if isinstance(info, dict) and info.keys() >= _INFO:
-            return info
+        return info
     raise ValueError(
         f"{path} is a package, but no law that export_law wrote: it does not hold the entry {_KEY}"
     )
 
 
 def _check_entry(path: Path, name: str) -> None:
-    """Refuse a file that, unpacked, would be written elsewhere than into the folder meant for it.
+    """Check that an entry is unpacked inside its folder.
 
     Raises:
         ValueError: naming the entry.

@@ -8,10 +8,11 @@ from typing import Literal
 
 import numpy as np
 import torch
+from pydantic import PositiveFloat
 from scipy.interpolate import make_interp_spline
 
 from pinn_dyn.control.contracts import Motion, Reference
-from pinn_dyn.control.references import require_positive, smooth_step
+from pinn_dyn.control.references import smooth_step
 from pinn_dyn.systems import HasLimits, HasTip
 
 _KNOTS_PER_TURN = 64
@@ -55,39 +56,32 @@ class Helix(Reference):
         path_error: largest distance of the tip from the helix, also between knots, m.
 
     Raises:
-        ValueError: on bad numbers, a posture outside the joint limits, or a helix that the arm
-            cannot follow within its joint limits.
+        ValueError: on a posture of another size or outside the joint limits, or a helix that the
+            arm cannot follow within its joint limits.
     """
 
     def __init__(
         self,
         arm: HasTip,
         posture: Sequence[float],
-        radius: float,
+        radius: PositiveFloat,
         pitch: float,
-        period: float,
-        turns: float,
+        period: PositiveFloat,
+        turns: PositiveFloat,
         axis: Literal["x", "y", "z"] = "z",
-        rise_time: float | None = None,
+        rise_time: PositiveFloat | None = None,
     ):
-        for name, value in (("radius", radius), ("period", period), ("turns", turns)):
-            require_positive(name, value)
-        if not math.isfinite(pitch):
-            raise ValueError(f"pitch is {pitch}, expected a finite number in m")
-        if axis not in ("x", "y", "z"):
-            raise ValueError(f"axis is {axis!r}, expected 'x', 'y' or 'z'")
         longest = turns * period
         rise_time = min(0.5 * period, longest) if rise_time is None else rise_time
-        require_positive("rise_time", rise_time)
         if rise_time > longest:
             raise ValueError(
                 f"rise_time is {rise_time:g} s, expected at most turns * period = {longest:g} s"
             )
-        rest = np.asarray(posture, dtype=float)
-        if rest.shape != (arm.num_coordinates,) or not np.isfinite(rest).all():
+        home = np.asarray(posture, dtype=float)
+        if home.shape != (arm.num_coordinates,):
             raise ValueError(
-                f"posture is {rest.tolist()}, but the robot has {arm.num_coordinates} coordinates "
-                f"({', '.join(_names(arm))}): expected one finite number for each"
+                f"posture has {home.size} entries, expected {arm.num_coordinates}, one for each "
+                "joint of the robot"
             )
         self.num_coordinates = arm.num_coordinates
         self.rise_time, self.duration = float(rise_time), float(longest + rise_time)
@@ -95,20 +89,20 @@ class Helix(Reference):
         self._end = 2 * math.pi * turns
         self._radius, self._slope = radius, pitch / (2 * math.pi)
         self._axes = np.roll(np.eye(3), -("xyz".index(axis) + 1), axis=0)
-        self._origin = _tip(arm, rest)
+        self._origin = _tip(arm, home)
 
         knots = np.linspace(0.0, self._end, max(6, math.ceil(_KNOTS_PER_TURN * turns)) + 1)
         q = np.empty((len(knots), arm.num_coordinates))
-        guess = rest
+        guess = home
         for k, phi in enumerate(knots):
-            q[k] = guess = self._solve(arm, rest, guess, phi)
+            q[k] = guess = self._solve(arm, home, guess, phi)
         self._curve = make_interp_spline(knots, q, k=5)
         self._slopes = self._curve.derivative(1), self._curve.derivative(2)
         between = (knots[:-1, None] + np.diff(knots)[:, None] * [0.25, 0.5, 0.75]).ravel()
         self.path_error = self._measure(arm, between)
 
     def path(self, t: float) -> np.ndarray:
-        """Where the tip should be at time t in s, ``(3,)``, m, in the frame of the base."""
+        """Return the desired tip position at time t in s, ``(3,)``, m, in the frame of the base."""
         return self._point(self._angle(t)[0])
 
     def __call__(self, t: float) -> Motion:
@@ -118,7 +112,7 @@ class Helix(Reference):
         return Motion(*(torch.from_numpy(value) for value in motion))
 
     def _angle(self, t: float) -> tuple[float, float, float]:
-        """phi in rad and its derivatives: the rate rises by s(x), at the end it falls likewise."""
+        """Return phi in rad and its derivatives: the rate rises by s(x) and falls likewise."""
         if t > 0.5 * self.duration:
             phi, rate, rate2 = self._angle(max(self.duration - t, 0.0))
             return self._end - phi, rate, -rate2
@@ -137,14 +131,14 @@ class Helix(Reference):
         shift = np.array([r * (math.cos(phi) - 1), r * math.sin(phi), self._slope * phi])
         return self._origin + shift @ self._axes
 
-    def _solve(self, arm: HasTip, rest: np.ndarray, guess: np.ndarray, phi: float) -> np.ndarray:
-        """The configuration nearest to rest that puts the tip at p(phi)."""
+    def _solve(self, arm: HasTip, home: np.ndarray, guess: np.ndarray, phi: float) -> np.ndarray:
+        """Return the configuration nearest to ``home`` that puts the tip at p(phi)."""
         target, q = self._point(phi), guess
         for _ in range(_ITERATIONS):
             tip, jacobian = _tip_and_jacobian(arm, q)
             error = target - tip
             left, values, rows = np.linalg.svd(jacobian, full_matrices=False)
-            homing = rest - q  # of which only the part in the null space is used
+            homing = home - q  # only the part in the null space is used
             change = homing + rows.T @ (
                 values / (values**2 + _DAMPING**2) * (left.T @ error) - rows @ homing
             )
@@ -161,7 +155,7 @@ class Helix(Reference):
         )
 
     def _measure(self, arm: HasTip, angles: np.ndarray) -> float:
-        """The largest path error at the angles, where the joint limits are checked as well."""
+        """Return the largest path error at the angles, and check the joint limits there."""
         q = self._curve(angles)
         for row, phi in zip(q, angles, strict=True):
             self._require_within_limits(arm, row, phi)
@@ -191,14 +185,9 @@ class Helix(Reference):
             )
 
     def _time(self, phi: float) -> float:
-        """The time at which the angle is phi, s, for messages."""
+        """Return the time at which the angle is phi, s, for messages."""
         times = np.linspace(0.0, self.duration, 10_001)
         return float(np.interp(phi, [self._angle(t)[0] for t in times], times))
-
-
-def _names(arm: HasTip) -> list[str]:
-    numbered = [f"q{k + 1}" for k in range(arm.num_coordinates)]
-    return arm.joint_names if isinstance(arm, HasLimits) else numbered
 
 
 def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:
@@ -206,7 +195,7 @@ def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:
 
 
 def _tip_and_jacobian(arm: HasTip, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The tip's position ``(3,)`` and its derivative by q, ``(3, N)``."""
+    """Return the tip's position ``(3,)`` and its derivative with respect to q, ``(3, N)``."""
     with torch.enable_grad():
         x = torch.from_numpy(q).requires_grad_()
         tip = arm.tip_position(x)

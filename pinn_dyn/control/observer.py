@@ -1,4 +1,4 @@
-"""A disturbance observer beside a model-based law: what the model misses is measured and undone."""
+"""A disturbance observer that measures and compensates the error of a model-based law."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
@@ -15,7 +16,7 @@ from pinn_dyn.mechanics.arrays import matvec
 
 
 class _Memory(NamedTuple):
-    """What the next call needs to know of this one."""
+    """Quantities of a call that the next call needs."""
 
     t: float
     momentum: Tensor
@@ -25,9 +26,9 @@ class _Memory(NamedTuple):
 
 
 class DisturbanceObserver(Controller):
-    """A law with a generalized-momentum observer, which takes the law's model and corrects it.
+    """A law with a generalized-momentum observer that corrects the law's model.
 
-    Whatever the terms of the model leave of the measured motion is a force d, the disturbance::
+    The disturbance d is the force that the model's terms do not explain::
 
         dp/dt = f(q, v) + A(q) u + d,   p = M(q) v,   f = d(v^T M v / 2)/dq - G - D v - F(v)
 
@@ -80,15 +81,14 @@ class DisturbanceObserver(Controller):
 
     Raises:
         TypeError: on a law that has no model.
-        ValueError: on a bandwidth that is not positive and finite, or a rate that is not positive.
     """
 
     def __init__(
         self,
         law: ModelBasedLaw,
-        bandwidth: float,
+        bandwidth: PositiveFloat,
         *,
-        max_rate: float | None = None,
+        max_rate: PositiveFloat | None = None,
         actuator: Actuator | None = None,
     ):
         if not isinstance(law, ModelBasedLaw):
@@ -97,10 +97,6 @@ class DisturbanceObserver(Controller):
                 "Tracking: the observer needs M, G, D and A; put a guard around the observer, "
                 "not inside"
             )
-        if not (bandwidth > 0 and math.isfinite(bandwidth)):
-            raise ValueError(f"bandwidth is {bandwidth}, expected a positive finite number in 1/s")
-        if max_rate is not None and not max_rate > 0:
-            raise ValueError(f"max_rate is {max_rate}, expected a positive number, or None")
         super().__init__(law.num_coordinates, law.num_inputs)
         self.law = law
         self.bandwidth = float(bandwidth)
@@ -131,7 +127,7 @@ class DisturbanceObserver(Controller):
         model = self.law.model
         with torch.no_grad():
             momentum, A = model.momentum(q, v), model.input_matrix(q)
-            # What moves p beside the input: C^T v - G - D v.
+            # The part of dp/dt without the input: C^T v - G - D v.
             state = torch.cat([q, momentum], dim=-1)
             force = model.momentum_derivative(state, torch.zeros_like(u))[..., q.shape[-1] :]
             if last is None or self.residual is None or last.momentum.shape != q.shape:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Motion, Reference
 
-Numbers = float | Sequence[float] | Tensor
-Limits = Sequence[float] | np.ndarray | Tensor
+Vector = Sequence[float] | np.ndarray | Tensor
 Configurations = Sequence[float] | Sequence[Sequence[float]] | Tensor
 
 # Samples of a check: one each millisecond, fewer if the motion is long.
@@ -23,10 +23,7 @@ class SetPoint(Reference):
     """A configuration to hold: q_ref(t) = q, v_ref = a_ref = 0.
 
     Args:
-        q: ``(N,)``, or ``(K, N)`` for one each of K runs, rad (m for a length).
-
-    Raises:
-        ValueError: on no numbers, numbers that are not finite, or rows of unequal length.
+        q: ``(N,)``, or ``(K, N)`` for K runs, rad (m for a length).
     """
 
     def __init__(self, q: Configurations):
@@ -44,13 +41,13 @@ class RandomSetPoints(SetPoint):
     Args:
         q_low, q_high: the box, ``(N,)``, rad.
         count: K.
-        seed: of the draw.
+        seed: seed of the draw.
 
     Raises:
-        ValueError: on a box that is empty somewhere, or a count below 1.
+        ValueError: on a box whose lower limit lies above the upper one.
     """
 
-    def __init__(self, q_low: Limits, q_high: Limits, count: int, seed: int):
+    def __init__(self, q_low: Vector, q_high: Vector, count: PositiveInt, seed: NonNegativeInt):
         low, high = _vector("q_low", q_low), _vector("q_high", q_high)
         _require_same_length("q_low", low, "q_high", high)
         if not (low <= high).all():
@@ -58,8 +55,6 @@ class RandomSetPoints(SetPoint):
             raise ValueError(
                 f"q_low[{i}] = {low[i]:g} lies above q_high[{i}] = {high[i]:g}: exchange them"
             )
-        if count < 1:
-            raise ValueError(f"count is {count}, expected at least 1 set point")
         draw = np.random.default_rng(seed).uniform(size=(count, len(low)))
         super().__init__(low + torch.from_numpy(draw) * (high - low))
 
@@ -77,28 +72,22 @@ class PointToPoint(Reference):
 
     Args:
         q_start, q_end: ``(N,)``, or ``(K, N)`` for K runs, rad.
-        duration: of the move, s.
-        begin: when it begins, s; q_start is held before.
+        duration: duration of the move, s.
+        begin: time at which the move begins, s; q_start is held before.
 
     Raises:
-        ValueError: on configurations that do not fit each other, or times that are none.
+        ValueError: on configurations of different sizes.
     """
 
     def __init__(
         self,
         q_start: Configurations,
         q_end: Configurations,
-        duration: float,
-        begin: float = 0.0,
+        duration: PositiveFloat,
+        begin: NonNegativeFloat = 0.0,
     ):
         start, end = _configurations("q_start", q_start), _configurations("q_end", q_end)
         _require_same_length("q_start", start, "q_end", end)
-        if start.ndim == end.ndim == 2 and len(start) != len(end):
-            raise ValueError(
-                f"q_start holds {len(start)} configurations and q_end {len(end)}: expected as many"
-            )
-        require_positive("duration", duration)
-        require_not_negative("begin", begin)
         self.num_coordinates = start.shape[-1]
         self._start, self._change = torch.broadcast_tensors(start, end - start)
         self.duration, self.begin = float(duration), float(begin)
@@ -128,26 +117,22 @@ class Sines(Reference):
         rise_time: s.
 
     Raises:
-        ValueError: on numbers that are not finite or not as many, or a negative frequency or time.
+        ValueError: on numbers of different sizes.
     """
 
     def __init__(
         self,
         centre: Configurations,
-        amplitude: Numbers,
-        frequency: Numbers,
-        phase: Numbers = 0.0,
-        rise_time: float = 0.0,
+        amplitude: float | Sequence[float],
+        frequency: NonNegativeFloat | Sequence[NonNegativeFloat],
+        phase: float | Sequence[float] = 0.0,
+        rise_time: NonNegativeFloat = 0.0,
     ):
         self._centre = _configurations("centre", centre)
         size = self.num_coordinates = self._centre.shape[-1]
         self._amplitude = _per_joint("amplitude", amplitude, size)
-        frequencies = _per_joint("frequency", frequency, size)
-        if (frequencies < 0).any():
-            raise ValueError(f"frequency is {frequency}, expected numbers of at least 0 in Hz")
-        self._omega = 2 * math.pi * frequencies
+        self._omega = 2 * math.pi * _per_joint("frequency", frequency, size)
         self._phase = _per_joint("phase", phase, size)
-        require_not_negative("rise_time", rise_time)
         self.rise_time = float(rise_time)
 
     def __call__(self, t: float) -> Motion:
@@ -169,19 +154,19 @@ class Sines(Reference):
 
 def check_limits(
     reference: Reference,
-    q_low: Limits,
-    q_high: Limits,
+    q_low: Vector,
+    q_high: Vector,
     duration: float,
-    v_max: Limits | None = None,
+    v_max: Vector | None = None,
 ) -> None:
-    """Refuse a reference that leaves the limits of a robot, before anything moves.
+    """Check that a reference stays within the limits of a robot, before anything moves.
 
     The reference is sampled every millisecond from 0 to ``duration``, at 10,000 times at most.
 
     Args:
         reference: the desired motion.
         q_low, q_high: limits of the configuration, ``(N,)``, rad; infinite where there is none.
-        duration: how long it will be followed, s.
+        duration: duration of the motion, s.
         v_max: limits of the speed, ``(N,)``, rad/s; 0 where there is none. None checks no speed.
 
     Raises:
@@ -199,9 +184,8 @@ def check_limits(
                 f"the reference has {size} coordinates, but {name} has the shape "
                 f"{tuple(bounds[-1].shape)}: give the reference one for each joint of the robot"
             )
-    low, high, *rest = bounds
-    speed = rest[0] if rest else torch.zeros_like(low)
-    require_positive("duration", duration)
+    low, high = bounds[:2]
+    speed = bounds[2] if v_max is not None else torch.zeros_like(low)
     speed = torch.where(speed == 0, torch.inf, speed)
     count = min(math.ceil(duration / _CHECK_STEP), _MOST_CHECKS) + 1
     for t in np.linspace(0.0, duration, count).tolist():
@@ -211,7 +195,7 @@ def check_limits(
 
 
 def smooth_step(x: float) -> tuple[float, float, float]:
-    """The quintic from 0 to 1 with zero slope and curvature at both ends, and its derivatives.
+    """Return the quintic from 0 to 1 with zero slope and curvature at both ends, and derivatives.
 
     s = 10 x^3 - 15 x^4 + 6 x^5, ds/dx and d^2s/dx^2; x is cut to [0, 1].
     """
@@ -221,18 +205,6 @@ def smooth_step(x: float) -> tuple[float, float, float]:
         30 * x**2 * (1 - x) ** 2,
         60 * x * (1 - x) * (1 - 2 * x),
     )
-
-
-def require_positive(name: str, value: float) -> None:
-    """Raises ValueError unless 0 < value < inf."""
-    if not 0 < value < math.inf:
-        raise ValueError(f"{name} is {value}, expected a positive finite number")
-
-
-def require_not_negative(name: str, value: float) -> None:
-    """Raises ValueError unless 0 <= value < inf."""
-    if not 0 <= value < math.inf:
-        raise ValueError(f"{name} is {value}, expected a finite number of at least 0")
 
 
 def _require_within(
@@ -251,45 +223,36 @@ def _require_within(
 
 
 def _configurations(name: str, value: Configurations | np.ndarray) -> Tensor:
-    """``(N,)`` or ``(K, N)`` finite numbers in float64."""
-    try:
-        tensor = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{name} is {value}, expected N numbers, or K rows of N numbers each: {error}"
-        ) from error
+    """Convert to float64, ``(N,)`` or ``(K, N)``."""
+    tensor = torch.as_tensor(value, dtype=torch.float64)
     if tensor.ndim not in (1, 2) or tensor.numel() == 0:
         raise ValueError(
             f"{name} has the shape {tuple(tensor.shape)}, expected (N,) or (K, N) with at least "
             "one number"
         )
-    if not tensor.isfinite().all():
-        raise ValueError(f"{name} is {tensor.tolist()}, expected finite numbers")
     return tensor.detach().clone()
 
 
-def _vector(name: str, value: Limits) -> Tensor:
+def _vector(name: str, value: Vector) -> Tensor:
     tensor = _configurations(name, value)
     if tensor.ndim != 1:
         raise ValueError(f"{name} has the shape {tuple(tensor.shape)}, expected (N,)")
     return tensor
 
 
-def _per_joint(name: str, value: Numbers, size: int) -> Tensor:
+def _per_joint(name: str, value: float | Sequence[float], size: int) -> Tensor:
     tensor = torch.as_tensor(value, dtype=torch.float64)
     if tensor.shape not in ((), (size,)):
         raise ValueError(
             f"{name} has the shape {tuple(tensor.shape)}, but centre has {size} coordinates: give "
             f"one number, or {size}"
         )
-    if not tensor.isfinite().all():
-        raise ValueError(f"{name} is {value}, expected finite numbers")
     return tensor.detach().clone()
 
 
-def _require_same_length(name: str, value: Tensor, other: str, other_value: Tensor) -> None:
-    if value.shape[-1] != other_value.shape[-1]:
+def _require_same_length(name: str, value: Tensor, second: str, second_value: Tensor) -> None:
+    if value.shape[-1] != second_value.shape[-1]:
         raise ValueError(
-            f"{name} has {value.shape[-1]} coordinates and {other} has {other_value.shape[-1]}: "
+            f"{name} has {value.shape[-1]} coordinates and {second} has {second_value.shape[-1]}: "
             "expected as many"
         )

@@ -1,4 +1,4 @@
-"""The region that training data cover, and a guard for control laws outside it."""
+"""The region that training data cover, and a guard for control laws outside this region."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
-from pinn_dyn.mechanics.arrays import require_finite, require_last_dim
+from pinn_dyn.mechanics.arrays import require_last_dim
 
 log = logging.getLogger(__name__)
 
 
 class DataRegion:
-    """How far a state is from the data that a model was trained on.
+    """Distance of a state from the data that a model was trained on.
 
     With x = (q, v) in units of the standard deviation of the data (an angle enters as its sine and
     cosine), and x_1 ... x_S states drawn from the training trajectories::
@@ -25,22 +26,21 @@ class DataRegion:
         distance(q, v) = min_i |x - x_i| / r
 
     r is the 99th percentile, over the drawn states, of the distance to the nearest drawn state of
-    *another* trajectory: how far a new trajectory of the same kind stays from the data. So 1 is
-    the edge of the data, and what lies inside is below 1. Neighbours along the same trajectory
-    would make r as small as the sample time, and every new trajectory an outlier.
+    *another* trajectory: the distance that a new trajectory of the same kind keeps from the data.
+    So 1 is the edge of the data, and states inside are below 1. With neighbors of the same
+    trajectory, r would be as small as the sample time, and each new trajectory an outlier.
 
     Args:
         q: configurations of the training trajectories, ``(T_k, N)`` each.
         v: their velocities, ``(T_k, N)`` each.
-        angles: which coordinates are angles that may wind, as the model has them.
-        samples: S, largest number of states to keep.
-        seed: seed of their draw.
+        angles: indices of the coordinates that are angles of unlimited joints.
+        samples: S, largest number of states that are drawn.
+        seed: seed of the draw.
 
     A single trajectory is cut into ten pieces of equal length, which count as trajectories.
 
     Raises:
-        ValueError: on shapes that do not match, non-finite states, too few states, or data without
-            any spread.
+        ValueError: on states of a single trajectory, or trajectories that all hold the same states.
     """
 
     def __init__(
@@ -48,31 +48,11 @@ class DataRegion:
         q: Sequence[Tensor],
         v: Sequence[Tensor],
         *,
-        angles: Sequence[int] = (),
-        samples: int = 5000,
-        seed: int = 0,
+        angles: Sequence[NonNegativeInt] = (),
+        samples: PositiveInt = 5000,
+        seed: NonNegativeInt = 0,
     ):
-        if len(q) == 0 or len(q) != len(v):
-            raise ValueError(
-                f"q holds {len(q)} trajectories and v {len(v)}: expected as many, one at least"
-            )
         self.num_coordinates = int(q[0].shape[-1])
-        for k, (positions, velocities) in enumerate(zip(q, v, strict=True)):
-            if positions.ndim != 2 or positions.shape != velocities.shape:
-                raise ValueError(
-                    f"q[{k}] has shape {tuple(positions.shape)} and v[{k}] "
-                    f"{tuple(velocities.shape)}: expected (T, {self.num_coordinates}) for both"
-                )
-            require_last_dim(f"q[{k}]", positions, self.num_coordinates, "N")
-            require_finite(f"q[{k}]", positions)
-            require_finite(f"v[{k}]", velocities)
-        if bad := [i for i in angles if not 0 <= i < self.num_coordinates]:
-            raise ValueError(
-                f"angles has the entries {bad}, expected coordinates from 0 to "
-                f"{self.num_coordinates - 1}"
-            )
-        if samples < 2:
-            raise ValueError(f"samples is {samples}, expected at least 2")
         self.angles = sorted(angles)
         states = np.concatenate([self._features(*pair) for pair in zip(q, v, strict=True)])
         spread = states.std(axis=0)
@@ -81,18 +61,18 @@ class DataRegion:
             spread[-2 * len(self.angles) :] = np.tile(np.hypot(sine, cosine), 2)
         self._scale = np.where(spread > 1e-12, spread, 1.0)
         if len(q) == 1:
-            owner = np.arange(len(states)) * 10 // len(states)
+            trajectory = np.arange(len(states)) * 10 // len(states)
         else:
-            owner = np.repeat(np.arange(len(q)), [len(x) for x in q])
+            trajectory = np.repeat(np.arange(len(q)), [len(x) for x in q])
 
         count = min(samples, len(states))
         drawn = np.random.default_rng(seed).choice(len(states), count, replace=False)
-        states, owner = states[drawn] / self._scale, owner[drawn]
+        states, trajectory = states[drawn] / self._scale, trajectory[drawn]
         self._tree = cKDTree(states)
-        self.radius = _distance_between_trajectories(states, owner)
+        self.radius = _distance_between_trajectories(states, trajectory)
 
     def distance(self, q: Tensor, v: Tensor) -> Tensor:
-        """Distance from the data, ``(*batch,)``, 1 at their edge; NaN where a state is NaN.
+        """Return the distance from the data, ``(*batch,)``, 1 at the edge; NaN for a NaN state.
 
         Raises:
             ValueError: on a last dimension that is not N.
@@ -100,9 +80,9 @@ class DataRegion:
         require_last_dim("q", q, self.num_coordinates, "N")
         require_last_dim("v", v, self.num_coordinates, "N")
         states = self._features(q, v) / self._scale
-        known = np.asarray(np.isfinite(states).all(axis=-1))
-        nearest, _ = self._tree.query(np.where(known[..., None], states, 0.0))
-        return torch.as_tensor(np.where(known, nearest / self.radius, np.nan)).to(q)
+        finite = np.asarray(np.isfinite(states).all(axis=-1))
+        nearest, _ = self._tree.query(np.where(finite[..., None], states, 0.0))
+        return torch.as_tensor(np.where(finite, nearest / self.radius, np.nan)).to(q)
 
     def _features(self, q: Tensor, v: Tensor) -> np.ndarray:
         x = torch.cat([q, v], dim=-1).detach().cpu().double().numpy()
@@ -114,14 +94,17 @@ class DataRegion:
         )
 
 
-def _distance_between_trajectories(states: np.ndarray, owner: np.ndarray) -> float:
-    """99th percentile of the distance from each state to the nearest of another trajectory."""
-    if len(np.unique(owner)) < 2:
+def _distance_between_trajectories(states: np.ndarray, trajectory: np.ndarray) -> float:
+    """Return the 99th percentile of the distances to the nearest state of another trajectory."""
+    if len(np.unique(trajectory)) < 2:
         raise ValueError(
             f"the {len(states)} states drawn come from one trajectory, expected two at least: give "
             "more data, or a larger number of samples"
         )
-    distances = [cKDTree(states[owner != k]).query(states[owner == k])[0] for k in np.unique(owner)]
+    distances = [
+        cKDTree(states[trajectory != k]).query(states[trajectory == k])[0]
+        for k in np.unique(trajectory)
+    ]
     radius = float(np.percentile(np.concatenate(distances), 99))
     if not radius > 0:
         raise ValueError(
@@ -132,13 +115,13 @@ def _distance_between_trajectories(states: np.ndarray, owner: np.ndarray) -> flo
 
 
 class Guarded(Controller):
-    """A law with a guard: it tells when the state is outside the data, and may hand over there::
+    """A law with a guard, which warns outside the training data and may use a fallback law there::
 
         u = fallback(t, q, v, reference)  if there is one and distance(q, v) > threshold
             law(t, q, v, reference)       otherwise
 
-    There is no hysteresis: each instant is judged alone, so a state that follows the edge may
-    switch back and forth. One warning is logged per run, when a state is first found outside.
+    Each instant is judged alone, without hysteresis: a state near the edge may switch back and
+    forth. One warning is logged per run, at the first state outside.
 
     Args:
         law: the law to guard.
@@ -147,7 +130,7 @@ class Guarded(Controller):
         threshold: distance from which a state is outside; 1 is the edge of the data.
 
     Raises:
-        ValueError: on sizes that do not match, or a threshold that is not positive.
+        ValueError: on sizes that do not match.
     """
 
     def __init__(
@@ -156,23 +139,18 @@ class Guarded(Controller):
         fallback: Controller | None,
         region: DataRegion,
         *,
-        threshold: float = 2.0,
+        threshold: PositiveFloat = 2.0,
     ):
         super().__init__(law.num_coordinates, law.num_inputs)
-        if region.num_coordinates != self.num_coordinates:
-            raise ValueError(
-                f"region has {region.num_coordinates} coordinates, expected those of the law, "
-                f"{self.num_coordinates}"
-            )
+        sizes = {"region": region.num_coordinates}
         if fallback is not None:
-            found = (fallback.num_coordinates, fallback.num_inputs)
-            if found != (self.num_coordinates, self.num_inputs):
+            sizes["fallback"] = fallback.num_coordinates
+        for name, size in sizes.items():
+            if size != self.num_coordinates:
                 raise ValueError(
-                    f"fallback has N, M = {found}, expected those of the law, "
-                    f"{(self.num_coordinates, self.num_inputs)}"
+                    f"{name} has {size} coordinates, expected those of the law, "
+                    f"{self.num_coordinates}"
                 )
-        if not threshold > 0:
-            raise ValueError(f"threshold is {threshold}, expected a positive number")
         self.law = law
         self.region = region
         self.threshold = threshold
@@ -201,18 +179,18 @@ class Guarded(Controller):
         return torch.where(outside.unsqueeze(-1), self._fallback(t, q, v, reference), u)
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """Those of the law, with ``distance`` and, as 0 or 1, ``outside`` and ``fallback``."""
+        """Return those of the law, ``distance``, and ``outside`` and ``fallback`` as 0 or 1."""
         if self._distance is None:
             return {}
-        own = {
+        guard = {
             "distance": self._distance,
             "outside": (self._distance > self.threshold).to(self._distance),
             "fallback": self._handed_over(self._distance).to(self._distance),
         }
-        return self.law.diagnostics() | own
+        return self.law.diagnostics() | guard
 
     def faults(self) -> dict[str, Tensor]:
-        """Those of the law, and of the fallback where it took over."""
+        """Return the faults of the law, and of the fallback where the fallback acts."""
         if self._distance is None:
             return {}
         handed = self._handed_over(self._distance)

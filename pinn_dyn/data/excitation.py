@@ -1,12 +1,26 @@
-"""Excitation signals: what the actuators are asked to do while data are taken."""
+"""Excitation signals: random inputs that move a robot while data are taken."""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+
+def _increasing(bounds: Sequence[float]) -> Sequence[float]:
+    if bounds[0] > bounds[1]:
+        raise ValueError("expected [low, high] with low <= high")
+    return bounds
+
+
+Bounds = Annotated[
+    Sequence[PositiveFloat], Field(min_length=2, max_length=2), AfterValidator(_increasing)
+]
+"""A range [low, high] with 0 < low <= high."""
 
 Signal = Callable[[np.ndarray], np.ndarray]
 """Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
@@ -14,7 +28,7 @@ Signal = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Drawn:
-    """Signals drawn together, a function of time and of arrays with a row for each of them."""
+    """Signals drawn together: a function of time and of arrays with one row per signal."""
 
     function: Callable[..., np.ndarray]
     arrays: Sequence[np.ndarray]
@@ -23,59 +37,43 @@ class Drawn:
         return self.function(t, *self.arrays)
 
     def rows(self, index: np.ndarray) -> Signal:
-        """Some of them; the others are not computed."""
+        """Select some of the signals; the other signals are not computed."""
         return Drawn(self.function, [array[index] for array in self.arrays])
 
 
 class Joined:
-    """Signals of several draws as one: the k-th is the ``row[k]``-th of ``signals[which[k]]``.
+    """Signals of several draws as one: signal k is number ``row[k]`` of ``signals[which[k]]``.
 
     Args:
-        signals: drawn, of one number of inputs; of a :class:`Drawn` only the rows are computed.
-        which: numbers of the draws, ``(count,)``.
-        row: numbers within them, ``(count,)``.
+        signals: draws with the same number of inputs; only the rows of a :class:`Drawn` that are
+            needed are computed.
+        which: index of the draw, ``(count,)``.
+        row: index of the signal within its draw, ``(count,)``.
     """
 
     def __init__(self, signals: Sequence[Signal], which: np.ndarray, row: np.ndarray):
-        self._given = signals, which, row
+        self._signals, self._which, self._row = signals, which, row
         self._parts: list[Signal] = []
         self._pick = np.empty(len(which), dtype=int)
         count = 0
         for k in np.unique(which):
-            needed, place = np.unique(row[which == k], return_inverse=True)
+            needed, position = np.unique(row[which == k], return_inverse=True)
             self._parts.append(_rows(signals[k], needed))
-            self._pick[which == k] = count + place
+            self._pick[which == k] = count + position
             count += len(needed)
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         return np.concatenate([part(t) for part in self._parts])[self._pick]
 
     def rows(self, index: np.ndarray) -> Signal:
-        """Some of them; the others are not computed."""
-        signals, which, row = self._given
-        return Joined(signals, which[index], row[index])
+        """Select some of the signals; the other signals are not computed."""
+        return Joined(self._signals, self._which[index], self._row[index])
 
 
 def _rows(signal: Signal, index: np.ndarray) -> Signal:
     if isinstance(signal, (Drawn, Joined)):
         return signal.rows(index)
     return lambda t: signal(t)[index]
-
-
-def _check_positive(owner: object, **values: float) -> None:
-    for name, value in values.items():
-        if not value > 0:
-            raise ValueError(
-                f"{type(owner).__name__}: {name} is {value}, expected a positive number"
-            )
-
-
-def _check_range(owner: object, name: str, bounds: Sequence[float]) -> None:
-    if len(bounds) != 2 or not 0 < bounds[0] <= bounds[1]:
-        raise ValueError(
-            f"{type(owner).__name__}: {name} is {list(bounds)}, expected [low, high] with "
-            "0 < low <= high"
-        )
 
 
 class Excitation(abc.ABC):
@@ -92,25 +90,14 @@ class Excitation(abc.ABC):
 
 @dataclass(frozen=True)
 class _Bounded(Excitation):
-    offset: Sequence[float]
-    amplitude: Sequence[float]
+    offset: Annotated[Sequence[float], Field(min_length=1)]
+    amplitude: Annotated[Sequence[NonNegativeFloat], Field(min_length=1)]
 
     def __post_init__(self) -> None:
         if len(self.offset) != len(self.amplitude):
             raise ValueError(
                 f"{type(self).__name__}: offset has {len(self.offset)} entries and amplitude "
                 f"{len(self.amplitude)}, expected one of each per input"
-            )
-        for name, values in (("offset", self.offset), ("amplitude", self.amplitude)):
-            if len(values) == 0 or not np.isfinite(values).all():
-                raise ValueError(
-                    f"{type(self).__name__}: {name} is {list(values)}, expected a finite number "
-                    "for each input"
-                )
-        if min(self.amplitude) < 0:
-            raise ValueError(
-                f"{type(self).__name__}: amplitude is {list(self.amplitude)}, expected no "
-                "negative entry"
             )
 
     def _scaled(self, shape: np.ndarray, peak: np.ndarray) -> np.ndarray:
@@ -133,13 +120,8 @@ class MultiSine(_Bounded):
         harmonics: number of sines; 1 gives a plain sine.
     """
 
-    frequency: Sequence[float] = (0.1, 1.0)
-    harmonics: int = 4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_range(self, "frequency", self.frequency)
-        _check_positive(self, harmonics=self.harmonics)
+    frequency: Bounds = (0.1, 1.0)
+    harmonics: PositiveInt = 4
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
         """Draw ``count`` multi-sines; they do not depend on the duration."""
@@ -174,11 +156,7 @@ class Chirp(_Bounded):
         frequency: [f_0, f_1] in Hz, swept over the duration T; half of the inputs sweep down.
     """
 
-    frequency: Sequence[float] = (0.1, 2.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_range(self, "frequency", self.frequency)
+    frequency: Bounds = (0.1, 2.0)
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
         """Draw ``count`` chirps that sweep the whole band within ``duration`` s."""
@@ -214,13 +192,11 @@ class Steps(_Bounded):
         rise_time: length of a ramp in s, at most ``hold[0]``; a jump would fall between samples.
     """
 
-    hold: Sequence[float] = (0.5, 2.0)
-    rise_time: float = 0.1
+    hold: Bounds = (0.5, 2.0)
+    rise_time: PositiveFloat = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_range(self, "hold", self.hold)
-        _check_positive(self, rise_time=self.rise_time)
         if self.rise_time > self.hold[0]:
             raise ValueError(
                 f"Steps: rise_time is {self.rise_time} s, expected at most the shortest hold, "
@@ -251,13 +227,9 @@ class Steps(_Bounded):
 
 @dataclass(frozen=True)
 class Mixture(Excitation):
-    """Signals of several kinds in turn: the k-th is drawn from ``parts[k % len(parts)]``."""
+    """Signals of several kinds in turn: signal k is drawn from ``parts[k % len(parts)]``."""
 
-    parts: Sequence[Excitation]
-
-    def __post_init__(self) -> None:
-        if not self.parts:
-            raise ValueError("Mixture: parts is empty, expected at least one excitation")
+    parts: Annotated[Sequence[Excitation], Field(min_length=1)]
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
         """Draw ``count`` signals, shared out among the parts in turn."""
@@ -266,5 +238,5 @@ class Mixture(Excitation):
         signals = [
             part.draw(size, duration, rng) for part, size in zip(self.parts, sizes, strict=True)
         ]
-        every = np.arange(count)
-        return Joined(signals, every % kinds, every // kinds)
+        index = np.arange(count)
+        return Joined(signals, index % kinds, index // kinds)

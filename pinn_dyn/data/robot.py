@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 from tqdm import tqdm
 
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.robot_excitation import Robot, RobotExcitation
-from pinn_dyn.data.simulation import SimulationError, check_amount
+from pinn_dyn.data.simulation import SimulationError
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.workers import end_with_parent
@@ -60,8 +62,8 @@ class RobotSource(DataSource):
 
     Raises:
         TypeError: if the system is no robot.
-        ValueError: on a step longer than the duration, a count below 1, no excitation, a joint
-            without limits, or a configuration outside them.
+        ValueError: on a step longer than the duration, a joint without limits, or a configuration
+            outside them.
     """
 
     def __init__(
@@ -69,14 +71,14 @@ class RobotSource(DataSource):
         *,
         name: str,
         system: Robot,
-        excitations: Sequence[RobotExcitation],
-        duration: float,
-        step: float,
-        train: int,
-        validation: int,
-        test: int,
-        seed: int = 0,
-        workers: int | None = None,
+        excitations: Annotated[Sequence[RobotExcitation], Field(min_length=1)],
+        duration: PositiveFloat,
+        step: PositiveFloat,
+        train: PositiveInt,
+        validation: PositiveInt,
+        test: PositiveInt,
+        seed: NonNegativeInt = 0,
+        workers: PositiveInt | None = None,
         cache: str,
         configurations: Mapping[str, Sequence[float]] | None = None,
     ):
@@ -84,17 +86,8 @@ class RobotSource(DataSource):
             raise TypeError(
                 f"{name}: system is a {type(system).__name__}, expected a robot such as BulletArm"
             )
-        if not 0 < step <= duration:
-            raise ValueError(
-                f"{name}: step is {step} s and duration {duration} s, expected 0 < step <= duration"
-            )
-        counts = {"train": train, "validation": validation, "test": test}
-        limits = {} if workers is None else {"workers": workers}
-        for key, value in {**counts, **limits}.items():
-            if value < 1:
-                raise ValueError(f"{name}: {key} is {value}, expected at least 1")
-        if not excitations:
-            raise ValueError(f"{name}: excitations is empty, expected at least one")
+        if step > duration:
+            raise ValueError(f"{name}: step is {step} s, expected at most duration, {duration} s")
         for joint, speed, torque in zip(
             system.joint_names, system.v_max, system.u_max, strict=True
         ):
@@ -116,14 +109,13 @@ class RobotSource(DataSource):
             if fault is not None:
                 raise ValueError(f"{name}: configurations.{key}: {fault}")
         size = system.num_coordinates
-        check_amount(name, sum(counts.values()), duration, step, 3 * size)
         self.name = name
         self.robot: Robot = system
         self.system: MechanicalSystem = system
         self.excitations = list(excitations)
         self.duration = duration
         self.step = step
-        self.counts = counts
+        self.counts = {"train": train, "validation": validation, "test": test}
         self.seed = seed
         self.workers = workers or os.cpu_count() or 1
         self.cache = Path(cache).expanduser()
@@ -214,13 +206,13 @@ def _record(
     rng = np.random.default_rng([seed, *task])
     for _ in range(_DRAWS):
         plan = excitation.draw(robot, t, rng)
-
-        def clipped(k: int, q: np.ndarray, v: np.ndarray, law=plan.torque) -> np.ndarray:
-            return np.clip(law(k, q, v), -robot.u_max, robot.u_max)
-
-        q, v, u = robot.simulate(
-            plan.q0, plan.v0, clipped, steps=len(t) - 1, step=float(t[1] - t[0])
-        )
+        q, v, u = (np.empty((len(t), len(plan.q0))) for _ in range(3))
+        q[0], v[0] = plan.q0, plan.v0
+        robot.set_state(q[0], v[0])
+        for k in range(len(t)):
+            u[k] = np.clip(plan.torque(k, q[k], v[k]), -robot.u_max, robot.u_max)
+            if k + 1 < len(t):
+                q[k + 1], v[k + 1] = robot.step(u[k], float(t[1] - t[0]))
         fault = _first_outside(robot, q, v)
         if fault is None:
             return q, v, u

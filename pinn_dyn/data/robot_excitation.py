@@ -5,37 +5,29 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from pydantic import Field, PositiveFloat, PositiveInt
 
-from pinn_dyn.data.excitation import MultiSine
-from pinn_dyn.systems import HasLimits
+from pinn_dyn.data.excitation import Bounds, MultiSine
+from pinn_dyn.systems import HasLimits, Stepped
 
 # Fine enough for references of a few Hz.
 _CHECK_STEP = 0.02
 
+Fraction = Annotated[float, Field(gt=0, le=1)]
+
 
 @runtime_checkable
-class Robot(HasLimits, Protocol):
-    """What a recording needs of a robot, beyond being a mechanical system with A = I."""
+class Robot(HasLimits, Stepped, Protocol):
+    """A robot that a recording can move, beyond being a mechanical system with A = I."""
 
     def describe(self) -> dict[str, object]:
-        """Everything the motion depends on, JSON-serializable."""
+        """Return everything the motion depends on, JSON-serializable."""
 
     def dynamics(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """M ``(N, N)`` and C v + G + D v ``(N,)`` at one state."""
-
-    def simulate(
-        self,
-        q0: np.ndarray,
-        v0: np.ndarray,
-        torque: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
-        *,
-        steps: int,
-        step: float,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """q, v and u, ``(steps + 1, N)`` each, under u_k = torque(k, q_k, v_k)."""
+        """Return M ``(N, N)`` and C v + G + D v ``(N,)`` at one state."""
 
 
 class Plan(NamedTuple):
@@ -53,12 +45,6 @@ class RobotExcitation(abc.ABC):
     @abc.abstractmethod
     def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
         """Draw one motion for the sample times ``t`` ``(T,)``, s."""
-
-
-def _require(owner: object, name: str, value: float, high: float = np.inf) -> None:
-    if not 0 < value <= high:
-        bound = "a positive number" if high == np.inf else f"more than 0 and at most {high:g}"
-        raise ValueError(f"{type(owner).__name__}: {name} is {value}, expected {bound}")
 
 
 @dataclass(frozen=True)
@@ -87,28 +73,16 @@ class TrackedMultiSine(RobotExcitation):
         bandwidth: of the controller, rad/s.
 
     Raises:
-        ValueError: on settings out of range; from :meth:`draw` if holding the arm up takes more
-            than the torque allowed.
+        ValueError: from :meth:`draw` if holding the arm up takes more than the torque allowed.
     """
 
-    frequency: Sequence[float]
-    harmonics: int
-    reach: float
-    amplitude: Sequence[float]
-    speed: float
-    torque: float
-    bandwidth: float
-
-    def __post_init__(self) -> None:
-        MultiSine(offset=[0.0], amplitude=[1.0], frequency=self.frequency, harmonics=self.harmonics)
-        for name in ("reach", "speed", "torque"):
-            _require(self, name, getattr(self, name), 1.0)
-        if len(self.amplitude) != 2 or not 0 < self.amplitude[0] <= self.amplitude[1] <= 1:
-            raise ValueError(
-                f"TrackedMultiSine: amplitude is {list(self.amplitude)}, expected [low, high] with "
-                "0 < low <= high <= 1"
-            )
-        _require(self, "bandwidth", self.bandwidth)
+    frequency: Bounds
+    harmonics: PositiveInt
+    reach: Fraction
+    amplitude: Annotated[Sequence[Fraction], Field(min_length=2, max_length=2)]
+    speed: Fraction
+    torque: Fraction
+    bandwidth: PositiveFloat
 
     def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
         """Draw a reference and its tracking law."""
@@ -180,20 +154,12 @@ class TorqueMultiSine(RobotExcitation):
         harmonics: number of sines.
         amplitude: peak of the multi-sines, as a fraction of the torque limits.
         reach: static displacement, as a fraction of the way to the nearer limit.
-
-    Raises:
-        ValueError: on settings out of range.
     """
 
-    frequency: Sequence[float]
-    harmonics: int
-    amplitude: float
-    reach: float
-
-    def __post_init__(self) -> None:
-        MultiSine(offset=[0.0], amplitude=[1.0], frequency=self.frequency, harmonics=self.harmonics)
-        for name in ("amplitude", "reach"):
-            _require(self, name, getattr(self, name), 1.0)
+    frequency: Bounds
+    harmonics: PositiveInt
+    amplitude: Fraction
+    reach: Fraction
 
     def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
         """Draw a torque signal and a centre."""

@@ -3,6 +3,7 @@
 from pinn_dyn.systems.bullet_arm import BulletArm
 from pinn_dyn.systems.protocols import Drawable, HasDomain, HasLimits, HasTip, Rendered, Stepped
 from pinn_dyn.systems.rigid_chain import RigidChain
+from pinn_dyn.systems.simulated_arm import SimulatedArm
 from pinn_dyn.systems.soft_arm import SoftArm
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "HasTip",
     "Rendered",
     "RigidChain",
+    "SimulatedArm",
     "SoftArm",
     "Stepped",
 ]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pinn_dyn.systems.bullet_world import connect
+from pinn_dyn.systems.bullet_client import connect
 
 
 def photograph(

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, rod
-from pinn_dyn.systems.rigid_chain_urdf import read_tree
+from pinn_dyn.systems.urdf import read_urdf
 
 
 class Kinematics(NamedTuple):
@@ -48,10 +49,6 @@ class RigidChain(MechanicalSystem):
     (:meth:`regressor`). Every function takes another ``inertia`` than the URDF's: that is what a
     model learns.
 
-    adam-robotics 0.5 (BSD-3) has M and the bias force in torch too. It loops over the links, which
-    takes ten times as long for 256 states of a 7-joint arm and thirty times for one, and has no
-    regressor (``studies/2026-11-24-known-mechanics.md``); so it is not used here.
-
     Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; the 4 x 4 matrices are
     those of Legnani et al. 1996, "A homogeneous matrix approach to 3D kinematics and dynamics".
 
@@ -61,18 +58,20 @@ class RigidChain(MechanicalSystem):
         locked_joints: names of joints that are held at zero.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
         gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
-        tip: link that carries the payload; None for the last one without a joint behind it.
-        payload: point mass at the origin of the tip's frame, kg.
+        tip: link at the end of the arm, which carries the payload; None for the last one of the
+            file without a joint behind it.
+        mass_scale: factor of all masses and inertias.
+        payload: point mass at the origin of the tip's frame, kg, which is not scaled.
 
     Attributes:
-        joint_names, body_names: N names each; a body is a link with all that is fixed to it.
-        turning: of each joint whether it turns, else it slides.
-        inertia: pseudo-inertias, ``(N, 4, 4)``, in the frames of the joints; the URDF's.
+        joint_names, body_names: N names each; a body is a link with everything fixed to it.
+        turning: true for a joint that turns, false for one that slides.
+        inertia: pseudo-inertias of the URDF, ``(N, 4, 4)``, in the frames of the joints.
 
     Raises:
         FileNotFoundError: if there is no such URDF.
-        ValueError: on a URDF that is no such robot (:func:`read_tree`), or a damping, gravity or
-            payload that is none.
+        ValueError: on a URDF that is no such robot (:func:`~pinn_dyn.systems.urdf.read_urdf`), or
+            a damping of another length.
     """
 
     inertia: Tensor
@@ -84,29 +83,32 @@ class RigidChain(MechanicalSystem):
     _damping: Tensor
     _screws: Tensor
     _basis: Tensor
+    _tip_pose: Tensor
 
     def __init__(
         self,
         urdf: str,
         *,
         locked_joints: Sequence[str] = (),
-        damping: float | Sequence[float] = 0.0,
-        gravity: Sequence[float] = (0.0, 0.0, -9.81),
+        damping: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.0,
+        gravity: Annotated[Sequence[float], Field(min_length=3, max_length=3)] = (0.0, 0.0, -9.81),
         tip: str | None = None,
-        payload: float = 0.0,
+        mass_scale: PositiveFloat = 1.0,
+        payload: NonNegativeFloat = 0.0,
     ):
-        tree = read_tree(urdf, locked_joints=locked_joints, tip=tip, payload=payload)
+        tree = read_urdf(
+            urdf, locked_joints=locked_joints, tip=tip, mass_scale=mass_scale, payload=payload
+        )
         size = len(tree.joints)
         super().__init__(num_coordinates=size, num_inputs=size)
         double = torch.float64
         acceleration = torch.tensor(list(gravity), dtype=double)
         resistance = torch.as_tensor(damping, dtype=double)
-        if acceleration.shape != (3,) or not acceleration.isfinite().all():
-            raise ValueError(f"gravity is {list(gravity)}, expected 3 finite numbers in m/s^2")
-        if resistance.shape not in ((), (size,)) or not (resistance >= 0).all():
-            raise ValueError(f"damping is {damping}, expected one number or {size}, at least 0")
-        if not 0 <= payload < float("inf"):
-            raise ValueError(f"payload is {payload}, expected a finite number of at least 0 in kg")
+        if resistance.shape not in ((), (size,)):
+            raise ValueError(
+                f"damping has {resistance.numel()} entries, expected one number or {size}, one for "
+                f"each of the joints {', '.join(tree.joints)}"
+            )
         self.joint_names, self.body_names = tree.joints, tree.bodies
         self.turning = tree.turning
         self.parents = tuple(tree.parents)
@@ -134,6 +136,8 @@ class RigidChain(MechanicalSystem):
         self.register_buffer("_damping", resistance.expand(size).clone())
         self.register_buffer("_screws", _screw_basis(), persistent=False)
         self.register_buffer("_basis", pseudo_inertia_basis(), persistent=False)
+        self._tip_body = tree.tip_body
+        self.register_buffer("_tip_pose", tree.tip_pose, persistent=False)
         smallest = float(torch.linalg.eigvalsh(self.mass_matrix(torch.zeros(size).double()))[0])
         if not smallest > 0:
             raise ValueError(
@@ -261,6 +265,14 @@ class RigidChain(MechanicalSystem):
             end = usual * axis if end is None or end.norm() < usual / 2 else end
             bodies.append(rod(torch.zeros_like(end), end, radius=usual / 6, density=density))
         return torch.stack(bodies)
+
+    def tip_position(self, q: Tensor) -> Tensor:
+        """Return the origin of the tip's frame in the frame of the base, ``(*batch, 3)``, m."""
+        self._check(q=q)
+        origin = self._tip_pose[:, 3]
+        if self._tip_body < 0:
+            return origin[:3].expand(*q.shape[:-1], 3)
+        return self.kinematics(q).poses[..., self._tip_body, :3, :] @ origin
 
     # The contract of a mechanical system.
 

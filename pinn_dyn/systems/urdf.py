@@ -1,244 +1,295 @@
-"""Reads a URDF and prepares it for Bullet: locked joints, no limits, no hidden friction."""
+"""Read the kinematic tree, the inertias and the limits of a robot with a fixed base from a URDF."""
 
 from __future__ import annotations
 
-import hashlib
+import importlib.util
 import math
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from pinn_dyn.spelling import did_you_mean
-from pinn_dyn.systems.urdf_checks import MOMENTS, TURNING, link_of, number, parse_urdf, tip_of
+from pinn_dyn.systems.inertia import pseudo_inertia
 
-Inertia = Literal["file", "collision"]
-"""Whether inertias are those of the URDF, or those that Bullet computes from collision shapes."""
-
-POINT_MASS = "pinn_dyn_point_mass"
-"""Name of the link that is added for a payload."""
+_TURNING = ("revolute", "continuous")
+_TOLERANCE = 1e-6  # of the largest principal moment of inertia
 
 
-class JointLimits(NamedTuple):
-    """Limits of a revolute joint: rad, rad, rad/s, Nm; 0 where the URDF gives none."""
-
-    low: float
-    high: float
-    speed: float
-    effort: float
-
-
-class Urdf(NamedTuple):
-    """A URDF that Bullet may load.
+class Tree(NamedTuple):
+    """N moving joints, each with one rigid body: a link and everything fixed to it.
 
     Attributes:
-        path: the file it was read from.
-        text: the URDF for Bullet, mesh paths absolute.
-        digest: SHA-256 of the file and of the meshes that its inertias come from.
-        limits: by the name of each joint that moves.
-        moments: by the name of each link, the sum of its principal moments of inertia, kg m^2.
-        tip: the name of the link at the end of the arm.
+        path: the file.
+        joints, bodies: names of the joints and of the links behind them.
+        parents: index of the joint before each joint, -1 at the base; parents come first.
+        placements: pose of each joint's frame at q = 0 in its parent's frame, ``(N, 4, 4)``.
+        axes: unit axis of each joint in its own frame, ``(N, 3)``.
+        turning: true for a joint that turns, false for one that slides.
+        inertia: pseudo-inertia of each body in its joint's frame, ``(N, 4, 4)``; kg, kg m, kg m^2.
+        limits: lower and upper position, speed and effort of each joint, ``(N, 4)``; zero where
+            the URDF has none, a position of -pi to pi for a continuous joint.
+        tip_body: index of the body that carries the tip, -1 for the base.
+        tip_pose: pose of the tip in that body's frame, ``(4, 4)``.
     """
 
     path: Path
-    text: str
-    digest: str
-    limits: dict[str, JointLimits]
-    moments: dict[str, float]
-    tip: str
+    joints: list[str]
+    bodies: list[str]
+    parents: list[int]
+    placements: Tensor
+    axes: Tensor
+    turning: list[bool]
+    inertia: Tensor
+    limits: np.ndarray
+    tip_body: int
+    tip_pose: Tensor
 
 
 def read_urdf(
-    path: Path,
-    locked_joints: Sequence[str],
-    inertia: Inertia,
+    urdf: str,
     *,
+    locked_joints: Sequence[str] = (),
     tip: str | None = None,
     mass_scale: float = 1.0,
     payload: float = 0.0,
-) -> Urdf:
-    """Read a URDF and change what would make Bullet's motion differ from M, G and C.
+) -> Tree:
+    """Read a URDF: a file, one that ships with PyBullet, or the text itself.
 
-    Locked joints become fixed at zero, so their links' masses stay; all others become continuous,
-    as Bullet's joint limits are walls. Visual shapes go, and collision shapes stay only where
-    inertias come from them. All masses and inertias are multiplied by ``mass_scale``; a point mass
-    ``payload`` in kg is then fixed to the origin of the link ``tip``, which is by default the last
-    of the file's joints that has no other joint behind it.
+    Args:
+        urdf: path or text.
+        locked_joints: names of joints that stay at zero.
+        tip: link at the end of the arm; None for the last of the file without a joint behind it.
+        mass_scale: factor of all masses and inertias.
+        payload: point mass at the origin of the tip, kg, which is not scaled.
 
     Raises:
-        ValueError: on text that is no URDF of a body (see :func:`~.urdf_checks.parse_urdf`), an
-            unknown locked joint or tip, a joint that moves and is not revolute, no revolute joint,
-            or a moving link without mass, inertia or shape.
-        FileNotFoundError: if a mesh that is needed is missing.
+        FileNotFoundError: if there is no such file.
+        ValueError: on text that is no URDF of a tree of links, an unknown locked joint or tip, a
+            joint that is neither revolute, continuous, prismatic nor fixed, a mimic joint, no
+            joint that moves, or a mass or inertia that no body has.
     """
-    content = path.read_bytes()
-    robot = parse_urdf(path, content, inertias=inertia == "file")
-    joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
+    file = _UrdfFile(*_open(urdf))
     for name in locked_joints:
-        if name not in joints:
+        if name not in file.joints:
             raise ValueError(
-                f"{path} has no joint {name!r} to lock: its joints are {', '.join(joints)}"
+                f"{file.path} has no joint {name!r} to lock: its joints are {list(file.joints)}"
             )
-    moving = {
-        name: joint
-        for name, joint in joints.items()
-        if joint.get("type") != "fixed" and name not in locked_joints
-    }
-    for name, joint in moving.items():
-        if joint.get("type") not in TURNING:
-            raise ValueError(
-                f"{path}: joint {name!r} is of type {joint.get('type')!r}, but an arm has a fixed "
-                "base and revolute joints: add it to locked_joints, or use another URDF"
-            )
-    if not moving:
+    tip = file.tip(tip)
+    joints: list[str] = []
+    parents: list[int] = []
+    placements: list[np.ndarray] = []
+    inertia: list[np.ndarray] = []
+    visited: dict[str, tuple[int, np.ndarray]] = {}
+
+    def visit(link: str, body: int, pose: np.ndarray) -> None:
+        """Add a link, at ``pose`` in the frame of the joint ``body``, and all links behind it."""
+        visited[link] = body, pose
+        if body >= 0:
+            inertia[body] += mass_scale * pose @ file.pseudo_inertia(link) @ pose.T
+            if link == tip:
+                inertia[body] += payload * np.outer(pose[:, 3], pose[:, 3])
+        for name, joint in file.joints.items():
+            if _end(joint, "parent") != link:
+                continue
+            placement = pose @ file.pose(joint)
+            if joint.get("type") == "fixed" or name in locked_joints:
+                visit(_end(joint, "child"), body, placement)
+                continue
+            joints.append(name)
+            parents.append(body)
+            placements.append(placement)
+            inertia.append(np.zeros((4, 4)))
+            visit(_end(joint, "child"), len(joints) - 1, np.eye(4))
+
+    visit(file.root, -1, np.eye(4))
+    if unreached := file.links.keys() - visited.keys():
         raise ValueError(
-            f"{path} has no revolute joint that is free (locked: {list(locked_joints)}), expected "
-            "at least one"
+            f"{file.path}: the links {', '.join(sorted(unreached))} are parents of each other in "
+            "a circle, expected a tree that starts at one root"
         )
-    limits = {name: _limits(path, name, joint) for name, joint in moving.items()}
-    _check_masses(path, robot, set(moving), inertia)
-    tip = tip_of(path, robot, tip)
-    if mass_scale != 1:
-        _scale_masses(path, robot, mass_scale)
-    digest = hashlib.sha256(content)
-    unused = ("visual", "collision") if inertia == "file" else ("visual",)
-    for name, joint in joints.items():
-        joint.set("type", "continuous" if name in moving else "fixed")
-        _make_unit(joint.find("axis"))
-    for link in robot.findall("link"):
-        for shape in [part for part in link if part.tag in unused]:
-            link.remove(shape)
-        for mesh in link.iter("mesh"):
-            file = _find_mesh(path, mesh.get("filename", ""))
-            digest.update(file.read_bytes())
-            mesh.set("filename", str(file))
-    if payload:
-        _add_point_mass(robot, tip, payload)
-    moments = {link.get("name", ""): _moments(path, link) for link in robot.findall("link")}
-    text = ET.tostring(robot, encoding="unicode")
-    return Urdf(path, text, digest.hexdigest(), limits, moments, tip)
-
-
-def find_urdf(urdf: str, folder: Path) -> Path:
-    """The file ``urdf``, or the one of that name in ``folder``, the robots that ship with Bullet.
-
-    Raises:
-        FileNotFoundError: saying where it was looked for, and which names are close.
-    """
-    given = Path(urdf).expanduser()
-    for path in (given, folder / given):
-        if path.is_file():
-            return path.resolve()
-    near = [str(path) for path in given.parent.glob("*.urdf")]
-    near += [str(path.relative_to(folder)) for path in folder.rglob("*.urdf")]
-    hint = did_you_mean(urdf, near) or ": give the path of a URDF"
-    raise FileNotFoundError(
-        f"URDF {urdf!r} not found, neither from {Path.cwd()} nor in {folder}{hint}"
+    if not joints:
+        raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked_joints)})")
+    return Tree(
+        path=file.path,
+        joints=joints,
+        bodies=[_end(file.joints[name], "child") for name in joints],
+        parents=parents,
+        placements=torch.from_numpy(np.stack(placements)),
+        axes=torch.from_numpy(np.stack([file.axis(name) for name in joints])),
+        turning=[file.joints[name].get("type") in _TURNING for name in joints],
+        inertia=torch.from_numpy(np.stack(inertia)),
+        limits=np.array([file.limits(name) for name in joints]),
+        tip_body=visited[tip][0],
+        tip_pose=torch.from_numpy(visited[tip][1]),
     )
 
 
-def _limits(path: Path, name: str, joint: ET.Element) -> JointLimits:
-    """A continuous joint may turn without end; what is then explored is one turn."""
-    limit = joint.find("limit")
-    values = {} if limit is None else {key: number(path, name, limit, key) for key in limit.attrib}
-    low, high = values.get("lower", 0.0), values.get("upper", 0.0)
-    if joint.get("type") == "continuous":
-        low, high = -math.pi, math.pi
-    elif not low < high:
-        raise ValueError(
-            f"{path}: joint {name!r} has limits lower = {low} and upper = {high}, expected lower < "
-            "upper: set them, lock the joint, or make it continuous"
-        )
-    return JointLimits(low, high, values.get("velocity", 0.0), values.get("effort", 0.0))
+class _UrdfFile:
+    """The links and joints of a URDF by name, and their numbers."""
 
-
-def _check_masses(path: Path, robot: ET.Element, moving: set[str], inertia: Inertia) -> None:
-    """Every body that moves, a link with all that is fixed to it, needs a mass and an inertia."""
-    links = {link.get("name", ""): link for link in robot.findall("link")}
-    starts: dict[str, str] = {}
-    rigid: dict[str, list[str]] = {}
-    for joint in robot.findall("joint"):
-        name, child = joint.get("name", ""), link_of(joint, "child")
-        if name in moving:
-            starts[name] = child
-        else:
-            rigid.setdefault(link_of(joint, "parent"), []).append(child)
-    for joint_name, start in starts.items():
-        body, mass = [start], 0.0
-        for name in body:
-            body += rigid.get(name, [])
-            mass += (own := _mass(path, links[name]))
-            shape = "inertial/inertia" if inertia == "file" else "collision"
-            if own > 0 and links[name].find(shape) is None:
+    def __init__(self, path: Path, content: bytes):
+        self.path = path
+        try:
+            robot = ET.fromstring(content)
+        except (ET.ParseError, LookupError, ValueError) as error:  # also unknown encodings
+            raise ValueError(f"{path} is not valid XML for a URDF: {error}") from error
+        if robot.tag != "robot" or robot.find("joint") is None:
+            raise ValueError(f"{path} is <{robot.tag}>, expected the <robot> of a URDF with joints")
+        self.links = self._by_name(robot, "link")
+        self.joints = self._by_name(robot, "joint")
+        children = Counter(_end(joint, "child") for joint in self.joints.values())
+        for name, joint in self.joints.items():
+            for end in ("parent", "child"):
+                if (link := _end(joint, end)) not in self.links:
+                    raise ValueError(
+                        f"{path}: joint {name!r} has the {end} {link!r}, which is no link: "
+                        f"expected one of {', '.join(self.links)}"
+                    )
+            if children[link] > 1:
                 raise ValueError(
-                    f"{path}: link {name!r} moves and has no <{shape.split('/')[-1]}>, which "
-                    f"inertia = {inertia!r} needs: add it, or use the other inertia"
+                    f"{path}: link {link!r} is the child of {children[link]} joints, expected one: "
+                    "a closed loop is not a URDF"
                 )
-        if mass == 0:
+        roots = [name for name in self.links if name not in children]
+        if len(roots) != 1:
             raise ValueError(
-                f"{path}: link {start!r} moves with joint {joint_name!r} and has no mass: expected "
-                "<inertial> with a positive mass, in it or in a link fixed to it"
+                f"{path} has {len(roots)} links that no joint moves ({', '.join(roots[:5])}), "
+                "expected one root, the base: join the others to it, or remove them"
             )
-    for link in links.values():
-        # Bullet takes 1 kg for a link without <inertial>, and refuses half of one; a mere frame
-        # weighs nothing.
-        inertial = link.find("inertial")
+        self.root = roots[0]
+
+    def tip(self, tip: str | None) -> str:
+        """Return the link at the end of the robot."""
+        children = [_end(joint, "child") for joint in self.joints.values()]
+        if tip is None:
+            parents = {_end(joint, "parent") for joint in self.joints.values()}
+            return [name for name in children if name not in parents][-1]
+        if tip not in children:
+            raise ValueError(
+                f"{self.path}: tip is {tip!r}, expected a link behind a joint: "
+                f"{', '.join(children)}"
+            )
+        return tip
+
+    def axis(self, name: str) -> np.ndarray:
+        """Return the unit axis of a joint that moves."""
+        joint = self.joints[name]
+        mimic, kind = joint.find("mimic") is not None, joint.get("type")
+        if mimic or kind not in (*_TURNING, "prismatic"):
+            raise ValueError(
+                f"{self.path}: joint {name!r} is {'a mimic joint' if mimic else repr(kind)}, "
+                "expected revolute, continuous, prismatic or fixed: add it to locked_joints"
+            )
+        axis = self._numbers(joint, "axis", "xyz", 3, "1 0 0")
+        length = np.linalg.norm(axis)
+        if length < _TOLERANCE:
+            raise ValueError(
+                f"{self.path}: joint {name!r} has the axis {axis.tolist()} of length 0, expected a "
+                "direction such as '0 0 1'"
+            )
+        return axis / length
+
+    def limits(self, name: str) -> list[float]:
+        """Return lower and upper position, speed and effort of a joint; zero where there is none.
+
+        A continuous joint turns without end; -pi to pi is the range that is explored.
+        """
+        joint = self.joints[name]
+        keys = ("lower", "upper", "velocity", "effort")
+        low, high, *limits = (self._numbers(joint, "limit", key, 1, "0")[0] for key in keys)
+        if joint.get("type") == "continuous":
+            low, high = -math.pi, math.pi
+        return [low, high, *limits]
+
+    def pose(self, owner: ET.Element) -> np.ndarray:
+        """Return the ``<origin>`` of a joint or an ``<inertial>``, ``(4, 4)``."""
+        pose = np.eye(4)
+        rpy = self._numbers(owner, "origin", "rpy", 3, "0 0 0")
+        pose[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
+        pose[:3, 3] = self._numbers(owner, "origin", "xyz", 3, "0 0 0")
+        return pose
+
+    def pseudo_inertia(self, link: str) -> np.ndarray:
+        """Return J of a link in its own frame, ``(4, 4)``; zero for a mere frame."""
+        inertial = self.links[link].find("inertial")
         if inertial is None:
-            inertial = ET.SubElement(link, "inertial")
-        if inertial.find("mass") is None:
-            ET.SubElement(inertial, "mass", value="0")
-        if inertial.find("inertia") is None:
-            ET.SubElement(inertial, "inertia", dict.fromkeys(MOMENTS, "0"))
+            return np.zeros((4, 4))
+        missing = None if inertial.find("mass") is not None else "0"
+        mass = self._numbers(inertial, "mass", "value", 1, missing)[0]
+        missing = None if inertial.find("inertia") is not None else "0"
+        keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
+        values = [self._numbers(inertial, "inertia", key, 1, missing)[0] for key in keys]
+        xx, xy, yy, xz, yz, zz = values
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        slack = _TOLERANCE * np.abs(moments).max()
+        if mass < 0 or moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
+            raise ValueError(
+                f"{self.path}: link {link!r} has mass {mass:g} kg and the principal moments of "
+                f"inertia {', '.join(f'{x:.3g}' for x in moments)} kg m^2, expected none negative "
+                "and no moment larger than the sum of the other two"
+            )
+        pose = self.pose(inertial)
+        parameters = torch.tensor([mass, 0.0, 0.0, 0.0, *values], dtype=torch.float64)
+        return pose @ pseudo_inertia(parameters).numpy() @ pose.T
+
+    def _by_name(self, robot: ET.Element, kind: str) -> dict[str, ET.Element]:
+        elements = robot.findall(kind)
+        names = Counter(element.get("name", "") for element in elements)
+        for name, count in names.items():
+            if count > 1 or not name:
+                raise ValueError(
+                    f"{self.path} has {count} {kind}s named {name!r}, expected a name for each "
+                    f"{kind}, and each name once"
+                )
+        return dict(zip(names, elements, strict=True))
+
+    def _numbers(
+        self, owner: ET.Element, tag: str, key: str, count: int, default: str | None
+    ) -> np.ndarray:
+        """Return the numbers of an attribute, ``(count,)``, or the default."""
+        element = owner.find(tag)
+        text = default if element is None else element.get(key, default)
+        try:
+            values = np.array([float(number) for number in (text or "").split()])
+        except ValueError:
+            values = np.empty(0)
+        if len(values) != count or not np.isfinite(values).all():
+            name = owner.get("name") or next(
+                name for name, link in self.links.items() if owner in link
+            )
+            raise ValueError(
+                f"{self.path}: {name!r} has <{tag} {key}={(text or '')[:80]!r}>, expected {count} "
+                f"finite number{'s' if count > 1 else ''}"
+            )
+        return values
 
 
-def _make_unit(axis: ET.Element | None) -> None:
-    """Bullet turns by the direction of an axis, and multiplies speeds by its length."""
-    if axis is not None and axis.get("xyz") is not None:
-        values = np.array(axis.get("xyz", "").split(), dtype=float)
-        length = np.linalg.norm(values)
-        if length > 0 and abs(length - 1) > 1e-12:  # a fixed joint may state 0 0 0
-            axis.set("xyz", " ".join(repr(float(x)) for x in values / length))
+def _end(joint: ET.Element, end: str) -> str:
+    """Return the ``parent`` or ``child`` of a joint, empty if it has none."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
 
 
-def _scale_masses(path: Path, robot: ET.Element, factor: float) -> None:
-    for link in robot.findall("link"):
-        for tag in ("mass", "inertia"):
-            for element in link.findall(f"inertial/{tag}"):
-                for key in element.attrib:
-                    value = number(path, link.get("name", ""), element, key)
-                    element.set(key, repr(factor * value))
-
-
-def _add_point_mass(robot: ET.Element, link: str, mass: float) -> None:
-    inertial = ET.SubElement(ET.SubElement(robot, "link", name=POINT_MASS), "inertial")
-    ET.SubElement(inertial, "mass", value=repr(mass))
-    ET.SubElement(inertial, "inertia", dict.fromkeys(MOMENTS, "0"))
-    joint = ET.SubElement(robot, "joint", name=POINT_MASS, type="fixed")
-    ET.SubElement(joint, "parent", link=link)
-    ET.SubElement(joint, "child", link=POINT_MASS)
-
-
-def _mass(path: Path, link: ET.Element) -> float:
-    mass = link.find("inertial/mass")
-    return 0.0 if mass is None else number(path, link.get("name", ""), mass, "value")
-
-
-def _moments(path: Path, link: ET.Element) -> float:
-    inertia = link.find("inertial/inertia")
-    if inertia is None:
-        return 0.0
-    return sum(number(path, link.get("name", ""), inertia, key) for key in ("ixx", "iyy", "izz"))
-
-
-def _find_mesh(path: Path, filename: str) -> Path:
-    """A mesh path is relative to the URDF or, as package://, to one of the folders above it."""
-    relative = filename.removeprefix("package://").removeprefix("file://")
-    for folder in path.parents:
-        if (folder / relative).is_file():
-            return folder / relative
-    raise FileNotFoundError(
-        f"{path}: mesh {filename!r} not found in {path.parent} or above: put it there, or use "
-        "inertia = 'file', which needs no mesh"
-    )
+def _open(urdf: str) -> tuple[Path, bytes]:
+    if urdf.lstrip().startswith("<"):
+        return Path("URDF text"), urdf.encode()
+    path = Path(urdf).expanduser()
+    folders = [Path()]
+    package = importlib.util.find_spec("pybullet_data")
+    if package is not None and package.origin:
+        folders.append(Path(package.origin).parent)
+    for folder in folders:
+        if (folder / path).is_file():
+            file = (folder / path).resolve()
+            return file, file.read_bytes()
+    near = [str(file) for file in path.parent.glob("*.urdf")]
+    near += [str(file.relative_to(folders[-1])) for file in folders[-1].glob("*/*.urdf")]
+    hint = did_you_mean(urdf, near) or ": give the path of a URDF"
+    raise FileNotFoundError(f"URDF {urdf!r} not found from {Path.cwd()}{hint}")

@@ -67,11 +67,7 @@ NO_LAW = {
     "no JSON": {METADATA: "{"},
     "a list": {METADATA: "[1]"},
     "a number": {METADATA: "7"},
-    "deep": {METADATA: "[" * 100_000},
-    "a number for a law": describing("7"),
-    "a text for a law": describing('"x"'),
     "no JSON for a law": describing("{"),
-    "half a law": describing({"law": "Tracking", "torch": torch.__version__}),
     "an object for a law": {METADATA: json.dumps({"pinn_dyn_law": {"law": 1}})},
 }
 
@@ -106,12 +102,9 @@ def test_another_checksum_is_refused_before_the_file_is_looked_at(tmp_path):
     other = "0" * 64
     with pytest.raises(ValueError, match=rf"law.pt2 has the SHA-256 {found}, expected {other}"):
         load_law(path, sha256=other)
-    for given in ("", "law.pt2", found[:-1]):
-        with pytest.raises(ValueError, match=rf"sha256 is '{given}', expected the 64 hexadecimal"):
-            load_law(path, sha256=given)
-    for given in (found, found.upper(), f" {found}\n"):
+    for text in (found, found.upper(), f" {found}\n"):
         with pytest.raises(ValueError, match="holds the entry"):
-            load_law(path, sha256=given)
+            load_law(path, sha256=text)
 
 
 def test_another_version_of_pytorch_is_refused(tmp_path):

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from pinn_dyn.control import Controller, Plant
-from pinn_dyn.control.closed_loop import close_loop_continuous
+from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.testing import LinearSystem
 from tests.support.closed_loops import K_D, K_P, PD, Q0, V0, Wave, double, sampled, spring
@@ -186,17 +186,13 @@ class Wide(PD):
         ({"q0": Q0[:2]}, r"v0 has shape \(3, 2\), expected \(K, 2\)"),
         ({"q0": Q0[:, :1]}, r"q0 has shape \(3, 1\)"),
         ({"q0": Q0[0], "v0": V0[0]}, r"q0 has shape \(2,\)"),
-        ({"v0": V0.float()}, "v0 is torch.float32, expected float64"),
         ({"q0": Q0 * torch.inf}, "q0 has"),
-        ({"rate": 0.0}, "rate 0.0"),
         ({"duration": 0.41, "rate": 50.0}, "integer multiple of 0.02 s"),
         ({"controller": PD(size=3)}, "controller has 3 coordinates and the plant 2"),
         ({"controller": OneInput()}, "controller has 1 inputs and the plant 2"),
         ({"controller": Wide()}, r"input has shape \(3, 5\), expected \(3, 2\)"),
         ({"reference": Wave(double([1.0]))}, "reference has 1 coordinates and the plant 2"),
         ({"reference": Wave(Q0[:2])}, r"reference's q has shape \(2, 2\), expected \(2,\) or"),
-        ({"delay": -1}, "samples is -1"),
-        ({"delay": 1.5}, "samples is 1.5, expected a whole number"),
         ({"delay": 21}, "delay is 21 instants, and the run has 21"),
     ],
 )

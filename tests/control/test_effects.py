@@ -78,14 +78,9 @@ def test_a_delay_gives_zeros_and_then_what_went_in(samples):
     ("build", "message"),
     [
         (lambda: Actuator(low=1.0, high=[2.0, 0.0]), "low exceeds high"),
-        (lambda: Actuator(low=float("nan")), "low is nan"),
-        (lambda: Actuator(rate=0.0), "rate is 0.0"),
-        (lambda: Actuator(low=[0.0] * 2, high=[1.0] * 3), "low has 2 entries and high 3"),
         (lambda: Actuator(high=[1.0] * 3)(torch.zeros(4, 2), 0.1), "3 entries, expected one .* 2"),
         (lambda: Actuator(rate=[1.0] * 3)(torch.zeros(4, 2), 0.1), "rate have 3 entries"),
-        (lambda: Sensor(q_noise=-0.1), "q_noise is -0.1"),
         (lambda: Sensor(v_noise=[0.1] * 3)(torch.zeros(1, 2), torch.zeros(1, 2)), "v_noise have 3"),
-        (lambda: Delay(-1), "samples is -1"),
     ],
 )
 def test_bad_arguments_are_named(build, message):

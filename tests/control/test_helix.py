@@ -95,7 +95,7 @@ def test_starts_and_stops_at_rest_and_stays(helix):
 def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
     for t in (2.0, 4.7, 7.0):
         q = helix(t).q
-        J = arm.tip_jacobian(q)[:3].numpy()
+        J = torch.autograd.functional.jacobian(arm.tip_position, q).numpy()
         homing = np.array(POSTURE) - q.numpy()
         assert np.linalg.norm(homing) > 0.1
         assert np.linalg.norm(homing - np.linalg.pinv(J) @ J @ homing) < 1e-6
@@ -118,14 +118,7 @@ def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
             {"posture": [0.1, -0.3, 0, -2.2, 0, 4.0, 0]},
             r"t = 0 s joint 'panda_joint6' would be at 4",
         ),
-        ({"posture": [0.1, -0.3]}, r"posture is \[0.1, -0.3\], but the robot has 7 coordinates"),
-        ({"radius": 0.0}, r"radius is 0.0, expected a positive"),
-        ({"pitch": math.nan}, r"pitch is nan, expected a finite"),
-        ({"period": -1.0}, r"period is -1.0, expected a positive"),
-        ({"turns": 0}, r"turns is 0, expected a positive"),
-        ({"axis": "up"}, r"axis is 'up', expected 'x', 'y' or 'z'"),
         ({"rise_time": 7.0}, r"rise_time is 7 s, expected at most turns \* period = 6 s"),
-        ({"rise_time": 0.0}, r"rise_time is 0.0, expected a positive"),
     ],
 )
 def test_what_cannot_be_followed_is_refused_with_what_to_change(arm, changes, message):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pinn_dyn.control import BulletPlant, Helix
+from pinn_dyn.control import Helix, SimulatorPlant
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import animate, pose_strip
@@ -71,7 +71,7 @@ def test_limits_are_checked_where_a_robot_has_them_and_joints_are_named():
     Helix(Limited(), POSTURE, radius=0.05, pitch=0.0, period=2.0, turns=0.5)
     with pytest.raises(ValueError, match=r"joint 'jib' would be at 0.5 rad"):
         Helix(Limited(), [0.0, 1.0, 0.5], radius=0.05, pitch=0.0, period=2.0, turns=0.5)
-    with pytest.raises(ValueError, match=r"has 3 coordinates \(q1, q2, q3\)"):
+    with pytest.raises(ValueError, match=r"posture has 1 entries, expected 3"):
         Helix(Crane(), [0.0], radius=0.05, pitch=0.0, period=2.0, turns=0.5)
 
 
@@ -113,14 +113,14 @@ class Hopping:
 
 
 def test_a_robot_that_steps_by_itself_is_a_plant():
-    plant = BulletPlant(Hopping(), step=0.01)
+    plant = SimulatorPlant(Hopping(), step=0.01)
     start = torch.zeros(2, 1, dtype=torch.float64)
     plant.start(start, start)
     q, v = plant.advance(torch.tensor([[1.0], [2.0]], dtype=torch.float64), 0.05)
     torch.testing.assert_close(q[:, 0], torch.tensor([0.05, 0.1], dtype=torch.float64))
     assert v.tolist() == [[5.0], [5.0]]
     with pytest.raises(TypeError, match="arm is a Crane, expected a robot with set_state and step"):
-        BulletPlant(Crane())
+        SimulatorPlant(Crane())
 
 
 def test_what_a_robot_offers_is_seen():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pinn_dyn.control.plants import BulletPlant, SystemPlant
+from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import PlantContract, damped_oscillators
 
@@ -14,7 +14,7 @@ class TestSystemPlant(PlantContract):
 
 
 @pytest.mark.panda
-class TestBulletPlant(PlantContract):
+class TestSimulatorPlant(PlantContract):
     @pytest.fixture(scope="class")
     def plant(self):
         pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
@@ -22,4 +22,4 @@ class TestBulletPlant(PlantContract):
 
         fingers = ("panda_finger_joint1", "panda_finger_joint2")
         arm = BulletArm("franka_panda/panda.urdf", locked_joints=fingers, damping=0.5)
-        return BulletPlant(arm, step=0.001)
+        return SimulatorPlant(arm, step=0.001)

@@ -142,8 +142,6 @@ def test_limits_of_another_robot_are_refused():
         check_limits(SetPoint(PAIR), np.zeros(2), np.ones(3), duration=1.0)
     with pytest.raises(ValueError, match=r"but v_max has the shape \(4,\)"):
         check_limits(SetPoint(PAIR), -np.ones(3), np.ones(3), duration=1.0, v_max=np.ones(4))
-    with pytest.raises(ValueError, match=r"duration is -1"):
-        check_limits(SetPoint(PAIR), -np.ones(3), np.ones(3), duration=-1)
 
 
 # Bad input.
@@ -153,21 +151,11 @@ def test_limits_of_another_robot_are_refused():
     ("build", "message"),
     [
         (lambda: SetPoint([]), r"q has the shape \(0,\), expected \(N,\) or \(K, N\)"),
-        (lambda: SetPoint([[0.0, 1.0], [2.0]]), r"q is \[\[0.0, 1.0\], \[2.0\]\], expected N"),
-        (lambda: SetPoint([0.0, math.inf]), r"q is \[0.0, inf\], expected finite"),
-        (lambda: SetPoint(["a"]), r"q is \['a'\], expected N numbers"),
         (lambda: SetPoint([[[0.0]]]), r"q has the shape \(1, 1, 1\)"),
         (lambda: RandomSetPoints([0.0], [1.0, 2.0], 3, 0), r"q_low has 1 coordinates and q_high"),
         (lambda: RandomSetPoints([0.0, 3.0], [1.0, 2.0], 3, 0), r"q_low\[1\] = 3 lies above"),
-        (lambda: RandomSetPoints([0.0], [1.0], 0, 0), r"count is 0, expected at least 1"),
         (lambda: PointToPoint([0.0], [1.0, 2.0], 1.0), r"q_start has 1 coordinates and q_end has"),
-        (lambda: PointToPoint([[0.0]] * 2, [[1.0]] * 3, 1.0), r"q_start holds 2 .* q_end 3"),
-        (lambda: PointToPoint([0.0], [1.0], 0.0), r"duration is 0.0, expected a positive"),
-        (lambda: PointToPoint([0.0], [1.0], 1.0, -1.0), r"begin is -1.0, expected .* at least 0"),
         (lambda: Sines([0.0] * 3, [1.0, 2.0], 1.0), r"amplitude has the shape \(2,\), but centre"),
-        (lambda: Sines([0.0] * 3, 1.0, -1.0), r"frequency is -1.0, expected numbers of at least 0"),
-        (lambda: Sines([0.0] * 3, 1.0, 1.0, math.nan), r"phase is nan, expected finite"),
-        (lambda: Sines([0.0], 1.0, 1.0, rise_time=-1), r"rise_time is -1, expected a finite"),
     ],
 )
 def test_bad_input_is_refused_with_what_was_expected(build, message):

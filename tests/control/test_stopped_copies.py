@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pinn_dyn.control.closed_loop import close_loop_continuous
+from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.effects import Sensor
 from pinn_dyn.control.plants import SystemPlant
 from tests.support.closed_loops import PD, Q0, V0, Wave, double, sampled, spring

@@ -154,35 +154,8 @@ def test_frequencies_of_a_sine_lie_in_its_band():
     assert np.ptp(turns) > 5
 
 
-BAD = {
-    "lengths": (lambda: MultiSine([0.0], [1.0, 2.0]), "MultiSine", "amplitude"),
-    "negative amplitude": (lambda: Chirp([0.0], [-1.0]), "Chirp", "amplitude"),
-    "zero frequency": (lambda: MultiSine([0.0], [1.0], [0.0, 1.0]), "MultiSine", "frequency"),
-    "reversed frequency": (lambda: Chirp([0.0], [1.0], [2.0, 1.0]), "Chirp", "frequency"),
-    "one frequency": (lambda: Chirp([0.0], [1.0], [2.0]), "Chirp", "frequency"),
-    "no harmonics": (lambda: MultiSine([0.0], [1.0], harmonics=0), "MultiSine", "harmonics"),
-    "reversed hold": (lambda: Steps([0.0], [1.0], hold=[2.0, 1.0]), "Steps", "hold"),
-    "zero rise time": (lambda: Steps([0.0], [1.0], rise_time=0.0), "Steps", "rise_time"),
-    "long rise": (
-        lambda: Steps([0.0], [1.0], hold=[0.1, 1.0], rise_time=0.2),
-        "Steps",
-        "rise_time",
-    ),
-    "empty mixture": (lambda: Mixture([]), "Mixture", "parts"),
-    "nan frequency": (
-        lambda: Chirp([0.0], [1.0], [float("nan"), 1.0]),
-        "Chirp",
-        "frequency",
-    ),
-    "no inputs": (lambda: MultiSine([], []), "MultiSine", "offset"),
-    "nan amplitude": (lambda: MultiSine([0.0], [float("nan")]), "MultiSine", "amplitude"),
-    "infinite offset": (lambda: Steps([float("inf")], [1.0]), "Steps", "offset"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_arguments_are_refused_by_name(case):
-    make, owner, argument = BAD[case]
-    with pytest.raises(ValueError, match=rf"{owner}: .*{argument}") as caught:
-        make()
-    assert argument in str(caught.value)
+def test_arguments_that_contradict_each_other_are_refused():
+    with pytest.raises(ValueError, match="MultiSine: offset has 1 entries and amplitude 2"):
+        MultiSine([0.0], [1.0, 2.0])
+    with pytest.raises(ValueError, match=r"Steps: rise_time is 0\.2 s, expected at most"):
+        Steps([0.0], [1.0], hold=[0.1, 1.0], rise_time=0.2)

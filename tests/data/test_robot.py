@@ -1,4 +1,4 @@
-"""The recorded data of a PyBullet arm: limits, splits, cache, processes, and bad input."""
+"""Recorded data of a PyBullet arm: limits, splits, cache and processes."""
 
 import importlib
 import re
@@ -16,7 +16,6 @@ from pinn_dyn.data import (
     RobotExcitation,
     RobotSource,
     SimulationError,
-    TorqueMultiSine,
     TrackedMultiSine,
     draw_windows,
 )
@@ -24,7 +23,6 @@ from pinn_dyn.data.cache import load_or_make
 from pinn_dyn.data.robot_excitation import Plan
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory, stack
-from pinn_dyn.systems import SoftArm
 from tests.support.processes import fork
 
 pytestmark = pytest.mark.panda
@@ -86,6 +84,18 @@ def test_counts_names_and_samples_are_those_asked_for(source, splits):
         assert float(item.t[1]) == pytest.approx(1e-3)
 
 
+def moved(robot, plan, steps):
+    """q, v and u of a plan that the robot follows, ``(steps, N)`` each."""
+    q, v = plan.q0, plan.v0
+    robot.set_state(q, v)
+    rows = []
+    for k in range(steps):
+        u = plan.torque(k, q, v)
+        rows.append((q, v, u))
+        q, v = robot.step(u, 1e-3)
+    return (np.array(x) for x in zip(*rows, strict=True))
+
+
 def recorded(source, split):
     """q, v and u as the simulator gave them, from the cache."""
     arrays = load_or_make(source.cache, source.name, source.fingerprint(), source.simulate)
@@ -130,7 +140,7 @@ def test_references_use_the_speed_and_range_allowed(source):
     peaks, low, high = [], [], []
     for seed in range(3):
         plan = TrackedMultiSine(**TRACKED).draw(source.robot, t, np.random.default_rng(seed))
-        q, v, _ = source.robot.simulate(plan.q0, plan.v0, plan.torque, steps=10000, step=1e-3)
+        q, v, _ = moved(source.robot, plan, 10000)
         peaks.append(np.abs(v).max(0) / source.robot.v_max)
         low.append(q.min(0))
         high.append(q.max(0))
@@ -153,18 +163,8 @@ def test_a_tight_torque_limit_slows_the_reference_down(source):
     )
     np.testing.assert_array_equal(fast.q0, slow.q0)
     assert (np.abs(slow.v0) < 0.95 * np.abs(fast.v0)).all()
-    _, _, u = source.robot.simulate(slow.q0, slow.v0, slow.torque, steps=2000, step=1e-3)
+    _, _, u = moved(source.robot, slow, 2000)
     assert (np.abs(u) <= 0.505 * source.robot.u_max).all()
-
-
-def test_no_two_motions_are_the_same(splits):
-    starts = torch.stack([item.q[0] for item in everything(splits)])
-    assert torch.pdist(starts).min() > 0.1
-
-
-def test_both_kinds_move_every_joint(splits):
-    for item in splits.train:
-        assert (item.v.std(0) > 1e-3).all()
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
         {"step": 0.0005},
         {"system": {"damping": 0.1}},
         {"system": {"gravity": [0, 0, 0]}},
-        {"system": {"inertia": "collision"}},
+        {"system": {"payload": 1.0}},
         {"system": {"locked_joints": [*FINGERS, "panda_joint3"], "damping": 0.5}},
     ],
     ids=str,
@@ -233,10 +233,7 @@ def test_any_urdf_by_path(cache):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"train": 0}, r"panda: train is 0, expected at least 1"),
-        ({"workers": 0}, r"panda: workers is 0"),
-        ({"step": 2.0}, r"panda: step is 2.0 s and duration 0.5 s"),
-        ({"excitations": []}, r"panda: excitations is empty"),
+        ({"step": 2.0}, r"panda: step is 2.0 s, expected at most duration, 0.5 s"),
         ({"configurations": {"short": [0.0]}}, r"configurations.short has 1 entries.* needs 7"),
         (
             {"configurations": {"bent": [0, 0, 0, 1.0, 0, 0, 0]}},
@@ -249,24 +246,6 @@ def test_bad_settings_are_refused(cache, changes, message):
         build(cache, **changes)
     with pytest.raises(ValueError, match=message):
         raise error.value.__cause__
-
-
-def test_a_system_that_is_no_robot_is_refused(cache, source):
-    arguments = {
-        "name": "soft",
-        "excitations": source.excitations,
-        "duration": 1.0,
-        "step": 0.001,
-        "train": 1,
-        "validation": 1,
-        "test": 1,
-        "seed": 0,
-        "workers": 1,
-        "cache": str(cache),
-        "configurations": None,
-    }
-    with pytest.raises(TypeError, match="soft: system is a SoftArm, expected a robot such as Bull"):
-        RobotSource(system=SoftArm(), **arguments)
 
 
 def test_a_urdf_without_torque_limits_is_refused(cache, tmp_path):
@@ -314,22 +293,6 @@ def test_a_robot_too_weak_to_hold_itself_is_reported(source):
     weak = TrackedMultiSine(**{**TRACKED, "torque": 0.1})
     with pytest.raises(ValueError, match=r"of the torque allowed at joint 'panda_joint5' \(0.1 of"):
         weak.draw(source.robot, np.arange(101) * 1e-3, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize(
-    ("kind", "change", "message"),
-    [
-        (TrackedMultiSine, {"amplitude": [0.5, 0.2]}, r"amplitude is \[0.5, 0.2\], expected"),
-        (TrackedMultiSine, {"reach": 1.2}, r"reach is 1.2, expected more than 0 and at most 1"),
-        (TrackedMultiSine, {"bandwidth": 0.0}, r"bandwidth is 0.0, expected a positive number"),
-        (TrackedMultiSine, {"frequency": [2.0, 1.0]}, r"frequency is \[2.0, 1.0\]"),
-        (TorqueMultiSine, {"amplitude": -1.0}, r"amplitude is -1.0"),
-        (TorqueMultiSine, {"harmonics": 0}, r"harmonics is 0"),
-    ],
-)
-def test_bad_excitations_are_refused(kind, change, message):
-    with pytest.raises(ValueError, match=message):
-        kind(**{**(TRACKED if kind is TrackedMultiSine else TORQUE), **change})
 
 
 def test_everything_else_imports_without_pybullet(tmp_path):

@@ -1,0 +1,173 @@
+"""An arm that a physics simulator moves, with the terms of the rigid chain of the same URDF."""
+
+from __future__ import annotations
+
+import abc
+import hashlib
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+from scipy.spatial.transform import Rotation
+
+from pinn_dyn.systems.rigid_chain import RigidChain
+from pinn_dyn.systems.urdf import read_urdf
+
+
+class SimulatedArm(RigidChain, abc.ABC):
+    """A rigid chain with joint limits that a simulator moves in time steps of its own.
+
+    A subclass gives :meth:`set_state` and :meth:`step`. The simulator loads :meth:`to_urdf`, which
+    holds exactly the bodies and joints of the chain, so locked joints, payload and mass scale are
+    in it. Simulators must not add joint motors, damping, friction, joint limits or contacts.
+
+    Args:
+        urdf, locked_joints, gravity, tip, mass_scale, payload: arguments of :class:`RigidChain`.
+        damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
+
+    Attributes:
+        path: file of the URDF.
+        text: the URDF that the simulator loads.
+        gravity: gravitational acceleration, m/s^2, 3 numbers.
+        q_low, q_high: joint limits, ``(N,)``, rad or m; -pi and pi for a continuous joint.
+        v_max: speed limits, ``(N,)``, rad/s or m/s; 0 where the URDF has none.
+        u_max: torque or force limits, ``(N,)``, Nm or N; 0 where the URDF has none.
+        angles: indices of the joints that turn.
+
+    Raises:
+        FileNotFoundError: if there is no such URDF.
+        ValueError: as :class:`RigidChain`, or on a joint without limits or a body without mass.
+    """
+
+    def __init__(
+        self,
+        urdf: str,
+        *,
+        locked_joints: Sequence[str] = (),
+        damping: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.5,
+        gravity: Annotated[Sequence[float], Field(min_length=3, max_length=3)] = (0.0, 0.0, -9.81),
+        tip: str | None = None,
+        mass_scale: PositiveFloat = 1.0,
+        payload: NonNegativeFloat = 0.0,
+    ):
+        self.import_simulator()
+        super().__init__(
+            urdf,
+            locked_joints=locked_joints,
+            damping=damping,
+            gravity=gravity,
+            tip=tip,
+            mass_scale=mass_scale,
+            payload=payload,
+        )
+        tree = read_urdf(urdf, locked_joints=locked_joints, tip=tip)
+        for name, (low, high, *_) in zip(tree.joints, tree.limits, strict=True):
+            if not low < high:
+                raise ValueError(
+                    f"{tree.path}: joint {name!r} has limits lower = {low} and upper = {high}, "
+                    "expected lower < upper: set them, lock the joint, or make it continuous"
+                )
+        for name, body in zip(tree.bodies, self.inertia, strict=True):
+            if not body[3, 3] > 0:
+                raise ValueError(
+                    f"{tree.path}: link {name!r} moves and has no mass: expected <inertial> with a "
+                    "positive mass, in it or in a link fixed to it"
+                )
+        self.path = tree.path
+        self.gravity = tuple(float(g) for g in gravity)
+        self.text = self.to_urdf()
+        self.q_low, self.q_high, self.v_max, self.u_max = tree.limits.T.copy()
+        self.angles = tuple(k for k, turns in enumerate(tree.turning) if turns)
+
+    def import_simulator(self) -> None:
+        """Import the simulator, to refuse an arm where it is not installed."""
+
+    @abc.abstractmethod
+    def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Put the arm into a state, ``(N,)`` each, from which :meth:`step` moves it."""
+
+    @abc.abstractmethod
+    def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Move the arm by one time step; return q and v after it, ``(N,)`` each.
+
+        Args:
+            torque: motor torque, ``(N,)``, Nm, held over the step; the joints' damping is added.
+            step: time step, s.
+        """
+
+    def dynamics(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return M ``(N, N)`` and C v + G + D v ``(N,)`` at one state, for a law in NumPy."""
+        with torch.no_grad():
+            mass, bias = self.mass_and_bias(torch.from_numpy(q), torch.from_numpy(v))
+        return mass.numpy(), bias.numpy() + self.friction * v
+
+    @property
+    def friction(self) -> np.ndarray:
+        """Viscous friction of the joints, ``(N,)``, Nms/rad or Ns/m."""
+        return self._damping.double().cpu().numpy()
+
+    def describe(self) -> dict[str, object]:
+        """Return everything that the motion depends on, JSON-serializable."""
+        return {
+            "urdf": hashlib.sha256(self.text.encode()).hexdigest(),
+            "damping": self.friction.tolist(),
+            "gravity": self.gravity,
+        }
+
+    def to_urdf(self) -> str:
+        """Return a URDF with one link per body and without shapes, limits and friction.
+
+        At q = 0 all frames have the axes of the base, so no joint is rotated; each inertia is given
+        in its principal axes, because PyBullet diagonalizes an inertia to six digits only.
+        """
+        poses = self.kinematics(torch.zeros(self.num_coordinates, dtype=torch.float64)).poses
+        weightless = '<mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
+        parts = [f'<link name="base"><inertial>{weightless}</inertial></link>']
+        for k, (name, parent) in enumerate(zip(self.joint_names, self.parents, strict=True)):
+            rotation, position = poses[k, :3, :3].numpy(), poses[k, :3, 3].numpy()
+            origin = position - (poses[parent, :3, 3].numpy() if parent >= 0 else 0.0)
+            axis = rotation @ self._axes[k].numpy()
+            kind = "continuous" if self.turning[k] else "prismatic"
+            parts.append(
+                f'<joint name="{name}" type="{kind}"><parent link="{_link(parent)}"/>'
+                f'<child link="{_link(k)}"/><origin xyz="{_text(origin)}"/>'
+                f'<axis xyz="{_text(axis)}"/>'
+                # PyBullet needs limits of a sliding joint; lower > upper means that there are none.
+                '<limit lower="1" upper="-1" effort="0" velocity="0"/></joint>'
+            )
+            mass, centre, moments, turn = _principal_inertia(self.inertia[k].numpy(), rotation)
+            ixx, iyy, izz = (repr(float(moment)) for moment in moments)
+            parts.append(
+                f'<link name="{_link(k)}"><inertial><mass value="{mass!r}"/>'
+                f'<origin xyz="{_text(centre)}" rpy="{_text(turn.as_euler("xyz"))}"/>'
+                f'<inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/>'
+                "</inertial></link>"
+            )
+        return f'<robot name="arm">{"".join(parts)}</robot>'
+
+
+def _principal_inertia(
+    pseudo: np.ndarray, rotation: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray, Rotation]:
+    """Return mass, centre, principal moments and principal axes of a body in a rotated frame."""
+    mass = float(pseudo[3, 3])
+    centre = pseudo[:3, 3] / mass
+    second = pseudo[:3, :3] - mass * np.outer(centre, centre)
+    inertia = np.trace(second) * np.eye(3) - second
+    moments, axes = np.linalg.eigh(rotation @ inertia @ rotation.T)
+    # Roll-pitch-yaw angles are inexact at a pitch of 90 degrees: keep the pitch below 36 degrees.
+    first = int(np.abs(axes[2]).argmin())
+    moments, axes = np.roll(moments, -first), np.roll(axes, -first, axis=1)
+    axes[:, 2] *= math.copysign(1.0, np.linalg.det(axes))
+    return mass, rotation @ centre, np.maximum(moments, 0.0), Rotation.from_matrix(axes)
+
+
+def _link(body: int) -> str:
+    return "base" if body < 0 else f"body{body}"
+
+
+def _text(values: np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in values)
