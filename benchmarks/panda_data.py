@@ -40,7 +40,9 @@ def bare_steps(source: RobotSource, steps: int = 20_000) -> float:
     middle = (source.robot.q_low + source.robot.q_high) / 2
     zero = 0 * middle
     start = time.perf_counter()
-    source.robot.simulate(middle, zero, lambda k, q, v: zero, steps=steps, step=source.step)
+    source.robot.set_state(middle, zero)
+    for _ in range(steps):
+        source.robot.step(zero, source.step)
     return (time.perf_counter() - start) / steps
 
 

@@ -270,6 +270,8 @@ def _options(hint: Any) -> tuple[Any, ...]:
     """The alternatives of a union, or the annotation itself."""
     if get_origin(hint) in (Union, types.UnionType):
         return tuple(option for part in get_args(hint) for option in _options(part))
+    if get_origin(hint) is Annotated and not any(isinstance(x, Range) for x in get_args(hint)):
+        return _options(get_args(hint)[0])
     return (hint,)
 
 
