@@ -1,8 +1,7 @@
-"""Look at a log before a training, as check.py does."""
+"""The check of a log before a training, as check.py does it."""
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -15,16 +14,12 @@ from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.run_folder import write_config
 from pinn_dyn.app.words import command_line
 from pinn_dyn.data.logs import LogError, LogSource
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.log_check import check_log
-from pinn_dyn.evaluation.report import check_report
 from pinn_dyn.models.known import Structure
-
-log = logging.getLogger(__name__)
 
 
 def check(cfg: DictConfig) -> None:
-    """Print what is in a log and whether it suffices, and write a page of it.
+    """Print the measurements of a log, and write a page of them.
 
     Raises:
         ConfigError: if the data set is no log or cannot be used, or a training makes no sense.
@@ -46,12 +41,12 @@ def check(cfg: DictConfig) -> None:
             )
         check_structure("model.structure", part, structure, source)
     try:
-        found = check_log(source, longest_delay=config["longest_delay"], structure=structure)
+        report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     except LogError as error:
         raise ConfigError(f"{source.name}: {error}") from error
     write_config(folder, config)
-    write_whole(folder / "check.html", check_report(found, source, command=command_line()))
-    write_whole(folder / "log_report.md", source.report)
-    print(f"\n{found}\n\nthe page is {folder / 'check.html'}")
-    if found.problems:
-        raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(found.problems)}")
+    page = report.save(folder, command_line())
+    print(f"\n{report}\n\nthe page is {page}")
+    if report.problems:
+        problems = "; ".join(report.problems)
+        raise ConfigError(f"{source.name}: a training makes no sense: {problems}")

@@ -12,6 +12,7 @@ import pandas as pd
 import yaml
 
 from pinn_dyn.data.logs import Columns, LogError
+from pinn_dyn.data.logs import columns as log_columns
 from pinn_dyn.data.logs.table import Table
 from pinn_dyn.data.whole import whole, write_whole
 
@@ -45,7 +46,9 @@ def frame_dataset(
     if run is not None and not isinstance(run, str):
         raise LogError(f"run is {run!r}, expected the name of a column, or None")
     described = {name: _described(name, given) for name, given in signals.items()}
-    columns = {name: Columns.from_config(name, given) for name, given in described.items()}
+    columns = {
+        name: log_columns.described(Columns, name, given) for name, given in described.items()
+    }
     table = Table(frame, "the frame")
     values = {name: table.numbers(x.columns, name) for name, x in columns.items()}
     if not len(frame):

@@ -8,7 +8,6 @@ import torch
 
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs import Recording
-from pinn_dyn.data.logs.step import sample_time
 from pinn_dyn.mechanics import Predictor, Signal
 
 
@@ -29,7 +28,7 @@ def predict_frame(model: Predictor, source: LogSource, frame: pd.DataFrame) -> p
     values = np.full((len(frame), len(names)), np.nan)
     alike: dict[tuple[int, float], list[tuple[np.ndarray, Recording, Recording]]] = {}
     for item in source.recordings(frame):
-        step = round(sample_time(item[2], "predict"), 9)
+        step = round(item[2].sample_time("predict"), 9)
         alike.setdefault((len(item[2]), step), []).append(item)
     for (_, step), items in alike.items():  # runs of one length side by side
         clock, times, states = _along(model, source, [clean for _, _, clean in items], step)

@@ -1,29 +1,36 @@
-"""Whether a log suffices for a training: what is in it, and what its data determine."""
+"""The check of a log before a training: measurements, each with a verdict."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import PositiveFloat
 
 from pinn_dyn.data.logs import (
+    Butterworth,
     Cleaned,
     DelayCurve,
     LogError,
     LogSource,
+    Measurement,
+    MovingAverage,
     Recording,
     agreed_delays,
     repeat_floor,
 )
-from pinn_dyn.evaluation.log_advice import Measured, advice
+from pinn_dyn.data.logs.measurement import judged
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.log_numbers import (
+    bandwidth,
     distance_from,
-    explained_shares,
-    own_share,
+    explained_share,
+    independent_share,
     regressor_columns,
     share_at_rest,
     white_noise,
@@ -32,178 +39,182 @@ from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_ex
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.known import Structure
 
-# What a training cannot do without.
+# A training makes no sense beyond these limits.
 _LEAST_SAMPLES = 200
 _LEAST_EXPLAINED = 0.1
 _MOST_REST = 0.98
-# What is warned of.
+_STILL = 0.25  # noise of q as a share of its range
+# A warning.
 _NOISE = 0.02
 _CONDITION = 1e3
-_OWN = 0.01
+_INDEPENDENT = 0.01
 _FAR = 3.0
 _OUTSIDE = 0.05
-_STILL = 0.25  # noise of q, of the range, above which a coordinate does not move
-_MOST_REPEATS = 20  # stretches of the training that are looked for in the others
-_SHOWN = 20  # lines of a table in the terminal
-_LINEAR = "condition number of the linear regressor (1, q, v, a), not of rigid bodies"
+_MOST_REPEATS = 20  # stretches of the training that are compared with the others
+_ROWS = 20  # lines of a table in the terminal
+
+_RANK = {"stop": 0, "warning": 1, "ok": 2}
 
 
 @dataclass(frozen=True)
 class LogCheck:
-    """The findings on a log.
+    """Measurements of a log, and the numbers behind them.
 
     Attributes:
-        name: of the data set.
+        source: the log.
+        measurements: the measurements, each with its verdict.
         runs: one row per stretch: split, duration, rows, sample time, jitter, longest gap.
-        coordinates: one row per coordinate: range, noise, rest, and what identifies its inertia.
-        inputs: one row per input: range, delay and its spread, or why there is none.
-        delays: the curve of each input.
-        figures: single numbers and what they mean, name to value.
-        distance: of the test samples from the nearest training sample, 1 where they are as far as a
-            tenth of the training is from the rest, ``(S,)``.
-        problems: why a training makes no sense; empty where it does.
-        warnings: what to look at before a training.
-        unidentified: the coordinates whose inertia the motion does not tell.
-        rigid: what the motion tells of the constants of a rigid robot; None without a structure.
-        suggestion: lines of YAML and commands to copy, each with its reason.
+        coordinates: one row per coordinate: range, noise, share of the acceleration that
+            identifies its inertia.
+        inputs: one row per input: range, delay and its spread, or why there is no delay.
+        delays: delay curve of each input.
+        distance: distance of the test samples from the nearest training sample, ``(S,)``; 1 is the
+            distance between tenths of the training.
+        rigid: excitation of the base parameters of a rigid robot; None without a structure.
+        steps: cleaning steps for the YAML of the data set that follow from measurements.
     """
 
-    name: str
+    source: LogSource
+    measurements: list[Measurement]
     runs: pd.DataFrame
     coordinates: pd.DataFrame
     inputs: pd.DataFrame
     delays: list[DelayCurve]
-    figures: dict[str, float]
     distance: np.ndarray
-    problems: list[str]
-    warnings: list[str]
-    unidentified: list[str]
-    rigid: RigidExcitation | None
-    suggestion: str
+    rigid: RigidExcitation | None = None
+    steps: list[str] = field(default_factory=list)
+
+    @property
+    def problems(self) -> list[str]:
+        """Reasons why a training makes no sense."""
+        return [x.text for x in self.measurements if x.verdict == "stop"]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Texts of the warnings."""
+        return [x.text for x in self.measurements if x.verdict == "warning"]
+
+    def table(self) -> pd.DataFrame:
+        """Return one row per measurement, stops and warnings first."""
+        rows = sorted(self.measurements, key=lambda x: _RANK[x.verdict])
+        return pd.DataFrame(
+            [[x.verdict, x.name, x.place, x.value, x.expected, x.text, x.section] for x in rows],
+            columns=["verdict", "measurement", "of", "value", "expected", "explanation", "docs"],
+        )
 
     def __str__(self) -> str:
-        tables = {
-            "Runs": self.runs.head(_SHOWN),
+        table = self.table()
+        many = len(self.runs) > _ROWS
+        parts = {
+            "Runs": self.runs.head(_ROWS),
+            f"{len(self.runs) - _ROWS} more runs are in the page" if many else "": None,
             "Coordinates": self.coordinates,
             "Inputs": self.inputs,
+            **({} if self.rigid is None else {"Rigid bodies": self.rigid.joints}),
+            "Measurements": table[["verdict", "measurement", "of", "value", "expected"]].head(50),
         }
+        lines = [f"{self.source.name}: check of the log"]
+        for title, frame in parts.items():
+            lines += ["", title] if title else []
+            if frame is not None:
+                lines.append(frame.to_string(index=False, na_rep="", float_format="{:.3g}".format))
         if self.rigid is not None:
-            tables["Rigid bodies"] = self.rigid.joints
-        lines = [f"{self.name}: what is in the log, and whether it suffices"]
-        for title, frame in tables.items():
-            lines += ["", title, frame.to_string(index=False, float_format=lambda x: f"{x:.3g}")]
-        if len(self.runs) > _SHOWN:
-            lines.append(f"... {len(self.runs) - _SHOWN} more runs in the page")
-        lines += ["", *(f"{name}: {value:.3g}" for name, value in self.figures.items())]
-        lines.append(f"inertia not identified: {', '.join(self.unidentified) or 'none'}")
-        if self.rigid is not None:
-            lines.append(f"rigid-body constants not determined: {self.rigid.words(_SHOWN)}")
-        lines += ["", "Warnings", *(f"- {text}" for text in self.warnings or ["none"])]
-        lines += ["", "To copy into the configuration, and to run", self.suggestion]
-        verdict = "a training makes sense" if not self.problems else "a training makes no sense:"
-        return "\n".join([*lines, "", f"Verdict: {verdict}", *(f"- {x}" for x in self.problems)])
+            lines.append(f"not determined: {self.rigid.summary(_ROWS)}")
+        for x in self.measurements:
+            if x.verdict != "ok":
+                lines += ["", f"{x.verdict}: {x.text} (docs/{x.section})"]
+        if self.steps:
+            lines += ["", "steps:", *(f"  {line}" for line in self.steps)]
+        verdict = "no sense" if self.problems else "sense"
+        return "\n".join([*lines, "", f"Verdict: a training makes {verdict}"])
+
+    def save(self, folder: str | Path, command: str = "") -> Path:
+        """Write ``check.html``, ``measurements.csv`` and ``log_report.md``; return the page.
+
+        Args:
+            folder: the folder, made if missing.
+            command: command line, for the page.
+        """
+        from pinn_dyn.evaluation.report.check_page import check_report
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / "check.html", check_report(self, command=command))
+        write_whole(folder / "measurements.csv", self.table().to_csv(index=False))
+        write_whole(folder / "log_report.md", self.source.report)
+        return folder / "check.html"
 
 
 def check_log(
-    source: LogSource, *, longest_delay: float = 0.3, structure: Structure | None = None
+    source: LogSource,
+    *,
+    longest_delay: PositiveFloat = 0.3,
+    structure: Structure | None = None,
 ) -> LogCheck:
-    """Look at a log as its configuration reads, splits and cleans it.
+    """Check a log as its configuration reads, splits and cleans it.
 
     Args:
         source: the log.
-        longest_delay: the longest delay of an input that is tried, s.
-        structure: the kinematics, whose joints are the coordinates of the log, if they are known.
+        longest_delay: longest delay of an input that is tried, s.
+        structure: kinematics of a rigid robot whose joints are the coordinates of the log, or None.
 
     Raises:
-        LogError: where the log cannot be used at all.
+        LogError: if the log cannot be used at all.
     """
     splits = source.load()
     inputs = len(source.u.columns)
     training = [
-        _with_inputs(item, inputs)
+        replace(item, u=item.u[:, :inputs])  # without rates of the inputs
         for part in source.cleaned
         if part.split == "train"
         for item in part.clean
     ]
-    test = splits.test
+    step = float(np.median(np.diff(training[0].t)))
     rigid = None if structure is None else functools.partial(_regressor, structure)
     delays, common = agreed_delays(training, longest=longest_delay, rigid=rigid)
-    step = float(np.median(np.diff(training[0].t)))
-    coordinates, condition = _coordinates(source, training, test, step)
-    repeats = _add_repeats(coordinates, source, training)
-    explained, follows = explained_shares(training, delays, step)
-    distance = distance_from(training, test)
-    samples = sum(len(item) for item in training)
-    figures = {
-        "training samples": float(samples),
-        "training time [s]": sum(item.duration for item in training),
-        "sample time [s]": step,
-        "share of the training at rest": share_at_rest(training),
-        _LINEAR: condition,
-        "motions that repeat one of the training": float(repeats),
-        "share of the motion that the inputs add to what (1, q, v) explains": explained,
-        "median distance of the test from the training [of a tenth of it from the rest]": float(
-            np.median(distance)
-        ),
-    }
-    problems = _problems(samples, figures, coordinates, explained)
-    measured = Measured(
-        source,
-        training,
-        step,
-        delays,
-        noise=coordinates["noise of q"].to_numpy(),
-        rest=figures["share of the training at rest"],
-        outside=max(float((distance > _FAR).mean()), float(coordinates["test outside"].max())),
-        condition=condition,
-        follows=follows,
-    )
-    excited = None
+    coordinates, condition = _coordinates(source, training, splits.test, step)
+    noise = coordinates["noise of q"].to_numpy()
+    highest = bandwidth(training, step, noise)
+    distance = distance_from(training, splits.test)
+    measurements = [
+        *source.measurements,
+        *_amount(training, explained_share(training, delays, step)),
+        *_motion(coordinates, condition),
+        *_coverage(coordinates, distance),
+        *_delay_measurements(source, delays, step),
+    ]
+    excitation = None
     if structure is not None:
-        excited = _excitation(structure, splits.train, coordinates, measured)
-        figures[
-            f"condition number of the rigid-body regressor ({excited.count} base parameters, "
-            "friction included, columns of unit norm)"
-        ] = excited.condition
-    frame = pd.DataFrame(
-        {
-            "input": source.input_labels[:inputs],
-            "least": np.vstack([item.u for item in training]).min(axis=0),
-            "most": np.vstack([item.u for item in training]).max(axis=0),
-            "delay [ms]": [np.nan if c.delay is None else 1e3 * c.delay for c in delays],
-            "spread [ms]": [
-                np.nan if c.delay is None else 1e3 * min(c.spread, 9.999) for c in delays
-            ],
-            "how": [c.reason or f"{c.form}{', common' * common}" for c in delays],
-        }
-    )
-    warnings = [*source.warnings, *_warnings(coordinates, figures, delays, distance, step)]
-    if excited is not None and excited.condition > MOST:
-        warnings.append(
-            f"the rigid-body regressor has the condition number {excited.condition:.3g}, expected "
-            f"less than {MOST:g}: these motions do not determine constants of "
-            f"{', '.join(excited.open_joints)}; excite them by more frequencies, poses and speeds"
-        )
+        longest = max(item.duration for item in splits.train)
+        # At least three periods of the cutoff are in the longest motion.
+        cutoff = min(max(4 * highest, 1.0, 3.01 / longest), 0.4 / step)
+        still = (coordinates["noise / range"] > _STILL).tolist()
+        try:
+            excitation = rigid_excitation(structure, splits.train, cutoff=cutoff, still=still)
+        except ValueError as error:
+            raise LogError(f"the rigid-body regressor: {error}") from error
+        measurements.append(_excitation(excitation))
+    u = np.vstack([item.u for item in training])
     return LogCheck(
-        source.name,
+        source,
+        measurements,
         pd.DataFrame([_run(part) for part in source.cleaned]),
         coordinates,
-        frame,
+        pd.DataFrame(
+            {
+                "input": source.input_labels[:inputs],
+                "min": u.min(axis=0),
+                "max": u.max(axis=0),
+                "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
+                "spread [ms]": [np.nan if x.delay is None else 1e3 * x.spread for x in delays],
+                "method": [x.reason or f"{x.form}{', common' * common}" for x in delays],
+            }
+        ),
         delays,
-        figures,
         distance,
-        problems,
-        warnings,
-        # Their acceleration follows from q, v and the other accelerations.
-        coordinates.loc[coordinates["own share of a"] < _OWN, "coordinate"].tolist(),
-        excited,
-        advice(measured),
+        excitation,
+        [*_filter(source, training, step, noise, highest), *_delay(delays, step)],
     )
-
-
-def _with_inputs(item: Recording, inputs: int) -> Recording:
-    """Without the rates of inputs that a step may have added."""
-    return Recording(item.run, item.t, item.q, item.v, item.u[:, :inputs])
 
 
 def _run(part: Cleaned) -> dict[str, object]:
@@ -220,139 +231,177 @@ def _run(part: Cleaned) -> dict[str, object]:
     }
 
 
-def _noise_of_v(raw: list[Recording]) -> dict[str, np.ndarray]:
-    """A column where the log has v; of a derived one the noise is not white any more."""
-    long = [item.v for item in raw if item.v is not None and len(item) > 10]
-    return {"noise of v": np.median([white_noise(v) for v in long], axis=0)} if long else {}
-
-
-def _add_repeats(frame: pd.DataFrame, source: LogSource, training: list[Recording]) -> int:
-    """The floors of q and v that repeated motions tell, as columns; returns their number."""
+def _coordinates(
+    source: LogSource, training: list[Recording], test: Sequence[Trajectory], step: float
+) -> tuple[pd.DataFrame, float]:
+    """Return one row per coordinate, and the condition number of (1, q, v, a)."""
+    q = np.vstack([item.q for item in training])
+    v = np.vstack([item.v for item in training if item.v is not None])
+    raw = [x.raw for x in source.cleaned if x.split == "train" and len(x.raw) > 10]
+    noise = np.median([white_noise(item.q) for item in raw], axis=0)
+    # The noise of a derived velocity is not white.
+    noise_of_v = [white_noise(item.v) for item in raw if item.v is not None]
+    tested = np.vstack([item.q.numpy() for item in test])
+    low, high = q.min(axis=0), q.max(axis=0)
+    regressor = regressor_columns(training, step)
+    size = q.shape[1]
+    frame = pd.DataFrame(
+        {
+            "coordinate": source.labels,
+            "min": low,
+            "max": high,
+            "fastest [/s]": np.abs(v).max(axis=0),
+            "noise of q": noise,
+            "noise / range": noise / np.ptp(q, axis=0).clip(min=1e-300),
+            **({"noise of v": np.median(noise_of_v, axis=0)} if noise_of_v else {}),
+            "test outside": ((tested < low) | (tested > high)).mean(axis=0),
+            "independent share of a": [independent_share(regressor, k, size) for k in range(size)],
+        }
+    )
     splits = source.load()
-    held = [
+    tests = [
         Recording("", x.t.numpy(), x.q.numpy(), x.v.numpy(), x.u.numpy())
         for x in (*splits.validation, *splits.test)
     ]
     some = training[:: max(1, len(training) // _MOST_REPEATS)]
     middles = [item.rows(slice(len(item) // 4, 3 * len(item) // 4)) for item in some]
-    repeats, q, v = repeat_floor([*held, *(x for x in middles if len(x) > 10)], training)
-    if repeats:
-        frame["floor of q"], frame["floor of v"] = q, v
-    return repeats
-
-
-def _coordinates(
-    source: LogSource, training: list[Recording], test: Sequence[Trajectory], step: float
-) -> tuple[pd.DataFrame, float]:
-    """One row per coordinate, and the condition number of (1, q, v, a)."""
-    q = np.vstack([item.q for item in training])
-    raw = [part.raw for part in source.cleaned if part.split == "train"]
-    noise = np.median([white_noise(item.q) for item in raw if len(item) > 10], axis=0)
-    v = np.vstack([item.v for item in training if item.v is not None])
-    seen = np.vstack([item.q.numpy() for item in test])
-    low, high = q.min(axis=0), q.max(axis=0)
-    regressor = regressor_columns(training, step)
-    size = q.shape[1]
-    own = [own_share(regressor, k, size) for k in range(size)]
-    scaled = regressor / np.linalg.norm(regressor, axis=0).clip(min=1e-300)
-    frame = pd.DataFrame(
-        {
-            "coordinate": source.labels,
-            "least": low,
-            "most": high,
-            "fastest [/s]": np.abs(v).max(axis=0),
-            "noise of q": noise,
-            "noise / range": noise / np.ptp(q, axis=0).clip(min=1e-300),
-            **_noise_of_v(raw),
-            "test outside": ((seen < low) | (seen > high)).mean(axis=0),
-            "own share of a": own,
-        }
+    repeats, floor_q, floor_v = repeat_floor(
+        [*tests, *(x for x in middles if len(x) > 10)], training
     )
+    if repeats:
+        frame["floor of q"], frame["floor of v"] = floor_q, floor_v
+    scaled = regressor / np.linalg.norm(regressor, axis=0).clip(min=1e-300)
     return frame, float(np.linalg.cond(scaled))
 
 
 def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
-    """Y ``(R, N, 10 N)`` of the bodies at q, v, a ``(R, N)``."""
+    """Return Y ``(R, N, 10 N)`` of the bodies at q, v, a ``(R, N)``."""
     return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
 
-def _excitation(
-    structure: Structure,
-    trajectories: Sequence[Trajectory],
-    coordinates: pd.DataFrame,
-    measured: Measured,
-) -> RigidExcitation:
-    """What the motions tell of rigid bodies, after a filter between them and their noise."""
-    longest = max(item.duration for item in trajectories)
-    try:
-        return rigid_excitation(
-            structure,
-            trajectories,
-            # At least three of its periods are in the longest motion.
-            cutoff=min(max(4 * measured.highest, 1.0, 3.01 / longest), 0.4 / measured.step),
-            still=(coordinates["noise / range"] > _STILL).tolist(),
-        )
-    except ValueError as error:
-        raise LogError(f"the rigid-body regressor: {error}") from error
+_judged = functools.partial(judged, section="bags_and_other_logs.md#is-the-log-good-enough")
 
 
-def _problems(
-    samples: int, figures: dict[str, float], coordinates: pd.DataFrame, explained: float
-) -> list[str]:
-    problems = []
-    if samples < _LEAST_SAMPLES:
-        problems.append(f"the training has {samples} samples, expected at least {_LEAST_SAMPLES}")
-    if explained < _LEAST_EXPLAINED:
-        problems.append(
-            f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these "
-            "the inputs of this robot, on the same clock?"
-        )
-    if figures["share of the training at rest"] > _MOST_REST:
-        problems.append("the robot rests for nearly the whole training: cut the rest out")
-    if (coordinates["noise / range"] > _STILL).all():
-        problems.append("no coordinate moves by more than its noise")
-    return problems
+def _amount(training: list[Recording], explained: float) -> list[Measurement]:
+    """Measure whether the training has enough samples, motion and input."""
+    samples = sum(len(item) for item in training)
+    at_rest = share_at_rest(training)
+    stop = functools.partial(_judged, verdict="stop")
+    text = f"the training has {samples} samples, expected at least {_LEAST_SAMPLES}"
+    few = samples < _LEAST_SAMPLES
+    results = [stop("samples", "training", samples, f"at least {_LEAST_SAMPLES}", few, text)]
+    text = "the robot rests for nearly the whole training: cut the rest out"
+    rests = at_rest > _MOST_REST
+    results.append(stop("share at rest", "training", at_rest, f"below {_MOST_REST}", rests, text))
+    text = (
+        f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these the "
+        "inputs of this robot, on the same clock?"
+    )
+    name = "share of the motion that inputs add to (1, q, v)"
+    bad = explained < _LEAST_EXPLAINED
+    results.append(stop(name, "inputs", explained, f"at least {_LEAST_EXPLAINED}", bad, text))
+    return results
 
 
-def _warnings(
-    coordinates: pd.DataFrame,
-    figures: dict[str, float],
-    delays: list[DelayCurve],
-    distance: np.ndarray,
-    step: float,
-) -> list[str]:
-    found = []
+def _motion(coordinates: pd.DataFrame, condition: float) -> list[Measurement]:
+    """Measure noise, and the identifiability of inertias from the linear regressor."""
+    results = []
     for row in coordinates.to_dict("records"):
-        name = row["coordinate"]
-        if row["noise / range"] > _NOISE:
-            found.append(f"{name}: its noise is {100 * row['noise / range']:.2g} % of its range")
-        if row["own share of a"] < _OWN:
-            found.append(
-                f"{name}: its acceleration follows from its q and v and from other "
-                f"accelerations, but for {100 * row['own share of a']:.2g} %: its inertia cannot "
-                "be told from stiffness, damping or another joint's; excite it with more "
-                "frequencies of its own"
-            )
-        if row["test outside"] > _OUTSIDE:
-            found.append(
-                f"{name}: {100 * row['test outside']:.0f} % of the test is outside the range of "
-                "the training"
-            )
-    if figures[_LINEAR] > _CONDITION:
-        found.append(
-            "the regressor (1, q, v, a) of all joints is ill-conditioned: their motions share few "
-            "frequencies, so take a model of few parameters (known mechanics), or excite more"
+        name, noise, share = (
+            row[key] for key in ("coordinate", "noise / range", "independent share of a")
         )
-    if (far := float((distance > _FAR).mean())) > _OUTSIDE:
-        found.append(
-            f"{100 * far:.0f} % of the test is {_FAR:g} times further from the training "
-            "than tenths of it are from each other"
+        text = f"{name}: its noise is {100 * noise:.2g} % of its range"
+        bad = noise > _NOISE
+        results.append(_judged("noise of q / range", name, noise, f"below {_NOISE}", bad, text))
+        text = (
+            f"{name}: its q, v and the accelerations of the other coordinates explain its "
+            f"acceleration but for {100 * share:.2g} %, so its inertia cannot be told from "
+            "stiffness, damping or the inertia of another joint; excite it with more frequencies"
         )
-    late = [c.delay for c in delays if c.delay is not None and c.delay > 0.75 * step]
-    if late:
-        shown = list(dict.fromkeys(f"{1e3 * delay:.0f}" for delay in (min(late), max(late))))
-        found.append(
-            f"inputs act {' to '.join(shown)} ms after they are logged: add the InputDelay step "
-            "below, or learn the delay with the model"
+        bad, expected = share < _INDEPENDENT, f"at least {_INDEPENDENT}"
+        results.append(_judged("independent share of a", name, share, expected, bad, text))
+    text = (
+        "the regressor (1, q, v, a) of all joints is ill-conditioned: their motions share few "
+        "frequencies, so choose a model of few parameters (known mechanics), or excite more"
+    )
+    bad, expected = condition > _CONDITION, f"below {_CONDITION:g}"
+    name = "condition number of (1, q, v, a)"
+    results.append(_judged(name, "training", condition, expected, bad, text))
+    if (coordinates["noise / range"] > _STILL).all():
+        text = "no coordinate moves by more than its noise"
+        results.append(_judged("motion", "training", 0.0, "", True, text, verdict="stop"))
+    return results
+
+
+def _coverage(coordinates: pd.DataFrame, distance: np.ndarray) -> list[Measurement]:
+    """Measure how far the test is from the training."""
+    results = []
+    expected = f"below {_OUTSIDE}"
+    for name, share in zip(coordinates["coordinate"], coordinates["test outside"], strict=True):
+        text = f"{name}: {100 * share:.0f} % of the test is outside the range of the training"
+        title = "share of the test outside the range"
+        results.append(_judged(title, name, share, expected, share > _OUTSIDE, text))
+    far = float((distance > _FAR).mean())
+    text = (
+        f"{100 * far:.0f} % of the test is {_FAR:g} times further from the training than tenths of "
+        "it are from each other"
+    )
+    results.append(_judged("share of the test far away", "", far, expected, far > _OUTSIDE, text))
+    return results
+
+
+def _delay_measurements(
+    source: LogSource, delays: Sequence[DelayCurve], step: float
+) -> list[Measurement]:
+    """Return the delay of each input; a delay of a sample or more is a warning."""
+    results = []
+    for name, curve in zip(source.u.columns, delays, strict=True):
+        delay = np.nan if curve.delay is None else 1e3 * curve.delay
+        late = delay > 750 * step
+        text = (
+            f"input {name!r} acts {delay:.0f} ms after it is logged: add the InputDelay step "
+            "below, or learn the delay with the model (model/delay=learned)"
         )
-    return found
+        results.append(_judged("delay [ms]", name, delay, "below a sample", late, text))
+    return results
+
+
+def _excitation(excitation: RigidExcitation) -> Measurement:
+    """Measure whether the motion determines the base parameters of a rigid robot."""
+    condition = excitation.condition
+    text = (
+        f"the rigid-body regressor has the condition number {condition:.3g}, expected less than "
+        f"{MOST:g}: these motions do not determine constants of "
+        f"{', '.join(excitation.open_joints)}; excite them by more frequencies, poses and speeds"
+    )
+    name = f"condition number of {excitation.count} base parameters"
+    return _judged(name, "training", condition, f"below {MOST:g}", condition > MOST, text)
+
+
+def _filter(
+    source: LogSource, training: list[Recording], step: float, noise: np.ndarray, highest: float
+) -> list[str]:
+    """Return the low-pass between motion and noise, where noise matters and no step filters."""
+    if any(isinstance(x, (Butterworth, MovingAverage)) for x in source.steps.values()):
+        return []
+    v = np.vstack([np.diff(item.q, axis=0) / step for item in training])
+    share = float((2**0.5 * noise / step / v.std(axis=0).clip(min=1e-300)).max())
+    cutoff = float(f"{max(4 * highest, 1.0):.2g}")
+    if share < _NOISE or not 0 < cutoff < 0.4 / step:
+        return []
+    return [
+        f"filter: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
+        f"{100 * share:.2g} % of the steps of q, and the motion ends at {highest:.2g} Hz"
+    ]
+
+
+def _delay(delays: Sequence[DelayCurve], step: float) -> list[str]:
+    """Return the step that shifts the inputs by their measured delays."""
+    shifts = [round(round((curve.delay or 0.0) / step) * step, 6) for curve in delays]
+    if not any(shifts):
+        return []
+    value = shifts[0] if len(set(shifts)) == 1 else shifts
+    return [
+        f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s, the delay of "
+        "the inputs"
+    ]

@@ -47,7 +47,7 @@ class RigidExcitation:
         """The joints with constants of body or drive that are not determined."""
         return self.joints.loc[self.joints["not determined"] > 0, "joint"].tolist()
 
-    def words(self, most: int) -> str:
+    def summary(self, most: int) -> str:
         """The first ``most`` directions that are not determined, and how many more there are."""
         shown = "; ".join(self.undetermined[:most]) or "none"
         more = len(self.undetermined) - most

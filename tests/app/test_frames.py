@@ -6,18 +6,11 @@ import pytest
 import torch
 import yaml
 
+from examples.cleaning_steps import PolynomialFit, SubtractStart
 from pinn_dyn.app.frame import frame_dataset
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import LogSource
-from pinn_dyn.data.logs import (
-    Deduplicate,
-    InputDelay,
-    InputRates,
-    PolynomialFit,
-    Resample,
-    SplitGaps,
-    SubtractStart,
-)
+from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample, SplitGaps
 from tests.support.linear import unit_masses
 
 
@@ -145,7 +138,7 @@ def test_rows_that_the_cleaning_drops_or_moves_are_predicted_all_the_same():
 @pytest.mark.parametrize(
     ("step", "expected"),
     [
-        (InputDelay(), "steps.own: InputDelay.* takes something from the training runs"),
+        (InputDelay(), "steps.own: InputDelay.* is estimated on the training runs"),
         (PolynomialFit(degree=3, segment=1.0), "steps.own leaves 3 stretches"),
         (SplitGaps(longest=0.01), "steps.own leaves 0 stretches"),
     ],

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import (
-    Butterworth,
-    InputDelay,
-    LogError,
-    Resample,
-    SubtractStart,
-    common_motions,
-)
+from examples.cleaning_steps import SubtractStart
+from pinn_dyn.data.logs import Butterworth, InputDelay, LogError, Resample, common_motions
 from tests.data.logs_files import RATE, motion, source, write
 
 DELAY = 0.05

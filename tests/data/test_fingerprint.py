@@ -189,7 +189,7 @@ def test_files_that_came_went_and_changed_are_named(recorded):
     (recorded / "run_3.csv").rename(recorded / "run_5.csv")
     text = "\n".join(changes(recorded, test=dict(runs=["run_5"], piece=1.0)))
     assert "file run_3.csv is gone" in text
-    assert 'test.names was ["run_3"], now it is ["run_5"]' in text
+    assert 'test.runs was ["run_3"], now it is ["run_5"]' in text
 
 
 def test_runs_that_moved_between_splits_are_named(recorded):

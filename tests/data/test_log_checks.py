@@ -1,10 +1,25 @@
-"""Bad logs: each is refused or reported with its place and what to do."""
+"""Bad logs: each is refused or measured as a warning, by its place and with a cure."""
+
+import gzip
+import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from pinn_dyn.data.logs import Deduplicate, LogError, Resample, RowClock, SplitGaps
+from examples.cleaning_steps import RowClock
+from pinn_dyn.data.logs import (
+    Deduplicate,
+    LogError,
+    MovingAverage,
+    RemoveJumps,
+    Resample,
+    SplitGaps,
+)
 from tests.data.logs_files import motion, source, write
+
+RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
+RUNS = dict(validation=dict(runs=["b"], piece=1.0), test=dict(runs=["c"], piece=1.0))
 
 
 def refused(folder, table, message, **changes):
@@ -15,8 +30,15 @@ def refused(folder, table, message, **changes):
 
 def warned(folder, table, **changes):
     write(folder, table)
-    report = source(folder, **changes).report
-    return report.split("## Warnings\n")[1].split("\n## ")[0].strip()
+    return "\n".join(source(folder, **changes).warnings)
+
+
+def warned_of_runs(folder, runs=(), **changes):
+    """Warnings of a log of the runs a (training), b (validation), c (test) and others."""
+    usual = {"a": motion(), "b": motion(phase=1.0), "c": motion(phase=2.5)}
+    for name, table in {**usual, **dict(runs)}.items():
+        write(folder, table, f"{name}.csv")
+    return "\n".join(source(folder, **{**RUNS, **changes}).warnings)
 
 
 def put(row, column, value):
@@ -36,43 +58,92 @@ def repeat(t):
     return t
 
 
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        (motion().rename(columns={"q2": "q_2"}), r"run.csv: no column 'q2'.*mean q_2.*has t, q1"),
-        (put(41, "q2", "broken"), r"run.csv, line 43, column 'q2' \(q\): the value is 'broken'"),
-        (
-            put(17, "u1", np.nan),
-            r"line 19, column 'u1' \(u\): the value is empty or NaN.*1 such row",
-        ),
-        (put(17, "v1", np.inf), r"line 19, column 'v1' \(v\): the value is 'inf'"),
-        (
-            clock(lambda t: np.where(t > 3, t - 3, t)),
-            r"line 303.*goes back from 3 to 0.01.*SplitGaps",
-        ),
-        (clock(repeat), r"line 402, column 't': the time 3.99 s repeats.*Deduplicate"),
-        (clock(lambda t: np.where(t > 3, t + 1, t)), r"line 303.*jumps from 3 to 4.01.*SplitGaps"),
-        (clock(lambda t: 1000 * t), r"sample time would be 10 s.*unit of the time wrong \(ms\?\)"),
-        (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
-        (motion().assign(u1=1.0, u2=0.0), r"every input \(u1, u2\) is constant"),
-        (motion()[:0], r"has no rows"),
-        (motion(2.0), r"too short to keep 2.0 s for test"),
-    ],
-    ids=str,
-)
+def alternating(first, second):
+    table = first.copy()
+    table.iloc[1::2, 1:] = second.iloc[1::2, 1:]
+    return table
+
+
+def wrapped(turn):
+    angle = turn * 0.15 * motion()["t"] + 0.01 * turn
+    return motion().assign(q2=angle % turn, v2=turn * 0.15)
+
+
+BAD = {
+    "name": (motion().rename(columns={"q2": "q_2"}), r"no column 'q2'.*mean q_2.*has t, q1"),
+    "text": (put(41, "q2", "broken"), r"run.csv, line 43, column 'q2' \(q\): .*'broken'"),
+    "NaN": (put(17, "u1", np.nan), r"line 19, column 'u1' \(u\): .*empty or NaN.*1 such row"),
+    "infinity": (put(17, "v1", np.inf), r"line 19, column 'v1' \(v\): the value is 'inf'"),
+    "1e300": (put(300, "v2", 1e300), r"line 302, column 'v2' \(v\): .*1e\+300 .*'no value'"),
+    "back": (clock(lambda t: np.where(t > 3, t - 3, t)), r"line 303.*from 3 to 0.01.*SplitGaps"),
+    "repeat": (clock(repeat), r"line 402, column 't': the time repeats from 3.99.*Deduplicate"),
+    "jump": (clock(lambda t: np.where(t > 3, t + 1, t)), r"line 303.*from 3 to 4.01.*SplitGaps"),
+    "unit": (clock(lambda t: 1000 * t), r"sample time would be 10 s.*unit .* wrong \(ms\?\)"),
+    "jitter": (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
+    "inputs": (motion().assign(u1=1.0, u2=0.0), r"every input \(u1, u2\) is constant"),
+    "rest": (motion().assign(q1=0.3, q2=0.0, v1=0.0, v2=0.0), "no coordinate .* moves"),
+    "empty": (motion()[:0], r"has no rows"),
+    "short": (motion(2.0), r"too short to keep 2.0 s for test"),
+    "wraps": (wrapped(2 * np.pi), r"run.csv, line \d+, column 'q2' \(q\): the angle wraps from"),
+    "mixture": (alternating(motion(), motion(phase=2.0)), r"line 3, .*rows go to and fro"),
+    "dates": (
+        motion().assign(t=pd.date_range("2026-11-25", periods=1001, freq="10ms").astype(str)),
+        "write seconds, as by .*total_seconds",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("table", "message"), BAD.values(), ids=BAD)
 def test_bad_files_are_refused_with_place_and_cure(tmp_path, table, message):
     refused(tmp_path, table, message)
 
 
+def csv(**options):
+    return motion().to_csv(index=False, float_format="%.6f", **options)
+
+
+FILES = {
+    "two of a name": (csv().replace("v2", "q1", 1).encode(), "2 columns have the name 'q1'"),
+    "decimal commas": (csv(sep=";", decimal=",").encode(), "line 2, column 't' .*decimal comma"),
+    "long rows": (csv().replace("\n0.02", "\n9,0.02").encode(), "run.csv: cannot be read"),
+    "a cut row": (csv()[:-40].rsplit(",", 2)[0].encode(), "line .* is empty or NaN"),
+    "a binary file": (bytes(range(256)) * 40, "run.csv: cannot be read"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), FILES.values(), ids=FILES)
+def test_damaged_tables_are_refused(tmp_path, content, message):
+    (tmp_path / "run.csv").write_bytes(content)
+    with pytest.raises(LogError, match=message):
+        source(tmp_path).load()
+
+
+def test_compressed_tables(tmp_path):
+    content = gzip.compress(csv().encode())
+    (tmp_path / "run.csv.gz").write_bytes(content)
+    log = source(tmp_path, files="*.gz")
+    assert log.load().train[0].q.shape == (601, 2)
+    assert log.cleaned[0].raw.run == "run"
+    (tmp_path / "run.csv.gz").write_bytes(content[:2000])
+    with pytest.raises(LogError, match=r"run.csv.gz: cannot be read"):
+        source(tmp_path, files="*.gz").load()
+
+
 def test_the_named_step_is_the_cure(tmp_path):
     write(tmp_path, clock(repeat))
-    steps = {"deduplicate": Deduplicate(), "resample": Resample(rate=100.0, max_gap=0.05)}
+    steps = {"deduplicate": Deduplicate(), **RESAMPLE}
     assert len(source(tmp_path, steps=steps).load().train[0].t) == 601
     write(tmp_path, clock(lambda t: np.where(t > 3, t + 1, t)))
     assert len(source(tmp_path, steps={"gaps": SplitGaps(longest=0.05)}).load().train) == 2
     write(tmp_path, clock(lambda t: t + 0.004 * np.sin(40 * t)))
-    steps = {"resample": Resample(rate=100.0, max_gap=0.05)}
-    assert source(tmp_path, steps=steps).load().train[0].t.diff().std() < 1e-12
+    assert source(tmp_path, steps=RESAMPLE).load().train[0].t.diff().std() < 1e-12
+
+
+def test_two_runs_of_equal_times_are_not_deduplicated_away(tmp_path):
+    rows = np.repeat(motion().to_numpy(), 2, axis=0)
+    rows[1::2, 1:] = motion(phase=2.0).to_numpy()[:, 1:]
+    table = pd.DataFrame(rows, columns=motion().columns)
+    refused(tmp_path, table, r"line 3, .*rows go to and fro", steps=dict(once=Deduplicate()))
 
 
 def test_two_clocks(tmp_path):
@@ -87,79 +158,46 @@ def test_two_clocks(tmp_path):
 
 @pytest.mark.parametrize("rate", [50, 200])
 def test_a_run_of_another_sample_time_is_named(tmp_path, rate):
-    write(tmp_path, motion(), "a.csv")
-    write(tmp_path, motion(phase=1.0), "b.csv")
-    message = rf"c .*its sample time is {1 / rate:g} s, that of the others 0.01 s: add a Resample"
-    write(tmp_path, motion(phase=2.0, rate=rate), "c.csv")
+    for name, table in zip("abc", (motion(), motion(), motion(rate=rate)), strict=True):
+        write(tmp_path, table, f"{name}.csv")
+    message = rf"c .*its sample time is {1 / rate:g} s, that of the other .* 0.01 s: .*Resample"
     with pytest.raises(LogError, match=message):
-        source(tmp_path).load()
+        source(tmp_path, validation=dict(seconds=1.0, piece=1.0)).load()
 
 
-def test_an_empty_pattern_names_itself_and_the_folder(tmp_path):
-    with pytest.raises(LogError, match=rf"nothing matches '\*.txt' in the folder {tmp_path}"):
-        source(tmp_path, files="*.txt").load()
+def test_files_that_are_not_there_and_runs_of_one_name(tmp_path):
+    (tmp_path / "run").mkdir()
     write(tmp_path, motion(), "b.csv")
-    with pytest.raises(LogError, match=r"which has b\.csv: mend dataset\.files or dataset\.root"):
-        source(tmp_path, files="*.txt").load()
+    for files in ("*.txt", "run"):
+        with pytest.raises(LogError, match=r"nothing matches .* has b\.csv, run.*dataset.root"):
+            source(tmp_path, files=files).load()
     with pytest.raises(LogError, match="absent', which is no folder"):
         source(tmp_path / "absent").load()
-
-
-def test_a_folder_that_is_no_bag_names_what_is_in_it(tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "run_0.mcap").touch()
-    with pytest.raises(LogError, match=r"folder without metadata.yaml.* as 'run/\*.mcap'"):
-        source(tmp_path, files="run").load()
-    (tmp_path / "csv").mkdir()
-    write(tmp_path / "csv", motion())
-    with pytest.raises(LogError, match=r"nothing matches 'c\*' .*, but a folder: .* 'csv/\*.csv'"):
-        source(tmp_path, files="c*").load()
+    write(tmp_path, motion(), "b.txt")
+    with pytest.raises(LogError, match=r"are both the run 'b'"):
+        source(tmp_path, files=["*.csv", "*.txt"]).load()
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("changes", "message"),
     [
-        ("run.ulg", r"\.ulg is not read, but CSV .*bags of ROS.*ulog2csv"),
-        ("run.pickle", r"read_pickle.*if you trust"),
-        ("run.tdms", r"nptdms"),
-        ("run.json", r"read_json"),
-        ("run.XLSX", r"read_excel"),
-        ("run.foo", r"cannot be read as CSV.*What is read is CSV .*NPZ, Parquet, .*to_parquet"),
+        (dict(test=dict(runs=["runs"], piece=1.0)), r"no run 'runs': did you mean run"),
+        (dict(test=dict(runs=1, piece=1.0)), r"1 runs to choose from.*split by 'seconds'"),
+        (
+            dict(test=dict(runs=["run"], piece=1.0), validation=dict(runs=["run"], piece=1.0)),
+            r"'run' is in validation and in test",
+        ),
+        (dict(shortest=20.0), r"train: after splitting no stretch lasts 20 s"),
+        (dict(test=dict(seconds=2.0, piece=0.333)), "multiple of the sample time"),
     ],
 )
-def test_files_of_other_formats_are_told_how_to_convert(tmp_path, name, message):
-    (tmp_path / name).write_bytes(b"ULog\x01\x12\xff\x00" * 50)
-    with pytest.raises(LogError, match=rf"{name}: .*{message}"):
-        source(tmp_path, files="run.*").load()
+def test_splits_that_cannot_be(tmp_path, changes, message):
+    refused(tmp_path, motion(), message, **changes)
 
 
-def test_runs_that_do_not_exist_or_do_not_suffice(tmp_path):
-    write(tmp_path, motion())
-    piece = dict(piece=1.0)
-    with pytest.raises(LogError, match=r"no run 'runs': did you mean run"):
-        source(tmp_path, test=dict(runs=["runs"], **piece)).load()
-    with pytest.raises(LogError, match=r"1 runs to choose from.*split by 'seconds'"):
-        source(tmp_path, test=dict(runs=1, **piece)).load()
-    both = dict(runs=["run"], **piece)
-    with pytest.raises(LogError, match=r"'run' is in validation and in test"):
-        source(tmp_path, test=both, validation=both).load()
-    with pytest.raises(LogError, match=r"train: after splitting no stretch.*shortest, 20 s"):
-        source(tmp_path, shortest=20.0).load()
-
-
-def test_rows_longer_than_the_header(tmp_path):
-    text = motion().to_csv(index=False).splitlines()
-    (tmp_path / "run.csv").write_text("\n".join([text[0], *(f"{row},1" for row in text[1:])]))
-    with pytest.raises(LogError, match=r"run.csv: cannot be read as CSV"):
-        source(tmp_path).load()
-
-
-def test_a_good_log_has_no_warning(tmp_path, caplog):
-    assert warned(tmp_path, motion()) == "- none"
+def test_a_good_log_has_no_warning_and_a_warning_is_logged_once(tmp_path, caplog):
+    assert warned(tmp_path, motion()) == ""
     assert not caplog.records
-
-
-def test_warnings_are_logged_once(tmp_path, caplog):
     write(tmp_path, motion().assign(u2=0.0))
     log = source(tmp_path)
     log.load()
@@ -167,35 +205,170 @@ def test_warnings_are_logged_once(tmp_path, caplog):
     assert [record.getMessage() for record in caplog.records] == [
         "oscillator: input 'u2' is constant in all runs: its column of A cannot be learned"
     ]
+    assert {x.name for x in log.measurements} >= {"dq/dt over v", "range of the input"}
+
+
+NOISE = np.random.default_rng(0).normal(size=(2, 1001))
+SWAPPED = motion().rename(columns={"v1": "v2", "v2": "v1"})
+SUSPICIOUS = {
+    "zero v": (dict(v2=0.0), "columns 'q2' and 'v2': v is not .*v is zero throughout"),
+    "v of noise": (dict(v1=NOISE[0]), "columns 'q1' and 'v1': v is not .*the right column"),
+    "exchanged v": (dict(v1=SWAPPED["v1"], v2=SWAPPED["v2"]), "'v2' fits it.*\n.*'v1' fits it"),
+    "still": (dict(q1=0.3, v1=0.0), r"column 'q1' \(q\): never moves"),
+    "only noise": (dict(q1=1e-3 * NOISE[0], v1=NOISE[1]), r"no more than its noise .* 0.000997"),
+    "one signal twice": (dict(u2=3 - 2 * motion()["u1"]), r"'u1' .u. and 'u2' .u. are the same"),
+    "an input is q": (dict(u1=motion()["q1"]), r"'q1' \(q\) and 'u1' \(u\) are the same"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("columns", "message"), SUSPICIOUS.values(), ids=SUSPICIOUS)
+def test_suspicious_signals_are_warned_of(tmp_path, columns, message):
+    assert re.search(message, warned(tmp_path, motion().assign(**columns)), re.DOTALL)
+
+
+@pytest.mark.parametrize(("factor", "said"), [(180 / np.pi, 0.01745), (-1.0, -1.0), (0.5, 2.0)])
+def test_velocity_that_disagrees_by_a_factor(tmp_path, factor, said):
+    text = warned(tmp_path, motion().assign(v2=factor * motion()["v2"]))
+    measured = float(text.split("derivative of q is ")[1].split(" ")[0])
+    assert measured == pytest.approx(said, rel=1e-2)
+    assert text.startswith("columns 'q2' and 'v2'")
+    assert ("degrees" in text) == (factor > 50)
+
+
+def test_a_noisy_velocity_that_fits_is_let_through(tmp_path):
+    table = motion()
+    table["v1"] += 0.5 * table["v1"].std() * NOISE[0]
+    assert warned(tmp_path, table) == ""
 
 
 def test_angles_in_degrees(tmp_path):
     table = motion()
     table[["q2", "v2"]] = np.degrees(table[["q2", "v2"]])
     text = warned(tmp_path, table)
-    assert text.startswith("- run, column 'q2': ")
-    assert "is it in degrees? Its unit is given as 'rad'" in text
+    assert text.startswith("run, column 'q2': an angle of ")
     assert "derivative" not in text
-
-
-@pytest.mark.parametrize(("factor", "said"), [(180 / np.pi, 0.01745), (-1.0, -1.0), (0.5, 2.0)])
-def test_velocity_that_disagrees_by_a_factor(tmp_path, factor, said):
-    text = warned(tmp_path, motion().assign(v2=factor * motion()["v2"]))
-    assert text.startswith("- columns 'q2' and 'v2': the derivative of q is ")
-    measured = float(text.split("derivative of q is ")[1].split(" ")[0])
-    assert measured == pytest.approx(said, rel=1e-2)
-    assert ("degrees" in text) == (factor > 50)
 
 
 def test_a_reversed_torque(tmp_path):
     table = motion()
-    rng = np.random.default_rng(0)
     # A force that the position does not explain, with the motion that follows from it.
-    force = np.interp(table["t"], np.arange(0, 11, 0.25), rng.normal(size=44))
+    levels = np.random.default_rng(0).normal(size=44)
+    force = np.interp(table["t"], np.arange(0, 11, 0.25), levels)
     v = np.cumsum(force) * 0.01
     table["v1"], table["q1"], table["u1"] = v, np.cumsum(v) * 0.01, force
-    assert warned(tmp_path, table) == "- none"
+    assert warned(tmp_path, table) == ""
     assert "input 'u1' seems to push backwards" in warned(tmp_path, table.assign(u1=-force))
+
+
+def test_a_robot_at_rest(tmp_path):
+    table = motion(100.0)
+    table.loc[500:, ["q1", "q2"]] = table.loc[500, ["q1", "q2"]].to_numpy()
+    table.loc[500:, ["v1", "v2"]] = 0.0
+    assert "at rest for 95 % of the training" in warned(tmp_path, table)
+
+
+def test_an_input_that_only_moves_in_the_test(tmp_path):
+    table = motion()
+    table.loc[:799, "u2"] = 0.25
+    text = warned(tmp_path, table, validation=dict(seconds=1.0, piece=1.0))
+    assert "column 'u2' (u): is 0.25 Nm in all training runs and moves in run" in text
+
+
+# Jumps and spikes.
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [("q1", 1.0, "a jump to 1 rad"), ("v1", 50.0, "a spike to 50"), ("u1", -400.0, "a spike")],
+)
+def test_a_spike_of_each_signal(tmp_path, column, value, message):
+    text = warned(tmp_path, put(300, column, value).astype(float))
+    assert f"run.csv, line 302, column '{column}' ({column[0]}): {message}" in text
+
+
+def test_a_jump_that_stays_and_a_step_that_removes_jumps(tmp_path):
+    table = motion()
+    table.loc[300:, "q1"] += 0.4
+    assert "line 302, column 'q1' (q): a jump to " in warned(tmp_path, table)
+    steps = dict(jumps=RemoveJumps(threshold=0.2, window=7))
+    assert warned(tmp_path, put(300, "q1", 3.0), steps=steps) == ""
+
+
+@pytest.mark.parametrize("value", [0.0, -999.0])
+def test_a_value_that_stands_for_none_in_many_rows(tmp_path, value):
+    """The rows are so many that the jumps are not unusual any more."""
+    table = motion()
+    table.loc[np.random.default_rng(0).choice(len(table), 60, replace=False), "q1"] = value
+    assert f"column 'q1' (q): the value {value:.5g} rad comes in " in warned(tmp_path, table)
+
+
+def test_steps_of_the_input_and_starts_from_rest_are_no_spikes(tmp_path):
+    t = np.arange(1001) / 100
+    q = np.where(t < 3, 0, 1 - np.exp(-5 * (t - 3).clip(0)))
+    v = np.where(t < 3, 0, 5 * np.exp(-5 * (t - 3).clip(0)))
+    table = motion().assign(q1=q, v1=v, u1=np.where(t < 3, 0.0, 5.0))
+    assert "line" not in warned(tmp_path, table)
+
+
+# Runs.
+
+
+def test_a_run_that_moves_one_input_alone_needs_no_warning(tmp_path):
+    rare = motion(phase=1.7)
+    rare[["q1", "v1", "u1"]] *= 60
+    columns = dict(q=dict(columns=["q1", "q2"], unit="m"), v=dict(columns=["v1", "v2"], unit="m/s"))
+    assert warned_of_runs(tmp_path, {"d": rare}, **columns) == ""
+
+
+@pytest.mark.parametrize(("run", "split"), [("b", "validation"), ("c", "test"), ("d", "train")])
+@pytest.mark.parametrize(("factor", "said"), [(-1, "-1"), (180 / np.pi, "0.01745"), (0, "zero")])
+def test_velocities_of_one_run_have_another_unit_or_sign(tmp_path, run, split, factor, said):
+    table = motion(phase=3.3)
+    table["v2"] *= factor
+    text = warned_of_runs(tmp_path, {run: table})
+    assert f"{run} ({split}), columns 'q2' and 'v2': " in text
+    assert (f"is {said} times v" if factor else "v is zero throughout this run") in text
+    assert "and 'v1'" not in text
+
+
+@pytest.mark.parametrize("run", ["b", "c", "d"])
+def test_inputs_of_one_run_have_another_unit(tmp_path, run):
+    table = motion(phase=3.3)
+    table[["u1", "u2"]] *= 1000
+    assert f"{run}: u spreads " in warned_of_runs(tmp_path, {run: table})
+
+
+def test_copies_of_runs(tmp_path):
+    with pytest.raises(LogError, match=r"c, in test, is a copy of b, in validation"):
+        warned_of_runs(tmp_path, {"c": motion(phase=1.0)})
+    text = warned_of_runs(tmp_path, {"c": motion(phase=2.5), "d": motion()})
+    assert "d is a copy of a, number by number (both train)" in text
+
+
+@pytest.mark.parametrize(("run", "split"), [("b", "validation"), ("c", "test")])
+def test_a_motion_that_repeats_a_training_motion(tmp_path, run, split):
+    again = motion()[200:601].reset_index(drop=True)
+    for k in (1, 2):
+        again[f"q{k}"] += 0.01 * again[f"q{k}"].std() * NOISE[k - 1][: len(again)]
+    text = warned_of_runs(tmp_path, {run: again})
+    assert f"{split}: 4 of the motions of {run} repeat one of a" in text
+    assert warned_of_runs(tmp_path, {run: motion(4.0, phase=1.3)}) == ""
+
+
+# Steps that destroy the data.
+
+
+def test_steps_that_destroy_the_data(tmp_path):
+    text = warned(tmp_path, motion(), steps=dict(smooth=MovingAverage(900)))
+    assert "smooth: MovingAverage(window=900" in text
+    assert "% of its spread left" in text
+    table = motion()
+    table["q1"] += 1e-3 * NOISE[0]
+    steps = dict(jumps=RemoveJumps(threshold=1e-4, window=5))
+    assert "threshold is below the noise" in warned(tmp_path, table, steps=steps)
+
+
+# Stamps.
 
 
 def in_bursts(seconds=10.0, rows=8, late=0.002, apart=0.0):
@@ -203,54 +376,34 @@ def in_bursts(seconds=10.0, rows=8, late=0.002, apart=0.0):
     table = motion(seconds)
     t = table["t"].to_numpy()
     number = np.arange(len(t))
-    # A burst is written when its last row is there.
+    # A burst is written after its last row.
     written = t[np.minimum(rows * (number // rows) + rows - 1, len(t) - 1)]
     return table.assign(t=written + late + apart * (number % rows))
 
 
-def test_stamps_in_bursts_are_refused_or_warned_of_by_their_cure(tmp_path):
-    refused(tmp_path, in_bursts(), r"line 3, column 't': the time .* repeats.*bursts.*RowClock")
-    refused(tmp_path, in_bursts(apart=2e-5), r"the time jumps .*RowClock step: its stamps come")
-    steps = {"resample": Resample(rate=100.0, max_gap=0.2)}
-    said = warned(tmp_path, in_bursts(apart=2e-5), steps=steps)
-    assert "run: stamps come in bursts" in said
-    assert "RowClock" in said
+def test_stamps_in_bursts_are_refused_or_warned_of(tmp_path):
+    refused(tmp_path, in_bursts(), r"line 3, column 't': the time repeats .*bursts.*RowClock")
+    refused(tmp_path, in_bursts(apart=2e-5), r"the time jumps .*RowClock")
+    text = warned(tmp_path, in_bursts(apart=2e-5), steps=RESAMPLE)
+    assert "run: stamps come in bursts" in text
 
 
 @pytest.mark.parametrize("apart", [0.0, 2e-5])
 @pytest.mark.parametrize("rate", [None, 100.0])
-def test_a_row_clock_mends_bursts(tmp_path, apart, rate):
+def test_a_row_clock_repairs_bursts(tmp_path, apart, rate):
     steps = {"clock": RowClock(longest=0.1, rate=rate)}
-    write(tmp_path, in_bursts(apart=apart))
-    found = source(tmp_path, steps=steps)
-    assert "## Warnings\n\n- none" in found.report
-    write(tmp_path, motion())
-    expected = source(tmp_path).load()
-    for name in ("train", "test"):
-        ours, theirs = getattr(found.load(), name)[0], getattr(expected, name)[0]
-        assert float(ours.t[1]) == pytest.approx(float(theirs.t[1]), rel=1e-3)
-    assert len(found.load().test) == len(expected.test)
-
-
-def test_lost_rows_are_no_bursts(tmp_path):
-    table = in_bursts()
-    write(tmp_path, table.drop(index=range(300, 360)))
-    with pytest.raises(LogError, match=r"RowClock found the stamp .* rows are missing.*SplitGaps"):
-        source(tmp_path, steps={"clock": RowClock(longest=0.1)}).load()
-    steps = {"gaps": SplitGaps(longest=0.3), "clock": RowClock(longest=0.1, rate=100.0)}
-    assert len(source(tmp_path, steps=steps).load().train) == 2
+    assert warned(tmp_path, in_bursts(apart=apart), steps=steps) == ""
+    splits = source(tmp_path, steps=steps).load()
+    assert float(splits.train[0].t[1]) == pytest.approx(0.01, rel=1e-3)
+    lost = in_bursts().drop(index=range(300, 360))
+    refused(tmp_path, lost, r"RowClock found the stamp .* rows are missing.*SplitGaps", steps=steps)
 
 
 def test_a_clock_that_contradicts_the_velocities_is_told_from_jitter(tmp_path):
     """Stamps that swing about the true times, and samples that were taken at such times."""
     uniform = motion()["t"].to_numpy()
     swing = uniform + 0.0115 * np.sin(0.5 * np.arange(len(uniform)))
-    assert (np.diff(swing) > 0).all()
-    steps = {"resample": Resample(rate=100.0, max_gap=0.05)}
-    said = warned(tmp_path, motion().assign(t=swing), steps=steps)
-    assert "coordinate 1: by the stamps v leaves" in said
-    assert "by a uniform clock" in said
-    sampled = (
-        motion().drop(columns="t").apply(lambda x: np.interp(swing, uniform, x)).assign(t=swing)
-    )
-    assert warned(tmp_path, sampled, steps=steps) == "- none"
+    text = warned(tmp_path, motion().assign(t=swing), steps=RESAMPLE)
+    assert "coordinate 1: by the stamps v leaves" in text
+    sampled = motion().drop(columns="t").apply(lambda x: np.interp(swing, uniform, x))
+    assert warned(tmp_path, sampled.assign(t=swing), steps=RESAMPLE) == ""

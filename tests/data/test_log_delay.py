@@ -64,7 +64,7 @@ def test_the_step_shifts_by_what_it_found_and_says_so():
     assert len(shifted) == len(item) - 4
     np.testing.assert_array_equal(shifted.u, item.u[:-4])
     np.testing.assert_array_equal(shifted.q, item.q[4:])
-    assert "4 samples (0.04 s), found on the training runs" in text
+    assert "4 samples (0.04 s), estimated on the training runs" in text
     assert "0 ms" in text  # the curve
     assert not step.losses([item], [shifted])
 

@@ -1,101 +1,140 @@
-"""The numbers of a log's check against what the log was made of."""
+"""The check of a log: measurements with verdicts, and the two steps that it measures."""
 
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pinn_dyn.data.logs import LogSource, Recording
+from pinn_dyn.data.logs import Butterworth, LogSource, Recording
 from pinn_dyn.evaluation.log_check import check_log
-from tests.support.delayed_robots import log
+from pinn_dyn.evaluation.log_numbers import bandwidth, white_noise
+
+RATE = 100.0
 
 
-def source(folder, table, **changes):
-    pd.DataFrame(table).to_csv(folder / "run.csv", index=False)
+def driven(delay=0.0, noise=0.0, seconds=60.0, seed=0):
+    """Two masses on springs that random forces move, as a data frame."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds * RATE)) / RATE
+    fine = np.arange(-2.0, seconds + 1, 0.001)
+    table = {"t": t}
+    for k in (1, 2):
+        knots = rng.normal(size=round((seconds + 4) / 0.2))
+        force = np.interp(fine, -2.0 + 0.2 * np.arange(len(knots)), knots)
+        acting = np.interp(fine - delay, fine, force)
+        q, v, motion = 0.0, 0.0, []
+        for f in acting:
+            v += 0.001 * (4 * f - 3 * q - 0.8 * v)
+            q += 0.001 * v
+            motion.append(q)
+        table[f"q{k}"] = np.interp(t, fine, motion) + noise * rng.normal(size=len(t))
+        table[f"u{k}"] = np.interp(t, fine, force)
+    return pd.DataFrame(table)
+
+
+def checked(frame, **changes):
     arguments = dict(
-        name="arm",
-        root=str(folder),
-        files="*.csv",
+        name="masses",
+        files=frame,
         time=dict(columns="t", unit="s"),
-        q=dict(columns=["q1", "q2"], unit="rad"),
-        u=dict(columns=["u1", "u2"], unit="Nm"),
-        validation=dict(seconds=1.0, piece=1.0),
-        test=dict(seconds=2.0, piece=1.0),
+        q=dict(columns=["q1", "q2"], unit="m"),
+        u=dict(columns=["u1", "u2"], unit="N"),
+        validation=dict(seconds=4.0, piece=2.0),
+        test=dict(seconds=8.0, piece=4.0),
     )
-    return LogSource(**{**arguments, **changes})
-
-
-def columns(item):
-    q, u = item.q, item.u
-    return {"t": item.t, "q1": q[:, 0], "q2": q[:, 1], "u1": u[:, 0], "u2": u[:, 1]}
+    return check_log(LogSource(**{**arguments, **changes}))
 
 
 @pytest.fixture(scope="module")
-def item():
-    return log("arm", 0, 0.03, noise=2e-3)
+def good():
+    return driven(noise=1e-5)
 
 
-def test_noise_delay_and_coverage_are_those_of_the_log(tmp_path, item):
-    found = check_log(source(tmp_path, columns(item)))
-    np.testing.assert_allclose(found.coordinates["noise / range"], 2e-3, rtol=0.4)
-    assert found.inputs["delay [ms]"].tolist() == pytest.approx([30, 30], abs=10)
-    assert not found.problems
-    assert "delay: 0.03}" in found.suggestion
-    assert "inertia not identified: none" in str(found)
-    assert found.runs["sample time [ms]"].tolist() == pytest.approx([10.0] * 3)
-    assert (found.coordinates["own share of a"] > 0.05).all()
+def verdicts(check):
+    return {(x.name, x.place): x.verdict for x in check.measurements}
 
 
-def test_a_joint_that_follows_another_cannot_be_identified(tmp_path, item):
-    table = columns(item)
-    table["q2"] = 0.5 * log("arm", 0, 0.03, noise=0.0).q[:, 0]
-    table["q1"] = 2 * table["q2"]
-    found = check_log(source(tmp_path, table))
-    assert (found.coordinates["own share of a"] < 1e-6).all()
-    assert sum("inertia cannot be told" in text for text in found.warnings) == 2
-    assert found.unidentified == ["q1 [rad]", "q2 [rad]"]
+def test_a_good_log_has_no_warning_and_no_step_to_add(good, tmp_path):
+    check = checked(good)
+    assert set(verdicts(check).values()) == {"ok"}
+    assert not check.problems
+    assert check.steps == []
+    assert "a training makes sense" in str(check)
+    page = check.save(tmp_path, "python check.py")
+    assert page.stat().st_size > 20_000
+    saved = (tmp_path / "measurements.csv").read_text()
+    assert saved.startswith("verdict,measurement,of,value,expected,explanation,docs")
+    assert (tmp_path / "log_report.md").is_file()
 
 
-def test_a_test_outside_the_training_is_told(tmp_path, item):
-    table = columns(item)
-    table["q1"] = table["q1"] + 3.0 * (item.t > item.t[-1] - 2.0)
-    found = check_log(source(tmp_path, table))
-    assert found.coordinates["test outside"][0] > 0.8
-    assert np.median(found.distance) > 3
-    assert any("outside the range" in text for text in found.warnings)
+def test_a_delay_is_measured_warned_of_and_given_as_a_step():
+    check = checked(driven(delay=0.05, noise=1e-5))
+    assert [x.delay for x in check.delays] == pytest.approx([0.05, 0.05], abs=0.006)
+    assert verdicts(check)["delay [ms]", "u1"] == "warning"
+    (line,) = check.steps
+    assert line.startswith("delay: {_target_: pinn_dyn.data.logs.InputDelay, delay: 0.05}")
 
 
-def test_a_robot_that_rests_is_not_worth_a_training(tmp_path, item):
-    table = columns(item)
-    moving = item.t < 0.1
-    for name in ("q1", "q2"):
-        table[name] = np.where(moving, table[name], 0.0)
-    found = check_log(source(tmp_path, table))
-    assert any("rests" in text for text in found.problems)
+def test_noise_is_measured_and_gives_a_filter_above_the_motion():
+    check = checked(driven(noise=0.005))
+    assert check.coordinates["noise of q"].to_numpy() == pytest.approx([0.005] * 2, rel=0.1)
+    (line,) = [x for x in check.steps if x.startswith("filter")]
+    cutoff = float(line.split("cutoff: ")[1].split("}")[0])
+    assert 2.0 < cutoff < 20.0
+    again = checked(driven(noise=0.005), steps={"smooth": Butterworth(cutoff)})
+    assert not any(x.startswith("filter") for x in again.steps)
 
 
-def test_the_noise_of_a_measured_velocity_is_its_own(tmp_path, item):
-    table = columns(item)
-    v = np.gradient(log("arm", 0, 0.03, noise=0.0).q, item.t, axis=0)
-    noise = np.random.default_rng(1).normal(size=v.shape) * [0.01, 0.03]
-    table |= {f"v{k + 1}": (v + noise)[:, k] for k in range(2)}
-    measured = source(tmp_path, table, v=dict(columns=["v1", "v2"], unit="rad/s"))
-    assert check_log(measured).coordinates["noise of v"].tolist() == pytest.approx(
-        [0.01, 0.03], rel=0.15
+def test_inputs_of_another_robot_stop_a_training(good):
+    other = driven(noise=1e-5, seed=5)
+    check = checked(good.assign(u1=other["u1"], u2=other["u2"]))
+    assert "the inputs explain" in check.problems[0]
+    assert check.table()["verdict"].iloc[0] == "stop"
+    assert "a training makes no sense" in str(check)
+
+
+def test_too_few_samples_stop_a_training(good):
+    part = dict(seconds=0.4, piece=0.2)
+    check = checked(good[:200], validation=part, test=part, guard=0.1)
+    assert any("samples, expected at least 200" in text for text in check.problems)
+
+
+def test_a_test_outside_the_training_is_warned_of(good):
+    far = good.copy()
+    far.loc[len(far) - 800 :, "q1"] += 3.0
+    check = checked(far)
+    assert verdicts(check)["share of the test outside the range", "q1 [m]"] == "warning"
+    assert verdicts(check)["share of the test far away", ""] == "warning"
+
+
+def test_coordinates_that_move_together_are_not_identified(good):
+    check = checked(good.assign(q2=good["q1"] * 0.5 + 1e-6 * np.sin(9 * good["t"])))
+    assert verdicts(check)["independent share of a", "q1 [m]"] == "warning"
+
+
+def test_motions_that_occur_twice_tell_the_floor(good):
+    twice = good.copy()
+    noise = 1e-3 * np.random.default_rng(1).normal(size=(800, 2))
+    twice.loc[len(twice) - 800 :, ["q1", "q2"]] = (
+        good.loc[500:1299, ["q1", "q2"]].to_numpy() + noise
     )
+    check = checked(twice)
+    floor = check.coordinates["floor of q"].to_numpy()
+    assert floor == pytest.approx([1e-3 / 2**0.5] * 2, rel=0.2)
 
 
-def test_motions_that_come_twice_give_the_floor(tmp_path, item):
-    """Two runs of one motion: they differ by the noise of both, and by a shift of 0.4 samples."""
-    clean, rng = log("arm", 0, 0.03, noise=0.0), np.random.default_rng(2)
-    spread = 1e-3 * np.ptp(clean.q, axis=0)
-    late = np.column_stack([np.interp(item.t - 0.004, item.t, x) for x in clean.q.T])
-    for k, q in enumerate((clean.q, late, item.q[::-1])):
-        table = columns(
-            Recording("run", item.t, q + spread * rng.normal(size=q.shape), None, item.u)
-        )
-        pd.DataFrame(table).to_csv(tmp_path / f"{k}.csv", index=False)
-    splits = {"test": dict(runs=["1"], piece=4.0), "validation": dict(runs=["2"], piece=4.0)}
-    found = check_log(source(tmp_path, columns(item), **splits, files="[0-2].csv"))
-    assert found.figures["motions that repeat one of the training"] == 3
-    np.testing.assert_allclose(found.coordinates["floor of q"], spread, rtol=0.15)
-    assert (found.coordinates["floor of v"] > 0).all()
+@given(st.floats(1e-6, 1e2), st.floats(0.2, 2.0))
+def test_white_noise_is_measured_beside_a_smooth_motion(size, frequency):
+    t = np.arange(4000) / RATE
+    noise = np.random.default_rng(0).normal(size=t.shape)
+    x = 10 * size * np.sin(frequency * t) + size * noise
+    assert white_noise(x[:, None])[0] == pytest.approx(size, rel=0.15)
+
+
+@pytest.mark.parametrize("frequency", [1.0, 4.0])
+def test_the_bandwidth_is_where_the_motion_ends(frequency):
+    t = np.arange(6000) / RATE
+    q = np.sin(2 * np.pi * frequency * t) + 1e-4 * np.random.default_rng(0).normal(size=t.shape)
+    item = Recording("run", t, q[:, None], None, q[:, None])
+    assert bandwidth([item], 1 / RATE, np.array([1e-4])) == pytest.approx(frequency, abs=0.3)

@@ -1,6 +1,6 @@
-"""Logs of robots: columns, units, cleaning steps, checks and the data source."""
+"""Logs of robots: readers, columns, units, cleaning steps, checks and the data source."""
 
-from pinn_dyn.data.logs.clock import Deduplicate, Resample, RowClock, SplitGaps
+from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.common import common_motions
 from pinn_dyn.data.logs.delay import DelayCurve, agreed_delays, input_delays
@@ -9,20 +9,23 @@ from pinn_dyn.data.logs.filters import (
     Butterworth,
     InputRates,
     MovingAverage,
-    PolynomialFit,
+    RemoveJumps,
     SavitzkyGolayVelocity,
 )
 from pinn_dyn.data.logs.input_delay import InputDelay
+from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned
+from pinn_dyn.data.logs.readers import READERS, Request
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.repairs import InterpolateHeld, RemoveJumps, SubtractStart
 from pinn_dyn.data.logs.repeats import repeat_floor
 from pinn_dyn.data.logs.source import LogSource
-from pinn_dyn.data.logs.splits import Part
-from pinn_dyn.data.logs.step import Step
+from pinn_dyn.data.logs.splits import Part, default_split
+from pinn_dyn.data.logs.step import Step, window_samples
+from pinn_dyn.data.logs.table import Table
 from pinn_dyn.data.logs.units import UNITS
 
 __all__ = [
+    "READERS",
     "UNITS",
     "Butterworth",
     "Cleaned",
@@ -31,22 +34,23 @@ __all__ = [
     "DelayCurve",
     "InputDelay",
     "InputRates",
-    "InterpolateHeld",
     "LogError",
     "LogSource",
+    "Measurement",
     "MovingAverage",
     "Part",
-    "PolynomialFit",
     "Recording",
     "RemoveJumps",
+    "Request",
     "Resample",
-    "RowClock",
     "SavitzkyGolayVelocity",
     "SplitGaps",
     "Step",
-    "SubtractStart",
+    "Table",
     "agreed_delays",
     "common_motions",
+    "default_split",
     "input_delays",
     "repeat_floor",
+    "window_samples",
 ]

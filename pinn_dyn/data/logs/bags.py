@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, MCAP included, as a table; read by rosbags, without ROS.
+"""Bags of ROS 1 and ROS 2, MCAP included, as tables; decoded by rosbags, without ROS.
 
 A column is ``<topic>/<field>``, as ``/joint_states/position/panda_joint1``: an entry of an array is
 picked by the joint's name, where the message has names, or by its number from 0, as in
@@ -6,12 +6,14 @@ picked by the joint's name, where the message has names, or by its number from 0
 none, when the bag received it.
 
 The topic of the time column has the rows. Of every other topic a row takes the last message that is
-not later than it, and not older than ``max_age``; rows without one are dropped.
+not later than it, and not older than ``max_age``; rows without such a message are dropped.
 """
 
 from __future__ import annotations
 
-import importlib
+import json
+import os
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,165 +21,177 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.messages import BATCH, Topic
+from pinn_dyn.data.logs.readers import Request, optional
+from pinn_dyn.data.logs.table import Table
+from pinn_dyn.data.whole import whole
 
-BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a file, or the folder that ROS 2 writes."""
-    return path.suffix in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+# Names of the entries of a message's arrays, in sensor_msgs and trajectory_msgs.
+_NAMES = ("name", "joint_names")
 
 
-def optional(name: str, path: Path) -> Any:
-    """A module of the extra ``logs``.
+def read_bag(path: Path, request: Request) -> Table:
+    """Read columns of a bag, one row per message of the topic of the time.
 
-    Raises:
-        LogError: if it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise LogError(
-            f"{path}: to read it takes the package {name.split('.')[0]}, which is not installed: "
-            "pip install 'pinn_dyn[logs]'"
-        ) from error
-
-
-def read_bag(path: Path, time: str, columns: Sequence[str], max_age: float) -> pd.DataFrame:
-    """The columns asked for, one row per message of the topic of the time.
-
-    Args:
-        path: the bag.
-        time: column of the time.
-        columns: all columns to read, the time among them or not.
-        max_age: how old a message of another topic may be, s.
+    The decoded messages are kept as Parquet files in the cache, since decoding takes 20 µs each.
 
     Raises:
-        LogError: on a bag that is damaged, topics, fields or joints that it does not have, and
-            clocks that never overlap.
+        LogError: on topics, fields or joints that the bag does not have, and on clocks that never
+            overlap.
     """
+    optional("pyarrow", path)
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    fields = list(dict.fromkeys([request.time, *request.columns]))
+    key = cache_key([str(path.absolute()), stats, fields])
+    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
+    index = folder / f"bag-{key}.json"
+    if index.is_file():
+        topics = {
+            topic: pd.read_parquet(folder / file)
+            for topic, file in json.loads(index.read_text()).items()
+        }
+    else:
+        topics = _decode(path, fields)
+        folder.mkdir(parents=True, exist_ok=True)
+        names = {topic: f"bag-{key}-{k}.parquet" for k, topic in enumerate(topics)}
+        for topic, name in names.items():
+            with whole(folder / name) as partial:
+                topics[topic].to_parquet(partial)
+        with whole(index) as partial:
+            partial.write_text(json.dumps(names))
+    return _merge(path, topics, request)
+
+
+def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
+    """Return the columns of each topic, with the time of each message as the index, s."""
     highlevel = optional("rosbags.highlevel", path)
     stores = optional("rosbags.typesys", path)
-    try:
-        # Old bags hold no definitions of their messages: the common ones are known.
-        known = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
-        with highlevel.AnyReader([path], default_typestore=known) as reader:
-            topics = _read(reader, path, [time, *columns])
-    except LogError:
-        raise
-    except Exception as error:  # rosbags and its codecs raise nearly anything on damaged bytes
-        raise LogError(
-            f"{path}: cannot be read as a bag, it may be cut short, or be compressed by a codec "
-            f"that is missing ({type(error).__name__}: {error}): try 'ros2 bag reindex', or "
-            "'rosbag reindex' for ROS 1, write it without compression ('ros2 bag convert'), or "
-            "record it again"
-        ) from error
-    return _merged(path, topics, time, max_age)
+    # Old bags hold no definitions of their messages: the common ones are known.
+    store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
+    with highlevel.AnyReader([path], default_typestore=store) as reader:
+        fields = _fields_of_topics(path, reader, columns)
+        numbers = {topic: array("d") for topic in fields}
+        connections = [item for item in reader.connections if item.topic in fields]
+        for connection in connections:
+            if connection.msgtype not in reader.typestore.types:
+                raise LogError(
+                    f"{path}, topic {connection.topic}: its type {connection.msgtype} is unknown "
+                    "and the bag has no definition of it: record the bag as MCAP, which keeps "
+                    "definitions"
+                )
+        for connection, stamp, raw in reader.messages(connections):
+            message = reader.deserialize(raw, connection.msgtype)
+            time = _time(message, stamp)
+            place = f"{path}, topic {connection.topic}"
+            numbers[connection.topic].append(time)
+            numbers[connection.topic].extend(
+                time if field == "t" else _number(message, field, place)
+                for field in fields[connection.topic].values()
+            )
+    topics = {}
+    for topic, names in fields.items():
+        values = np.frombuffer(numbers[topic]).reshape(-1, 1 + len(names))
+        if not len(values):
+            raise LogError(f"{path}, topic {topic}: has no messages")
+        frame = pd.DataFrame(values[:, 1:], index=values[:, 0], columns=list(names))
+        if (empty := frame.isna().all()).any():
+            raise LogError(
+                f"{path}, topic {topic}: no message has a value of {names[empty.idxmax()]!r}, "
+                "expected the name of a joint or the number of an entry, from 0"
+            )
+        topics[topic] = frame
+    return topics
 
 
-def _read(reader: Any, path: Path, columns: Sequence[str]) -> dict[str, Topic]:
-    """The topics that columns are asked of."""
+def _fields_of_topics(path: Path, reader: Any, columns: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return for each topic its columns and their fields in a message."""
     topics = sorted(reader.topics, key=len, reverse=True)
     fields: dict[str, dict[str, str]] = {}
-    for column in dict.fromkeys(columns):
+    for column in columns:
         topic = next((name for name in topics if column.startswith(f"{name}/")), None)
         if topic is None:
-            there = listed(
-                f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())
-            )
-            raise LogError(f"{path}: no topic for the column {column!r}: the bag has {there}")
+            names = listed(f"{name} ({x.msgtype})" for name, x in sorted(reader.topics.items()))
+            raise LogError(f"{path}: no topic for the column {column!r}: the bag has {names}")
         fields.setdefault(topic, {})[column] = column[len(topic) + 1 :]
-    for connection in reader.connections:
-        if connection.topic in fields and connection.msgtype not in reader.typestore.types:
+    return fields
+
+
+def _time(message: Any, received: int) -> float:
+    """Return the time of a message, s, from its header or from when the bag received it, ns."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is not None and (stamp.sec or stamp.nanosec):
+        received = 10**9 * stamp.sec + stamp.nanosec
+    return 1e-9 * received
+
+
+def _number(message: Any, field: str, place: str) -> float:
+    """Return the number at a path such as ``position/joint1``; NaN for an entry that is missing.
+
+    Raises:
+        LogError: if the message has no such field, or it is no number.
+    """
+    node = message
+    for step in field.split("/"):
+        if hasattr(node, "__len__") and not isinstance(node, str):
+            names = next((list(getattr(message, x)) for x in _NAMES if hasattr(message, x)), [])
+            k = int(step) if step.isdigit() else names.index(step) if step in names else len(node)
+            if k >= len(node):
+                return np.nan
+            node = node[k]
+        elif hasattr(node, step):
+            node = getattr(node, step)
+        else:
             raise LogError(
-                f"{path}, topic {connection.topic}: its type {connection.msgtype} is unknown and "
-                "the bag has no definition of it: record the bag as MCAP, which keeps definitions"
+                f"{place}: its messages have no {field!r}: their fields are {_fields(message)}"
             )
-    wanted = [c for c in reader.connections if c.topic in fields]
-    taken = {
-        topic: Topic(
-            f"{path}, topic {topic}", asked, sum(c.msgcount for c in wanted if c.topic == topic)
-        )
-        for topic, asked in fields.items()
-    }
-    waiting: dict[tuple[str, str], tuple[list[bytes], list[int]]] = {}
-    for connection, stamp, raw in reader.messages(wanted):
-        key = connection.topic, connection.msgtype
-        raws, stamps = waiting.setdefault(key, ([], []))
-        raws.append(raw)
-        stamps.append(stamp)
-        if len(raws) == BATCH:
-            taken[connection.topic].add(raws, stamps, connection.msgtype, reader)
-            del waiting[key]
-    for (topic, kind), (raws, stamps) in waiting.items():
-        taken[topic].add(raws, stamps, kind, reader)
-    for topic, found in taken.items():
-        if not found.rows:
-            raise LogError(f"{path}, topic {topic}: has no messages")
-        for field, column in zip(fields[topic].values(), found.values, strict=True):
-            if np.isnan(column).all():
-                array, most = found.arrays.get(field, (field, 0))
-                there = f"{array!r} has {most} entries at most, which count from 0"
-                if found.names and most:
-                    there = f"its joints are {listed(sorted(found.names))}"
-                raise LogError(
-                    f"{path}, topic {topic}: no message has a value of {field!r}: "
-                    f"{there if most else f'{array!r} is empty in all of them'}"
-                )
-    return taken
+    if isinstance(node, (int, float, np.number, np.bool_)):
+        return float(node)
+    if hasattr(node, "__dataclass_fields__"):
+        cure = f"name a field of it, {_fields(node)}, or the column '<topic>/t' for the time"
+    else:
+        cure = f"name an entry, as {field + '/0'!r}, or by the name of a joint"
+    raise LogError(f"{place}: {field!r} is a {type(node).__name__}, expected a number: {cure}")
 
 
-def _merged(
-    path: Path,
-    topics: dict[str, Topic],
-    time: str,
-    max_age: float,
-) -> pd.DataFrame:
-    """All columns at the times of the topic that has the time."""
-    clock_topic = next(topic for topic, found in topics.items() if time in found.fields)
-    own = _table(topics[clock_topic])
-    kept = own.notna().all(axis=1).to_numpy()
+def _fields(message: Any) -> str:
+    return ", ".join(name for name in message.__dataclass_fields__ if not name.startswith("__"))
+
+
+def _merge(path: Path, topics: dict[str, pd.DataFrame], request: Request) -> Table:
+    """Return all columns at the times of the topic that has the time."""
+    clock_topic = next(topic for topic, frame in topics.items() if request.time in frame)
+    frame = topics[clock_topic].copy()
+    usable = frame.notna().all(axis=1).to_numpy()
     notes = []
-    if not kept.all():
-        notes.append(f"{int((~kept).sum())} messages of {clock_topic} lack a joint asked for")
-    t = own[time].to_numpy()
-    table = own
-    for topic, found in topics.items():
+    if not usable.all():
+        notes.append(f"{int((~usable).sum())} messages of {clock_topic} lack an entry")
+    t = frame[request.time].to_numpy()
+    frame.index = pd.RangeIndex(1, len(frame) + 1)
+    for topic, messages in topics.items():
         if topic == clock_topic:
             continue
-        other = _table(found)
-        whole = other.notna().all(axis=1).to_numpy()
-        order = np.argsort(found.times[whole], kind="stable")
-        s, other = found.times[whole][order], other[whole].iloc[order]
-        if not len(s) or s[-1] < t.min() - max_age or s[0] > t.max():
+        messages = messages.dropna().sort_index(kind="stable")
+        stamps = messages.index.to_numpy()
+        if not len(stamps) or stamps[-1] < t.min() - request.max_age or stamps[0] > t.max():
             raise LogError(
                 f"{path}: the clocks of {clock_topic} and {topic} never overlap: {t.min():.6f} to "
-                f"{t.max():.6f} s, and {s[:1]} to {s[-1:]} s: does one of them stamp by the time "
-                "of the simulation?"
+                f"{t.max():.6f} s, and {stamps[:1]} to {stamps[-1:]} s: does one of them stamp by "
+                "the time of a simulation?"
             )
-        last = np.searchsorted(s, t, side="right") - 1
-        fresh = (last >= 0) & (t - s[last.clip(min=0)] <= max_age)
+        last = np.searchsorted(stamps, t, side="right") - 1
+        fresh = (last >= 0) & (t - stamps[last.clip(min=0)] <= request.max_age)
         if not fresh.all():
             notes.append(
                 f"{int((~fresh).sum())} messages of {clock_topic} have none of {topic} in the "
-                f"{max_age:g} s before them"
+                f"{request.max_age:g} s before them"
             )
-        kept = kept & fresh
-        for column in other:
-            table[column] = other[column].to_numpy()[last.clip(min=0)]
-    if not kept.any():
+        usable = usable & fresh
+        for column in messages:
+            frame[column] = messages[column].to_numpy()[last.clip(min=0)]
+    if not usable.any():
         raise LogError(f"{path}: no row is left: {'; '.join(notes)}")
-    table.index = pd.RangeIndex(1, len(table) + 1)
-    if kept.all():
-        return table
-    whole_table = len(table)
-    table = table[kept]
-    table.attrs["notes"] = [f"{whole_table - len(table)} rows are dropped: {x}" for x in notes]
-    return table
-
-
-def _table(topic: Topic) -> pd.DataFrame:
-    """Its columns, not copied: logs are large."""
-    return pd.DataFrame(topic.values.T, columns=list(topic.fields), copy=False)
+    dropped = int((~usable).sum())
+    notes = [f"{dropped} rows are dropped: {note}" for note in notes]
+    return Table(frame[usable], str(path), "message", notes=notes)

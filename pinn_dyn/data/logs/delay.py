@@ -31,7 +31,6 @@ from pinn_dyn.data.logs.delay_regression import (
     terms,
 )
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.step import sample_time
 
 _WIDTHS = (0.005, 0.01, 0.02, 0.04, 0.08)  # of the kernel, s
 _CANDIDATES = 60  # at most: a parabola finds what is between them
@@ -99,7 +98,7 @@ def input_delays(
     Raises:
         LogError: if a clock is not uniform.
     """
-    step = sample_time(recordings[0], "a delay")
+    step = recordings[0].sample_time("a delay")
     inputs = recordings[0].u.shape[1]
     stride = max(1, round(longest / step / _CANDIDATES))
     lags = stride * np.arange(-2, max(round(longest / step / stride), 3) + 1)
@@ -153,7 +152,7 @@ def agreed_delays(
     own = input_delays(recordings, longest=longest, rigid=rigid)
     found = [curve.delay for curve in own if curve.delay is not None]
     whole = len(found) == len(own)
-    step = sample_time(recordings[0], "a delay")
+    step = recordings[0].sample_time("a delay")
     after = any(curve.reason == _AFTER for curve in own)
     if len(own) == 1 or not found or after or (whole and max(found) - min(found) <= step):
         return own, False

@@ -1,31 +1,22 @@
-"""The one error of the logs."""
+"""The error of the logs, and names in its messages."""
 
 from collections.abc import Iterable
+
+_MOST_LETTERS, _MOST_NAMES = 80, 30
 
 
 class LogError(ValueError):
     """A log or its description cannot be used; the message names the place and what to do."""
 
 
-_MOST_LETTERS, _MOST_NAMES = 80, 30
-_SMALL = 100_000_000
-_MOST_EXPANSION = 50  # numbers of a robot compress to a tenth or so
-
-
 def shown(value: object) -> str:
-    """A value in a message: an open quote makes a cell of a whole file."""
+    """Return a value for a message, shortened: an open quote makes a cell of a whole file."""
     text = repr(value)
     return text if len(text) <= _MOST_LETTERS else f"{text[:_MOST_LETTERS]}..."
 
 
 def listed(names: Iterable[object]) -> str:
-    """Names in a message, of a file that may have thousands."""
-    every = [" ".join(str(name).split()) for name in names]
-    cut = [name if len(name) <= _MOST_LETTERS else f"{name[:_MOST_LETTERS]}..." for name in every]
-    more = f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else ""
-    return ", ".join(cut[:_MOST_NAMES]) + more
-
-
-def most_bytes(stored: int) -> int:
-    """How many bytes may come out of so many compressed ones: what gives more is no log."""
-    return max(_SMALL, _MOST_EXPANSION * stored)
+    """Return the first names of a list that may be long, for a message."""
+    texts = [str(name) for name in names]
+    more = f" and {len(texts) - _MOST_NAMES} more" if len(texts) > _MOST_NAMES else ""
+    return ", ".join(texts[:_MOST_NAMES]) + more

@@ -1,33 +1,28 @@
-"""Steps that smooth the signals."""
+"""Steps that smooth or differentiate the signals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.polynomial import polynomial
+from pydantic import PositiveFloat, PositiveInt
 from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
 from pinn_dyn.data.lengths import Length
 from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.step import (
-    SIGNALS,
-    Step,
-    change,
-    check_signals,
-    check_window,
-    sample_time,
-    window_samples,
-)
+from pinn_dyn.data.logs.recording import SIGNALS, Recording
+from pinn_dyn.data.logs.step import Signals, Step, window_samples
+
+# Share of the rows that may be jumps; more are noise or motion.
+_MOST_JUMPS = 0.05
 
 
 @dataclass(frozen=True)
 class MovingAverage(Step):
-    """The centred mean of ``window`` samples, of fewer at the ends, as MATLAB's ``movmean``.
+    """Average ``window`` samples around each sample, fewer at the ends, as MATLAB's ``movmean``.
 
         x̄_k = mean(x_{k-b}, ..., x_{k+f}),   b = ⌊w/2⌋,   f = ⌈w/2⌉ - 1
 
@@ -35,116 +30,43 @@ class MovingAverage(Step):
 
     Args:
         window: number of samples w, or a time, such as ``"0.1 s"``.
-        signals: which of q, v and u.
+        signals: signals that are averaged.
     """
 
     window: Length = 50
-    signals: Sequence[str] = SIGNALS
-
-    def __post_init__(self) -> None:
-        check_signals(self.signals)
-        check_window("MovingAverage", self.window, 1)
+    signals: Signals = SIGNALS
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        step = sample_time(recording, "MovingAverage")
+        step = recording.sample_time("MovingAverage")
         window = window_samples(self.window, recording, 1)
-        smooth = change(
-            recording,
-            self.signals,
-            lambda x: pd.DataFrame(x).rolling(window, center=True, min_periods=1).mean().to_numpy(),
-        )
-        names = ", ".join(self.signals)
-        return [smooth], f"mean of {window} samples ({window * step:.4g} s) of {names}"
 
+        def average(x: np.ndarray) -> np.ndarray:
+            return pd.DataFrame(x).rolling(window, center=True, min_periods=1).mean().to_numpy()
 
-@dataclass(frozen=True)
-class PolynomialFit(Step):
-    """Least-squares polynomials, centred and scaled as MATLAB's ``[p, S, mu] = polyfit(t, x, n)``.
-
-        x(t) ≈ Σ_i p_i z^i,   z = (t - μ)/σ,   μ = mean(t), σ = std(t) (over T - 1)
-
-    Each segment is fitted alone and becomes a recording of its own, as polynomials of neighbouring
-    segments do not meet. A missing velocity is the derivative of the polynomial of q.
-
-    Args:
-        degree: degree n.
-        segment: length of a segment, s; a rest shorter than that is dropped.
-        signals: which of q, v and u.
-    """
-
-    degree: int
-    segment: float
-    signals: Sequence[str] = SIGNALS
-
-    def __post_init__(self) -> None:
-        check_signals(self.signals)
-        if self.degree < 1 or not self.segment > 0:
-            raise LogError(
-                f"PolynomialFit: degree is {self.degree} and segment {self.segment} s, expected a "
-                "degree of at least 1 and a segment longer than 0"
-            )
-
-    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        step = sample_time(recording, "PolynomialFit")
-        samples = round(self.segment / step) + 1
-        if samples <= self.degree:
-            raise LogError(
-                f"{recording.run}: PolynomialFit has segments of {samples} samples for degree "
-                f"{self.degree}, expected more samples than the degree: use a longer segment"
-            )
-        parts = [
-            self._fit(recording.rows(slice(first, first + samples)))
-            for first in range(0, len(recording) - samples + 1, samples)
-        ]
-        text = (
-            f"degree {self.degree} in {len(parts)} segments of {self.segment:g} s; dropped the "
-            f"last {len(recording) - len(parts) * samples} samples"
-        )
-        return parts, text
-
-    def _fit(self, part: Recording) -> Recording:
-        centre, scale = part.t.mean(), part.t.std(ddof=1)
-        z = (part.t - centre) / scale
-        fits = {
-            name: polynomial.polyfit(z, getattr(part, name), self.degree)
-            for name in self.signals
-            if getattr(part, name) is not None
-        }
-        # polyval returns one row per column of the coefficients.
-        changed = {name: polynomial.polyval(z, fit).T for name, fit in fits.items()}
-        if part.v is None and "q" in fits:
-            changed["v"] = polynomial.polyval(z, polynomial.polyder(fits["q"])).T / scale
-        return replace(part, **changed)
+        text = f"mean of {window} samples ({window * step:.4g} s) of {', '.join(self.signals)}"
+        return [recording.change(self.signals, average)], text
 
 
 @dataclass(frozen=True)
 class Butterworth(Step):
-    """A Butterworth low-pass run forwards and backwards, so that nothing is delayed.
+    """Filter by a Butterworth low-pass, forwards and backwards, so that nothing is delayed.
 
         |H(f)|² = 1 / (1 + (tan(π f/f_s)/tan(π f_c/f_s))^{2n}),   squared by the second pass
 
     The same filter on q, v and u keeps linear equations of motion between them true.
 
     Args:
-        cutoff: cut-off frequency f_c, Hz; there the two passes halve the amplitude.
+        cutoff: cut-off frequency f_c, Hz; the two passes together halve the amplitude at f_c.
         order: order n of one pass.
-        signals: which of q, v and u.
+        signals: signals that are filtered.
     """
 
-    cutoff: float
-    order: int = 4
-    signals: Sequence[str] = SIGNALS
-
-    def __post_init__(self) -> None:
-        check_signals(self.signals)
-        if not self.cutoff > 0 or self.order < 1:
-            raise LogError(
-                f"Butterworth: cutoff is {self.cutoff} Hz and order {self.order}, expected a "
-                "cut-off above 0 and an order of at least 1"
-            )
+    cutoff: PositiveFloat
+    order: PositiveInt = 4
+    signals: Signals = SIGNALS
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        rate = 1 / sample_time(recording, "Butterworth")
+        rate = 1 / recording.sample_time("Butterworth")
         if self.cutoff >= rate / 2:
             raise LogError(
                 f"{recording.run}: Butterworth has a cut-off of {self.cutoff} Hz, expected less "
@@ -158,32 +80,83 @@ class Butterworth(Step):
                 f"{recording.place}: {len(recording)} samples are too few for Butterworth, "
                 f"expected more than {padding}: raise the cut-off, or drop the run"
             )
-        smooth = change(
-            recording,
-            self.signals,
-            lambda x: sosfiltfilt(sections, x, axis=0, padlen=padding),
+        smooth = recording.change(
+            self.signals, lambda x: sosfiltfilt(sections, x, axis=0, padlen=padding)
         )
         return [smooth], f"low-pass of {self.cutoff:g} Hz on {', '.join(self.signals)}"
 
 
 @dataclass(frozen=True)
+class RemoveJumps(Step):
+    """Replace samples far from the median of their neighbors, such as jumps of a marker.
+
+    A sample is a jump where |x_k - median(x_{k-h}, ..., x_{k+h})| > threshold, h = (window - 1)/2.
+    The straight line between the good samples around it replaces it, and the report lists time and
+    distance. A jump that lasts longer than h samples is not detected. The first and last h samples
+    are not judged, as a one-sided median lags behind a motion.
+
+    Args:
+        threshold: largest distance from the median that is no jump, SI units; one value, or one
+            per column.
+        window: number of samples, odd, or a time, such as ``"0.25 s"``.
+        signals: signals that are repaired.
+    """
+
+    threshold: PositiveFloat | Sequence[PositiveFloat]
+    window: Length = 25
+    signals: Signals = ("q",)
+
+    @property
+    def repairs(self) -> Collection[str]:
+        return [f"jumps of {signal}" for signal in self.signals]
+
+    def apply(self, recording: Recording) -> tuple[list[Recording], str]:
+        jumps: list[str] = []
+        window = window_samples(self.window, recording, 3, odd=True)
+
+        def repair(x: np.ndarray) -> np.ndarray:
+            frame = pd.DataFrame(x)
+            distance = (frame - frame.rolling(window, center=True).median()).abs()
+            bad = distance > np.asarray(self.threshold)
+            for k in np.flatnonzero(bad.any(axis=1)):
+                jumps.append(f"{recording.t[k]:.6g} s ({distance.iloc[k].max():.2g})")
+            return frame.mask(bad).interpolate(limit_direction="both").to_numpy()
+
+        repaired = recording.change(self.signals, repair)
+        if not jumps:
+            return [repaired], "no jumps"
+        more = " ..." if len(jumps) > 20 else ""
+        text = f"{len(jumps)} samples replaced, at (distance): {', '.join(jumps[:20])}{more}"
+        return [repaired], text
+
+    def losses(self, before: list[Recording], after: list[Recording]) -> list[str]:
+        changes = [
+            (getattr(old, name) != getattr(new, name)).any(axis=1)
+            for old, new in zip(before, after, strict=True)
+            for name in self.signals
+            if getattr(old, name) is not None
+        ]
+        warnings = super().losses(before, after)
+        if (replaced := np.concatenate(changes).mean()) > _MOST_JUMPS:
+            warnings.append(
+                f"{100 * (1 - replaced):.0f} % of the rows are left as they were: the threshold is "
+                "below the noise, or below the motion within a window"
+            )
+        return warnings
+
+
+@dataclass(frozen=True)
 class _SavitzkyGolaySlope(Step):
-    """What needs the slope of a polynomial through ``window`` samples around each sample."""
+    """Base class of steps that use the slope of a polynomial through the samples around each."""
 
     window: Length = 11
-    order: int = 3
-
-    def __post_init__(self) -> None:
-        name = type(self).__name__
-        if self.order < 1:
-            raise LogError(f"{name}: order is {self.order}, expected at least 1")
-        check_window(name, self.window, self.order + 1, odd=True)
+    order: PositiveInt = 3
 
     def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, int, float]:
-        """The slope of each column of ``values``, the samples of a window, and the sample time."""
+        """Return the slope of each column of ``values``, the window in samples, the sample time."""
         name = type(self).__name__
-        step = sample_time(recording, name)
-        # The shortest odd window that has the order.
+        step = recording.sample_time(name)
+        # The shortest odd window that determines the polynomial.
         window = window_samples(self.window, recording, self.order + 1 + self.order % 2, odd=True)
         if len(recording) < window:
             raise LogError(
@@ -196,20 +169,20 @@ class _SavitzkyGolaySlope(Step):
 
 @dataclass(frozen=True)
 class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
-    """Velocity as the slope of a polynomial through ``window`` samples of q around each sample.
+    """Derive the velocity as the slope of a polynomial through ``window`` samples of q.
 
     Within half a window of an end the polynomial of the outermost full window is used.
 
-    The velocity of a sample then knows what q does half a window later, and a prediction that
-    starts there knows it too: a model can read the first half window of its errors from v. With
-    ``causal`` the polynomial goes through the sample and the ``window`` - 1 before it, as a
-    controller has them; only the first ``window`` - 1 samples of a run still share one polynomial.
-    It carries more noise, so a shorter window and a lower order suit it.
+    The velocity of a sample then depends on q up to half a window later, and so does a prediction
+    that starts there: a model can read the first half window of its errors from v. With ``causal``
+    the polynomial goes through the sample and the ``window`` - 1 samples before it, which a
+    controller has too; only the first ``window`` - 1 samples of a run share one polynomial. It
+    carries more noise, so a shorter window and a lower order suit it.
 
     Args:
         window: number of samples, odd, or a time, such as ``"50 ms"``.
         order: order of the polynomial.
-        causal: whether only the past counts.
+        causal: use only the past of each sample.
     """
 
     causal: bool = False
@@ -238,7 +211,7 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
 
 @dataclass(frozen=True)
 class InputRates(_SavitzkyGolaySlope):
-    """The rates of the inputs as further inputs: u becomes (u, du/dt), 2 M columns.
+    """Append the rates of the inputs: u becomes (u, du/dt), 2 M columns.
 
     For inputs that are positions, such as motor angles of tendons. A tendon that pulls like a
     spring and a damper side by side has the force k (u - q) + c (du/dt - dq/dt), so it needs

@@ -1,4 +1,4 @@
-"""Parquet files, those of a LeRobot data set (version 3) among them, as tables.
+"""Parquet files, those of a LeRobot data set (version 3) among them.
 
 A column of vectors becomes ``name_1``, ``name_2`` and so on, or, where ``meta/info.json`` above the
 file names its entries, ``name/entry``, as ``observation.state/shoulder_pan.pos``.
@@ -14,74 +14,47 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs.bags import optional
-from pinn_dyn.data.logs.errors import LogError, shown
+from pinn_dyn.data.logs.readers import Request, optional
+from pinn_dyn.data.logs.table import Table
 
 
-def read_parquet(path: Path) -> pd.DataFrame:
-    """All columns of numbers and texts; the index is the row.
-
-    Raises:
-        LogError: if it cannot be read or is empty.
-    """
-    arrow = optional("pyarrow", path)
-    parquet = optional("pyarrow.parquet", path)
-    try:
-        content = parquet.read_table(path)
-    except (OSError, arrow.ArrowException) as error:
-        raise LogError(
-            f"{path}: cannot be read as Parquet, it may be cut short: {error}"
-        ) from error
-    if not content.num_rows:
-        raise LogError(f"{path}: has no rows")
+def read_parquet(path: Path, request: Request) -> Table:
+    """Read a Parquet file; the index is the number of the row."""
+    optional("pyarrow", path)
+    content = pd.read_parquet(path, engine="pyarrow").reset_index(drop=True)
     entries = _entries(path)
     columns: dict[str, Any] = {}
     unusable: dict[str, str] = {}
-    for name in content.column_names:
-        column = content.column(name)
-        kind = column.type
-        lists = (
-            arrow.types.is_list(kind)
-            or arrow.types.is_large_list(kind)
-            or arrow.types.is_fixed_size_list(kind)
-        )
-        if not lists:
-            columns[name] = column.to_pandas().to_numpy()
+    for name, column in content.items():
+        key = str(name)
+        if column.dtype != object or not isinstance(column.iloc[0], np.ndarray):
+            columns[key] = column.to_numpy()
             continue
-        rows = column.to_pylist()
-        if any(row is None for row in rows) or len({len(row) for row in rows}) != 1:
-            unusable[name] = "has rows of different lengths"
+        try:
+            values = np.stack(column.to_list())
+        except (ValueError, TypeError):
+            unusable[key] = "has rows of different lengths"
             continue
-        values = np.array(rows)
-        if values.ndim != 2 or values.dtype.kind not in "fiub":
-            unusable[name] = f"has entries of the type {kind.value_type}"
-            continue
-        given = entries.get(name, [])
+        names = entries.get(key, [])
+        if len(names) != values.shape[1]:
+            names = []
         for k in range(values.shape[1]):
-            own = f"{name}/{given[k]}" if len(given) == values.shape[1] else f"{name}_{k + 1}"
-            columns[own] = values[:, k]
-    table = pd.DataFrame(columns, index=pd.RangeIndex(1, content.num_rows + 1))
-    table.attrs["unusable"] = unusable
-    return table
+            columns[f"{key}/{names[k]}" if names else f"{key}_{k + 1}"] = values[:, k]
+    frame = pd.DataFrame(columns, index=pd.RangeIndex(1, len(content) + 1))
+    return Table(frame, str(path), unusable=unusable)
 
 
 def _entries(path: Path) -> dict[str, Sequence[str]]:
-    """Names of the entries of vectors, from the description of a LeRobot data set."""
-    infos = [folder / "meta" / "info.json" for folder in path.absolute().parents]
+    """Return the names of the entries of vectors, from the description of a LeRobot data set."""
+    infos = (folder / "meta" / "info.json" for folder in path.absolute().parents)
     info = next((file for file in infos if file.is_file()), None)
-    if info is None:
-        return {}
-    try:
-        features = json.loads(info.read_text())["features"]
-        given = {name: feature.get("names") for name, feature in features.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        said = shown(error)
-        raise LogError(f"{info}: is no description of a LeRobot data set: {said}") from error
-    found: dict[str, Sequence[str]] = {}
-    for name, names in given.items():
+    features = {} if info is None else json.loads(info.read_text()).get("features", {})
+    entries: dict[str, Sequence[str]] = {}
+    for key, feature in features.items():
+        names = feature.get("names")
         # Version 2 has them one level deeper, as {"motors": [...]}.
         if isinstance(names, dict) and len(names) == 1:
             names = next(iter(names.values()))
         if isinstance(names, list):
-            found[name] = [str(entry) for entry in names]
-    return found
+            entries[key] = [str(entry) for entry in names]
+    return entries

@@ -1,98 +1,109 @@
-"""Motions that come twice: copies of runs, and tests that repeat what was trained on."""
+"""Motions that occur twice: copies of runs, and test motions that repeat a training motion."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from scipy.signal import fftconvolve
 
 from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.measurement import Measurement, judged
+from pinn_dyn.data.logs.recording import Recording
 
-# A motion within this share of its spread of another one repeats it.
+# A motion within this share of its spread of another motion repeats it.
 _SAME = 0.05
-# Samples of a motion that are compared.
+# Number of samples of a motion that are compared.
 _SAMPLES = 300
 
 
-def check_copies(parts: dict[str, list[Recording]], report: Report) -> None:
-    """Warns of stretches with the same numbers in one split.
+def check_copies(parts: Mapping[str, list[Recording]]) -> list[Measurement]:
+    """Warn of stretches with the same numbers in one split.
 
     Raises:
-        LogError: where they are in two splits, as the test would be of what was trained on.
+        LogError: if they are in two splits: the test would measure training motions.
     """
     first: dict[bytes, tuple[str, Recording]] = {}
+    results = []
     for split, recordings in parts.items():
         for item in recordings:
             content = b"".join(
                 hashlib.blake2b(np.ascontiguousarray(x).data).digest() for x in (item.q, item.u)
             )
-            if content not in first:
-                first[content] = split, item
-                continue
-            other_split, other = first[content]
-            if other_split != split:
+            first_split, original = first.setdefault(content, (split, item))
+            if first_split != split:
                 raise LogError(
-                    f"{item.run}, in {split}, is a copy of {other.run}, in {other_split}, number "
-                    "by number: leave one of them out, or put both into one split"
+                    f"{item.run}, in {split}, is a copy of {original.run}, in {first_split}, "
+                    "number by number: leave one of them out, or put both into one split"
                 )
-            report.warn(f"{item.run} is a copy of {other.run}, number by number (both {split})")
+            if original is not item:
+                text = f"{item.run} is a copy of {original.run}, number by number (both {split})"
+                results.append(judged("copy of a run", item.run, 1, "0", True, text))
+    return results
 
 
 def check_repeats(
-    training: list[Recording], test: list[Recording], name: str, report: Report
-) -> None:
-    """Warns where a roll-out of the test repeats a motion of the training.
+    training: list[Recording], pieces: list[Recording], name: str
+) -> list[Measurement]:
+    """Count the roll-outs of a split that repeat a motion of the training.
 
-    It does where, at some shift s along a training stretch, the mean over its samples of
+    A roll-out repeats a training stretch if, at a shift s along it, the mean over its samples of
     ‖q_test(t) - q_train(t + s)‖² is below 0.05² times the variance of q_test, all at one rate.
 
     Args:
         training: training stretches.
-        test: the roll-outs.
-        name: of their split.
-        report: takes the warnings.
+        pieces: the roll-outs.
+        name: name of their split.
     """
-    found = Counter((piece.run, item.run) for piece, item, _ in _repeats(test, training))
-    for (run, other), pieces in found.items():
-        report.warn(
-            f"{name}: {pieces} of the motions of {run} repeat one of {other}, which is in the "
-            "training: errors on them say little of new motions; keep such runs in one split"
+    pairs = Counter((piece.run, item.run) for piece, item, _ in _repeats(pieces, training))
+    title = f"motions of the {name} that repeat one of the training"
+    results = [
+        judged(
+            title,
+            run,
+            count,
+            "0",
+            True,
+            f"{name}: {count} of the motions of {run} repeat one of {original}, which is in the "
+            "training: errors on them say little of new motions; keep such runs in one split",
+            section="csv_logs.md#splits",
         )
+        for (run, original), count in pairs.items()
+    ]
+    return results or [judged(title, name, 0, "0", False, "")]
 
 
 def repeat_floor(
     pieces: list[Recording], training: list[Recording]
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """What motions that come twice differ by: noise, and all that is not the same in both.
+    """Measure by how much motions that occur twice differ: by noise, and by unrepeatable effects.
 
-    The difference of a piece and of the stretch of the training that it repeats, at the nearest
-    shift, freed of the rest of a sample's shift (the part of it along v), is √2 times the floor.
+    The floor is 1/√2 of the difference between a piece and the training stretch that it repeats,
+    at the nearest shift, without the part along v, which is a shift by a fraction of a sample.
 
     Args:
         pieces: motions that may repeat one of the training, with q and v.
-        training: stretches, with q and v; a piece is not compared with the stretch it is from.
+        training: stretches, with q and v; a piece is not compared with its own stretch.
 
     Returns:
-        The number of repeats, and the floors of q and of v, ``(N,)`` each, NaN without a repeat.
+        Number of repeats, and the floors of q and of v, ``(N,)`` each, NaN without a repeat.
     """
     squares = []
     for piece, item, firsts in _repeats(pieces, training):
         parts = [item.rows(slice(first, first + len(piece))) for first in firsts]
-        other = min(parts, key=lambda part: float(((part.q - piece.q) ** 2).sum()))
+        match = min(parts, key=lambda part: float(((part.q - piece.q) ** 2).sum()))
         assert piece.v is not None
-        assert other.v is not None
-        dq, dv = piece.q - other.q, piece.v - other.v
-        shift = float((dq * other.v).sum() / max((other.v**2).sum(), 1e-300))
-        dq = dq - shift * other.v
+        assert match.v is not None
+        dq, dv = piece.q - match.q, piece.v - match.v
+        shift = float((dq * match.v).sum() / max((match.v**2).sum(), 1e-300))
+        dq = dq - shift * match.v
         if dq.any():  # a copy of a file tells nothing
             squares.append([(x**2).mean(axis=0) for x in (dq, dv)])
     if not squares:
-        none = np.full(training[0].q.shape[1], np.nan)
-        return 0, none, none
+        nothing = np.full(training[0].q.shape[1], np.nan)
+        return 0, nothing, nothing
     q, v = np.sqrt(np.mean(squares, axis=0) / 2)
     return len(squares), q, v
 
@@ -100,7 +111,7 @@ def repeat_floor(
 def _repeats(
     pieces: list[Recording], training: list[Recording]
 ) -> Iterator[tuple[Recording, Recording, range]]:
-    """Each piece with each stretch that it repeats, and the samples where that may begin."""
+    """Yield each piece with each stretch that it repeats, and the samples where it may begin."""
     for piece in pieces:
         thin = max(1, len(piece) // _SAMPLES)
         q = piece.q[::thin]
@@ -116,23 +127,23 @@ def _repeats(
 
 
 def _nearest(q: np.ndarray, track: np.ndarray, thin: int) -> tuple[float, int]:
-    """Smallest mean square distance of q ``(T, N)`` from every ``thin``-th sample of a track.
+    """Return the smallest mean square distance of q ``(T, N)`` from a track, and its first sample.
 
-    Also the sample of the track where the nearest stretch begins.
+    Both are compared at every ``thin``-th sample of the track.
     """
-    best, where = np.inf, 0
-    centre = q.mean(axis=0)
-    q = q - centre
+    smallest, start_of_match = np.inf, 0
+    center = q.mean(axis=0)
+    q = q - center
     for start in range(0, thin, max(1, thin // 4)):
-        other = track[start::thin] - centre
-        if len(other) >= len(q):
-            squares = np.cumsum(np.r_[0.0, (other**2).sum(axis=1)])
+        samples = track[start::thin] - center
+        if len(samples) >= len(q):
+            squares = np.cumsum(np.r_[0.0, (samples**2).sum(axis=1)])
             energy = squares[len(q) :] - squares[: -len(q)]
             products = (
-                fftconvolve(a, b[::-1], mode="valid") for a, b in zip(other.T, q.T, strict=True)
+                fftconvolve(a, b[::-1], mode="valid") for a, b in zip(samples.T, q.T, strict=True)
             )
             distances = (energy - 2 * sum(products) + (q**2).sum()) / len(q)
             k = int(distances.argmin())
-            if distances[k] < best:
-                best, where = float(distances[k]), start + k * thin
-    return best, where
+            if distances[k] < smallest:
+                smallest, start_of_match = float(distances[k]), start + k * thin
+    return smallest, start_of_match

@@ -1,4 +1,4 @@
-"""Which runs, or which parts of a run, are for training, validation and test."""
+"""The assignment of runs, or of parts of a run, to training, validation and test."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
+from pydantic import PositiveFloat, PositiveInt
+from pydantic.dataclasses import dataclass
 
-from pinn_dyn.data.logs.columns import ShortForm
+from pinn_dyn.data.logs.columns import STRICT
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.source import SPLITS
 from pinn_dyn.spelling import did_you_mean
-
-WHOLE: Literal["whole"] = "whole"
-"""As a piece: one roll-out of each stretch, as long as it is."""
-
 
 _WHOLE_RUNS = 5  # from this number of runs on, the default split keeps some of them whole
 _SHARE = 0.15  # of the runs, or of each run, for the test, and again for the validation
@@ -23,54 +21,42 @@ _PIECE = 5.0  # s, longest piece of the default split
 _GUARD = 0.5  # s, longest guard of the default split
 
 
-class Part(ShortForm):
-    """What is kept from training: whole runs, or seconds at the end of the others or along them.
+@dataclass(config=STRICT)
+class Part:
+    """Validation or test data: whole runs, or seconds of the other runs.
 
     Args:
-        piece: length of the roll-outs that it is cut into, s; ``"whole"``: each stretch is one,
-            as long as it is; an evaluation takes those that last as long as its horizon.
+        piece: length of the roll-outs that it is cut into, s; ``"whole"``: each stretch is one
+            roll-out, and an evaluation takes the roll-outs that last as long as its horizon.
         runs: number of runs, drawn by the seed, or the names of the runs.
         seconds: the last so many seconds of every run that is not named elsewhere.
-        blocks: with ``seconds``, so many blocks of that length spread evenly along every such run,
-            in place of its end.
+        blocks: with ``seconds``, number of blocks of that length, spread evenly along every such
+            run instead of at its end.
 
     Raises:
-        LogError: unless just one of ``runs`` and ``seconds`` is given, and all are above 0.
+        LogError: unless exactly one of ``runs`` and ``seconds`` is given.
     """
 
-    form = "{runs: ... or seconds: ..., piece: ...}"
-    needed = ("piece",)
+    piece: PositiveFloat | Literal["whole"]
+    runs: PositiveInt | Sequence[str | int] | None = None
+    seconds: PositiveFloat | None = None
+    blocks: PositiveInt | None = None
 
-    def __init__(
-        self,
-        piece: float | Literal["whole"],
-        *,
-        runs: int | Sequence[str | int] | None = None,
-        seconds: float | None = None,
-        blocks: int | None = None,
-    ):
-        if (runs is None) == (seconds is None):
+    def __post_init__(self) -> None:
+        if (self.runs is None) == (self.seconds is None):
             raise LogError(
-                f"runs is {runs} and seconds is {seconds}, expected one of them: a number or list "
-                "of whole runs, or the seconds at the end of each run"
+                f"runs is {self.runs} and seconds is {self.seconds}, expected one of them: a "
+                "number or list of whole runs, or the seconds at the end of each run"
             )
-        self.names = None if runs is None or isinstance(runs, int) else [str(run) for run in runs]
-        self.count = runs if isinstance(runs, int) else len(self.names or [])
-        if blocks is not None and (seconds is None or not blocks >= 1):
-            raise LogError(
-                f"blocks is {blocks} and seconds is {seconds}, expected at least one block and "
-                "with it seconds, the length of each"
-            )
-        self.seconds = seconds
-        self.blocks = blocks
-        self.piece = piece
-        if (runs is not None and self.count < 1) or not (seconds is None or seconds > 0):
-            raise LogError(f"runs is {runs} and seconds is {seconds}, expected more than 0")
-        if isinstance(piece, str):
-            if piece != WHOLE:
-                raise LogError(f"piece is {piece!r}, expected a time in s, or 'whole'")
-        elif not piece > 0 or (seconds is not None and piece > seconds):
-            raise LogError(f"piece is {piece} s, expected more than 0 and at most seconds")
+        if self.blocks is not None and self.seconds is None:
+            raise LogError("blocks needs seconds, the length of each block")
+        if self.seconds is not None and self.piece != "whole" and self.piece > self.seconds:
+            raise LogError(f"piece is {self.piece} s, expected at most seconds, {self.seconds} s")
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the runs, where they are named."""
+        return [] if self.runs is None or isinstance(self.runs, int) else [*map(str, self.runs)]
 
 
 def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part, float]:
@@ -113,48 +99,48 @@ def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part
 def split(
     recordings: list[Recording], validation: Part, test: Part, *, guard: float, seed: int
 ) -> dict[str, list[Recording]]:
-    """Assign whole runs, and cut parts out of the others, before any filter sees them.
+    """Assign whole runs, and cut parts out of the other runs, before any filter sees them.
 
-    Along a run that is cut at its end: training, guard, validation, guard, test. Blocks lie in the
-    middles of as many equal parts of what is left of the run, those of validation and test taking
-    turns, a guard on both sides of each, and training between them.
+    A run that is cut at its end consists of training, guard, validation, guard, test. Blocks lie
+    in the middles of equal parts of the run, blocks of validation and test in turns. A guard is
+    left out on both sides of each block, and training lies between them.
 
     Raises:
         LogError: on unknown or doubly used runs, or too few or too short ones.
     """
-    by_name = {recording.run: recording for recording in recordings}
-    taken: dict[str, str] = {}
+    names = [recording.run for recording in recordings]
+    splits: dict[str, str] = {}
     for name, part in (("validation", validation), ("test", test)):
-        for run in part.names or []:
-            if run not in by_name:
-                hint = did_you_mean(run, by_name) or "."
+        for run in part.names:
+            if run not in names:
+                hint = did_you_mean(run, names) or "."
                 raise LogError(
-                    f"{name}.runs: there is no run {run!r}{hint} The runs are {listed(by_name)}"
+                    f"{name}.runs: there is no run {run!r}{hint} The runs are {listed(names)}"
                 )
-            if run in taken:
-                raise LogError(f"run {run!r} is in {taken[run]} and in {name}, expected in one")
-            taken[run] = name
-    counted = {
-        name: part.count
+            if run in splits:
+                raise LogError(f"run {run!r} is in {splits[run]} and in {name}, expected in one")
+            splits[run] = name
+    counts = {
+        name: part.runs
         for name, part in (("test", test), ("validation", validation))
-        if part.names is None and part.seconds is None
+        if isinstance(part.runs, int)
     }
-    free = [run for run in by_name if run not in taken]
-    if sum(counted.values()) >= len(free):
-        wanted = " and ".join(f"{count} for {name}" for name, count in counted.items())
+    free = [run for run in dict.fromkeys(names) if run not in splits]
+    if sum(counts.values()) >= len(free):
+        wanted = " and ".join(f"{count} for {name}" for name, count in counts.items())
         raise LogError(
-            f"there are {len(free)} runs to choose from, but {wanted or 'none'} were asked for, "
-            "and one must be left for training: with a single run, split by 'seconds'"
+            f"there are {len(free)} runs to choose from, expected more than {wanted or 'none'}: "
+            "one run must be left for training; with a single run, split by 'seconds'"
         )
     order = np.random.default_rng(seed).permutation(len(free))
-    for name, count in counted.items():
-        taken |= {free[k]: name for k in order[:count]}
+    for name, count in counts.items():
+        splits |= {free[k]: name for k in order[:count]}
         order = order[count:]
 
     parts: dict[str, list[Recording]] = {name: [] for name in SPLITS}
     for recording in recordings:
-        if recording.run in taken:
-            parts[taken[recording.run]].append(recording)
+        if recording.run in splits:
+            parts[splits[recording.run]].append(recording)
         else:
             for name, stretch in _cut(recording, validation, test, guard):
                 parts[name].append(stretch)
@@ -164,7 +150,7 @@ def split(
 def _cut(
     recording: Recording, validation: Part, test: Part, guard: float
 ) -> list[tuple[str, Recording]]:
-    """Training, validation and test stretches of one run."""
+    """Return training, validation and test stretches of one run."""
     if validation.seconds is None and test.seconds is None:
         return [("train", recording)]
     t = recording.t
@@ -190,24 +176,22 @@ def _cut(
         stretches.append((name, recording.rows(slice(first, last))))
         end, last = border, min(left, first)
     # The row after the border only completes a stretch that is measured from its end.
-    rest = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
-    return [*stretches, *_blocks(rest, {"validation": validation, "test": test}, guard)]
+    start = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
+    return [*stretches, *_blocks(start, {"validation": validation, "test": test}, guard)]
 
 
 def _blocks(
     recording: Recording, parts: Mapping[str, Part], guard: float
 ) -> list[tuple[str, Recording]]:
-    """The blocks of one run, in turns, and the training before, between and after them."""
+    """Return the blocks of one run, in turns, and the training before, between and after them."""
     order = sorted(
-        ((k + 0.5) / part.blocks, name)
+        ((k + 0.5) / part.blocks, name, part.seconds)
         for name, part in parts.items()
-        for k in range(part.blocks or 0)
-        if part.blocks
+        if part.blocks and part.seconds
+        for k in range(part.blocks)
     )
     t, stretches, free = recording.t, [], 0
-    for number, (_, name) in enumerate(order):
-        seconds = parts[name].seconds
-        assert seconds is not None
+    for number, (_, name, seconds) in enumerate(order):
         if recording.duration / len(order) < seconds + 2 * guard:
             raise LogError(
                 f"{recording.place}: too short for {len(order)} blocks, of which {name} has "

@@ -9,7 +9,6 @@ from pinn_dyn.spelling import did_you_mean
 
 _DEGREE = math.pi / 180
 
-# Unit in a file: (SI unit, factor to it).
 UNITS: dict[str, tuple[str, float]] = {
     "1": ("1", 1.0),
     "%": ("1", 0.01),
@@ -50,13 +49,14 @@ UNITS: dict[str, tuple[str, float]] = {
     "bar": ("Pa", 1e5),
     "psi": ("Pa", 6894.757293168361),
 }
+"""SI unit of each unit, and the factor to it: x_SI = factor * x."""
 
 
 def to_si(unit: str) -> tuple[str, float]:
-    """The SI unit of a unit, and the factor to it: x_SI = factor * x.
+    """Return the SI unit of a unit, and the factor to it.
 
     Raises:
-        LogError: on an unknown unit; lists those that are known.
+        LogError: on an unknown unit; lists the known units.
     """
     if unit not in UNITS:
         hint = did_you_mean(unit, UNITS) or "."

@@ -1,15 +1,14 @@
-"""The page of a log's check."""
+"""The page of the check of a log."""
 
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import LogSource
 from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_figures import cleaning_figure
-from pinn_dyn.evaluation.plots import model_style
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
@@ -23,53 +22,46 @@ from pinn_dyn.evaluation.report.page import (
 from pinn_dyn.evaluation.rigid_excitation import MOST
 
 
-def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
-    """The HTML page: verdict, tables, delay curves, coverage, cleaning.
+def check_report(check: LogCheck, *, command: str) -> str:
+    """Return the HTML page: verdict, measurements, tables, delay curves, coverage, cleaning.
 
     Args:
-        check: the findings.
-        source: the log.
-        command: the command line that made them.
+        check: the measurements.
+        command: the command line.
     """
-    verdict = ["A training makes sense."] if not check.problems else check.problems
-    facts = pd.DataFrame({"what": check.figures.keys(), "value": check.figures.values()})
-    parts = [paragraph(text) for text in verdict]
-    parts += [paragraph(f"Warning: {text}") for text in check.warnings]
-    parts.append(table(facts, headers={"what": "", "value": " "}))
-    parts += [
-        paragraph("To copy into the configuration, and to run; each line with its reason:"),
-        preformatted(check.suggestion),
-    ]
+    source = check.source
+    verdict = [paragraph(text) for text in check.problems or ["A training makes sense."]]
+    verdict += [paragraph(f"Warning: {text}") for text in check.warnings]
+    if check.steps:
+        text = "Steps that follow from the measured delay and noise, for the YAML of the data set:"
+        verdict += [paragraph(text), preformatted("\n".join(["steps:", *check.steps]))]
+    measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
     sections = [
-        Section("Verdict", parts),
+        Section("Verdict", verdict),
+        Section("Measurements", [table(measurements)]),
         Section("Clock", [table(check.runs), drawing(_clock(source), "time between rows")]),
         Section(
             "Coordinates",
             [
                 paragraph(
-                    "Noise is what third differences leave; of v, where the log has one. The "
-                    "floors of q and v, where motions come twice, are what both differ by, over "
-                    "√2: noise, and all that is not the same in both. No model errs less."
-                ),
-                paragraph(
-                    "The own share of an acceleration is what 1, its own q and v, and the other "
-                    "accelerations do not explain of it: below a hundredth its inertia cannot be "
-                    "identified. Not identified: "
-                    f"{', '.join(check.unidentified) or 'none'}. This and the condition number "
-                    "are of the linear regressor (1, q, v, a), as a log has no bodies; those of a "
-                    "rigid robot are below, where its kinematics is given (model/structure=...)."
+                    "The noise is estimated from third differences. The floors of q and v, if "
+                    "motions occur twice, are 1/√2 of the difference between them: no model is "
+                    "more accurate. The independent share of an acceleration is the share that 1, "
+                    "q and v of the same coordinate and the other accelerations do not explain: "
+                    "below a hundredth its inertia cannot be identified."
                 ),
                 table(check.coordinates),
-                drawing(_coverage(check, source), "coverage of the test by the training"),
+                drawing(_coverage(check), "coverage of the test by the training"),
             ],
         ),
-        *_rigid(check),
+        Section("Rigid bodies", _rigid(check)),
         Section(
             "Inputs and their delays",
             [
                 paragraph(
-                    "What the equation of motion, by least squares, leaves unexplained when an "
-                    "input is taken d earlier. A delay is where it is least."
+                    "The curve shows the share of the equation of motion, fitted by least squares, "
+                    "that stays unexplained if an input is shifted by a delay. The delay is at its "
+                    "minimum."
                 ),
                 table(check.inputs),
                 drawing(_delays(check), "unexplained share over the delay"),
@@ -87,48 +79,32 @@ def check_report(check: LogCheck, source: LogSource, *, command: str) -> str:
                     ),
                     "raw and cleaned signals",
                 ),
-                details("What each step did", from_markdown(source.report)),
+                details("Notes of each step", from_markdown(source.report)),
             ],
         ),
     ]
-    return page(f"{check.name}: check of the log", command, sections)
+    sections = [section for section in sections if section.parts]
+    return page(f"{source.name}: check of the log", command, sections)
 
 
-def _rigid(check: LogCheck) -> list[Section]:
-    """What the motions tell of rigid bodies, where their kinematics is known."""
+def _rigid(check: LogCheck) -> list[Markup]:
     if check.rigid is None:
         return []
-    return [
-        Section(
-            "Rigid bodies",
-            [
-                paragraph(
-                    f"The torques of rigid bodies and their drives are linear in "
-                    f"{check.rigid.count} base parameters. The regressor of the training motions, "
-                    "each column of unit norm, has the condition number "
-                    f"{check.rigid.condition:.3g}; below {MOST:g} a motion is well conditioned. "
-                    "Directions with less than a hundredth of the largest singular value are not "
-                    f"determined: {check.rigid.words(len(check.rigid.undetermined))}. The own "
-                    "share of the weakest parameter is what the other columns do not explain of "
-                    "its own."
-                ),
-                table(check.rigid.joints),
-            ],
-        )
-    ]
+    text = (
+        f"The torques of rigid bodies and their drives are linear in {check.rigid.count} base "
+        "parameters. The regressor of the training motions, each column of unit norm, has the "
+        f"condition number {check.rigid.condition:.3g}; below {MOST:g} a motion is well "
+        "conditioned. Directions with less than a hundredth of the largest singular value are not "
+        f"determined: {check.rigid.summary(len(check.rigid.undetermined))}."
+    )
+    return [paragraph(text), table(check.rigid.joints)]
 
 
 def _clock(source: LogSource) -> Figure:
     figure = Figure(figsize=(9, 2.6), layout="constrained")
     ax = figure.subplots()
-    for index, part in enumerate(source.cleaned[:6]):
-        ax.plot(
-            part.raw.t[1:],
-            1e3 * np.diff(part.raw.t),
-            ".",
-            color=model_style(index)["color"],
-            markersize=2,
-        )
+    for part in source.cleaned[:6]:
+        ax.plot(part.raw.t[1:], 1e3 * np.diff(part.raw.t), ".", markersize=2)
     ax.set(xlabel="time (s)", ylabel="time between rows (ms)")
     return figure
 
@@ -137,30 +113,28 @@ def _delays(check: LogCheck) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     ax = figure.subplots()
     for index, (name, curve) in enumerate(zip(check.inputs["input"], check.delays, strict=True)):
-        colour = model_style(index)["color"]
-        ax.plot(1e3 * curve.candidates, 100 * curve.residual, color=colour, label=name)
+        color = f"C{index}"
+        ax.plot(1e3 * curve.candidates, 100 * curve.residual, color=color, label=name)
         if curve.delay is not None:
-            ax.axvline(1e3 * curve.delay, color=colour, linewidth=0.8, linestyle="--")
+            ax.axvline(1e3 * curve.delay, color=color, linewidth=0.8, linestyle="--")
     ax.set(xlabel="delay (ms)", ylabel="unexplained (%)", yscale="log")
     ax.legend(fontsize="small")
     return figure
 
 
-def _coverage(check: LogCheck, source: LogSource) -> Figure:
+def _coverage(check: LogCheck) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
+    source = check.source
     splits = source.load()
-    for name, colour, items in (
-        ("training", "0.7", splits.train),
-        ("test", model_style(0)["color"], splits.test),
-    ):
-        q = np.vstack([np.hstack([item.q[:, :2].numpy(), item.v[:, :1].numpy()]) for item in items])
-        if len(source.labels) > 1:
-            q = q[:, :2]
-        q = q[:: max(1, len(q) // 4000)]
-        left.plot(q[:, 0], q[:, -1], ".", color=colour, markersize=2, label=name)
-    left.set(xlabel=source.labels[0], ylabel=[*source.labels, "its velocity"][1])
+    several = len(source.labels) > 1
+    for name, color, items in (("training", "0.7", splits.train), ("test", "C0", splits.test)):
+        x = np.concatenate([item.q[:, 0].numpy() for item in items])
+        y = np.concatenate([(item.q[:, 1] if several else item.v[:, 0]).numpy() for item in items])
+        thin = slice(None, None, max(1, len(x) // 4000))
+        left.plot(x[thin], y[thin], ".", color=color, markersize=2, label=name)
+    left.set(xlabel=source.labels[0], ylabel=source.labels[1] if several else "its velocity")
     left.legend(fontsize="small")
-    right.hist(check.distance, bins=40, color=model_style(0)["color"])
+    right.hist(check.distance, bins=40)
     right.set(xlabel="distance of a test sample from the training", ylabel="samples")
     return figure

@@ -1,0 +1,49 @@
+"""One measurement of a log check, with its verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+Verdict = Literal["ok", "warning", "stop"]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A number that a check measured, and what it means for a training.
+
+    Attributes:
+        name: measured quantity.
+        place: run, column or input.
+        value: the number; NaN where there is none.
+        expected: range of a good log, in words.
+        verdict: ``"ok"``, ``"warning"``, or ``"stop"`` where a training makes no sense.
+        text: explanation of a warning or a stop, a full sentence.
+        section: section of the documentation.
+    """
+
+    name: str
+    place: str = ""
+    value: float = math.nan
+    expected: str = ""
+    verdict: Verdict = "ok"
+    text: str = ""
+    section: str = "csv_logs.md#what-is-checked"
+
+
+def judged(
+    name: str,
+    place: str,
+    value: float,
+    expected: str,
+    bad: bool,
+    text: str,
+    *,
+    verdict: Verdict = "warning",
+    section: str = Measurement.section,
+) -> Measurement:
+    """Return a measurement with a verdict and a text if it is bad, else ``"ok"``."""
+    if not bad:
+        return Measurement(name, place, float(value), expected, section=section)
+    return Measurement(name, place, float(value), expected, verdict, text, section)

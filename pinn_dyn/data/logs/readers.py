@@ -1,0 +1,175 @@
+"""Log files by their suffix: the registry of readers, and the search for files.
+
+A new format is one function in ``READERS``::
+
+    def read_feather(path, request):
+        return pd.read_feather(path)
+
+    READERS[".feather"] = read_feather
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import importlib
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.table import Table
+
+
+@dataclass(frozen=True)
+class Request:
+    """Columns that a data set needs of a file.
+
+    Attributes:
+        time: column of the time.
+        columns: columns of all signals, the time among them. A reader may return more.
+        max_age: oldest message of another topic of a bag that a row may use, s.
+    """
+
+    time: str
+    columns: Sequence[str]
+    max_age: float = 0.1
+
+
+Reader = Callable[[Path, Request], pd.DataFrame | Table]
+"""Reads a file. One row per sample; the index names a row in messages."""
+
+
+def optional(name: str, path: Path) -> Any:
+    """Import a module of the extra ``logs``.
+
+    Raises:
+        LogError: if it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise LogError(
+            f"{path}: reading it needs the package {name.split('.')[0]}: "
+            "pip install 'pinn_dyn[logs]'"
+        ) from error
+
+
+def read_csv(path: Path, request: Request) -> Table:
+    """Read a CSV file with a header line, separated by commas, semicolons or tabs."""
+    with (gzip.open if path.suffix == ".gz" else open)(path, "rt", encoding="utf-8-sig") as file:
+        header = file.readline()
+    separator = max(",;\t", key=header.count)
+    with warnings.catch_warnings():
+        # pandas would cut rows that are longer than the header, and only warn.
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        frame = pd.read_csv(
+            path,
+            sep=separator,
+            encoding="utf-8-sig",
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            index_col=False,
+        )
+    # pandas would number the columns of one name.
+    names = next(csv.reader([header], delimiter=separator, skipinitialspace=True))
+    frame.columns = pd.Index([name.strip() for name in names])
+    frame.index = pd.RangeIndex(2, len(frame) + 2)
+    return Table(frame.dropna(how="all"), str(path), "line")
+
+
+def _lazy(module: str, function: str) -> Reader:
+    """Return a reader whose module is imported at its first use."""
+
+    def read(path: Path, request: Request) -> pd.DataFrame | Table:
+        reader: Reader = getattr(importlib.import_module(f"{__package__}.{module}"), function)
+        return reader(path, request)
+
+    return read
+
+
+READERS: dict[str, Reader] = {
+    **dict.fromkeys((".csv", ".gz", ".txt", ".tsv", ".dat", ".log"), read_csv),
+    ".mat": _lazy("arrays", "read_mat"),
+    **dict.fromkeys((".h5", ".hdf5"), _lazy("arrays", "read_hdf5")),
+    ".npz": _lazy("arrays", "read_npz"),
+    ".parquet": _lazy("parquet", "read_parquet"),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), _lazy("bags", "read_bag")),
+}
+"""Reader of each suffix; the folder of a ROS 2 bag is read as ``.db3``."""
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Tell whether a path is the folder of a ROS 2 bag."""
+    return (path / "metadata.yaml").is_file()
+
+
+def read_table(path: Path, request: Request) -> Table:
+    """Read a log file.
+
+    Raises:
+        LogError: if no reader knows its format, or it is damaged or empty.
+    """
+    suffix = ".db3" if is_bag_folder(path) else path.suffix.lower()
+    if suffix not in READERS:
+        raise LogError(
+            f"{path}: no reader for {suffix or 'files without a suffix'}, expected one of "
+            f"{', '.join(READERS)}: convert it with pandas (to_csv, to_parquet), or add a "
+            "function to pinn_dyn.data.logs.READERS"
+        )
+    try:
+        table = READERS[suffix](path, request)
+    except LogError:
+        raise
+    except Exception as error:  # a damaged file raises nearly anything
+        raise LogError(
+            f"{path}: cannot be read as {suffix}, it may be damaged or cut short: "
+            f"{' '.join(str(error).split()) or type(error).__name__}"
+        ) from error
+    if isinstance(table, pd.DataFrame):
+        table = Table(table, str(path))
+    if not len(table):
+        raise LogError(f"{path}: has no rows")
+    return table
+
+
+def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
+    """Return the files of names or glob patterns in a folder, in order of their names.
+
+    Raises:
+        LogError: if the folder does not exist, or a pattern matches nothing.
+    """
+    folder = Path(root).expanduser()
+    if not folder.is_dir():
+        raise LogError(
+            f"root is {str(folder.absolute())!r}, which is no folder: give the folder of the logs "
+            "as dataset.root=..., or set the variable PINN_DYN_LOGS where the data set uses it"
+        )
+    files: set[Path] = set()
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        paths = list(folder.glob(pattern))
+        matches = [path for path in paths if path.is_file() or is_bag_folder(path)]
+        if not matches:
+            names = sorted(
+                path.relative_to(folder).as_posix()
+                for parent in [folder, *paths]
+                for path in parent.glob("*")
+                if not path.name.startswith(".")
+            )
+            raise LogError(
+                f"files: nothing matches {pattern!r} in the folder {folder.absolute()}, which has "
+                f"{listed(names) or 'no files'}: correct dataset.files or dataset.root"
+            )
+        files.update(matches)
+    return sorted(files)
+
+
+def run_name(path: Path, root: str) -> str:
+    """Return the name of a file's run: its path in the folder, without its suffix."""
+    inside = path.relative_to(Path(root).expanduser())
+    return (inside.with_suffix("") if inside.suffix == ".gz" else inside).with_suffix("").as_posix()
