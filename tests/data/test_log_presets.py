@@ -95,7 +95,7 @@ def test_neck_with_its_moving_average(neck):
 
 
 def test_neck_with_polynomials_instead(neck):
-    fit = "{_target_: pinn_dyn.data.logs.PolynomialFit, degree: 7, segment: 5.0}"
+    fit = "{_target_: examples.cleaning_steps.PolynomialFit, degree: 7, segment: 5.0}"
     source = preset("neck", *neck, "dataset.steps.smooth=null", f"++dataset.steps.fit={fit}")
     splits = source.load()
     assert {len(item.t) for item in splits.train} == {51}
@@ -140,5 +140,16 @@ def test_the_documentation_names_every_unit_and_step():
         and isinstance(getattr(logs, name), type)
         and issubclass(getattr(logs, name), logs.Step)
     ]
-    assert len(steps) == 13
+    assert len(steps) == 9
     assert [name for name in steps if f"| `{name}(" not in text] == []
+
+
+def test_the_sections_that_measurements_link_to_exist():
+    code = [*(ROOT / "pinn_dyn" / "data" / "logs").glob("*.py")]
+    code.append(ROOT / "pinn_dyn" / "evaluation" / "log_check.py")
+    links = set(re.findall(r'"(\w+\.md)#([\w-]+)"', "".join(x.read_text() for x in code)))
+    assert len(links) >= 3
+    for page, anchor in links:
+        headings = re.findall(r"^#+ (.*)$", (ROOT / "docs" / page).read_text(), re.MULTILINE)
+        anchors = [re.sub(r"[^\w -]", "", x).lower().replace(" ", "-") for x in headings]
+        assert anchor in anchors

@@ -253,7 +253,7 @@ def test_the_figure_holds_raw_and_cleaned_values(folder):
     np.testing.assert_array_equal(clean.get_ydata(), part.clean[0].q[:, 1])
     assert len(panels["d/dt q1 [rad/s]"].get_lines()) == 1
     assert "oscillator: run, train" in figure.get_suptitle()
-    with pytest.raises(ValueError, match="labels has 1 entries, expected 2"):
+    with pytest.raises(ValueError, match="1 labels for q, expected 2"):
         cleaning_figure(part, title="", labels=["q"], input_labels=["u1", "u2"])
 
 
