@@ -75,8 +75,8 @@ def write_results(
         for name, record in records.items()
     }
     summary = comparison_table(metrics)
-    coordinates = _together({name: m.per_coordinate() for name, m in metrics.items()})
-    inputs = _together({name: m.per_input() for name, m in metrics.items()})
+    coordinates = _together({name: m.coordinates for name, m in metrics.items()})
+    inputs = _together({name: m.inputs for name, m in metrics.items()})
     tables = {"summary": summary, "coordinates": coordinates, "inputs": inputs}
     for stem, table in tables.items():
         write_table(table, folder, stem)
@@ -115,7 +115,7 @@ def write_results(
     )
     write_whole(folder / "report.html", report)
     print(f"\ntables, figures and records are in {folder}; open report.html in a browser")
-    return metrics[first].rms_error
+    return metrics[first].summary["rms_error"]
 
 
 def write_stability(

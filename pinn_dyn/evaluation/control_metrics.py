@@ -1,11 +1,11 @@
-"""Figures of closed loops: every number about control quality is computed here."""
+"""Metrics of closed loops."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from statistics import median
+from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
@@ -14,134 +14,51 @@ from torch import Tensor
 from pinn_dyn.control.record import ClosedLoopRecord
 
 SMALL_STEP = 0.05
-"""Overshoot is not asked of a coordinate that steps by less than this part of the largest step."""
+"""A coordinate whose step is smaller than this part of the largest step has no overshoot."""
 
 STEADY_PART = 0.1
 """The steady state is the last tenth of a run."""
 
+Limit = Tensor | Sequence[float] | float | None
 
-@dataclass(frozen=True)
-class ClosedLoopMetrics:
-    """How well and at what cost K closed loops follow their references, e(t) = q_ref(t) - q(t).
 
-    Figures are over the runs that went to their end, as roll-out errors leave out what diverged;
-    they are infinite if none did, never NaN. What is called worst or max is infinite if any run
-    was stopped. Counts are over all runs. RMS is over times, runs and coordinates, N of them; e is
-    in the units of q, where rad and m are mixed if q mixes them. The input is held between control
-    instants, so its last sample, which nothing obeys, does not count.
+class ClosedLoopMetrics(NamedTuple):
+    """Tracking errors and input effort of K closed loops, with e(t) = q_ref(t) - q(t).
 
-    A record is of set points if each reference is constant and no run starts at its own. With the
-    step s = q_ref - q(0) and its size RMS(s), over the coordinates, only then it has the figures
-    that are None otherwise.
+    Means are over the runs that were not stopped, and infinite if all were stopped. A worst or
+    largest value is infinite if any run was stopped. RMS values are over times, runs and the N
+    coordinates; e is in the units of q. The input is constant between two control instants, so its
+    last sample has no effect and does not count.
+
+    The metrics marked with * exist only for set points: each reference is constant, and no run
+    starts at its reference. The step is s = q_ref - q(0).
 
     Attributes:
-        runs: K.
-        stopped: how many of them were stopped before their end.
-        duration: length of the runs, s.
-        set_points: whether the references are set points.
-        rms_error: sqrt(mean e_i^2).
-        mean_error: mean of |e|_2.
-        max_error: largest |e|_2.
-        worst_run: index of the run with the largest RMS error, the first stopped one if any.
-        step_error_after: the time in s that the two next figures are for, None if not asked for.
-        step_error_mean, step_error_worst: see :func:`step_error_after`, %, over runs.
-        settling_time_median, settling_time_worst: first time in s, to a sample, from which on
-            |e|_2 stays below ``settle_fraction`` |s|_2; infinite for a run that never settles or
-            was stopped, and the median is over all runs.
-        never_settled: how many runs never settle, the stopped ones among them.
-        overshoot_mean, overshoot_worst: how far a coordinate goes beyond its set point, in % of
-            its own step, over runs and coordinates; coordinates whose step is below 5 % of the
-            largest in the run are left out.
-        steady_state_error: mean of |e|_2 over the last tenth of the runs.
-        steady_state_error_relative: the same in % of |s|_2.
-        input_rms: sqrt(mean u_i^2), over inputs too; in the units of u.
-        input_peak: largest |u_i|.
-        input_square_integral: integral of |u|^2 over a run, mean over runs.
-        input_variation: path length of u per second, sum_k |u_k+1 - u_k|_2 / duration.
-        saturated_samples: at how many control instants any input is at a limit or beyond it, all
-            runs together; None without limits.
-        saturated_part: the same in % of the instants.
-        rms_error_of, max_error_of: RMS and largest |e_i| of each coordinate, N.
-        overshoot_mean_of, overshoot_worst_of: overshoot of each coordinate, %, N; NaN for one
-            that is always left out.
-        input_rms_of, input_peak_of, input_square_integral_of: of each input, M.
+        summary: metrics over all coordinates and inputs:
+
+            - ``runs``, ``stopped``: number of runs, and of stopped runs.
+            - ``rms_error``, ``mean_error``, ``max_error``: sqrt(mean e_i^2), mean and largest
+              |e|_2.
+            - ``step_error_after_<T>_s_mean_percent``, ``..._worst_percent`` *: see
+              :func:`step_error_after`.
+            - ``settling_time_median_s``, ``settling_time_worst_s`` *: first time from which |e|_2
+              stays below ``settle_fraction`` |s|_2, and ``never_settled``, the number of runs that
+              never settle, stopped runs among them.
+            - ``overshoot_mean_percent``, ``overshoot_worst_percent`` *: largest distance beyond the
+              set point, relative to the step of the coordinate.
+            - ``steady_state_error``: mean |e|_2 over the last tenth of the runs, and
+              ``steady_state_error_percent`` *, relative to |s|_2.
+            - ``input_rms``, ``input_peak``, ``input_square_integral`` (integral of |u|^2 over a
+              run), ``input_variation_per_s`` (path length of u per second).
+            - ``saturated_samples``, ``saturated_percent``: control instants of all runs at which
+              an input reaches a limit; absent without limits.
+        coordinates: one row per coordinate: RMS and largest error, and overshoot *.
+        inputs: one row per input: RMS, peak and integral of the square.
     """
 
-    runs: int
-    stopped: int
-    duration: float
-    set_points: bool
-    rms_error: float
-    mean_error: float
-    max_error: float
-    worst_run: int
-    step_error_after: float | None
-    step_error_mean: float | None
-    step_error_worst: float | None
-    settling_time_median: float | None
-    settling_time_worst: float | None
-    never_settled: int | None
-    overshoot_mean: float | None
-    overshoot_worst: float | None
-    steady_state_error: float
-    steady_state_error_relative: float | None
-    input_rms: float
-    input_peak: float
-    input_square_integral: float
-    input_variation: float
-    saturated_samples: int | None
-    saturated_part: float | None
-    rms_error_of: tuple[float, ...]
-    max_error_of: tuple[float, ...]
-    overshoot_mean_of: tuple[float, ...] | None
-    overshoot_worst_of: tuple[float, ...] | None
-    input_rms_of: tuple[float, ...]
-    input_peak_of: tuple[float, ...]
-    input_square_integral_of: tuple[float, ...]
-
-    def to_dict(self) -> dict[str, float]:
-        """The row of a table: scalars under names that say their unit, without what is None."""
-        after = f"step_error_after_{self.step_error_after or 0:g}_s"
-        row: dict[str, float | None] = {
-            "runs": self.runs,
-            "stopped": self.stopped,
-            "rms_error": self.rms_error,
-            "mean_error": self.mean_error,
-            "max_error": self.max_error,
-            f"{after}_mean_percent": self.step_error_mean,
-            f"{after}_worst_percent": self.step_error_worst,
-            "settling_time_median_s": self.settling_time_median,
-            "settling_time_worst_s": self.settling_time_worst,
-            "never_settled": self.never_settled,
-            "overshoot_mean_percent": self.overshoot_mean,
-            "overshoot_worst_percent": self.overshoot_worst,
-            "steady_state_error": self.steady_state_error,
-            "steady_state_error_percent": self.steady_state_error_relative,
-            "input_rms": self.input_rms,
-            "input_peak": self.input_peak,
-            "input_square_integral": self.input_square_integral,
-            "input_variation_per_s": self.input_variation,
-            "saturated_samples": self.saturated_samples,
-            "saturated_percent": self.saturated_part,
-        }
-        return {name: value for name, value in row.items() if value is not None}
-
-    def per_coordinate(self) -> pd.DataFrame:
-        """One row per coordinate: RMS and largest error, and overshoot for set points."""
-        columns = {"rms_error": self.rms_error_of, "max_error": self.max_error_of}
-        if self.overshoot_mean_of is not None and self.overshoot_worst_of is not None:
-            columns["overshoot_mean_percent"] = self.overshoot_mean_of
-            columns["overshoot_worst_percent"] = self.overshoot_worst_of
-        return _numbered("coordinate", "q", columns)
-
-    def per_input(self) -> pd.DataFrame:
-        """One row per input: RMS, peak and integral of the square."""
-        columns = {
-            "rms": self.input_rms_of,
-            "peak": self.input_peak_of,
-            "square_integral": self.input_square_integral_of,
-        }
-        return _numbered("input", "u", columns)
+    summary: dict[str, float]
+    coordinates: pd.DataFrame
+    inputs: pd.DataFrame
 
 
 def closed_loop_metrics(
@@ -149,90 +66,91 @@ def closed_loop_metrics(
     *,
     settle_fraction: float = 0.02,
     settled_after: float | None = None,
-    u_low: Tensor | Sequence[float] | float | None = None,
-    u_high: Tensor | Sequence[float] | float | None = None,
+    u_low: Limit = None,
+    u_high: Limit = None,
 ) -> ClosedLoopMetrics:
-    """Figures of K closed loops.
+    """Return the metrics of K closed loops.
 
     Args:
-        record: what the loop left behind.
+        record: K runs of a control law, with at least two samples.
         settle_fraction: part of the step within which the error has settled.
-        settled_after: time in s from which on the step error is judged; None leaves it out.
-        u_low, u_high: limits of the inputs, one number or M; None for no limit on that side.
+        settled_after: time from which the step error is taken, s; None leaves the step error out.
+        u_low, u_high: limits of the inputs, one number or M; None for no limit.
 
     Raises:
-        ValueError: on fewer than two samples, a settle_fraction outside (0, 1), limits that do
-            not fit the inputs, or a settled_after where there is no step or no sample.
+        ValueError: if ``settled_after`` is given and there is no step or no sample after it.
     """
-    if record.t.shape[0] < 2:
-        raise ValueError(f"record has {record.t.shape[0]} samples, expected at least 2")
-    if not 0 < settle_fraction < 1:
-        raise ValueError(f"settle_fraction is {settle_fraction}, expected a part between 0 and 1")
     t = record.t.double() - record.t[0].double()
     duration = float(t[-1])
     lost = stopped_runs(record)
     error = (record.reference.q - record.q).double()
     norm = error.norm(dim=-1)
     square = error.square().mean(dim=1)  # (K, N)
-    run_rms = _marked(square.mean(dim=1).sqrt(), lost)
     steady = norm[:, t >= (1 - STEADY_PART) * duration].mean(dim=1)
-
-    held, times = record.u[:, :-1].double(), t.diff()
-    effort = (held.square() * times[:, None]).sum(dim=1)  # (K, M)
-    variation = held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration
-    saturated = _saturated(held, u_low, u_high)
-    applied = int(torch.isfinite(held).all(dim=-1).sum())
-
+    summary: dict[str, Any] = {
+        "runs": len(lost),
+        "stopped": int(lost.sum()),
+        "rms_error": _mean(square, lost).mean().sqrt(),
+        "mean_error": _mean(norm.mean(dim=1), lost),
+        "max_error": _marked(norm.amax(dim=1), lost).max(),
+    }
+    coordinates = {
+        "rms_error": _mean(square, lost).sqrt(),
+        "max_error": _marked(error.abs().amax(dim=1), lost).amax(dim=0),
+    }
+    if settled_after is not None:
+        ratio = 100 * step_error_after(record, settled_after)
+        name = f"step_error_after_{settled_after:g}_s"
+        summary[f"{name}_mean_percent"] = _mean(ratio, lost)
+        summary[f"{name}_worst_percent"] = ratio.max()
     step = _step(record)
-    settling = kept = mean_of = worst_of = None
     if step is not None:
         settling = _marked(_settling_times(norm, t, settle_fraction * step.norm(dim=-1)), lost)
         overshoot = _overshoot(error, step, lost)
-        kept = overshoot if lost.all() else overshoot[~lost]
-        mean_of, worst_of = kept.nanmean(dim=0), _nanmax(overshoot)
-    after = None if settled_after is None else step_error_after(record, settled_after)
+        complete = overshoot if lost.all() else overshoot[~lost]
+        summary |= {
+            "settling_time_median_s": median(settling.tolist()),
+            "settling_time_worst_s": settling.max(),
+            "never_settled": int(settling.isinf().sum()),
+            "overshoot_mean_percent": complete.nanmean(),
+            "overshoot_worst_percent": _nanmax(_nanmax(overshoot)),
+        }
+        coordinates["overshoot_mean_percent"] = complete.nanmean(dim=0)
+        coordinates["overshoot_worst_percent"] = _nanmax(overshoot)
+    summary["steady_state_error"] = _mean(steady, lost)
+    if step is not None:
+        summary["steady_state_error_percent"] = 100 * _mean(steady / step.norm(dim=-1), lost)
+
+    held = record.u[:, :-1].double()
+    effort = (held.square() * t.diff()[:, None]).sum(dim=1)  # (K, M)
+    summary |= {
+        "input_rms": (_mean(effort, lost).mean() / duration).sqrt(),
+        "input_peak": _largest(held.abs().amax(dim=(1, 2)), lost),
+        "input_square_integral": _mean(effort.sum(dim=-1), lost),
+        "input_variation_per_s": _mean(held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration, lost),
+    }
+    if u_low is not None or u_high is not None:
+        saturated = _saturated(held, u_low, u_high)
+        applied = int(torch.isfinite(held).all(dim=-1).sum())
+        summary["saturated_samples"] = saturated
+        summary["saturated_percent"] = 100 * saturated / max(applied, 1)
+    inputs = {
+        "rms": (_mean(effort, lost) / duration).sqrt(),
+        "peak": _largest(held.abs().amax(dim=1), lost),
+        "square_integral": _mean(effort, lost),
+    }
     return ClosedLoopMetrics(
-        runs=len(lost),
-        stopped=int(lost.sum()),
-        duration=duration,
-        set_points=step is not None,
-        rms_error=_mean(square, lost).mean().sqrt().item(),
-        mean_error=_mean(norm.mean(dim=1), lost).item(),
-        max_error=_marked(norm.amax(dim=1), lost).max().item(),
-        worst_run=int(run_rms.argmax()),
-        step_error_after=settled_after,
-        step_error_mean=None if after is None else 100 * _mean(after, lost).item(),
-        step_error_worst=None if after is None else 100 * after.max().item(),
-        settling_time_median=None if settling is None else median(settling.tolist()),
-        settling_time_worst=None if settling is None else settling.max().item(),
-        never_settled=None if settling is None else int(settling.isinf().sum()),
-        overshoot_mean=None if kept is None else kept.nanmean().item(),
-        overshoot_worst=None if worst_of is None else _nanmax(worst_of).item(),
-        steady_state_error=_mean(steady, lost).item(),
-        steady_state_error_relative=(
-            None if step is None else 100 * _mean(steady / step.norm(dim=-1), lost).item()
-        ),
-        input_rms=(_mean(effort, lost).mean() / duration).sqrt().item(),
-        input_peak=_largest(held.abs().amax(dim=(1, 2)), lost).item(),
-        input_square_integral=_mean(effort.sum(dim=-1), lost).item(),
-        input_variation=_mean(variation, lost).item(),
-        saturated_samples=saturated,
-        saturated_part=None if saturated is None else 100 * saturated / max(applied, 1),
-        rms_error_of=tuple(_mean(square, lost).sqrt().tolist()),
-        max_error_of=tuple(_marked(error.abs().amax(dim=1), lost).amax(dim=0).tolist()),
-        overshoot_mean_of=None if mean_of is None else tuple(mean_of.tolist()),
-        overshoot_worst_of=None if worst_of is None else tuple(worst_of.tolist()),
-        input_rms_of=tuple((_mean(effort, lost) / duration).sqrt().tolist()),
-        input_peak_of=tuple(_largest(held.abs().amax(dim=1), lost).tolist()),
-        input_square_integral_of=tuple(_mean(effort, lost).tolist()),
+        {k: x.item() if isinstance(x, Tensor) else x for k, x in summary.items()},
+        _numbered("coordinate", "q", coordinates),
+        _numbered("input", "u", inputs),
     )
 
 
 def step_error_after(record: ClosedLoopRecord, seconds: float) -> Tensor:
-    """max over t >= seconds of RMS_i(e_i(t)) / RMS_i(s_i) with the step s = q_ref - q(0), ``(K,)``.
+    """Return max over t >= seconds of |e(t)|_2 / |s|_2 with the step s = q_ref - q(0), ``(K,)``.
 
-    RMS is over the coordinates; a stopped run has an infinite one. The paper reports that its
-    controller is within one second below 0.0023 (section on the two-segment soft manipulator).
+    The result is infinite for a stopped run. The paper reports that its controller is below 0.0023
+    within one second (section on the two-segment soft manipulator).
 
     Raises:
         ValueError: if the references are no set points, or if the runs do not last that long.
@@ -240,71 +158,54 @@ def step_error_after(record: ClosedLoopRecord, seconds: float) -> Tensor:
     step = _step(record)
     if step is None:
         raise ValueError(
-            "the record has no step to relate an error to: expected references that are constant "
-            "in time and differ from q(0) in every run; leave settled_after out"
+            "settled_after needs a step: references that are constant in time and differ from q(0) "
+            "in every run; leave settled_after out"
         )
     t = record.t.double() - record.t[0].double()
-    late = t >= seconds - 1e-9 * float(t[-1])
-    if seconds < 0 or not late.any():
-        raise ValueError(
-            f"settled_after is {seconds} s, expected between 0 and {float(t[-1]):g} s, as long as "
-            "the runs last"
-        )
-    error = (record.reference.q - record.q).double()[:, late].norm(dim=-1).amax(dim=1)
+    after = t >= seconds - 1e-9 * float(t[-1])
+    if not after.any():
+        raise ValueError(f"settled_after is {seconds} s, expected at most {float(t[-1]):g} s")
+    error = (record.reference.q - record.q).double()[:, after].norm(dim=-1).amax(dim=1)
     return _marked(error / step.norm(dim=-1), stopped_runs(record))
 
 
 def stopped_runs(record: ClosedLoopRecord) -> Tensor:
-    """Which runs did not go to their end, ``(K,)``, bool: stopped, or q not finite throughout."""
+    """Return which runs were stopped or have a q that is not finite, ``(K,)``, bool."""
     stopped = torch.tensor([reason is not None for reason in record.stopped])
     return stopped | ~torch.isfinite(record.q).all(dim=(1, 2))
 
 
 def samples_before_stop(record: ClosedLoopRecord, run: int) -> int:
-    """How many samples of a run come before its first q that is not finite; all if none is.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    alive = torch.isfinite(record.q[run]).all(dim=-1)
-    if not alive[0]:
-        raise ValueError(f"run {run} has no finite q at its start: expected one that started")
-    return len(alive) if alive.all() else int((~alive).int().argmax())
+    """Return the number of samples of a run before its first q that is not finite."""
+    finite = torch.isfinite(record.q[run]).all(dim=-1)
+    return len(finite) if finite.all() else int((~finite).int().argmax())
 
 
-def comparison_table(results: dict[str, ClosedLoopMetrics]) -> pd.DataFrame:
-    """One row per controller; errors are in the units of q, inputs in the units of u.
-
-    A figure that a controller has not, as its runs are no set points, is missing in its row.
-
-    Raises:
-        ValueError: on an empty dictionary.
-    """
-    if not results:
-        raise ValueError("results is empty: expected at least one controller")
-    return pd.DataFrame([{"controller": name} | m.to_dict() for name, m in results.items()])
+def comparison_table(results: Mapping[str, ClosedLoopMetrics]) -> pd.DataFrame:
+    """Return one row per control law; errors are in the units of q, inputs in the units of u."""
+    return pd.DataFrame([{"controller": name} | m.summary for name, m in results.items()])
 
 
 def _step(record: ClosedLoopRecord) -> Tensor | None:
-    """q_ref - q(0), ``(K, N)``, where all references are set points away from q(0)."""
+    """Return q_ref - q(0), ``(K, N)``; None unless all references are set points off q(0)."""
     q_ref = record.reference.q.double()
     first = q_ref[:, :1]
-    moved = (q_ref - first).abs().nan_to_num(0.0)  # NaN where a run has stopped
+    change = (q_ref - first).abs().nan_to_num(0.0)  # NaN after a stop
     step = first[:, 0] - record.q[:, 0].double()
-    if (moved > 1e-9 * (1 + first.abs())).any() or (step.norm(dim=-1) == 0).any():
+    if (change > 1e-9 * (1 + first.abs())).any() or (step.norm(dim=-1) == 0).any():
         return None
     return step
 
 
 def _settling_times(norm: Tensor, t: Tensor, bound: Tensor) -> Tensor:
+    """Return the time after the last sample outside the bound; infinite if that is the end."""
     outside = ~(norm <= bound[:, None])
     last = torch.where(outside, torch.arange(len(t)), -1).amax(dim=1)
-    # One after the last sample outside; there is none if that is the last of all.
     return torch.cat([t, t.new_full((1,), math.inf)])[last + 1]
 
 
 def _overshoot(error: Tensor, step: Tensor, lost: Tensor) -> Tensor:
-    """In % of the step, ``(K, N)``; NaN for a coordinate that hardly steps."""
+    """Return the overshoot in % of the step, ``(K, N)``; NaN for a coordinate with a small step."""
     size = step.abs()
     beyond = (-error * step.sign()[:, None]).amax(dim=1).clamp(min=0)
     counted = size >= SMALL_STEP * size.amax(dim=1, keepdim=True)
@@ -312,47 +213,37 @@ def _overshoot(error: Tensor, step: Tensor, lost: Tensor) -> Tensor:
 
 
 def _nanmax(values: Tensor) -> Tensor:
-    """Largest over the first dimension; NaN only where there is nothing else."""
+    """Return the largest value over the first dimension; NaN only where all values are NaN."""
     largest = values.nan_to_num(-1.0, posinf=math.inf).amax(dim=0)
     return torch.where(values.isnan().all(dim=0), torch.nan, largest)
 
 
-def _saturated(
-    held: Tensor,
-    low: Tensor | Sequence[float] | float | None,
-    high: Tensor | Sequence[float] | float | None,
-) -> int | None:
-    if low is None and high is None:
-        return None
+def _saturated(held: Tensor, low: Limit, high: Limit) -> int:
+    """Return the number of instants at which any input reaches a limit."""
     at_limit = torch.zeros_like(held, dtype=torch.bool)
-    for name, limit, sign in (("u_low", low, -1.0), ("u_high", high, 1.0)):
-        if limit is None:
-            continue
-        value = torch.as_tensor(limit, dtype=held.dtype)
-        if value.shape not in ((), held.shape[-1:]):
-            raise ValueError(
-                f"{name} has shape {tuple(value.shape)}, expected one number or "
-                f"{held.shape[-1]}, one for each input"
-            )
-        at_limit |= sign * held >= sign * value
+    for limit, sign in ((low, -1.0), (high, 1.0)):
+        if limit is not None:
+            at_limit |= sign * held >= sign * torch.as_tensor(limit, dtype=held.dtype)
     return int(at_limit.any(dim=-1).sum())
 
 
 def _marked(values: Tensor, lost: Tensor) -> Tensor:
-    """The values ``(K, ...)`` with infinity for the runs that were stopped."""
+    """Return the values ``(K, ...)`` with infinity for the stopped runs."""
     return torch.where(lost.view(-1, *[1] * (values.ndim - 1)), torch.inf, values)
 
 
 def _mean(values: Tensor, lost: Tensor) -> Tensor:
-    """Mean over the runs that went to their end; infinite if none did."""
+    """Return the mean over the complete runs; infinite without any."""
     return _marked(values, lost).mean(dim=0) if lost.all() else values[~lost].mean(dim=0)
 
 
 def _largest(values: Tensor, lost: Tensor) -> Tensor:
-    """Largest over the runs that went to their end; infinite if none did."""
+    """Return the largest value over the complete runs; infinite without any."""
     return (_marked(values, lost) if lost.all() else values[~lost]).amax(dim=0)
 
 
-def _numbered(what: str, letter: str, columns: dict[str, tuple[float, ...]]) -> pd.DataFrame:
+def _numbered(kind: str, letter: str, columns: Mapping[str, Tensor]) -> pd.DataFrame:
+    """Return a table with one numbered row per entry of the columns."""
     count = len(next(iter(columns.values())))
-    return pd.DataFrame({what: [f"{letter}{i + 1}" for i in range(count)], **columns})
+    table = {kind: [f"{letter}{i + 1}" for i in range(count)]}
+    return pd.DataFrame(table | {name: x.tolist() for name, x in columns.items()})

@@ -177,8 +177,8 @@ def control_page(names=("learned", "pd"), title="a loop", animation=None):
     page = control_report(
         title=title,
         summary=summary,
-        coordinates=first.per_coordinate(),
-        inputs=first.per_input(),
+        coordinates=first.coordinates,
+        inputs=first.inputs,
         records=laws,
         figures={
             "comparison": controller_comparison_figure(laws, title=title),
