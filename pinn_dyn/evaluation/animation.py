@@ -1,7 +1,8 @@
-"""Moving pictures of closed loops as GIFs, and a strip of poses, drawn without a display."""
+"""Animations of closed loops as GIF, and a strip of poses, drawn without a display."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,82 +18,91 @@ from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.plots import COLORS, TRUTH
 from pinn_dyn.systems import Drawable, Rendered
 
-_TIP = "#CC0000"
-_FRAME = 40  # ms, and of pictures, which take long to render, 50; a GIF counts in 10 ms
-_PICTURE, _SIZE = 50, (480, 360)  # px
-_LAST_FRAME = 1000  # ms
+_TIP, _GOAL = "#CC0000", "#707070"
+_FRAME, _LAST_FRAME = 50, 1000  # ms
+_SIZE = (480, 360)  # of a rendered image, px
 
 
 def animate(record: ClosedLoopRecord, run: int, robot: object, path: Path) -> None:
-    """Write a GIF of a robot that can be drawn; of any other there is none."""
+    """Write a GIF of one run in real time, up to its end or stop; nothing for other robots.
+
+    Args:
+        record: K runs.
+        run: index of the run.
+        robot: a system that gives its lines (:class:`Drawable`) or images (:class:`Rendered`).
+        path: the GIF; its folder is created.
+    """
     if isinstance(robot, Rendered):
-        animate_pictures(record, run, robot, path)
+        animate_images(record, run, robot, path)
     elif isinstance(robot, Drawable):
         animate_lines(record, run, robot, path)
 
 
 def animate_lines(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> None:
-    """Write a GIF of a robot's lines in motion, in real time, with the path of its tip in red.
-
-    The wanted shape is in grey.
-
-    Args:
-        record: K runs.
-        run: which of the K to draw; a stopped one is drawn up to its stop.
-        robot: what gives the lines of q.
-        path: the GIF; its folder is made if there is none.
-    """
-    samples = _frames(record, run, _FRAME)
-    shape, wanted = _shapes(record, run, robot)
-    scene = _scene(record, run, shape, wanted)
+    """Write a GIF of the lines of a robot. The reference is grey, the path of the tip red."""
+    samples = _frames(record, run)
+    shape, goal = _shapes(record, run, robot)
     figure = Figure(figsize=(4.8, 4.8), dpi=90)
     canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
-    _set_space(ax, scene, robot.z_is_down)
-    images: list[Image.Image] = []
+    _set_space(ax, _scene(record, run, shape, goal), robot.z_is_down)
+    images = []
     for sample in samples:
         for line in list(ax.lines):
             line.remove()
-        _draw_pose(ax, shape, wanted, sample)
-        text = _time_text(record, run, sample, last=sample == samples[-1])
+        _draw_pose(ax, shape, goal, sample)
+        text = _caption(record, run, sample, last=sample == samples[-1])
         figure.suptitle(text, x=0.03, y=0.98, ha="left", fontsize="medium", family="monospace")
         if not images:
             _legend(figure, ax)
         canvas.draw()
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
-    _save_gif(images, path, _FRAME)
+    _save_gif(images, path)
+
+
+def animate_images(record: ClosedLoopRecord, run: int, robot: Rendered, path: Path) -> None:
+    """Write a GIF of images from a robot's simulator, with the paths of tip and reference."""
+    samples = _frames(record, run)
+    q, q_ref = (x[run, samples].double() for x in (record.q, record.reference.q))
+    points = torch.cat([robot.tip_position(q), robot.tip_position(q_ref)]).numpy()
+    pictures, pixels = robot.render(q.numpy(), points, _SIZE)
+    tip, goal = (list(map(tuple, part.tolist())) for part in np.split(pixels, 2))
+    images = []
+    for frame, (sample, picture) in enumerate(zip(samples, pictures, strict=True)):
+        image = Image.fromarray(picture)
+        draw = ImageDraw.Draw(image)
+        draw.line(goal, fill=_GOAL, width=1)
+        draw.line(tip[: frame + 1], fill=_TIP, width=2)
+        draw.circle(goal[frame], 3, outline="black")
+        draw.circle(tip[frame], 3, fill=_TIP)
+        legend = "path of the tip: red, reference: grey"
+        draw.text((8, _SIZE[1] - 20), legend, fill="black", font_size=12)
+        text = _caption(record, run, sample, last=frame == len(samples) - 1)
+        draw.text((8, 6), text, fill="black", font_size=14)
+        images.append(image)
+    _save_gif(images, path)
 
 
 def pose_strip(
-    record: ClosedLoopRecord, run: int, robot: Drawable, times: list[float], *, title: str
+    record: ClosedLoopRecord, run: int, robot: Drawable, times: Sequence[float], *, title: str
 ) -> Figure:
-    """Poses side by side: the robot, the wanted pose in grey, the path of the tip so far in red.
+    """Draw poses side by side: the robot, the reference in grey, the path of the tip in red.
 
     Args:
         record: K runs.
-        run: which of the K to draw.
-        robot: what gives the lines of q.
-        times: when, s, on the clock of the record; the nearest sample is drawn.
-        title: plant and controller.
-
-    Raises:
-        ValueError: on no times, or times outside the run, which ends where it was stopped.
+        run: index of the run.
+        robot: a system that gives its lines.
+        times: times of the poses, s; the nearest sample before the end or stop is drawn.
+        title: title of the figure.
     """
-    shape, wanted = _shapes(record, run, robot)
+    shape, goal = _shapes(record, run, robot)
     t = record.t[: len(shape)]
-    first, last = float(t[0]), float(t[-1])
-    slack = 1e-9 * (1 + last - first)
-    if not times or min(times) < first - slack or max(times) > last + slack:
-        raise ValueError(
-            f"times is {times}, expected some between {first:g} and {last:g} s, where run {run} "
-            "begins and ends"
-        )
     figure = Figure(figsize=(2.7 * len(times), 3.9))
     axes = figure.subplots(1, len(times), subplot_kw={"projection": "3d"}, squeeze=False)[0]
-    scene = _scene(record, run, shape, wanted)
+    scene = _scene(record, run, shape, goal)
     for ax, time in zip(axes, times, strict=True):
         _set_space(ax, scene, robot.z_is_down)
-        _draw_pose(ax, shape, wanted, int((t - time).abs().argmin()))
+        _draw_pose(ax, shape, goal, int((t - time).abs().argmin()))
         ax.set_title(f"{time:g} s", y=1.0)
     _legend(figure, axes[0])
     figure.suptitle(title)
@@ -100,79 +110,45 @@ def pose_strip(
     return figure
 
 
-def animate_pictures(record: ClosedLoopRecord, run: int, robot: Rendered, path: Path) -> None:
-    """Write a GIF of the pictures that a robot's simulator takes of its motion, in real time.
-
-    The path of the tip in red and the wanted one in grey are in front of the robot.
-
-    Args:
-        record: K runs.
-        run: which of the K to draw; a stopped one is drawn up to its stop.
-        robot: what takes the pictures.
-        path: the GIF; its folder is made if there is none.
-    """
-    samples = _frames(record, run, _PICTURE)
-    q, q_ref = (x[run, samples].double() for x in (record.q, record.reference.q))
-    points = torch.cat([robot.tip_position(q), robot.tip_position(q_ref)]).numpy()
-    pictures, places = robot.render(q.numpy(), points, _SIZE)
-    shown, goal = (list(map(tuple, part.tolist())) for part in np.split(places, 2))
-    images = []
-    for frame, (sample, picture) in enumerate(zip(samples, pictures, strict=True)):
-        image = Image.fromarray(picture)
-        draw = ImageDraw.Draw(image)
-        draw.line(goal, fill="#707070", width=1)
-        draw.line(shown[: frame + 1], fill=_TIP, width=2)
-        draw.circle(goal[frame], 3, outline="black")
-        draw.circle(shown[frame], 3, fill=_TIP)
-        key = "path of the tip: red, wanted: grey"
-        draw.text((8, _SIZE[1] - 20), key, fill="black", font_size=12)
-        text = _time_text(record, run, sample, last=frame == len(samples) - 1)
-        draw.text((8, 6), text, fill="black", font_size=14)
-        images.append(image)
-    _save_gif(images, path, _PICTURE)
-
-
-def _frames(record: ClosedLoopRecord, run: int, duration: int) -> list[int]:
-    """Samples to draw, a frame each ``duration`` ms, the last one before a stop included."""
+def _frames(record: ClosedLoopRecord, run: int) -> list[int]:
+    """Return the samples to draw at 20 frames per second, with the last one before a stop."""
     t = record.t[: samples_before_stop(record, run)].double()
-    times = torch.arange(float(t[0]), float(t[-1]), 1e-3 * duration, dtype=t.dtype)
+    times = torch.arange(float(t[0]), float(t[-1]), 1e-3 * _FRAME, dtype=t.dtype)
     samples = (t - times[:, None]).abs().argmin(dim=1).tolist()
     return [*dict.fromkeys([*samples, len(t) - 1])]
 
 
-def _time_text(record: ClosedLoopRecord, run: int, sample: int, *, last: bool) -> str:
+def _caption(record: ClosedLoopRecord, run: int, sample: int, *, last: bool) -> str:
     reason = record.stopped[run]
     note = f"\nstopped: {reason}" if last and reason else ""
     return f"t = {float(record.t[sample]):.2f} s{note}"
 
 
-def _save_gif(images: list[Image.Image], path: Path, duration: int) -> None:
-    """The last frame, which has all the colours, gives the palette, and stays for a second."""
+def _save_gif(images: Sequence[Image.Image], path: Path) -> None:
+    """Write the GIF. The last frame has all colors, gives the palette, and lasts a second."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = images[-1].quantize(64)
-    frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    times = [duration] * (len(frames) - 1) + [_LAST_FRAME]
-    frames[0].save(
-        path, format="GIF", save_all=True, append_images=frames[1:], duration=times, loop=0
-    )
+    first, *rest = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    times = [_FRAME] * len(rest) + [_LAST_FRAME]
+    first.save(path, format="GIF", save_all=True, append_images=rest, duration=times, loop=0)
 
 
 def _shapes(record: ClosedLoopRecord, run: int, robot: Drawable) -> tuple[Tensor, Tensor]:
-    """Lines reached and wanted, ``(T, S, P, 3)`` each, up to the stop."""
+    """Return the lines of robot and reference up to the stop, ``(T, S, P, 3)`` each."""
     end = samples_before_stop(record, run)
     q, q_ref = record.q[run, :end], record.reference.q[run, :end]
     return robot.lines(q.double()), robot.lines(q_ref.double())
 
 
-def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, wanted: Tensor) -> Tensor:
-    """All points ``(P, 3)`` to be seen; of a stopped run not the last tenth, it may run away."""
+def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, goal: Tensor) -> Tensor:
+    """Return all visible points ``(P, 3)``. A stopped run may run away in its last tenth."""
     end = len(shape) if record.stopped[run] is None else 1 + int(0.9 * (len(shape) - 1))
-    return torch.cat([shape[:end].reshape(-1, 3), shape.new_zeros(1, 3), wanted.reshape(-1, 3)])
+    return torch.cat([shape[:end].reshape(-1, 3), shape.new_zeros(1, 3), goal.reshape(-1, 3)])
 
 
 def _set_space(ax: Axes3D, points: Tensor, z_is_down: bool) -> None:
-    """Equal scales around points ``(P, 3)``, gravity downwards."""
+    """Set equal scales around points ``(P, 3)``, with gravity pointing downwards."""
     low, high = points.amin(dim=0), points.amax(dim=0)
     size = (1.1 * (high - low)).clamp(min=0.5 * float((high - low).max()))
     middle = 0.5 * (low + high)
@@ -192,12 +168,12 @@ def _legend(figure: Figure, ax: Axes3D) -> None:
     figure.legend(handles, names, loc="lower center", ncols=len(names), fontsize="small")
 
 
-def _draw_pose(ax: Axes3D, shape: Tensor, wanted: Tensor, sample: int) -> None:
-    ax.plot(*wanted[sample].flatten(0, 1).T.numpy(), color=TRUTH, linewidth=7, label="reference")
+def _draw_pose(ax: Axes3D, shape: Tensor, goal: Tensor, sample: int) -> None:
+    ax.plot(*goal[sample].flatten(0, 1).T.numpy(), color=TRUTH, linewidth=7, label="reference")
     for index, segment in enumerate(shape[sample]):
-        colour = COLORS[(0, 5)[index % 2]]
+        color = COLORS[(0, 5)[index % 2]]
         name = "arm" if index == 0 else None
-        ax.plot(*segment.T.numpy(), color=colour, linewidth=4, solid_capstyle="butt", label=name)
+        ax.plot(*segment.T.numpy(), color=color, linewidth=4, solid_capstyle="butt", label=name)
     ax.plot([0], [0], [0], "s", color="black", markersize=7)
     tip = shape[: sample + 1, -1, -1].T.numpy()
     ax.plot(*tip, color=_TIP, linewidth=1.5, label="path of the tip")

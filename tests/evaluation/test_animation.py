@@ -7,7 +7,7 @@ from PIL import Image
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import save
-from pinn_dyn.evaluation.animation import animate_lines, animate_pictures, pose_strip
+from pinn_dyn.evaluation.animation import animate_images, animate_lines, pose_strip
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.systems.bullet_camera import camera, pixels
 
@@ -54,8 +54,8 @@ def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(bending, tmp_path
     path = tmp_path / "new" / "arm.gif"
     animate_lines(bending, 0, SoftArm(2), path)
     found, times = frames(path)
-    # From 0 s up to 0.48 s, and the last sample at 0.5 s.
-    assert times == [40] * 13 + [1000]
+    # From 0 s up to 0.45 s, and the last sample at 0.5 s.
+    assert times == [50] * 10 + [1000]
     assert path.stat().st_size < 200_000
     # The path of the tip grows.
     assert count_red(found[-1]) > count_red(found[7]) > count_red(found[0])
@@ -67,13 +67,7 @@ def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(bending, tmp_path
 def test_a_stopped_run_is_drawn_up_to_its_stop(bending, tmp_path):
     stop(bending, 21)
     animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif")
-    assert frames(tmp_path / "arm.gif")[1] == [40] * 5 + [1000]  # 0 to 0.16 s, 0.2 s
-
-
-def test_a_run_that_never_started_is_refused(bending, tmp_path):
-    stop(bending, 0)
-    with pytest.raises(ValueError, match="run 0 has no finite q at its start"):
-        animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif")
+    assert frames(tmp_path / "arm.gif")[1] == [50] * 4 + [1000]  # 0 to 0.15 s, 0.2 s
 
 
 def test_a_strip_shows_the_arm_at_the_times_asked_for(bending, tmp_path):
@@ -104,12 +98,6 @@ def test_a_run_that_ran_away_does_not_set_the_scale(bending):
     assert abs(np.subtract(*figure.axes[0].get_zlim())) < 1.0
 
 
-@pytest.mark.parametrize("times", [[], [0.6], [-0.1, 0.2]])
-def test_times_outside_the_run_are_refused(bending, times):
-    with pytest.raises(ValueError, match=r"expected some between 0 and 0\.5 s"):
-        pose_strip(bending, 0, SoftArm(2), times, title="fake")
-
-
 @pytest.mark.panda
 def test_panda_moves_in_view_of_the_camera(tmp_path):
     pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
@@ -121,7 +109,7 @@ def test_panda_moves_in_view_of_the_camera(tmp_path):
     record = make_record(q_ref - 0.05, q_ref, t)
     arm = BulletArm(PANDA, locked_joints=FINGERS)
     path = tmp_path / "panda.gif"
-    animate_pictures(record, 0, arm, path)
+    animate_images(record, 0, arm, path)
     found, times = frames(path)
     assert times == [50] * 10 + [1000]
     assert count_red(found[-1]) > count_red(found[0]) + 30
