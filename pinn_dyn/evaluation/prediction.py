@@ -1,4 +1,4 @@
-"""Roll-outs of a model along test trajectories, over the whole horizon or window by window."""
+"""Rollouts of a model along test trajectories, over the whole horizon or window by window."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from pinn_dyn.mechanics import (
 from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop, RecordedSteps
 
 LONGEST = 5.0
-"""Length of a roll-out in s that is taken where the trajectories are longer."""
+"""Default horizon in s for longer trajectories."""
 
 WINDOWS = (0.1, 0.5, 1.0)
-"""Windows in s, of which those that fit are taken."""
+"""Default windows in s."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Prediction:
 
     Attributes:
         t: times, ``(T,)``, s.
-        q_hat: predicted configuration, ``(K, T, N)``; not finite where the roll-out broke down.
+        q_hat: predicted configuration, ``(K, T, N)``; not finite where the rollout broke down.
         q: true configuration, ``(K, T, N)``.
-        members: what each of E members predicts, ``(E, K, T, N)``: those of an ensemble, whose mean
-            q_hat is, or draws of fitted constants.
-        v_hat, v: predicted and true velocity, ``(K, T, N)``; only of whole roll-outs of a single
+        members: predictions of E members, ``(E, K, T, N)``. They are the members of an ensemble,
+            whose mean is q_hat, or draws of fitted constants.
+        v_hat, v: predicted and true velocity, ``(K, T, N)``; only for full rollouts of a single
             model.
     """
 
@@ -52,11 +52,11 @@ class Prediction:
     v: Tensor | None = None
 
     def error(self) -> Tensor:
-        """e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
+        """Return the configuration error e(t) = |q_hat(t) - q(t)|_2, ``(K, T)``."""
         return torch.linalg.vector_norm(self.q_hat - self.q, dim=-1)
 
     def every(self, samples: int) -> Prediction:
-        """The same roll-outs at every ``samples``-th time, to be compared on a coarser grid."""
+        """Return the rollouts at every ``samples``-th time, for a comparison on a coarser grid."""
         thinned: dict[str, Any] = {
             name: None if values is None else values[..., ::samples, :]
             for name, values in vars(self).items()
@@ -65,17 +65,17 @@ class Prediction:
         return Prediction(self.t[::samples], **thinned)
 
     def deviation(self) -> Tensor:
-        """Standard deviation of each coordinate over the E members, ``(K, T, N)``.
+        """Return the standard deviation of each coordinate over the E members, ``(K, T, N)``.
 
         Raises:
-            ValueError: if this is the prediction of a single model.
+            ValueError: if the prediction has no members.
         """
         if self.members is None:
             raise ValueError("a single model has no spread: expected the prediction of an ensemble")
         return self.members.std(dim=0)
 
     def spread(self) -> Tensor:
-        """s(t), ``(K, T)``, how far the E members of an ensemble are from each other::
+        """Return the spread s(t) of the E members of an ensemble, ``(K, T)``::
 
             s(t)^2 = sum over members i of |q_hat_i(t) - mean(t)|^2 / (E - 1)
 
@@ -88,17 +88,17 @@ class Prediction:
 def predict_trajectories(
     model: Predictor, truth: Trajectory, *, step: float | None = None
 ) -> Prediction:
-    """Roll the model out from each true initial state under the true input.
+    """Roll out a model from each true initial state under the true input.
 
-    The roll-out runs in float64 on a copy of the model in evaluation mode; a long one takes
-    compiled steps, which changes its numbers by rounding alone. Where a trajectory breaks down (a
-    mass matrix that is no longer positive definite), its q_hat is NaN from there on.
+    The rollout runs in float64 on a copy of the model in evaluation mode. A long rollout takes
+    compiled steps, which changes the result by rounding errors only. If a trajectory breaks down
+    (the mass matrix is no longer positive definite), its q_hat is NaN from there on.
 
     Args:
-        model: what predicts, with N coordinates and M inputs.
+        model: predictor with N coordinates and M inputs.
         truth: K test trajectories stacked, q ``(K, T, N)``.
-        step: step of the roll-out in s, an integer multiple of the sample time; None takes the
-            data's own sample times.
+        step: step of the rollout in s, an integer multiple of the sample time; None takes the
+            sample times of the data.
 
     Raises:
         ValueError: if the trajectories are not stacked, the step is no multiple of the sample
@@ -128,16 +128,16 @@ def predict_trajectories(
 def predict_windows(
     model: Predictor, truth: Trajectory, *, window: float, step: float | None = None
 ) -> Prediction:
-    """The same as :func:`predict_trajectories`, the state re-set to the true one every window.
+    """Roll out a model as :func:`predict_trajectories` does, with resets to the true state.
 
-    At the time of a re-set the prediction is the end of the window before. The last window is
+    At the time of a reset the prediction is the end of the window before. The last window is
     left out if the trajectory ends within it. All windows are rolled out as one batch.
 
     Args:
-        model: what predicts, with N coordinates and M inputs.
+        model: predictor with N coordinates and M inputs.
         truth: K test trajectories stacked, q ``(K, T, N)``, with a constant sample time.
-        window: time between two re-sets in s, an integer multiple of the step.
-        step: step of the roll-out in s, an integer multiple of the sample time, or None.
+        window: time between two resets in s, an integer multiple of the step.
+        step: step of the rollout in s, an integer multiple of the sample time, or None.
 
     Raises:
         ValueError: as :func:`predict_trajectories`, if the window is no multiple of the step, or
@@ -179,7 +179,7 @@ def _members(paths: Tensor) -> Tensor | None:
 def model_for_roll_outs(
     model: Predictor, device: torch.device, steps: int, batch: int
 ) -> Predictor:
-    """The model in float64, its steps compiled, or recorded on a GPU, where that pays."""
+    """Return the model in float64, with compiled (on a GPU recorded) steps for long rollouts."""
     copy = double_copy(model, device)
     members, inner = (copy.size, copy.stack) if isinstance(copy, Ensemble) else (1, copy)
     if isinstance(inner, ContinuousPredictor) and device.type == "cuda":
@@ -193,7 +193,7 @@ def model_for_roll_outs(
 
 @torch.no_grad()
 def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-    """States ``(E, B, T, 2N)`` at the times t; E is 1, but for an ensemble."""
+    """Return the states ``(E, B, T, 2N)`` at the times t; E is 1 unless for an ensemble."""
     if isinstance(model, Ensemble):
         return x0.unsqueeze(-2) + model.member_increments(x0, t, input)
     return model.predict(x0, t, input).unsqueeze(0)
@@ -201,15 +201,15 @@ def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
 
 @torch.no_grad()
 def _velocities(model: Predictor, states: Tensor) -> Tensor | None:
-    """v ``(B, T, N)`` of a single model's states ``(1, B, T, 2N)``; None for an ensemble."""
+    """Return v ``(B, T, N)`` of a single model's states ``(1, B, T, 2N)``; None for an ensemble."""
     if isinstance(model, Ensemble):
         return None
-    q, rest = states[0].split(model.num_coordinates, dim=-1)
+    q, v_or_p = states[0].split(model.num_coordinates, dim=-1)
     if model.state == "qv":
-        return rest
+        return v_or_p
     if not isinstance(model, MechanicalSystem):
         return None
-    pieces = zip(q.flatten(0, 1).split(2048), rest.flatten(0, 1).split(2048), strict=True)
+    pieces = zip(q.flatten(0, 1).split(2048), v_or_p.flatten(0, 1).split(2048), strict=True)
     return torch.cat([model.velocity(*piece) for piece in pieces]).reshape(q.shape)
 
 
@@ -222,7 +222,7 @@ def _require_stacked(truth: Trajectory) -> None:
 
 
 def samples_of_window(window: float, step: float | None, t: Tensor) -> tuple[int, int]:
-    """How many sample times a step and a window of such steps hold.
+    """Return the number of sample times in a step and in a window.
 
     Raises:
         ValueError: unless the step is an integer multiple of the sample time of t, ``(T,)``, and
@@ -239,17 +239,17 @@ def samples_of_window(window: float, step: float | None, t: Tensor) -> tuple[int
 
 
 def default_horizon(duration: float) -> float:
-    """The whole trajectory, up to 5 s."""
+    """Return the duration of the trajectories, up to 5 s."""
     return min(duration, LONGEST)
 
 
 def default_windows(horizon: float, grid: float) -> list[float]:
-    """Those of 0.1, 0.5 and 1 s that are a multiple of the grid and shorter than the horizon.
+    """Return the windows of 0.1, 0.5 and 1 s that fit the grid and are below the horizon.
 
-    Where none is, the multiple of the grid next to a tenth of the horizon.
+    If none fits, return the multiple of the grid next to a tenth of the horizon.
 
     Args:
-        horizon: length of the roll-outs, s.
+        horizon: length of the rollouts, s.
         grid: time between two compared samples, s.
     """
     fitting = [w for w in WINDOWS if w < 0.99 * horizon and _whole(w / grid)]
@@ -258,15 +258,15 @@ def default_windows(horizon: float, grid: float) -> list[float]:
 
 
 def common_stride(steps: Sequence[float], t: Tensor) -> int:
-    """Samples between the times that roll-outs of different steps have in common.
+    """Return the number of samples between the common times of rollouts with different steps.
 
     Args:
         steps: step of each model, s.
         t: sample times of the data, ``(T,)``, s.
 
     Raises:
-        ValueError: if a step is no multiple of the sample time, or the roll-outs have no time in
-            common but their start.
+        ValueError: if a step is no multiple of the sample time, or the rollouts have only
+            their start in common.
     """
     stride = math.lcm(*(samples_of("step", step, t) for step in set(steps)))
     if stride > len(t) - 1:

@@ -1,4 +1,4 @@
-"""What Lightning's loggers have no common call for: figures, texts, and what a run is made of."""
+"""Figures, settings and run times in the logs of a training (TensorBoard and MLflow)."""
 
 from __future__ import annotations
 
@@ -21,21 +21,19 @@ def log_figures(loggers: Iterable[Logger], figures: Mapping[str, Figure], step: 
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.add_figure(name, figure, step)
             elif isinstance(logger, MLFlowLogger):
-                # Numbers of one width sort as they should.
-                file = f"{name}/step_{step:07d}.png"
+                file = f"{name}/step_{step:07d}.png"  # numbers of one width sort by value
                 logger.experiment.log_figure(logger.run_id, figure, file)
 
 
 class RunDescription(L.Callback):
-    """Logs what a run is made of when it starts, and what it took when it has ended.
+    """Settings of a run in its log at the start, and its run time at the end.
 
-    A run that fails or is interrupted has its settings and its last errors among the others, and
-    no success. What a resumed one took includes the time up to the checkpoint it goes on from.
-    TensorBoard compares the settings that any of the runs has: no list of them is written, as
-    TensorBoard would take the one of the first run for all.
+    A run that fails or is interrupted keeps its settings and last errors, without a success. The
+    run time of a resumed training includes the time before the checkpoint. No list of settings is
+    written for TensorBoard, which would take the list of the first run for all runs.
 
     Args:
-        settings: names and values that tell this run from others.
+        settings: names and values in which this run may differ from others.
         configuration: the whole configuration, YAML.
         provenance: commit, software and hardware.
     """
@@ -56,22 +54,22 @@ class RunDescription(L.Callback):
 
     @property
     def seconds(self) -> tuple[float, float]:
-        """What the training has taken so far, by the clock and of the processor, s."""
+        """Run time of the training so far: wall-clock and processor time, s."""
         parts = zip(self._before, _clocks(), self._started, strict=True)
         wall, cpu = (before + now - start for before, now, start in parts)
         return wall, cpu
 
     def state_dict(self) -> dict[str, float]:
-        """The seconds, for a training that is resumed."""
+        """Return the run time, for a training that is resumed."""
         wall, cpu = self.seconds
         return {"wall_seconds": wall, "cpu_seconds": cpu}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """The inverse of :meth:`state_dict`."""
+        """Restore the run time before the checkpoint."""
         self._before = (state_dict["wall_seconds"], state_dict["cpu_seconds"])
 
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the settings and the configuration."""
+        """Log settings, configuration and provenance."""
         if not trainer.is_global_zero:
             return
         parameters = sum(p.numel() for p in pl_module.parameters())
@@ -79,10 +77,8 @@ class RunDescription(L.Callback):
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.file_writer.add_summary(self._start)
-                table = "\n".join(
-                    ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
-                )
-                logger.experiment.add_text("run/provenance", table)
+                lines = ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
+                logger.experiment.add_text("run/provenance", "\n".join(lines))
                 code = f"```yaml\n{self.configuration}\n```"
                 logger.experiment.add_text("run/configuration", code)
             elif isinstance(logger, MLFlowLogger):
@@ -92,10 +88,10 @@ class RunDescription(L.Callback):
                     logger.experiment.set_tag(logger.run_id, key, value)
 
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the seconds that the training took, and the success."""
+        """Log the run time and the success."""
         if not trainer.is_global_zero:
             return
-        # TensorBoard shows the metrics that come first by name: after those of val/.
+        # TensorBoard sorts metrics by name: this one comes after those of val/.
         seconds = {"wall_time/training_seconds": self.seconds[0]}
         for logger in trainer.loggers:
             logger.log_metrics(seconds, trainer.global_step - 1)
@@ -104,5 +100,5 @@ class RunDescription(L.Callback):
 
 
 def _clocks() -> tuple[float, float]:
-    """Now, and the processor time of this process and of those that it has waited for, s."""
+    """Return the wall-clock time, and the processor time of this process and its children, s."""
     return time.perf_counter(), sum(os.times()[:4])

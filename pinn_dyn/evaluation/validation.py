@@ -1,4 +1,4 @@
-"""Validation during training: roll-outs, their figures of merit, and pictures of them."""
+"""Validation during training: rollouts, their errors, and figures of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 import lightning as L
 import torch
 from matplotlib.figure import Figure
+from pydantic import PositiveFloat, PositiveInt
 
 from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
@@ -24,70 +25,65 @@ from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
-_WORST = 10.0
-_APART = 1.5  # last above best: beyond the usual ups and downs
-_REMEDIES = (
-    "See last.ckpt too (evaluate.py checkpoint=last), at longer windows (data.steps), or at "
-    "whether the validation motions are like the training ones"
+_LARGEST_RATIO = 10.0
+_MAX_GAP = 1.5  # ratio of the last error to the best: beyond the usual ups and downs
+_ADVICE = (
+    "Evaluate last.ckpt too (evaluate.py checkpoint=last), train on longer windows (data.steps), "
+    "or check whether the validation motions resemble the training motions"
 )
 
 
 class RolloutValidator:
-    """Figures of merit of roll-outs on validation trajectories.
+    """Errors of rollouts on validation trajectories.
 
-    ``error_windowed``, by which the best checkpoint is chosen, is the mean over windows W of a
+    ``error_windowed`` selects the best checkpoint. It is the mean over the windows W of a
     twentieth, a quarter and the whole of ``window`` (of ``horizon`` if that is None) of::
 
         mean over trajectories of min(10, mean over t of e_W(t) / mean of f_W)
 
-    e_W is the error with the state re-set to the measured one every W seconds, and f_W that of
-    standing still instead, over all times and trajectories. So 1 is what a model is worth that
-    predicts no motion; a trajectory that diverged counts as 10, and no long roll-out alone decides.
-    The windows are rounded to whole steps.
+    Here e_W is the error with the state reset to the measured state every W seconds, and f_W the
+    same error of the baseline that holds its position, over all times and trajectories. So 1 is
+    the result of a model that predicts no motion. A diverged trajectory counts as 10. Windows are
+    rounded to whole steps.
 
     Args:
         horizon: length of the trajectories, s.
-        window: time between two re-sets to the measured state, s; open loop if None.
-        step: step of the roll-outs, s; that of the training windows if None.
+        window: time between two resets to the measured state, s; open loop if None.
+        step: step of the rollouts, s; None takes that of the training windows.
         training_step: step of the training windows, s.
 
     Raises:
-        ValueError: if the step is longer than the horizon, or the window no part of it.
+        ValueError: unless step <= window <= horizon.
     """
 
     def __init__(
         self,
         *,
-        horizon: float,
-        step: float | None = None,
-        training_step: float,
-        window: float | None = None,
+        horizon: PositiveFloat,
+        step: PositiveFloat | None = None,
+        training_step: PositiveFloat,
+        window: PositiveFloat | None = None,
     ):
         self.horizon = horizon
         self.window = window
         self.step = training_step if step is None else step
-        if not 0 < self.step <= horizon:
-            raise ValueError(
-                f"step is {self.step} s and horizon {horizon} s, expected 0 < step <= horizon"
-            )
-        if window is not None and not self.step <= window <= horizon:
+        if not self.step <= (horizon if window is None else window) <= horizon:
             raise ValueError(
                 f"window is {window} s, step {self.step} s and horizon {horizon} s, "
                 "expected step <= window <= horizon, or window=null for open loop"
             )
 
     def __str__(self) -> str:
-        """What it measures, in words: ``2 s open loop``."""
         if self.window is None:
             return f"{self.horizon:g} s open loop"
-        return f"{self.horizon:g} s, re-set every {self.window:g} s"
+        return f"{self.horizon:g} s, reset every {self.window:g} s"
 
     def check(self, truth: Trajectory) -> None:
-        """Refuse data that these roll-outs do not fit, before a training has begun.
+        """Refuse data that do not fit the rollouts, before the training begins.
 
         Raises:
-            ValueError: if the trajectory is shorter than the horizon, or the step no multiple of
-                its sample time, or the window none of the step.
+            ValueError: if the trajectory is shorter than the horizon, the step is no multiple of
+                the sample time, or the window is no multiple of the step.
         """
         t = truth.until(self.horizon).t
         if self.window is None:
@@ -104,50 +100,50 @@ class RolloutValidator:
         return predict_windows(model, truth, window=self.window, step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
-        """Error mean, median, worst and windowed, diverged count, and the seconds that it took.
+        """Return mean, median, worst and windowed error, diverged count, and run time in s.
 
-        With a residual force comes its share, see :func:`.residual_share`.
-        Of an ensemble these are of its mean prediction; with them come the mean error and the
-        spread of its members.
+        With a residual force comes its share, see :func:`.residual_share`. The errors of an
+        ensemble are those of its mean prediction, with the mean error and the spread of its
+        members.
         """
         start = time.perf_counter()
         prediction = self.predict(model, truth)
-        metrics = rollout_metrics(
-            prediction.q_hat, prediction.q, prediction.t, thresholds={}
-        ).to_dict()
+        metrics = rollout_metrics(prediction.q_hat, prediction.q, prediction.t, thresholds={})
         names = ("error_mean", "error_median", "error_worst", "diverged")
-        figures = {name: float(metrics[name]) for name in names}
+        errors = {name: float(getattr(metrics, name)) for name in names}
         if prediction.members is not None:
-            figures["member_error_mean"] = member_metrics(prediction)["member_error_mean"]
-            figures["spread_mean"] = member_metrics(prediction)["spread_mean"]
+            of_members = member_metrics(prediction)
+            errors |= {name: of_members[name] for name in ("member_error_mean", "spread_mean")}
         if isinstance(model, MechanicalSystem) and model.has_residual:
-            figures["residual_share"] = residual_share(model, truth.until(self.horizon))
-        figures["error_windowed"] = self._windowed(model, truth, prediction)
-        return {**figures, "rollout_seconds": time.perf_counter() - start}
+            errors["residual_share"] = residual_share(model, truth.until(self.horizon))
+        errors["error_windowed"] = self._windowed(model, truth, prediction)
+        return {**errors, "rollout_seconds": time.perf_counter() - start}
 
     def _windowed(self, model: Predictor, truth: Trajectory, longest: Prediction) -> float:
-        """``error_windowed``; the roll-outs of the longest window are there already."""
+        """Return ``error_windowed``, with ``longest`` for the longest window."""
         step = model.fixed_step or self.step
         truth = truth.until(self.horizon)
         span = self.window or self.horizon
         steps = {max(1, round(part * span / step)) for part in _PARTS} - {round(span / step)}
         still = HoldPosition(model.num_coordinates, model.num_inputs)
-        found, floors = [longest], [self.predict(still, truth)]
+        pairs = [(longest, self.predict(still, truth))]
         for n in steps:
-            found.append(predict_windows(model, truth, window=n * step, step=step))
-            floors.append(predict_windows(still, truth, window=n * step, step=step))
-        ratios = [
-            (item.error().mean(dim=1) / floor.error().mean()).nan_to_num(_WORST).clamp(max=_WORST)
-            for item, floor in zip(found, floors, strict=True)
-        ]
-        return float(torch.stack(ratios).mean())
+            pairs.append(
+                (
+                    predict_windows(model, truth, window=n * step, step=step),
+                    predict_windows(still, truth, window=n * step, step=step),
+                )
+            )
+        ratios = [item.error().mean(dim=1) / baseline.error().mean() for item, baseline in pairs]
+        limited = torch.stack(ratios).nan_to_num(_LARGEST_RATIO).clamp(max=_LARGEST_RATIO)
+        return float(limited.mean())
 
 
 class ValidationHistory(L.Callback):
-    """Keeps the figures of every validation, to tell how the best checkpoint came about.
+    """Errors of every validation, from which the best checkpoint is explained.
 
     Attributes:
-        rows: of each validation the epoch, the mean training loss of that epoch, ``error_mean``
+        rows: for each validation the epoch, the mean training loss of that epoch, ``error_mean``
             and ``error_windowed``.
     """
 
@@ -156,54 +152,51 @@ class ValidationHistory(L.Callback):
         self._validated = False
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """The loss of the epoch is known only at its end."""
+        """Note that this epoch was validated; the training loss is known at its end."""
         self._validated = True
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Keep the figures of this epoch, if it was validated."""
+        """Append the errors of this epoch, if it was validated."""
         if self._validated:
             names = ("train/loss", "val/error_mean", "val/error_windowed")
-            found = {n: float(trainer.callback_metrics.get(n, torch.nan)) for n in names}
-            self.rows.append({"epoch": trainer.current_epoch, **found})
+            metrics = {n: float(trainer.callback_metrics.get(n, torch.nan)) for n in names}
+            self.rows.append({"epoch": trainer.current_epoch, **metrics})
         self._validated = False
 
     def state_dict(self) -> dict[str, list[dict[str, float]]]:
-        """The rows, for a training that is resumed."""
+        """Return the rows, for a training that is resumed."""
         return {"rows": self.rows}
 
     def load_state_dict(self, state_dict: dict[str, list[dict[str, float]]]) -> None:
-        """The inverse of :meth:`state_dict`."""
+        """Restore the rows."""
         self.rows = list(state_dict["rows"])
 
     def summary(self) -> str:
-        """Best beside last; empty without a validation."""
-        if not self.rows:
-            return ""
-        best, last = self._best(), self.rows[-1]
+        """Return the errors of the best and of the last checkpoint; empty without a validation."""
+        rows = {"best.ckpt": self._best(), "last.ckpt": self.rows[-1]} if self.rows else {}
         return "; ".join(
             f"{name} (epoch {row['epoch']:.0f}): windowed {row['val/error_windowed']:.3g}, "
             f"mean {row['val/error_mean']:.3g}"
-            for name, row in (("best.ckpt", best), ("last.ckpt", last))
+            for name, row in rows.items()
         )
 
     def warning(self) -> str | None:
-        """What to be wary of: a best that the last has left far behind, or the first validation."""
+        """Return a warning if the best checkpoint is the first, or far better than the last."""
         if len(self.rows) < 2:
             return None
         best, last = self._best(), self.rows[-1]
         if best is self.rows[0] and last["train/loss"] < best["train/loss"]:
             return (
-                "best.ckpt is of the first validation, while the training loss fell from "
+                "best.ckpt is from the first validation, although the training loss fell from "
                 f"{best['train/loss']:.3g} to {last['train/loss']:.3g} after it: the model fits "
-                f"its windows better and predicts worse. {_REMEDIES}"
+                f"its windows better and predicts worse. {_ADVICE}"
             )
         errors = [row["val/error_windowed"] for row in (best, last)]
-        # Not <=: an error that is no number is far away too.
-        if not errors[1] <= _APART * errors[0]:
+        if not errors[1] <= _MAX_GAP * errors[0]:  # also if the last error is NaN
             return (
-                f"last.ckpt errs by {errors[1]:.3g} (windowed), best.ckpt (epoch "
-                f"{best['epoch']:.0f}) by {errors[0]:.3g}: what the best one is worth may be luck. "
-                f"{_REMEDIES}"
+                f"the windowed error of last.ckpt is {errors[1]:.3g}, that of best.ckpt (epoch "
+                f"{best['epoch']:.0f}) {errors[0]:.3g}: the best checkpoint may be a lucky one. "
+                f"{_ADVICE}"
             )
         return None
 
@@ -212,20 +205,21 @@ class ValidationHistory(L.Callback):
 
 
 class RolloutFigures(L.Callback):
-    """Logs pictures of a validation roll-out, its error and the learned terms.
+    """Figures of a validation rollout, its error and the learned terms in the training log.
 
     Args:
-        every_n_validations: draw at every n-th validation, and at the end of training.
-        validator: makes the roll-outs.
+        every_n_validations: number of validations between two drawings; the end of the training
+            is always drawn.
+        validator: validator that makes the rollouts.
         labels, input_labels: names and units of coordinates and inputs.
-        system: the truth, for its terms; None for measured data.
+        system: the true system, for its terms; None for measured data.
         configurations: named configurations at which terms are compared, each ``(N,)``.
     """
 
     def __init__(
         self,
         *,
-        every_n_validations: int,
+        every_n_validations: PositiveInt,
         validator: RolloutValidator,
         labels: list[str],
         input_labels: list[str],
@@ -241,13 +235,13 @@ class RolloutFigures(L.Callback):
         self._validations = 0
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Draw, every n-th time."""
+        """Draw at every n-th validation."""
         self._validations += 1
         if self._validations % self.every_n_validations == 0:
             self._draw(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Draw the final model, if the last validation did not."""
+        """Draw the final model, unless the last validation did."""
         if self._validations % self.every_n_validations:
             self._draw(trainer, pl_module)
 
@@ -256,8 +250,7 @@ class RolloutFigures(L.Callback):
         (truth,) = list(datamodule.val_dataloader())
         model = pl_module.model
         assert isinstance(model, Predictor)
-        name = type(model).__name__
-        predictions = {name: self.validator.predict(model, truth)}
+        predictions = {type(model).__name__: self.validator.predict(model, truth)}
         figures: dict[str, Figure] = {
             "rollout/trajectory": trajectory_figure(
                 truth.until(self.validator.horizon),
@@ -271,13 +264,10 @@ class RolloutFigures(L.Callback):
         }
         if self.system is not None and isinstance(model, MechanicalSystem) and self.configurations:
             names = list(self.configurations)
-            q = torch.tensor([self.configurations[key] for key in names], dtype=torch.float64)
+            q = torch.tensor([*self.configurations.values()], dtype=torch.float64)
             comparison = compare_terms(model, self.system, q, names=names)
-            for index, key in enumerate(names):
-                figures[f"terms/{key}"] = terms_figure(
-                    comparison,
-                    configuration=index,
-                    title=f"Learned and true terms at {key}",
-                )
+            for k, name in enumerate(names):
+                title = f"Learned and true terms at {name}"
+                figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
         # The step at which Lightning logs the errors of the same validation.
         log_figures(trainer.loggers, figures, trainer.global_step - 1)

@@ -168,8 +168,6 @@ def test_metrics_refuse_shapes_that_do_not_match():
     q = torch.zeros(2, 5, 3)
     with pytest.raises(ValueError, match=r"q_hat has shape \(5, 3\).*expected \(K, T, N\)"):
         rollout_metrics(q[0], q, torch.arange(5.0), thresholds={})
-    with pytest.raises(ValueError, match="q has non-finite"):
-        rollout_metrics(q, q / 0, torch.arange(5.0), thresholds={})
 
 
 @pytest.mark.parametrize(("step", "stride"), [(None, 1), (0.25, 1), (0.5, 2), (1.0, 4)])

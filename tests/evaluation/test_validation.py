@@ -34,7 +34,7 @@ def validator(window, horizon=3.0, step=0.5):
     ("window", "errors", "text"),
     [
         (None, [0, 0.5, 1, 1.5, 2, 2.5, 3], "3 s open loop"),
-        (1.0, [0, 0.5, 1, 0.5, 1, 0.5, 1], "3 s, re-set every 1 s"),
+        (1.0, [0, 0.5, 1, 0.5, 1, 0.5, 1], "3 s, reset every 1 s"),
     ],
 )
 def test_the_error_is_that_of_the_horizon_re_set_every_window(window, errors, text):
@@ -129,4 +129,4 @@ def test_a_best_at_the_first_validation_while_the_loss_falls_is_a_warning(rows, 
 def test_a_last_that_is_far_behind_the_best_is_a_warning(rows, warned):
     said = history(rows).warning()
     assert (said is not None) == warned
-    assert not warned or "best.ckpt (epoch 9) by 0.1" in said
+    assert not warned or "best.ckpt (epoch 9) 0.1" in said
