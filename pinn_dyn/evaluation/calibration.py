@@ -1,4 +1,4 @@
-"""Whether the intervals of predictions hold what they promise, on motions that nobody fitted."""
+"""Calibration of prediction intervals on motions that no model was fitted to."""
 
 from __future__ import annotations
 
@@ -13,26 +13,25 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from pinn_dyn.evaluation.metrics import diverged_trajectories
-from pinn_dyn.evaluation.plots import model_style
+from pinn_dyn.evaluation.plots import legend_below, model_style
 from pinn_dyn.evaluation.prediction import Prediction
 
 LEVEL = 0.95
-"""What an interval is said to hold, where one number is wanted."""
+"""Default level of an interval."""
 
 _LEVELS = np.array([0.05, *np.arange(0.1, 0.91, 0.1), LEVEL, 0.99])
-_AT = -2  # of LEVEL among them
+_AT = -2  # index of LEVEL in _LEVELS
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How much of held-out errors the intervals of some levels contain.
+    """Coverage of intervals of L nominal levels on held-out errors.
 
     Attributes:
-        level: what the intervals promise, ``(L,)``.
-        share: what they contain, ``(L,)``: as wide as the members say.
-        corrected: the same once their width is that which the validation motions needed, ``(L,)``;
-            None without any.
-        factor: corrected width over that of the members at 95 %; None as well.
+        level: nominal levels, ``(L,)``.
+        share: share of the errors within intervals as wide as the members say, ``(L,)``.
+        corrected: the same with widths taken from the validation motions, ``(L,)``, or None.
+        factor: corrected width over the members' width at the 95 % level, or None.
     """
 
     level: np.ndarray
@@ -52,79 +51,74 @@ class Calibration:
 
 
 def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
-    """Half the width of an interval in standard deviations sqrt(1 + 1/E) s of E members.
+    """Return half the width of an interval in standard deviations sqrt(1 + 1/E) s of E members.
 
-    Student's t with E - 1 degrees of freedom: what a further member, and so the truth if it is like
-    one, lies within.
+    The width is the quantile of Student's t with E - 1 degrees of freedom. A further member, and
+    so the truth if it is distributed like the members, lies within.
     """
     return np.asarray(student.ppf(0.5 + 0.5 * np.asarray(level), members - 1))
 
 
 def standardized_errors(prediction: Prediction) -> Tensor:
-    """|q - q_hat| / (sqrt(1 + 1/E) s), ``(K, T - 1, N)``, with s the spread of the E members.
+    """Return |q - q_hat| / (sqrt(1 + 1/E) s), ``(K, T - 1, N)``, with s the spread of E members.
 
-    Without the start, where there is neither error nor spread. Infinite where a roll-out diverged
-    and where the members agree on something else than the truth.
+    The start is left out. The result is infinite where a rollout diverged, and where the members
+    agree on something else than the truth.
 
     Raises:
-        ValueError: on the prediction of a single model.
+        ValueError: if the prediction has no members.
     """
     deviation = prediction.deviation()[:, 1:]
     assert prediction.members is not None
     deviation = deviation * (1 + 1 / len(prediction.members)) ** 0.5
     error = (prediction.q - prediction.q_hat).abs()[:, 1:]
     ratio = torch.where(error > 0, error / deviation, 0.0).nan_to_num(torch.inf, posinf=torch.inf)
-    lost = diverged_trajectories(prediction)
-    return torch.where(lost[:, None, None], torch.inf, ratio)
+    diverged = diverged_trajectories(prediction)
+    return torch.where(diverged[:, None, None], torch.inf, ratio)
 
 
 def calibration(held_out: Prediction, validation: Prediction | None) -> Calibration:
-    """Nominal levels of intervals against what they contain, over all coordinates and times.
+    """Compare nominal levels of intervals with their coverage, over all coordinates and times.
 
-    The interval of level p is q_hat +- c_p sqrt(1 + 1/E) s. As the members say, c_p is the quantile
-    of :func:`half_widths`. Corrected, it is what contains the share p of the validation errors:
-    members know nothing of the noise of the measured start, nor of what no model of theirs can
-    say. Source: Lei et al. 2018, "Distribution-free predictive inference for regression", sec. 5.2
-    (locally weighted conformal inference).
+    The interval of level p is q_hat +- c_p sqrt(1 + 1/E) s. According to the members, c_p is the
+    quantile of :func:`half_widths`. The corrected c_p contains the share p of the validation
+    errors. The correction is needed since members do not know the noise of the measured start, nor
+    errors that all of them share. Source: Lei et al. 2018, "Distribution-free predictive inference
+    for regression", sec. 5.2 (locally weighted conformal inference).
 
     Args:
-        held_out: roll-outs of motions that took no part in training, with members.
-        validation: roll-outs of the validation motions over the same time, if there are any.
+        held_out: rollouts with members, of motions that took no part in training.
+        validation: rollouts of the validation motions over the same time, or None.
     """
     assert held_out.members is not None
-    found = standardized_errors(held_out).flatten().numpy()
+    errors = standardized_errors(held_out).flatten().numpy()
     width = half_widths(len(held_out.members), _LEVELS)
-    share = _within(found, width)
+    share = _within(errors, width)
     if validation is None:
         return Calibration(_LEVELS, share, None, None)
-    seen = standardized_errors(validation).flatten().numpy()
-    needed = np.quantile(seen, _LEVELS, method="higher")
-    factor = float(needed[_AT] / width[_AT])
-    return Calibration(_LEVELS, share, _within(found, needed), factor)
+    validation_errors = standardized_errors(validation).flatten().numpy()
+    corrected = np.quantile(validation_errors, _LEVELS, method="higher")
+    factor = float(corrected[_AT] / width[_AT])
+    return Calibration(_LEVELS, share, _within(errors, corrected), factor)
 
 
-def calibration_table(found: Mapping[str, Mapping[float, Calibration]]) -> pd.DataFrame:
-    """One row per run, window and level: ``share``, ``corrected`` and ``factor``."""
-    rows = [
-        {
-            "run": run,
-            "window": window,
-            "level": float(level),
-            "share": float(item.share[k]),
-            "corrected": None if item.corrected is None else float(item.corrected[k]),
-            "factor": item.factor,
-        }
-        for run, windows in found.items()
+def calibration_table(runs: Mapping[str, Mapping[float, Calibration]]) -> pd.DataFrame:
+    """Return one row per run, window and level, with ``share``, ``corrected`` and ``factor``."""
+    frames = [
+        pd.DataFrame(
+            {"level": item.level, "share": item.share, "corrected": item.corrected}
+        ).assign(run=run, window=window, factor=item.factor)
+        for run, windows in runs.items()
         for window, item in windows.items()
-        for k, level in enumerate(item.level)
     ]
-    return pd.DataFrame(rows)
+    columns = ["run", "window", "level", "share", "corrected", "factor"]
+    return pd.concat(frames, ignore_index=True)[columns] if frames else pd.DataFrame()
 
 
-def interval_lines(found: Mapping[str, Mapping[float, Calibration]]) -> list[str]:
-    """What the 95 % intervals of each run hold, in a line for each."""
+def interval_lines(runs: Mapping[str, Mapping[float, Calibration]]) -> list[str]:
+    """Return one sentence per run about the coverage of its 95 % intervals."""
     lines = []
-    for run, windows in found.items():
+    for run, windows in runs.items():
         parts = []
         for window, item in windows.items():
             text = f"{100 * item.within:.0f} % after {window:g} s"
@@ -132,48 +126,43 @@ def interval_lines(found: Mapping[str, Mapping[float, Calibration]]) -> list[str
                 corrected = f"{100 * item.within_corrected:.0f} %"
                 text += f" ({corrected} with {item.factor:.3g} times the width)"
             parts.append(text)
-        if parts:
-            lines.append(f"{run}: its 95 % intervals hold {', '.join(parts)} of the errors")
+        lines.append(f"{run}: its 95 % intervals contain {', '.join(parts)} of the errors")
     return lines
 
 
-def calibration_figure(found: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:
-    """Levels of intervals against what they contain, a panel for each window.
+def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:
+    """Draw the coverage of intervals over their nominal level, one panel per window.
 
-    On the diagonal an interval holds what it promises; below, it is too narrow.
+    An interval on the diagonal has the nominal coverage; below the diagonal it is too narrow.
 
     Args:
-        found: names of runs, and their calibration for each window in s.
-        title: data set.
+        runs: names of runs, and their calibration for each window in s.
+        title: title of the figure.
     """
-    windows = sorted({window for item in found.values() for window in item})
-    size = (max(3.6 * len(windows) + 0.6, 6.0), 4.2 + 0.25 * len(found))
+    windows = sorted({window for item in runs.values() for window in item})
+    size = (max(3.6 * len(windows) + 0.6, 6.0), 4.2 + 0.25 * len(runs))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
     for ax, window in zip(axes, windows, strict=True):
-        honest = "what is promised; below: too narrow"
-        ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label=honest)
-        for index, (run, item) in enumerate(found.items()):
-            if window not in item:
+        ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label="nominal")
+        for index, (run, items) in enumerate(runs.items()):
+            if window not in items:
                 continue
-            one, colour = item[window], model_style(index)["color"]
-            ax.plot(100 * one.level, 100 * one.share, "o-", color=colour, markersize=4, label=run)
-            if one.corrected is not None:
+            item, color = items[window], model_style(index)["color"]
+            ax.plot(100 * item.level, 100 * item.share, "o-", color=color, markersize=4, label=run)
+            if item.corrected is not None:
                 label = f"{run}, width from validation"
-                ax.plot(100 * one.level, 100 * one.corrected, "--", color=colour, label=label)
-        ax.set_title(f"re-set every {window:g} s", fontsize="medium")
-        ax.set_xlabel("promised by the interval [%]")
-        ax.set_xlim(0, 100)
-        ax.set_ylim(0, 101)
+                ax.plot(100 * item.level, 100 * item.corrected, "--", color=color, label=label)
+        ax.set_title(f"reset every {window:g} s", fontsize="medium")
+        ax.set(xlabel="nominal level [%]", xlim=(0, 100), ylim=(0, 101))
         ax.grid(True, alpha=0.3)
-    axes[0].set_ylabel("errors within [%]")
-    named = dict(zip(*axes[0].get_legend_handles_labels()[::-1], strict=True))
-    figure.legend(named.values(), named, loc="outside lower center", ncols=2, fontsize="small")
+    axes[0].set_ylabel("errors within the interval [%]")
+    legend_below(figure, columns=2, fontsize="small")
     figure.suptitle(title)
     return figure
 
 
 def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Shares of errors up to each width, those that are infinite never among them."""
+    """Return the share of errors up to each width; infinite errors are never within."""
     finite = np.sort(errors[np.isfinite(errors)])
     return np.searchsorted(finite, width, side="right") / max(len(errors), 1)

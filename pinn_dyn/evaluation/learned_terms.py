@@ -1,9 +1,11 @@
-"""Learned terms against true ones, directly and up to the factor P(q) of the paper."""
+"""Learned terms beside true terms, directly and up to the factor P(q) of the paper."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -22,11 +24,10 @@ class TermComparison:
         q: configurations, ``(K, N)``.
         true: M, D, G, A of the true system.
         learned: M, D, G, A of the model.
-        P: best-fit factor, ``(K, N, N)``, see
-            :func:`pinn_dyn.control.factor.fit_factor`.
-        P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``; the paper's controllers
-            are proven for a positive one.
-        of_inverse_mass: whether the equations of the model, in (q, p), are in the inverse of M.
+        P: best-fit factor, ``(K, N, N)``, see :func:`pinn_dyn.control.factor.fit_factor`.
+        P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``. The proof for the paper's
+            controllers needs a positive one.
+        of_inverse_mass: the equations of the model, in (q, p), contain the inverse of M.
     """
 
     names: list[str]
@@ -38,21 +39,21 @@ class TermComparison:
     of_inverse_mass: bool
 
     def matrices(self) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-        """For M, M_inverse, D, G and A: the true term X, the learned X_L, and P X.
+        """Return true X, learned X_L and P X for M, M_inverse, D, G and A.
 
-        Each ``(K, N, .)``, G as one column. For M_inverse the third is (P M)^-1.
+        Each is ``(K, N, .)``, G with one column. The third matrix of M_inverse is (P M)^-1.
         """
         true, learned = _as_matrices(self.true), _as_matrices(self.learned)
-        pairs = {name: (true[name], learned[name], self.P @ true[name]) for name in true}
-        mass = pairs.pop("M")
+        versions = {name: (true[name], learned[name], self.P @ true[name]) for name in true}
+        mass = versions.pop("M")
         inverse = (_inverse(mass[0]), _inverse(mass[1]), _inverse(mass[2]))
-        return {"M": mass, "M_inverse": inverse, **pairs}
+        return {"M": mass, "M_inverse": inverse, **versions}
 
     def to_frame(self) -> pd.DataFrame:
-        """One row per configuration and term, with Frobenius norms::
+        """Return one row per configuration and term, with Frobenius norms::
 
-        relative_error_identity = |X_L - X| / |X|         (P = I)
-        relative_error_best_P   = |X_L - P X| / |X_L|
+            relative_error_identity = |X_L - X| / |X|         (P = I)
+            relative_error_best_P   = |X_L - P X| / |X_L|
 
         An error is 0 where both terms vanish and infinite where only the reference does.
         """
@@ -69,59 +70,52 @@ class TermComparison:
         return pd.DataFrame(rows, columns=columns)
 
     def to_text(self) -> str:
-        """True and learned matrices side by side, as in the paper's tables, then P."""
-        frame = self.to_frame()
-        errors = iter(zip(frame.relative_error_identity, frame.relative_error_best_P, strict=True))
+        """Return the true and the learned matrices, as in the paper's tables, and P."""
+        errors = iter(self.to_frame().itertuples())
         lines = []
         for index, name in enumerate(self.names):
-            lines += [f"configuration {name}", f"q = {_numbers(self.q[index])}", ""]
+            lines.append(f"configuration {name}, q = {_array(self.q[index])}")
             for term, (true, learned, _) in self.matrices().items():
-                identity, best = next(errors)
-                left, right = _rows(true[index]), _rows(learned[index])
-                width = max(len(left[0]), len(f"{term} true"))
-                lines.append(
-                    f"  {f'{term} true':<{width}}   {term} learned   "
-                    f"(relative error {identity:.2g}, with the best P {best:.2g})"
-                )
-                lines += [f"  {a:<{width}}   {b}" for a, b in zip(left, right, strict=True)]
-                lines.append("")
+                row = next(errors)
+                identity, best = row.relative_error_identity, row.relative_error_best_P
+                lines.append(f"{term} true\n{_array(true[index])}")
+                lines.append(f"{term} learned: error {identity:.2g}, with the best P {best:.2g}")
+                lines.append(_array(learned[index]))
             smallest = float(self.P_min_eigenvalue[index])
             verdict = "positive definite" if smallest > 0 else "NOT positive definite"
-            lines.append(
-                f"  P, the best fit of learned = P true (symmetric part {verdict}: "
-                f"smallest eigenvalue {smallest:.3g})"
-            )
-            lines += [f"  {row}" for row in _rows(self.P[index])] + [""]
+            lines.append(f"P, best fit of learned = P true: {verdict}, eigenvalue {smallest:.3g}")
+            lines.append(f"{_array(self.P[index])}\n")
         return "\n".join(lines)
 
 
 def compare_terms(
-    model: MechanicalSystem, truth: MechanicalSystem, q: Tensor, *, names: list[str] | None = None
+    model: MechanicalSystem,
+    truth: MechanicalSystem,
+    q: Tensor,
+    *,
+    names: Sequence[str] | None = None,
 ) -> TermComparison:
-    """Compare the terms of a learned model with the true ones, in float64.
+    """Compare the terms of a learned model with the true terms, in float64.
 
     Args:
         model: the learned system.
         truth: the true system, with the same N and M.
         q: configurations, ``(K, N)``.
-        names: one name per configuration; None counts them "1", "2", ...
+        names: K names of the configurations; None numbers them.
 
     Raises:
-        TypeError: if the model has no terms, as a black box has none.
-        ValueError: if the systems, ``q`` and ``names`` do not match in size.
+        TypeError: if the model has no terms, such as a black box.
+        ValueError: if the systems and ``q`` do not match in size.
     """
     require_same_robot(model, truth)
     q = require_samples("q", q, truth)
-    if names is None:
-        names = [str(index + 1) for index in range(q.shape[0])]
-    if len(names) != q.shape[0]:
-        raise ValueError(f"names has {len(names)} entries, expected {q.shape[0]}, one per row of q")
+    labels = list(names) if names else [str(k + 1) for k in range(len(q))]
     with torch.no_grad():
         true = double_copy(truth, q.device).terms(q)
         learned = double_copy(model, q.device).terms(q)
     P = fit_factor(true, learned)
     smallest = torch.linalg.eigvalsh(0.5 * (P + P.transpose(-1, -2)))[..., 0]
-    return TermComparison(names, q, true, learned, P, smallest, model.state == "qp")
+    return TermComparison(labels, q, true, learned, P, smallest, model.state == "qp")
 
 
 def _as_matrices(terms: Terms) -> dict[str, Tensor]:
@@ -129,7 +123,7 @@ def _as_matrices(terms: Terms) -> dict[str, Tensor]:
 
 
 def _inverse(matrix: Tensor) -> Tensor:
-    """The inverse, infinite where there is none."""
+    """Return the inverse, infinite for a singular matrix."""
     inverse, info = torch.linalg.inv_ex(matrix)
     return torch.where((info > 0)[..., None, None], torch.inf, inverse)
 
@@ -139,14 +133,8 @@ def _relative(difference: Tensor, reference: Tensor) -> Tensor:
     return torch.where(size > 0, size / torch.linalg.matrix_norm(reference), 0.0)
 
 
-def _rows(matrix: Tensor) -> list[str]:
-    """The rows of a matrix as text of one width, three significant digits."""
-    # What is far below the largest entry is rounding, and prints as 0.
-    clean = torch.where(matrix.abs() < 1e-9 * matrix.abs().max(), 0.0, matrix)
-    cells = [[f"{value:.3g}" for value in row] for row in clean.tolist()]
-    width = max(len(cell) for row in cells for cell in row)
-    return ["[" + "  ".join(f"{cell:>{width}}" for cell in row) + "]" for row in cells]
-
-
-def _numbers(vector: Tensor) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in vector.tolist()) + ")"
+def _array(values: Tensor) -> str:
+    """Return an array as text with three significant digits; rounding errors print as 0."""
+    clean = torch.where(values.abs() < 1e-9 * values.abs().max(), 0.0, values)
+    formatter = {"float_kind": lambda value: f"{value:10.3g}"}
+    return np.array2string(clean.numpy(), formatter=formatter, max_line_width=100)

@@ -1,4 +1,4 @@
-"""Forces along measured motions: the torque error, and who contributes what."""
+"""Forces along measured motions: the torque error, and the shares of a model's parts."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem, Sum, Trajectory, double_copy
 
-_SMOOTHED = 0.05  # s of velocity that one acceleration is fitted to, at least 5 samples
-_OF_ERROR, _OF_SHARES = 5_000, 2_000  # samples at which they are taken, at most
+_SMOOTHING = 0.05  # s of velocity in the fit of one acceleration, at least 5 samples
+_ERROR_SAMPLES, _SHARE_SAMPLES = 5_000, 2_000  # upper limits
 
 
 @dataclass(frozen=True)
 class TorqueError:
-    """Of N joints, in the unit of the generalized force tau = A(q) u, N m or N::
+    """Inverse-dynamics error of N joints, in the unit of tau = A(q) u, N m or N::
 
-        tau_hat = M a + C v + G + D v + F(v),      all terms, A too, those of the model
+        tau_hat = M a + C v + G + D v + F(v),      all terms of the model, A too
 
     Attributes:
         mean: mean of |tau_hat - tau|_2 over samples.
-        share: sqrt(sum_i mean (tau_hat_i - tau_i)^2 / sum_i var tau_i), which a common factor of
-            all terms does not change; 1 is what a constant torque reaches.
+        share: sqrt(sum_i mean (tau_hat_i - tau_i)^2 / sum_i var tau_i). A common factor of all
+            terms does not change it. A constant torque reaches 1.
         rms: root mean square of tau_hat_i - tau_i, ``(N,)``.
         spread: standard deviation of tau_i, ``(N,)``; 0 for a joint without a motor.
     """
@@ -36,7 +36,7 @@ class TorqueError:
     spread: Tensor
 
     def to_frame(self, labels: Sequence[str]) -> pd.DataFrame:
-        """One row per joint: rms, spread, and their ratio, missing where there is no motor."""
+        """Return one row per joint: RMS, spread, and their ratio, missing without a motor."""
         share = torch.where(self.spread > 0, self.rms / self.spread, torch.nan)
         columns = {"torque_rms": self.rms, "torque_spread": self.spread, "torque_share": share}
         return pd.DataFrame({"joint": list(labels)} | {k: v.numpy() for k, v in columns.items()})
@@ -45,11 +45,11 @@ class TorqueError:
 def torque_error(
     model: MechanicalSystem, truth: Trajectory, *, system: MechanicalSystem | None
 ) -> TorqueError:
-    """How far the model's inverse dynamics is from the force that was applied.
+    """Compare the model's inverse dynamics with the force that was applied.
 
-    The acceleration is that of the true system where there is one. Of measured data it is the
-    slope of the velocity by local polynomials of degree 3 (Savitzky and Golay 1964), fitted to
-    0.05 s or 5 samples, whichever is longer; its noise is part of the error.
+    The acceleration is that of the true system. For measured data it is the slope of the velocity
+    by local polynomials of degree 3 (Savitzky and Golay 1964), fitted to 0.05 s or 5 samples,
+    whichever is longer; its noise is part of the error.
 
     Args:
         model: the learned system.
@@ -61,19 +61,19 @@ def torque_error(
     """
     learned = double_copy(model)
     with torch.no_grad():
-        q, v, u = _samples(learned, truth, _OF_ERROR)
+        q, v, u = _samples(learned, truth, _ERROR_SAMPLES)
         if system is None:
-            a = _some(_slope(truth), _OF_ERROR)
+            a = _thinned(_acceleration(truth), _ERROR_SAMPLES)
         else:
             a = double_copy(system).forward_dynamics(q, v, u).double()
-        # A(q) u, also of a model whose A depends on u.
+        # A(q) u, also for a model whose A depends on u.
         tau = learned.inverse_dynamics(q, v, learned.forward_dynamics(q, v, u))
-        off = (learned.inverse_dynamics(q, v, a) - tau).nan_to_num(torch.inf)
+        error = (learned.inverse_dynamics(q, v, a) - tau).nan_to_num(torch.inf)
     spread = tau.std(dim=0, correction=0).nan_to_num(0.0)
     spread = torch.where(spread > 1e-9 * spread.max(), spread, 0.0)
-    rms, total = off.square().mean(dim=0).sqrt(), float(spread.norm())
+    rms, total = error.square().mean(dim=0).sqrt(), float(spread.norm())
     return TorqueError(
-        mean=float(off.norm(dim=-1).mean()),
+        mean=float(error.norm(dim=-1).mean()),
         share=float(rms.norm()) / total if total > 0 else float("inf"),
         rms=rms,
         spread=spread,
@@ -81,59 +81,59 @@ def torque_error(
 
 
 def residual_share(model: MechanicalSystem, truth: Trajectory) -> float:
-    """rms |r| / (rms |A u| + rms |r|) along measured motions: 0 is a mechanical robot, 1 is none.
+    """Return rms |r| / (rms |A u| + rms |r|) along measured motions; 0 for a mechanical robot.
 
     Args:
         model: a model with a residual force.
         truth: K trajectories stacked, q ``(K, T, N)``.
     """
-    q, v, u = _samples(model, truth, _OF_SHARES)
+    q, v, u = _samples(model, truth, _SHARE_SAMPLES)
     with torch.no_grad():
         residual = model.residual_force(q, v, u)
         applied = model.inverse_dynamics(q, v, model.forward_dynamics(q, v, u))  # A u + r
-        taken, driven = _rms(residual), _rms(applied - residual)
-    return taken / (taken + driven)
+        numerator, driven = _rms(residual), _rms(applied - residual)
+    return numerator / (numerator + driven)
 
 
 def part_shares(model: Sum, truth: Trajectory) -> pd.DataFrame:
-    """What each part of a sum contributes along measured motions: part, term, rms, share.
+    """Return the contributions of the parts of a sum: columns part, term, rms, share.
 
-    The terms are the forces M a + C v, G and D v + F, with the acceleration that the sum gives; the
-    rms is that of its norm, N m or N, and the share is of the rms of all parts.
+    The terms are the forces M a + C v, G and D v + F, with the acceleration of the sum. The rms is
+    that of the norm of the force, N m or N, and the share is relative to the rms of all parts.
     """
-    q, v, u = _samples(model, truth, _OF_SHARES)
+    q, v, u = _samples(model, truth, _SHARE_SAMPLES)
     rows = []
     with torch.no_grad():
         a = model.forward_dynamics(q, v, u)
         for name, part in model.parts.items():
             assert isinstance(part, MechanicalSystem)
-            rest, lost = part.potential_force(q), part.dissipative_force(q, v)
-            moving = part.inverse_dynamics(q, v, a) - rest - lost
-            for term, force in (("M a + C v", moving), ("G", rest), ("D v + F", lost)):
-                rows.append((name, term, _rms(force)))
+            potential, dissipative = part.potential_force(q), part.dissipative_force(q, v)
+            inertial = part.inverse_dynamics(q, v, a) - potential - dissipative
+            forces = {"M a + C v": inertial, "G": potential, "D v + F": dissipative}
+            rows += [(name, term, _rms(force)) for term, force in forces.items()]
     table = pd.DataFrame(rows, columns=["part", "term", "rms"])
     table["share"] = table["rms"] / table.groupby("term")["rms"].transform("sum")
     return table
 
 
-def _samples(model: MechanicalSystem, truth: Trajectory, most: int) -> list[Tensor]:
-    """q, v and the acting u at some of the samples, ``(S, .)`` each, in the model's precision."""
+def _samples(model: MechanicalSystem, truth: Trajectory, limit: int) -> list[Tensor]:
+    """Return q, v and the acting u, ``(S, .)`` each with S <= limit, in the model's precision."""
     like = next(model.parameters(), torch.empty(0, dtype=torch.float64))
     u = model.acting_samples(truth).detach()
-    return [_some(x, most).to(like) for x in (truth.q, truth.v, u)]
+    return [_thinned(x, limit).to(like) for x in (truth.q, truth.v, u)]
 
 
-def _some(values: Tensor, most: int) -> Tensor:
-    """Every n-th of the samples ``(K, T, .)`` of all trajectories."""
-    return values.flatten(0, 1)[:: -(-values.shape[:2].numel() // most)]
+def _thinned(values: Tensor, limit: int) -> Tensor:
+    """Return every n-th of the samples ``(K, T, .)`` of all trajectories."""
+    return values.flatten(0, 1)[:: -(-values.shape[:2].numel() // limit)]
 
 
 def _rms(force: Tensor) -> float:
     return float(force.square().sum(-1).mean().sqrt())
 
 
-def _slope(truth: Trajectory) -> Tensor:
-    """dv/dt, ``(K, T, N)``."""
+def _acceleration(truth: Trajectory) -> Tensor:
+    """Return dv/dt, ``(K, T, N)``."""
     steps = truth.t.double().diff()
     step = float(steps.mean())
     if len(truth.t) < 5 or float((steps - step).abs().max()) > 1e-3 * step:
@@ -141,6 +141,6 @@ def _slope(truth: Trajectory) -> Tensor:
             f"the trajectories have {len(truth.t)} samples, {float(steps.min()):g} to "
             f"{float(steps.max()):g} s apart: accelerations need at least 5 at a constant step"
         )
-    length = min(max(5, 2 * round(_SMOOTHED / step / 2) + 1), 2 * ((len(truth.t) - 1) // 2) + 1)
+    length = min(max(5, 2 * round(_SMOOTHING / step / 2) + 1), 2 * ((len(truth.t) - 1) // 2) + 1)
     slope = savgol_filter(truth.v.double().numpy(), length, 3, deriv=1, delta=step, axis=-2)
     return torch.from_numpy(slope)

@@ -85,7 +85,7 @@ def test_the_table_the_lines_and_the_figure_say_the_same():
     assert np.isnan(table.query("run == 'lnn' and window == 1").factor).all()
     first, second = interval_lines(found)
     share = f"{100 * row.share:.0f} %"
-    assert first.startswith(f"lnn: its 95 % intervals hold {share} after 0.1 s (")
+    assert first.startswith(f"lnn: its 95 % intervals contain {share} after 0.1 s (")
     assert first.endswith(f", {share} after 1 s of the errors")
     assert second.startswith("known: ")
     figure = calibration_figure(found, title="an arm")
