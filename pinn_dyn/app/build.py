@@ -14,11 +14,9 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, TQ
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
-from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.keys import MOST_MEMBERS
-from pinn_dyn.app.parts import build_part
+from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.app.progress import EpochLines
-from pinn_dyn.app.schema import arguments
+from pinn_dyn.app.validation import argument_names
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -52,7 +50,7 @@ MONITORED = (
 def build_source(config: dict[str, Any]) -> DataSource:
     """The data source of ``config["dataset"]``; one that simulates has a cache."""
     part = config["dataset"]
-    if "cache" in arguments(part.get("_target_"), "dataset"):
+    if "cache" in argument_names(part["_target_"]):
         part = {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn"), **part}
     return build_part("dataset", part)
 
@@ -104,11 +102,8 @@ def ensemble_size(config: dict[str, Any]) -> int:
         ConfigError: unless that is a positive integer.
     """
     size = config.get("ensemble", 1)
-    if not isinstance(size, int) or not 1 <= size <= MOST_MEMBERS:
-        raise ConfigError(
-            f"ensemble is {size}, expected a number of members up to {MOST_MEMBERS}, 1 for a "
-            "single model"
-        )
+    if not isinstance(size, int) or size < 1:
+        raise ConfigError(f"ensemble is {size}, expected a number of members, 1 for a single model")
     return size
 
 
@@ -137,7 +132,7 @@ def build_learner(
     ensemble = isinstance(model, Ensemble)
     single = model.member(0) if isinstance(model, Ensemble) else model
     loss = build_part("loss", config["loss"], statistics=statistics, model=single)
-    steps = "params" in arguments(config["optimizer"]["_target_"], "optimizer")
+    steps = "params" in argument_names(config["optimizer"]["_target_"])
     optimizer = build_part("optimizer", config["optimizer"], partial_=steps)
     if isinstance(optimizer, LeastSquares):
         try:

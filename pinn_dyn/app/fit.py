@@ -14,16 +14,15 @@ import numpy as np
 import pandas as pd
 import torch
 from lightning.pytorch.utilities.seed import isolate_rng
+from pydantic import PositiveInt
 
 from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError, composed
 from pinn_dyn.app.frame import Signals, frame_dataset, in_frame
-from pinn_dyn.app.keys import KEYS, Count
 from pinn_dyn.app.learned_model import LearnedModel, load
 from pinn_dyn.app.run_folder import CONFIG, claimed
-from pinn_dyn.app.schema import check_value
 from pinn_dyn.app.train import train_in
-from pinn_dyn.app.words import OVERRIDE
+from pinn_dyn.app.validation import Seed, check_value
 from pinn_dyn.data import DataSource, store
 
 STEPS = 1000
@@ -88,7 +87,7 @@ def fit(
         if (place / CONFIG).exists():
             raise ConfigError(f"folder is {place}, which holds a training: give another one")
         for name, number in (("seed", seed), ("steps", 1 if steps is None else steps)):
-            check_value(name, number, KEYS["train"]["seed"] if name == "seed" else Count)
+            check_value(name, number, Seed if name == "seed" else PositiveInt)
         if not re.fullmatch(r"\w+", str(model)):
             raise ConfigError(f"model is {model!r}, expected the name of one, as 'lnn'")
         words = [f"model={model}", f"model_name={model}", f"seed={seed}"]
@@ -151,7 +150,7 @@ def _words(overrides: Sequence[str], *, own_data: bool) -> list[str]:
     if not given and overrides:
         raise ConfigError(f"overrides is {overrides!r}, expected a list, as ['optimizer.lr=0.002']")
     for word in given:
-        if not isinstance(word, str) or not OVERRIDE.match(word):
+        if not isinstance(word, str) or not re.match("~|[^-=].*=", word):
             raise ConfigError(f"overrides has {word!r}, expected words as 'optimizer.lr=0.002'")
         key = word.lstrip("+~").partition("=")[0]
         if key.split(".")[0].split("/")[0] == "hydra" or (own_data and key == "dataset"):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pinn_dyn.app.build import build_data, build_model
-from pinn_dyn.app.parts import build_part
+from pinn_dyn.app.config import build_part
 from pinn_dyn.app.run_folder import Run
 from pinn_dyn.app.shared_data import RunData
 from pinn_dyn.mechanics import Predictor

@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
-from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.parts import build_part
+from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.models.known import Structure
 

@@ -15,7 +15,7 @@ import yaml
 
 from pinn_dyn import __version__
 from pinn_dyn.app.run_folder import Run, write_json
-from pinn_dyn.app.words import command_line
+from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.evaluation.report import Origin

@@ -19,12 +19,11 @@ from filelock import FileLock, Timeout
 from pinn_dyn import __version__
 from pinn_dyn.app.build import CHECKPOINTS, VALIDATION_ERROR, build_predictor
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.keys import KEYS
-from pinn_dyn.app.schema import check_value
-from pinn_dyn.app.settings import flatten
 from pinn_dyn.app.trust import read_foreign
+from pinn_dyn.app.validation import Seed, check_value
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, posterior_draws
+from pinn_dyn.evaluation.sweep_table import flatten
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import expect_output_limits
@@ -161,7 +160,7 @@ def _load_run(folder: Path, checkpoint: str, trust: tuple[str, ...]) -> Run:
             raise ConfigError(
                 f"{folder / CONFIG}: {key} is {config.get(key)!r}, expected what train.py writes"
             )
-    check_value(f"{folder / CONFIG}: seed", config["seed"], KEYS["train"]["seed"])
+    check_value(f"{folder / CONFIG}: seed", config["seed"], Seed)
     path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
     saved = read_checkpoint(path)
     parameters = saved["hyper_parameters"]

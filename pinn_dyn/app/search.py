@@ -5,16 +5,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from scipy.stats import qmc
 
-from pinn_dyn.app.keys import Count, Index, Range
-from pinn_dyn.app.schema import ConfigError
+from pinn_dyn.app.validation import ConfigError
 
 log = logging.getLogger(__name__)
 
-PositiveNumber = Annotated[float, Range(0, above=True)]
 T = TypeVar("T")
 Activation = Literal["softplus", "silu", "tanh"]
 
@@ -40,14 +39,14 @@ class EqualSearch:
         ConfigError: on a range that is none, or no choices.
     """
 
-    draw: Index
-    lr: Sequence[PositiveNumber]
-    weight_decay: Sequence[PositiveNumber]
-    width: Sequence[Count]
-    depth: Sequence[Count]
+    draw: NonNegativeInt
+    lr: Sequence[PositiveFloat]
+    weight_decay: Sequence[PositiveFloat]
+    width: Sequence[PositiveInt]
+    depth: Sequence[PositiveInt]
     activation: Sequence[Activation]
-    length: Sequence[PositiveNumber]
-    substeps: Sequence[Count]
+    length: Sequence[PositiveFloat]
+    substeps: Sequence[PositiveInt]
 
     def __post_init__(self) -> None:
         for name in ("lr", "weight_decay"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import torch
@@ -26,12 +26,10 @@ from pinn_dyn.app.build import (
     require_compiler,
     require_device,
 )
-from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.config import ConfigError, build_part, check, checked
 from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.data_record import check_data, write_data
-from pinn_dyn.app.keys import KEYS
 from pinn_dyn.app.known_data import check_known
-from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -45,14 +43,14 @@ from pinn_dyn.app.run_folder import (
     require_same,
     write_json,
 )
-from pinn_dyn.app.schema import check_value
-from pinn_dyn.app.settings import Cell, flatten
 from pinn_dyn.app.trust import check_name, packages
+from pinn_dyn.app.validation import check_value
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import RunDescription, ValidationHistory, cleaning_figure, save
+from pinn_dyn.evaluation.sweep_table import Cell, flatten
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
 from pinn_dyn.models.output_limits import set_output_limits
@@ -110,7 +108,7 @@ def train(cfg: DictConfig) -> float:
             raise ConfigError(
                 f"resume goes on with the run's own configuration: leave out {', '.join(others)}"
             )
-        check_value("resume_from", name, KEYS["train"]["resume_from"])
+        check_value("resume_from", name, Literal["last", "best"])
         config = read_config(folder, trust)
         epochs(config)  # an old run says so
         check("train", config)

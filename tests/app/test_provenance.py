@@ -3,7 +3,7 @@
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.provenance import data_hash, provenance
 from pinn_dyn.app.run_folder import read_config
-from pinn_dyn.app.words import command_line
+from pinn_dyn.app.sweep import command_line
 
 
 def test_the_hash_of_a_simulation_is_that_of_its_cache_file(hnn_run, cache):
