@@ -38,7 +38,7 @@ def check(cfg: DictConfig) -> None:
                 f"model.structure is a {type(structure).__name__}, expected rigid bodies: "
                 "model/structure=urdf model.structure.urdf=my_robot.urdf, or leave it out"
             )
-        check_structure("model.structure", part, structure, source)
+        check_structure("model.structure", structure, source)
     try:
         report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     except LogError as error:

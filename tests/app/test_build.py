@@ -65,5 +65,5 @@ def test_arguments_of_a_part_and_of_the_parts_in_it_are_checked():
 
 
 def test_a_missing_argument_is_named_with_its_part():
-    with pytest.raises(ConfigError, match="part: .*'amplitude'"):
+    with pytest.raises(ConfigError, match=r"part: .*'amplitude'"):
         build_part("part", {"_target_": "pinn_dyn.data.Chirp", "offset": [0.0]})

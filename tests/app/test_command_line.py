@@ -132,8 +132,8 @@ def test_a_value_that_does_not_fit_the_data_is_reported(elsewhere, capsys, overr
 def test_compiling_without_a_compiler_is_refused_before_the_data_are_made(
     elsewhere, capsys, monkeypatch
 ):
-    monkeypatch.setattr("pinn_dyn.app.build.has_cpp_compiler", lambda: False)
-    monkeypatch.setattr("pinn_dyn.app.train.build_data", lambda *_: pytest.fail("made data"))
+    monkeypatch.setattr("pinn_dyn.app.trainer.has_cpp_compiler", lambda: False)
+    monkeypatch.setattr("pinn_dyn.app.training.build_data", lambda *_: pytest.fail("made data"))
     text = said(fails("train.py", *TINY, NO_FIGURES, "compile=true"), capsys)
     assert "compile is true, but there is no C++ compiler" in text
 
@@ -146,13 +146,13 @@ def test_a_gpu_that_is_not_there_is_refused_before_the_data_are_made(
     elsewhere, capsys, monkeypatch, cuda, why
 ):
     monkeypatch.setattr(torch.version, "cuda", cuda)
-    monkeypatch.setattr("pinn_dyn.app.train.build_data", lambda *_: pytest.fail("made data"))
+    monkeypatch.setattr("pinn_dyn.app.training.build_data", lambda *_: pytest.fail("made data"))
     text = said(
         fails("train.py", *TINY, NO_FIGURES, "trainer.accelerator=gpu", "compile=true"), capsys
     )
     assert "trainer.accelerator is gpu, but" in text
     assert why in text
-    assert "take trainer.accelerator=cpu" in text
+    assert "use trainer.accelerator=cpu" in text
 
 
 @pytest.mark.parametrize("exists", [False, True])
