@@ -3,7 +3,7 @@
     python benchmarks/many_segments.py runs/arm_16                 # 16 segments, N = 48
     python benchmarks/many_segments.py runs/arm_4 --segments 4
 
-What studies/2026-11-25-wide-heads.md says of 16 segments: it runs train.py, evaluate.py and
+The experiment with 16 segments of docs/what_we_tried.md: it runs train.py, evaluate.py and
 control.py, each in a folder below the one that is given, with lists of three numbers a segment.
 Of 16 segments the simulation takes 4 minutes of the processor, once, the training 6.
 """
