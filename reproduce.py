@@ -1,328 +1,160 @@
-"""Remake the paper's tables, an entry of results/reproduction.yaml after another.
+"""Run the entries of results/reproduction.yaml, which made the tables of the documentation.
 
-    python reproduce.py                       all entries; what is finished is not done again
-    python reproduce.py --list                the entries, how long each takes, how far each is
-    python reproduce.py --only panda/lnn      some entries
+    python reproduce.py                       all entries
+    python reproduce.py --list                names, duration and state of the entries
+    python reproduce.py --only panda/lnn      some entries, with the entries that they need
 
-Each entry has a folder in runs/reproduce: its trainings and, in evaluation/, their tables. An
-interrupted training goes on from its last checkpoint; one whose configuration has changed since is
-refused, with the keys that differ. An entry that fails does not stop the others.
+The runs of an entry are in runs/reproduce/<entry>. A second call skips finished parts and resumes
+interrupted trainings. An entry that fails does not stop the others.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from pydantic import PositiveFloat
-
-from pinn_dyn.app.run_folder import METRICS
-from pinn_dyn.app.trust import read_yaml
-from pinn_dyn.app.validation import ConfigError, check_value
-from pinn_dyn.spelling import did_you_mean
+import yaml
 
 ROOT = Path(__file__).resolve().parent
 ENTRIES = ROOT / "results" / "reproduction.yaml"
-SUMMARY = "summary.csv"
+RESULTS = ROOT / "results" / "results.csv"
+COMMAND = "python reproduce.py --only "  # begins the column "command" of an entry's results
 
 Entry = dict[str, Any]
 
 
-@dataclass
-class _Keys:
-    """Of an entry: what results/reproduction.yaml says of them."""
-
-    train: Sequence[str] = ()
-    evaluate: Sequence[str] = ()
-    control: Sequence[str] = ()
-    runs: Sequence[str] = ()
-    results: str = ""
-    select: Mapping[str, Any] | None = None
-    metric: str = ""
-    unit: str = ""
-    minutes: PositiveFloat = 1.0
-    paper: str = ""
-    pairs: int = 0
-    steps: int = 0
-    missing: str = ""
+def read_entries() -> dict[str, Entry]:
+    """Return the entries by name; the file itself describes their keys."""
+    return yaml.safe_load(ENTRIES.read_text(encoding="utf-8"))["entries"]
 
 
-_WHOLE = (
-    {"train", "evaluate"},
-    {"evaluate", "runs", "minutes"},
-    {"control", "runs", "minutes"},
-    {"missing"},
-)
-"""Keys that an entry needs, of one kind or another."""
+def recorded(name: str) -> pd.DataFrame:
+    """Return the recorded results of an entry: one row per run, one column per metric."""
+    data = pd.read_csv(RESULTS)
+    data = data[data["command"] == COMMAND + name].fillna({"seed": 0})
+    return data.pivot(index=["robot", "model", "seed"], columns="metric", values="value")
 
 
-class EntryError(Exception):
-    """A program of an entry ended with an error, or has nothing to start from."""
-
-
-def read_entries(path: Path = ENTRIES) -> dict[str, Entry]:
-    """The entries by name; results/reproduction.yaml says what is in one.
-
-    Raises:
-        ConfigError: on a file that cannot be read, or an entry that cannot be run.
-    """
-    entries: Any = read_yaml(path).get("entries")
-    try:
-        check_value("entries", entries, Mapping[str, _Keys | Mapping[str, Any]])
-        for name, entry in entries.items():
-            _check_entry(name, entry, entries)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
-    return entries
-
-
-def _check_entry(name: str, entry: Entry, entries: dict[str, Entry]) -> None:
-    """Refuse an entry that nothing can be run of, or whose folder would be elsewhere."""
-    parts = Path(name).parts if isinstance(name, str) else ()
-    if not parts or Path(name).is_absolute() or ".." in parts:
-        raise ConfigError(f"entries has {name!r}, expected the name of a folder below --folder")
-    if not any(keys <= entry.keys() for keys in _WHOLE):
-        raise ConfigError(
-            f"entries.{name} has {', '.join(entry) or 'nothing'}, expected train and evaluate, or "
-            "evaluate or control with runs and minutes, or missing"
-        )
-    before = list(entries)[: list(entries).index(name)]
-    for one in entry.get("runs", ()):
-        if one not in before or "train" not in entries[one]:
-            raise ConfigError(
-                f"entries.{name}.runs has {one!r}, expected entries above it that train"
-            )
-    if Path(entry.get("results", "")).is_absolute():
-        raise ConfigError(
-            f"entries.{name}.results is {entry['results']!r}, expected files below {ROOT}"
-        )
-
-
-def recorded(entry: Entry) -> pd.DataFrame:
-    """The rows of our results that belong to an entry; none where nothing is recorded."""
-    files = sorted(ROOT.glob(entry["results"])) if "results" in entry else []
-    return selected(entry, files)
-
-
-def selected(entry: Entry, files: list[Path]) -> pd.DataFrame:
-    """The rows of an entry in tables that evaluate.py or control.py wrote.
-
-    Raises:
-        ConfigError: naming the table that cannot be read, or has no such column.
-    """
-    found = []
-    for path in files:
-        try:
-            rows = pd.read_csv(path)
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be read, delete it and run again: {error}") from error
-        for column, value in (entry.get("select") or {}).items():
-            if column not in rows:
-                raise ConfigError(
-                    f"{path} has no column {column!r}, by which its entry selects rows: "
-                    f"there are {', '.join(rows)}"
-                )
-            rows = rows[rows[column].isin(value if isinstance(value, list) else [value])]
-        found.append(rows)
-    return pd.concat(found) if found else pd.DataFrame()
-
-
-def training_seconds(rows: pd.DataFrame) -> pd.Series:
-    """Seconds on a core; wall-clock seconds where the run did not count them.
-
-    Raises:
-        ConfigError: if the tables do not have them.
-    """
-    if not {"training_cpu_seconds", "training_seconds"} <= {*rows}:
-        raise ConfigError(
-            "the tables of an entry have no columns training_cpu_seconds and training_seconds, "
-            f"there are {', '.join(rows)}: give results that evaluate.py wrote, or minutes"
-        )
-    return rows["training_cpu_seconds"].fillna(rows["training_seconds"])
-
-
-def minutes(entry: Entry) -> float:
-    """How long an entry takes on one core."""
-    if "minutes" in entry:
-        return entry["minutes"]
-    rows = recorded(entry)
-    return training_seconds(rows).sum() / 60 if len(rows) else 0.0
-
-
-def tables(name: str, entry: Entry, folder: Path) -> list[Path]:
-    """The tables that an entry leaves, one for each run that controls, else one of them all."""
-    if "control" not in entry:
-        return [folder / name / "evaluation" / SUMMARY]
-    runs = trained_of(entry, folder)
-    return [folder / name / run.name / SUMMARY for run in runs]
+def minutes(name: str, entry: Entry) -> float:
+    """Return the duration of an entry on one core."""
+    seconds = recorded(name).get("training_seconds", pd.Series(dtype=float)).sum()
+    return entry.get("minutes", seconds / 60)
 
 
 def trained(folder: Path) -> list[Path]:
-    """The finished trainings of an entry."""
-    return sorted(path.parent for path in folder.glob(f"*/{METRICS}"))
+    """Return the folders of finished trainings in ``folder``."""
+    return sorted(path.parent for path in folder.glob("*/metrics.json"))
 
 
-def trained_of(entry: Entry, folder: Path) -> list[Path]:
-    """The finished trainings that an entry starts from."""
-    return [path for one in entry.get("runs", ()) for path in trained(folder / one)]
+def start_runs(entry: Entry, folder: Path) -> list[Path]:
+    """Return the finished trainings that an entry evaluates, controls with or starts from."""
+    return [path for name in entry.get("runs", ()) for path in trained(folder / name)]
 
 
-def state(name: str, entry: Entry, folder: Path) -> str:
-    """How far an entry is."""
-    if "missing" in entry:
-        return "no data"
-    written = tables(name, entry, folder)
-    if written and all(path.is_file() for path in written):
-        return "done"
-    return "begun" if (folder / name).exists() else "to do"
+def summaries(name: str, entry: Entry, folder: Path) -> list[Path]:
+    """Return the paths of the tables that an entry writes."""
+    runs = [path.name for path in start_runs(entry, folder)] if "control" in entry else []
+    return [folder / name / part / "summary.csv" for part in runs or ["evaluation"]]
 
 
 def run(name: str, entry: Entry, folder: Path) -> None:
     """Run the programs of an entry.
 
     Raises:
-        EntryError: if one fails.
+        subprocess.CalledProcessError: if a program fails.
+        FileNotFoundError: if an entry that this entry needs has no finished training.
     """
-    for one in entry.get("runs", ()):
-        if not trained(folder / one):
-            raise EntryError(f"needs {one}, which has no finished training")
-    runs = trained_of(entry, folder)
+    runs = start_runs(entry, folder)
+    if "runs" in entry and not runs:
+        raise FileNotFoundError(f"no finished training of {', '.join(entry['runs'])}")
     if "control" in entry:
         for path in runs:
-            if not (folder / name / path.name / SUMMARY).is_file():
-                out = f"hydra.run.dir={quoted(folder / name / path.name)}"
-                call("control.py", *entry["control"], f"run={quoted(path)}", out)
+            target = folder / name / path.name
+            if not (target / "summary.csv").is_file():
+                call("control.py", entry["control"], f"run='{path}'", f"hydra.run.dir='{target}'")
         return
     if "train" in entry:
-        starts = [
-            [f"seed={read_yaml(path / METRICS)['seed']}", f"start_from={quoted(path)}"]
-            for path in runs
-        ]
-        # train.py itself passes over what is finished, and goes on with what is not.
-        for start in starts or [[]]:
-            sweep = f"hydra.sweep.dir={quoted(folder / name)}"
-            call("train.py", "-m", *entry["train"], *start, sweep)
+        commands = entry["train"] if isinstance(entry["train"], list) else [entry["train"]]
+        # A run folder is named <number>_<model>-seed<seed>.
+        starts = [[f"seed={x.name.split('-seed')[1]}", f"start_from='{x}'"] for x in runs] or [[]]
+        for command in commands:
+            for start in starts:  # train.py skips finished trainings and resumes the others
+                call("train.py", f"-m {command}", *start, f"hydra.sweep.dir='{folder / name}'")
         runs = trained(folder / name)
-        if not runs:
-            raise EntryError("train.py left no finished training")
-    (table,) = tables(name, entry, folder)
-    newest = max((path / METRICS).stat().st_mtime for path in runs)
+    (table,) = summaries(name, entry, folder)
+    newest = max((path / "metrics.json").stat().st_mtime for path in runs)
     if not table.is_file() or table.stat().st_mtime < newest:
-        found = ",".join(quoted(path) for path in runs)
-        out = f"hydra.run.dir={quoted(table.parent)}"
-        call("evaluate.py", f"runs=[{found}]", *entry["evaluate"], out)
+        paths = ",".join(f"'{path}'" for path in runs)
+        call("evaluate.py", entry["evaluate"], f"runs=[{paths}]", f"hydra.run.dir='{table.parent}'")
 
 
-def quoted(path: Path) -> str:
-    """A path as a value of an override, whatever characters it has."""
-    text = str(path)
-    if re.fullmatch(r"[\w./-]+", text, re.ASCII):
-        return text
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
-
-
-def call(program: str, *words: str) -> None:
-    """Run an entry script.
-
-    Raises:
-        EntryError: if it fails.
-    """
+def call(program: str, overrides: str, *more: str) -> None:
+    """Print and run a command of this folder."""
+    words = [*shlex.split(overrides), *more]
     print("$", shlex.join(["python", program, *words]), flush=True)
-    ended = subprocess.run([sys.executable, str(ROOT / program), *words], check=False)
-    if ended.returncode:
-        raise EntryError(f"{program} ended with status {ended.returncode}, its output says why")
+    subprocess.run([sys.executable, str(ROOT / program), *words], check=True)
 
 
-def comparison(entries: dict[str, Entry], names: list[str], folder: Path) -> str:
-    """What was remade, beside what is recorded and what the paper says."""
-    lines = [f"{'entry':<42}{'remade':>12}{'recorded':>12}   paper"]
-    for name in names:
-        entry = entries[name]
+def comparison(entries: dict[str, Entry], folder: Path) -> pd.DataFrame:
+    """Return new and recorded errors of each entry, means over the seeds."""
+    errors = {}
+    for name, entry in entries.items():
         metric = entry.get("metric", "error_mean")
-        files = [path for path in tables(name, entry, folder) if path.is_file()]
-        both = [selected(entry, files), recorded(entry)]
-        models = both[1]["model"].unique() if "model" in both[1] else []
-        # A line for each of several models, with the mean over its runs.
-        for model in models if len(models) > 1 else [None]:
-            means = []
-            for data in both:
-                rows = data[data["model"] == model] if model and len(data) else data
-                found = len(rows) and metric in rows
-                means.append(f"{rows[metric].mean():.3g}" if found else "-")
-            label = f"{name} {model}" if model else name
-            lines.append(f"{label:<42}{means[0]:>12}{means[1]:>12}   {entry.get('paper', '-')}")
-    return "\n".join(lines)
+        old = recorded(name).reindex(columns=[metric]).dropna().reset_index()
+        if "control" in entry:
+            old = old[old["model"].str.endswith("learned")].assign(model="learned")
+        tables = [pd.read_csv(path) for path in summaries(name, entry, folder) if path.is_file()]
+        new = pd.concat(tables or [pd.DataFrame(columns=["model", "seed", metric])])
+        new = new.rename(columns={"controller": "model"}).dropna(subset=set(new) & {"seed"})
+        if old["model"].nunique() == 1:
+            new = new.assign(model=old["model"].iloc[0])
+        means = (table.groupby("model")[metric].mean() for table in (new, old))
+        errors[name] = pd.concat(means, axis=1, keys=["new", "recorded"])
+    return pd.concat(errors, names=["entry"])
 
 
-def chosen(entries: dict[str, Entry], only: list[str] | None) -> list[str]:
-    """The entries to run, those that others need first."""
-    if unknown := set(only or []) - set(entries):
-        hint = did_you_mean(min(unknown), entries) or "; --list shows them"
-        raise SystemExit(f"no entry {', '.join(sorted(unknown))}{hint}")
-    wanted = only or [name for name, entry in entries.items() if "missing" not in entry]
-    if lacking := [name for name in wanted if "missing" in entries[name]]:
-        raise SystemExit(f"{', '.join(lacking)}: the paper's log is not published")
-    needed = set(wanted)
-    for name in reversed(entries):  # what an entry needs stands above it
-        if name in needed:
-            needed.update(entries[name].get("runs", ()))
-    return [name for name in entries if name in needed]
+def selected(entries: dict[str, Entry], only: list[str] | None) -> dict[str, Entry]:
+    """Return the entries named in ``only``, or all, with the entries that they need."""
+    if unknown := set(only or ()) - set(entries):
+        raise SystemExit(f"no entry {', '.join(sorted(unknown))}; --list shows the entries")
+    names = set(only or entries)
+    for name in reversed(entries):  # needed entries come first in the file
+        if name in names:
+            names.update(entries[name].get("runs", ()))
+    return {name: entry for name, entry in entries.items() if name in names}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run, or list, the entries."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--list", action="store_true", help="show the entries and stop")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="these entries, not all")
-    parser.add_argument("--folder", type=Path, default=Path("runs/reproduce"))
-    parser.add_argument("--entries", type=Path, default=ENTRIES, help="another list of entries")
-    given = parser.parse_args(arguments)
-    try:
-        _remake(read_entries(given.entries), given.folder, given.only, listed=given.list)
-    except ConfigError as error:
-        raise SystemExit(f"Error: {error}") from error
-
-
-def _remake(
-    entries: dict[str, Entry], folder: Path, only: list[str] | None, *, listed: bool
-) -> None:
-    if listed:
+    """Run or list the entries."""
+    parser = argparse.ArgumentParser(description="Run the entries of results/reproduction.yaml.")
+    parser.add_argument("--list", action="store_true", help="list the entries and stop")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="names of entries to run")
+    parser.add_argument("--folder", type=Path, default=Path("runs/reproduce"), help="of the runs")
+    options = parser.parse_args(arguments)
+    entries = selected(read_entries(), options.only)
+    tables = {name: summaries(name, entry, options.folder) for name, entry in entries.items()}
+    todo = [name for name, paths in tables.items() if not all(path.is_file() for path in paths)]
+    if options.list:
         for name, entry in entries.items():
-            took = "" if "missing" in entry else f"{minutes(entry):.0f} min"
-            print(f"{name:<42}{took:>8}   {state(name, entry, folder)}")
-    names = chosen(entries, only)
-    left = [name for name in names if state(name, entries[name], folder) != "done"]
-    print(f"{sum(minutes(entries[name]) for name in left):.0f} min to go, on one core")
-    if listed:
+            state = "to do" if name in todo else "done"
+            print(f"{name:<42}{minutes(name, entry):>8.0f} min   {state}")
         return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"--folder is {folder}, which cannot be written to: {error}") from error
+    print(f"{sum(minutes(name, entries[name]) for name in todo):.0f} min to go, on one core")
     failures = {}
-    for number, name in enumerate(names, start=1):
-        takes = f"{minutes(entries[name]):.0f} min" if name in left else "done, looking for changes"
-        print(f"\n[{number}/{len(names)}] {name}: {takes}", flush=True)
+    for name, entry in entries.items():
+        print(f"\n{name}", flush=True)
         try:
-            run(name, entries[name], folder)
-        except EntryError as error:
-            failures[name] = str(error)
-        except KeyboardInterrupt:
-            raise SystemExit("interrupted; the same command goes on") from None
-    print(f"\n{comparison(entries, names, folder)}")
+            run(name, entry, options.folder)
+        except (subprocess.CalledProcessError, FileNotFoundError) as error:
+            failures[name] = error
+    print(f"\n{comparison(entries, options.folder).to_string(na_rep='-')}")
     if failures:
-        lines = [f"  {name}: {error}" for name, error in failures.items()]
-        raise SystemExit("\n".join([f"\n{len(failures)} failed:", *lines]))
+        raise SystemExit("\n".join(f"{name} failed: {error}" for name, error in failures.items()))
 
 
 if __name__ == "__main__":

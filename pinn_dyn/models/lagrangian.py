@@ -17,10 +17,6 @@ from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.residual import NoResidual, ResidualHead
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
-    DAMPING,
-    INPUT,
-    MASS,
-    POTENTIAL,
     CholeskyHead,
     FrictionHead,
     InputHead,
@@ -57,10 +53,10 @@ class LagrangianNetwork(StructuredNetwork):
     def __init__(
         self,
         statistics: Statistics,
-        mass: CholeskyHead = MASS,
-        potential: PotentialHead = POTENTIAL,
-        damping: CholeskyHead = DAMPING,
-        input: InputHead = INPUT,
+        mass: CholeskyHead,
+        potential: PotentialHead,
+        damping: CholeskyHead,
+        input: InputHead,
         friction: FrictionHead = NoFriction,
         residual: ResidualHead = NoResidual,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,

@@ -1,5 +1,7 @@
 """The paper's range of the one-segment arm: what inputs and motions cover, what is beyond."""
 
+import shlex
+
 import numpy as np
 import pytest
 import torch
@@ -24,8 +26,9 @@ def wide():
 
 @pytest.fixture(scope="module")
 def beyond():
-    entry = read_entries()["study/beyond"]
-    return build("soft_arm_1_wide", *(word for word in entry["evaluate"] if "dataset." in word))
+    entry = read_entries()["beyond/soft_arm_1_wide"]
+    words = shlex.split(entry["evaluate"])
+    return build("soft_arm_1_wide", *(word for word in words if "dataset." in word))
 
 
 def drawn(source, split, count):
