@@ -26,11 +26,7 @@ from pinn_dyn.control.references import (
 )
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.control.stability import certify
-from pinn_dyn.control.stability_report import (
-    check_without_truth,
-    model_report,
-    stability_report,
-)
+from pinn_dyn.control.stability_report import model_report, stability_report
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 
 __all__ = [
@@ -59,7 +55,6 @@ __all__ = [
     "Tracking",
     "certify",
     "check_limits",
-    "check_without_truth",
     "close_loop",
     "close_loop_continuous",
     "export_law",

@@ -16,65 +16,14 @@ docs/stability.md derives it line by line. Shapes: K configurations q ``(K, N)``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.factor import FactorBounds, factor_bounds, fit_factor
+from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.control.laws import Gain, diagonal_gain
-from pinn_dyn.mechanics import MechanicalSystem, double_copy
-from pinn_dyn.mechanics.arrays import matvec, require_finite, require_last_dim
-
-
-@dataclass(frozen=True)
-class StabilityCertificate:
-    """Proposition 1 at K configurations of a region. Each is ``(K,)`` unless it says otherwise.
-
-    Attributes:
-        region: name of the region.
-        q: configurations, ``(K, N)``.
-        position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``.
-        condition_1: smallest eigenvalue of the symmetric part of A A_L^T, eq. (PD_transpose); the
-            condition holds where it is positive.
-        position_eigenvalue, velocity_eigenvalue: the same of Khat_P and Khat_D. For gains that
-            differ between coordinates condition 1 does not make them positive.
-        delta_all: |A A_L^-1 G_L - G|.
-        potential_force: |G|, to compare with.
-        rest_error: |Khat_P^-1 Delta_all|, the distance from q_ref of an arm that rests at q.
-        rest_error_bound: delta_all / (min K_P * condition_1), a cruder bound on the same;
-            infinite where condition 1 fails.
-        smallest_singular_value_A, smallest_singular_value_A_L: of the true and the learned one.
-        fitted: bounds with the P that fits M, D, G and A together.
-        matched: bounds with P = A_L A^-1, which makes Delta_A vanish.
-    """
-
-    region: str
-    q: Tensor
-    position_gain: Tensor
-    velocity_gain: Tensor
-    condition_1: Tensor
-    position_eigenvalue: Tensor
-    velocity_eigenvalue: Tensor
-    delta_all: Tensor
-    potential_force: Tensor
-    rest_error: Tensor
-    rest_error_bound: Tensor
-    smallest_singular_value_A: Tensor
-    smallest_singular_value_A_L: Tensor
-    fitted: FactorBounds
-    matched: FactorBounds
-
-    def to_frame(self) -> pd.DataFrame:
-        """One row per configuration: q1 to qN, then every number of that configuration."""
-        columns: dict[str, Tensor] = {}
-        for name, value in vars(self).items():
-            if isinstance(value, FactorBounds):
-                columns |= {f"{name}_{key}": x for key, x in vars(value).items() if key != "P"}
-            elif name not in ("region", "q", "position_gain", "velocity_gain"):
-                columns[name] = value
-        return per_configuration(self.q, columns)
+from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
+from pinn_dyn.mechanics.arrays import matvec
 
 
 def certify(
@@ -83,121 +32,128 @@ def certify(
     q: Tensor,
     position_gain: Gain,
     velocity_gain: Gain,
-    *,
-    region: str,
-) -> StabilityCertificate:
-    """Proposition 1 at every configuration of a region.
+) -> pd.DataFrame:
+    """Evaluate Proposition 1 at configurations q ``(K, N)``, one row each.
 
     Args:
         model: the learned system.
         truth: the true system, with the same N = M.
         q: configurations, ``(K, N)``.
-        position_gain: diagonal of K_P, one number or N.
-        velocity_gain: diagonal of K_D, one number or N.
-        region: a name for where the configurations come from.
+        position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
+
+    Returns:
+        The columns ``q1`` to ``qN``, those of :func:`factor_bounds` with the P of
+        :func:`fit_factor`, and
+
+        - ``condition_1``: smallest eigenvalue of the symmetric part of A A_L^T, eq. (PD_transpose),
+          which must be positive;
+        - ``position_eigenvalue``, ``velocity_eigenvalue``: the same of Khat_P and Khat_D, which
+          condition 1 does not make positive where gains differ between coordinates;
+        - ``delta_all``: |A A_L^-1 G_L - G|, to compare with ``potential_force``, |G|;
+        - ``rest_error``: |Khat_P^-1 Delta_all|, the distance from q_ref of an arm that rests at q.
 
     Raises:
-        TypeError: if one of the two is no mechanical system.
         ValueError: on sizes that do not match, an underactuated system, gains that are not
             positive, or an A or A_L without full rank.
     """
-    model, truth, q = prepare(model, truth, q, "q")
+    model, truth, q = prepare(model, truth, q)
     K_P = diagonal_gain("position_gain", position_gain, q.shape[-1]).to(q)
     K_D = diagonal_gain("velocity_gain", velocity_gain, q.shape[-1]).to(q)
     with torch.no_grad():
         true, learned = truth.terms(q), model.terms(q)
-        A, A_L = true.A, learned.A
-        K_A = A @ A_L.mT
-        delta_all = matvec(A, solve(A_L, learned.G)) - true.G
-        size = torch.linalg.vector_norm(delta_all, dim=-1)
-        condition_1 = smallest_eigenvalue(K_A)
-        crude = torch.where(condition_1 > 0, size / (K_P.min() * condition_1), torch.inf)
-        rest = solve(K_A, delta_all) / K_P
-        return StabilityCertificate(
-            region=region,
-            q=q,
-            position_gain=K_P,
-            velocity_gain=K_D,
-            condition_1=condition_1,
-            position_eigenvalue=smallest_eigenvalue(K_A * K_P),
-            velocity_eigenvalue=smallest_eigenvalue(K_A * K_D),
-            delta_all=size,
-            potential_force=torch.linalg.vector_norm(true.G, dim=-1),
-            rest_error=torch.linalg.vector_norm(rest, dim=-1),
-            rest_error_bound=crude,
-            smallest_singular_value_A=torch.linalg.svdvals(A)[..., -1],
-            smallest_singular_value_A_L=torch.linalg.svdvals(A_L)[..., -1],
-            fitted=factor_bounds(fit_factor(true, learned), true, learned),
-            matched=factor_bounds(A_L @ torch.linalg.inv(A), true, learned),
-        )
+        K_A = true.A @ learned.A.mT
+        delta_all = matvec(true.A, solve(learned.A, learned.G)) - true.G
+        columns = {
+            "condition_1": smallest_eigenvalue(K_A),
+            "position_eigenvalue": smallest_eigenvalue(K_A * K_P),
+            "velocity_eigenvalue": smallest_eigenvalue(K_A * K_D),
+            "delta_all": torch.linalg.vector_norm(delta_all, dim=-1),
+            "potential_force": torch.linalg.vector_norm(true.G, dim=-1),
+            "rest_error": torch.linalg.vector_norm(solve(K_A, delta_all) / K_P, dim=-1),
+            **factor_bounds(fit_factor(true, learned), true, learned),
+        }
+    return per_configuration(q, columns)
+
+
+def factor_bounds(P: Tensor, true: Terms, learned: Terms) -> dict[str, Tensor]:
+    """Return the deltas of Proposition 1 for a factor P ``(K, N, N)``, with N = M.
+
+    With Delta_A = A_L - P A, Delta_G = G_L - P G, Delta_I = A_L^-1 - (P A)^-1 and X = (P A)^-1, the
+    spectral norms, ``(K,)`` each:
+
+    - ``condition_2``: |X Delta_A|, which must be below 1, eq. (smallenss_A_2);
+    - ``delta_A``, ``delta_G``, ``delta_I``: |Delta_A|, |Delta_G|, |Delta_I|;
+    - ``delta_I_bound``: |X Delta_A X| / (1 - |X Delta_A|), the paper's bound on delta_I, infinite
+      where condition 2 fails;
+    - ``delta_all_bound``: |P^-1| delta_G + |A| delta_I_bound (|P G| + delta_G), the triangle
+      inequality on the three terms of the paper's Delta_all.
+
+    Source: paper, Proposition 1 and its proof.
+    """
+    PA, PG = P @ true.A, matvec(P, true.G)
+    X = torch.linalg.inv(PA)
+    delta_A = learned.A - PA
+    delta_G = torch.linalg.vector_norm(learned.G - PG, dim=-1)
+    condition_2 = _norm(X @ delta_A)
+    neumann = _norm(X @ delta_A @ X) / (1 - condition_2)
+    delta_I = torch.where(condition_2 < 1, neumann, torch.inf)
+    size = torch.linalg.vector_norm(PG, dim=-1) + delta_G
+    return {
+        "condition_2": condition_2,
+        "delta_A": _norm(delta_A),
+        "delta_G": delta_G,
+        "delta_I": _norm(torch.linalg.inv(learned.A) - X),
+        "delta_I_bound": delta_I,
+        "delta_all_bound": _norm(torch.linalg.inv(P)) * delta_G + _norm(true.A) * delta_I * size,
+    }
 
 
 def prepare(
-    model: MechanicalSystem, truth: MechanicalSystem, q: Tensor, name: str
+    model: MechanicalSystem, truth: MechanicalSystem, q: Tensor
 ) -> tuple[MechanicalSystem, MechanicalSystem, Tensor]:
-    """Checked float64 copies of the two systems and of the configurations."""
-    require_same_robot(model, truth)
-    if truth.num_coordinates != truth.num_inputs:
+    """Return float64 copies of two systems and of configurations, after checking their sizes."""
+    N, M = truth.num_coordinates, truth.num_inputs
+    if (model.num_coordinates, model.num_inputs) != (N, M):
         raise ValueError(
-            f"truth has N = {truth.num_coordinates} coordinates and M = {truth.num_inputs} "
-            "inputs: Proposition 1 needs N = M. See check_without_truth for what can be said still"
+            f"model has (N, M) = {(model.num_coordinates, model.num_inputs)}, truth {(N, M)}: "
+            "expected the same"
         )
-    q = require_samples(name, q, truth)
+    if N != M:
+        raise ValueError(
+            f"truth has N = {N} coordinates and M = {M} inputs: Proposition 1 needs N = M. See "
+            "model_report for a report without it"
+        )
+    if q.ndim != 2 or q.shape[-1] != N:
+        raise ValueError(f"q has shape {tuple(q.shape)}, expected (K, {N})")
+    q = q.double()
     model, truth = double_copy(model, q.device), double_copy(truth, q.device)
-    for matrix, system in (("A", truth), ("A_L", model)):
+    for name, system in (("A", truth), ("A_L", model)):
         with torch.no_grad():
             smallest = torch.linalg.svdvals(system.input_matrix(q))[..., -1]
-        bad = int(smallest.argmin())
-        if not smallest[bad] > 1e-12:
+        k = int(smallest.argmin())
+        if not smallest[k] > 1e-12:
             raise ValueError(
-                f"{matrix} is singular at {name}[{bad}] = {q[bad].tolist()}: Proposition 1 needs "
-                "A and A_L of full rank. Leave such configurations out"
+                f"{name} is singular at q[{k}] = {q[k].tolist()}: Proposition 1 needs A and A_L of "
+                "full rank. Leave such configurations out"
             )
     return model, truth, q
 
 
-def require_system(name: str, system: object) -> None:
-    """Refuse what is no mechanical system by a TypeError."""
-    if not isinstance(system, MechanicalSystem):
-        raise TypeError(
-            f"{name} is a {type(system).__name__}, expected a MechanicalSystem: only a "
-            "mechanical system has the terms M, D, G, A"
-        )
-
-
-def require_same_robot(model: object, truth: object) -> None:
-    """Refuse systems of other sizes by a ValueError, and what is none by a TypeError."""
-    sizes = []
-    for name, system in (("model", model), ("truth", truth)):
-        require_system(name, system)
-        assert isinstance(system, MechanicalSystem)
-        sizes.append((system.num_coordinates, system.num_inputs))
-    if sizes[0] != sizes[1]:
-        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
-
-
-def require_samples(name: str, q: Tensor, system: MechanicalSystem) -> Tensor:
-    """The configurations ``(K, N)`` in float64; a ValueError if they are none."""
-    if q.ndim != 2 or q.shape[0] < 1:
-        raise ValueError(
-            f"{name} has shape {tuple(q.shape)}, expected (K, N) with at least one row"
-        )
-    require_last_dim(name, q, system.num_coordinates, "N")
-    require_finite(name, q)
-    return q.double()
-
-
 def per_configuration(q: Tensor, columns: dict[str, Tensor]) -> pd.DataFrame:
-    """A table with one row per configuration: q1 to qN, then the columns, ``(K,)`` each."""
+    """Return a table with one row per configuration: q1 to qN, then the columns, ``(K,)`` each."""
     coordinates = {f"q{i + 1}": value for i, value in enumerate(q.unbind(-1))}
     return pd.DataFrame({k: v.cpu().numpy() for k, v in (coordinates | columns).items()})
 
 
 def solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """matrix^-1 vector, batched; not finite where the matrix is singular."""
+    """Return matrix^-1 vector, batched; not finite where the matrix is singular."""
     return torch.linalg.solve_ex(matrix, vector.unsqueeze(-1))[0].squeeze(-1)
 
 
 def smallest_eigenvalue(matrix: Tensor) -> Tensor:
-    """Smallest eigenvalue of the symmetric part."""
+    """Return the smallest eigenvalue of the symmetric part."""
     return torch.linalg.eigvalsh(0.5 * (matrix + matrix.mT))[..., 0]
+
+
+def _norm(matrix: Tensor) -> Tensor:
+    return torch.linalg.matrix_norm(matrix, 2)
