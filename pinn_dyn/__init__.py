@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pinn_dyn.app.learned_model import load as load
     from pinn_dyn.data import DataSource as DataSource
     from pinn_dyn.data import Splits as Splits
+    from pinn_dyn.evaluation.closed_loops import close_loop as close_loop
     from pinn_dyn.mechanics import MechanicalSystem as MechanicalSystem
     from pinn_dyn.mechanics import Signal as Signal
     from pinn_dyn.mechanics import Terms as Terms
@@ -32,6 +33,7 @@ _HOMES = {
     "Splits": "pinn_dyn.data",
     "Terms": "pinn_dyn.mechanics",
     "Trajectory": "pinn_dyn.mechanics",
+    "close_loop": "pinn_dyn.evaluation.closed_loops",
     "fit": "pinn_dyn.app.fit",
     "load": "pinn_dyn.app.learned_model",
 }

@@ -1,4 +1,4 @@
-"""What control.py writes: tables, figures, animation, the stability report, the TensorBoard log."""
+"""Write tables, figures, animation, stability report and TensorBoard log of control.py."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -26,10 +25,9 @@ from pinn_dyn.control import (
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import (
+    ControlResult,
     animate,
     closed_loop_figure,
-    closed_loop_metrics,
-    comparison_table,
     controller_comparison_figure,
     pose_strip,
     save,
@@ -53,7 +51,7 @@ _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 
 
 def write_results(
-    records: dict[str, ClosedLoopRecord],
+    result: ControlResult,
     source: DataSource,
     robot: MechanicalSystem,
     reference: Reference,
@@ -63,23 +61,8 @@ def write_results(
     origin: Origin,
 ) -> float:
     """Write tables, figures, animation, report; returns the RMS error of the first controller."""
-    actuator = config["actuator"]
-    metrics = {
-        name: closed_loop_metrics(
-            record,
-            settle_fraction=config["settle_fraction"],
-            settled_after=config["settled_after"] if _at_rest(record) else None,
-            u_low=actuator.get("low"),
-            u_high=actuator.get("high"),
-        )
-        for name, record in records.items()
-    }
-    summary = comparison_table(metrics)
-    coordinates = _together({name: m.coordinates for name, m in metrics.items()})
-    inputs = _together({name: m.inputs for name, m in metrics.items()})
-    tables = {"summary": summary, "coordinates": coordinates, "inputs": inputs}
-    for stem, table in tables.items():
-        write_table(table, folder, stem)
+    records, summary = result.records, result.table
+    result.save(folder)
     figures = _figures(records, source, robot, reference, config)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
@@ -104,8 +87,8 @@ def write_results(
     report = control_report(
         title=f"{source.name}: closed loop on a learned model",
         summary=summary,
-        coordinates=coordinates,
-        inputs=inputs,
+        coordinates=result.coordinates,
+        inputs=result.inputs,
         records=records,
         figures=figures,
         labels=source.labels,
@@ -115,7 +98,7 @@ def write_results(
     )
     write_whole(folder / "report.html", report)
     print(f"\ntables, figures and records are in {folder}; open report.html in a browser")
-    return metrics[first].summary["rms_error"]
+    return result.metrics[first].summary["rms_error"]
 
 
 def write_stability(
@@ -143,7 +126,7 @@ def write_stability(
     if bool((record.reference.q != record.reference.q[:, :1]).any()):
         raise ValueError(
             "the reference moves: a steady state is predicted for set points only, use "
-            "reference=set_point or reference=random_set_points"
+            "reference=set_point or a RandomSetPoints"
         )
     predicted = predict_steady_state(learned, robot, q_ref, *gains)
     measured = torch.linalg.vector_norm(record.q[:, -1] - q_ref, dim=-1)
@@ -213,15 +196,3 @@ def _tip_path(arm: HasTip, q: Tensor) -> Tensor:
     path = q.new_full((len(q), 3), torch.nan)
     path[alive] = arm.tip_position(q[alive])
     return path
-
-
-def _together(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
-    """Tables of several controllers under each other."""
-    named = pd.concat(tables, names=["controller"]).reset_index("controller")
-    return named.reset_index(drop=True)
-
-
-def _at_rest(record: ClosedLoopRecord) -> bool:
-    """Whether the reference is a set point that the runs do not start at."""
-    constant = bool((record.reference.q == record.reference.q[:, :1]).all())
-    return constant and not bool((record.q[:, 0] == record.reference.q[:, 0]).all(-1).any())

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import abc
-import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
+from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
@@ -84,8 +85,8 @@ class ModelBasedLaw(StateFeedback):
 
     Raises:
         TypeError: on a model that is no mechanical system.
-        ValueError: on bad gains, a negative damping, a condition number below 1, or a model of a
-            delayed input.
+        ValueError: on bad gains, or a model with a delayed input, a force that is not linear in
+            the input, or a residual force.
     """
 
     def __init__(
@@ -94,8 +95,8 @@ class ModelBasedLaw(StateFeedback):
         position_gain: Gain,
         velocity_gain: Gain,
         *,
-        inverse_damping: float = 0.0,
-        max_condition: float = 1e6,
+        inverse_damping: NonNegativeFloat = 0.0,
+        max_condition: Annotated[float, Field(ge=1)] = 1e6,
     ):
         if not isinstance(model, MechanicalSystem):
             raise TypeError(
@@ -110,10 +111,17 @@ class ModelBasedLaw(StateFeedback):
                 "lower the gains until the delay does not matter and set "
                 "model.delay = pinn_dyn.models.NoDelay(), or train with ~model/delay"
             )
-        if not (inverse_damping >= 0 and math.isfinite(inverse_damping)):
-            raise ValueError(f"inverse_damping is {inverse_damping}, expected 0 or more, finite")
-        if not max_condition >= 1:
-            raise ValueError(f"max_condition is {max_condition}, expected a number of at least 1")
+        if not model.input_affine:
+            raise ValueError(
+                f"{type(self).__name__}: the model has a force that is not linear in the input "
+                "(model/input=nonlinear or model/friction=load_dependent), and the control laws "
+                "invert A(q): train with model/input=network, or another friction"
+            )
+        if model.has_residual:
+            raise ValueError(
+                f"{type(self).__name__}: the model has a residual force (model/residual=network), "
+                "which the control laws cannot invert: train with model/residual=none"
+            )
         super().__init__(model.num_coordinates, model.num_inputs, position_gain, velocity_gain)
         self.model = model
         self.inverse_damping = float(inverse_damping)

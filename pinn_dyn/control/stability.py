@@ -108,24 +108,30 @@ def factor_bounds(P: Tensor, true: Terms, learned: Terms) -> dict[str, Tensor]:
     }
 
 
+def checked_samples(model: MechanicalSystem, truth: MechanicalSystem, q: Tensor) -> Tensor:
+    """Return configurations ``(K, N)`` of two systems of the same size in float64.
+
+    Raises:
+        ValueError: if the sizes differ.
+    """
+    sizes = [(system.num_coordinates, system.num_inputs) for system in (model, truth)]
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
+    if q.ndim != 2 or q.shape[-1] != truth.num_coordinates:
+        raise ValueError(f"q has shape {tuple(q.shape)}, expected (K, {truth.num_coordinates})")
+    return q.double()
+
+
 def prepare(
     model: MechanicalSystem, truth: MechanicalSystem, q: Tensor
 ) -> tuple[MechanicalSystem, MechanicalSystem, Tensor]:
-    """Return float64 copies of two systems and of configurations, after checking their sizes."""
-    N, M = truth.num_coordinates, truth.num_inputs
-    if (model.num_coordinates, model.num_inputs) != (N, M):
+    """Return float64 copies of two systems and of configurations, after checking them."""
+    q = checked_samples(model, truth, q)
+    if truth.num_coordinates != truth.num_inputs:
         raise ValueError(
-            f"model has (N, M) = {(model.num_coordinates, model.num_inputs)}, truth {(N, M)}: "
-            "expected the same"
+            f"truth has N = {truth.num_coordinates} coordinates and M = {truth.num_inputs} inputs: "
+            "Proposition 1 needs N = M. See model_report for a report without it"
         )
-    if N != M:
-        raise ValueError(
-            f"truth has N = {N} coordinates and M = {M} inputs: Proposition 1 needs N = M. See "
-            "model_report for a report without it"
-        )
-    if q.ndim != 2 or q.shape[-1] != N:
-        raise ValueError(f"q has shape {tuple(q.shape)}, expected (K, {N})")
-    q = q.double()
     model, truth = double_copy(model, q.device), double_copy(truth, q.device)
     for name, system in (("A", truth), ("A_L", model)):
         with torch.no_grad():

@@ -115,7 +115,7 @@ def model_report(model: MechanicalSystem, q: Tensor, *, region: str) -> str:
 
 def _steady_states(table: pd.DataFrame, measured: Tensor | None) -> list[str]:
     error = pd.Series(torch.nan if measured is None else measured.numpy(), table.index)
-    held = table[table["holds"]].assign(measured=error)
+    held = table.assign(measured=error)[table["holds"]]
     above = held["measured"] > held["bound"] + MEASUREMENT_TOLERANCE
     rows = [
         ["conditions hold", _share(table["holds"])],

@@ -10,6 +10,7 @@ from pinn_dyn.evaluation.calibration import (
     half_widths,
     interval_lines,
 )
+from pinn_dyn.evaluation.closed_loops import ControlResult, close_loop, close_loops
 from pinn_dyn.evaluation.control_figures import (
     closed_loop_figure,
     controller_comparison_figure,
@@ -71,6 +72,7 @@ __all__ = [
     "Calibration",
     "ClosedLoopMetrics",
     "ConstantVelocity",
+    "ControlResult",
     "Entry",
     "Evaluation",
     "HoldPosition",
@@ -90,6 +92,8 @@ __all__ = [
     "calibration_figure",
     "calibration_table",
     "cleaning_figure",
+    "close_loop",
+    "close_loops",
     "closed_loop_figure",
     "closed_loop_metrics",
     "common_stride",

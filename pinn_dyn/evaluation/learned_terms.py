@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.factor import fit_factor
-from pinn_dyn.control.stability import require_same_robot, require_samples
+from pinn_dyn.control.stability import checked_samples
 from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
 
 
@@ -107,8 +107,7 @@ def compare_terms(
         TypeError: if the model has no terms, such as a black box.
         ValueError: if the systems and ``q`` do not match in size.
     """
-    require_same_robot(model, truth)
-    q = require_samples("q", q, truth)
+    q = checked_samples(model, truth, q)
     labels = list(names) if names else [str(k + 1) for k in range(len(q))]
     with torch.no_grad():
         true = double_copy(truth, q.device).terms(q)

@@ -179,7 +179,7 @@ def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
         (["rate=null", "actuator.rate=1.0"], ["rate"]),
         (["rate=null", "delay=1"], ["delay", "rate"]),
         (["rate=null", "sensor.v_noise=0.1"], ["sensor", "rate"]),
-        (["plant=simulator"], ["plant"]),
+        (["plant=simulator", "rate=200"], ["plant"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
         (["stability={region: x, q_low: [0], q_high: [1], samples: 5}"], ["stability.q_low", "3"]),
         (["checkpoint=first"], ["first", "best or last"]),

@@ -317,20 +317,6 @@ def test_a_black_box_has_no_terms_for_a_law(law, kind):
         law(make_model(kind), 1.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("inverse_damping", -0.1),
-        ("inverse_damping", float("inf")),
-        ("max_condition", 0.5),
-        ("max_condition", float("nan")),
-    ],
-)
-def test_a_bad_option_is_named(option, value):
-    with pytest.raises(ValueError, match=f"^{option} is {value}, expected"):
-        Regulation(CartPole(), 1.0, 1.0, **{option: value})
-
-
 # The contract.
 
 

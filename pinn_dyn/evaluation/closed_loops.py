@@ -1,0 +1,242 @@
+"""Close the loop of control laws on a robot, and compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from pinn_dyn.control import (
+    Actuator,
+    ClosedLoopRecord,
+    Controller,
+    Plant,
+    Reference,
+    Sensor,
+    SystemPlant,
+    check_limits,
+    close_loop_continuous,
+)
+from pinn_dyn.control import close_loop as close_sampled_loop
+from pinn_dyn.data.whole import whole
+from pinn_dyn.evaluation.control_metrics import (
+    ClosedLoopMetrics,
+    closed_loop_metrics,
+    comparison_table,
+)
+from pinn_dyn.evaluation.tables import write_table
+from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory, double_copy
+from pinn_dyn.systems import HasDomain, HasLimits
+
+_DOMAIN_SAMPLES = 101  # of a reference
+
+
+@dataclass(frozen=True)
+class ControlResult:
+    """Closed loops of some control laws on one robot.
+
+    Attributes:
+        records: K closed loops of each law, by the name of the law.
+        metrics: figures of each law, by its name.
+    """
+
+    records: dict[str, ClosedLoopRecord]
+    metrics: dict[str, ClosedLoopMetrics]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """One row per law: errors in the units of q, inputs in the units of u."""
+        return comparison_table(self.metrics)
+
+    @property
+    def coordinates(self) -> pd.DataFrame:
+        """One row per law and coordinate."""
+        return _concatenated({name: m.coordinates for name, m in self.metrics.items()})
+
+    @property
+    def inputs(self) -> pd.DataFrame:
+        """One row per law and input."""
+        return _concatenated({name: m.inputs for name, m in self.metrics.items()})
+
+    def trajectories(self, law: str) -> list[Trajectory]:
+        """Return the K motions under a law, up to the sample at which a run was stopped."""
+        record = self.records[law]
+        motions = []
+        for q, v, u in zip(record.q, record.v, record.u, strict=True):
+            samples = int((q.isfinite() & v.isfinite()).all(-1).sum())
+            signal = Signal(record.t[:samples], u[:samples], "hold")
+            motions.append(Trajectory(q[:samples], v[:samples], signal))
+        return motions
+
+    def save(self, folder: Path | str) -> None:
+        """Write the tables as CSV files and the records as ``record_<law>.npz``."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, table in (
+            ("summary", self.table),
+            ("coordinates", self.coordinates),
+            ("inputs", self.inputs),
+        ):
+            write_table(table, folder, name)
+        for name, record in self.records.items():
+            arrays: dict[str, Any] = {
+                **{key: getattr(record, key).numpy() for key in ("t", "q", "v", "u", "u_wanted")},
+                **{f"{key}_ref": x.numpy() for key, x in record.reference._asdict().items()},
+                **{key: value.numpy() for key, value in record.diagnostics.items()},
+                "stopped": np.array([reason or "" for reason in record.stopped]),
+            }
+            path = folder / f"record_{name}.npz"
+            with whole(path) as partial, partial.open("wb") as file:
+                np.savez_compressed(file, **arrays)
+
+
+def close_loop(
+    run: Any,
+    law: Callable[[MechanicalSystem], Controller],
+    reference: Reference,
+    robot: MechanicalSystem,
+    **settings: Any,
+) -> ControlResult:
+    """Control a robot by a law on a trained model, and by the same law on the robot's true terms.
+
+    ::
+
+        run = pinn_dyn.load("runs/arm")
+        law = functools.partial(Tracking, position_gain=100.0, velocity_gain=10.0)
+        result = pinn_dyn.close_loop(run, law, Sines([0.2, 0.0, 0.1], 0.1, 0.5), SoftArm())
+        result.table
+
+    Args:
+        run: a loaded run, or a mechanical system, whose terms the law ``"learned"`` uses.
+        law: builds the law on the terms of a system.
+        reference: the desired motion.
+        robot: the true system, which also gives the terms of the law ``"truth"``.
+        settings: keyword arguments of :func:`close_loops`.
+
+    Raises:
+        TypeError, ValueError: as :func:`close_loops`, or if the model has no terms for the law.
+    """
+    learned = double_copy(getattr(run, "model", run))
+    return close_loops({"learned": law(learned), "truth": law(robot)}, reference, robot, **settings)
+
+
+def close_loops(
+    laws: Mapping[str, Controller],
+    reference: Reference,
+    robot: MechanicalSystem,
+    *,
+    duration: float = 2.0,
+    rate: float | None = 1000.0,
+    samples_rate: float = 200.0,
+    q0: Tensor | None = None,
+    v0: Tensor | None = None,
+    plant: Plant | None = None,
+    actuator: Actuator | None = None,
+    sensor: Sensor | None = None,
+    delay: int = 0,
+    settle_fraction: float = 0.02,
+    settled_after: float | None = None,
+    progress: bool = False,
+) -> ControlResult:
+    """Close the loop of each law on a robot and compare their errors and inputs.
+
+    Args:
+        laws: control laws by name.
+        reference: the desired motion.
+        robot: the true system.
+        duration: length of the runs, s.
+        rate: control instants per second, 1/s; None for a law in continuous time.
+        samples_rate: samples per second of a continuous-time record, 1/s.
+        q0, v0: initial states, ``(K, N)`` each; None starts on the reference.
+        plant: the simulation of the robot at control instants; None solves its equation of motion.
+        actuator: limits of the input; None for no limits.
+        sensor: noise of the measurement; None for no noise.
+        delay: dead time of the input, control instants.
+        settle_fraction: part of the step within which the error of a set point has settled.
+        settled_after: time from which the error of a set point is measured, s; None leaves it out.
+        progress: true shows a progress bar on a terminal.
+
+    Raises:
+        ValueError: if the reference leaves the limits or the domain of the robot, sizes do not
+            agree, or a law in continuous time has a delay or noise.
+    """
+    start = reference(0.0)
+    if q0 is None or v0 is None:
+        q0, v0 = (x.double().reshape(-1, reference.num_coordinates) for x in (start.q, start.v))
+    check_reference(reference, robot, q0, duration)
+    at_rest = _is_set_point(reference, q0, duration)
+    if at_rest and settled_after is not None and settled_after > duration:
+        raise ValueError(
+            f"settled_after is {settled_after} s, expected at most duration, {duration} s"
+        )
+    if rate is None and (delay or sensor is not None):
+        raise ValueError(
+            "rate is null, a law in continuous time, which has neither delay nor sensor noise: "
+            "give a rate, or set them to 0"
+        )
+    records = {}
+    for name, law in laws.items():
+        bar = f"closing the loop: {name}" if progress else None
+        common: dict[str, Any] = {"duration": duration, "actuator": actuator, "progress": bar}
+        if rate is None:
+            records[name] = close_loop_continuous(
+                robot, law, reference, q0, v0, samples_rate=samples_rate, **common
+            )
+        else:
+            plant = SystemPlant(robot) if plant is None else plant
+            records[name] = close_sampled_loop(
+                plant, law, reference, q0, v0, rate=rate, sensor=sensor, delay=delay, **common
+            )
+    metrics = {
+        name: closed_loop_metrics(
+            record,
+            settle_fraction=settle_fraction,
+            settled_after=settled_after if at_rest else None,
+            u_low=None if actuator is None else actuator.low,
+            u_high=None if actuator is None else actuator.high,
+        )
+        for name, record in records.items()
+    }
+    return ControlResult(records, metrics)
+
+
+def check_reference(
+    reference: Reference, robot: MechanicalSystem, q0: Tensor, duration: float
+) -> None:
+    """Check that a reference fits a robot and stays within its limits and its domain.
+
+    Raises:
+        ValueError: if it does not.
+    """
+    for name, size in (("the reference", reference.num_coordinates), ("q0", q0.shape[-1])):
+        if size != robot.num_coordinates:
+            raise ValueError(
+                f"{name} has {size} coordinates, expected {robot.num_coordinates}, as the robot has"
+            )
+    if isinstance(robot, HasLimits):
+        check_limits(reference, robot.q_low, robot.q_high, duration, robot.v_max)
+    if isinstance(robot, HasDomain):
+        times = np.linspace(0.0, duration, _DOMAIN_SAMPLES)
+        motion = [reference(float(t)).q.reshape(-1, q0.shape[-1]) for t in times]
+        visited = torch.cat([q0, *motion]).numpy()
+        robot.check_domain(visited.min(0), visited.max(0))
+
+
+def _is_set_point(reference: Reference, q0: Tensor, duration: float) -> bool:
+    """Return true for a constant reference that no run starts at."""
+    first = reference(0.0).q
+    times = np.linspace(0.0, duration, _DOMAIN_SAMPLES)
+    constant = all(torch.equal(reference(float(t)).q, first) for t in times)
+    return constant and not bool((q0 == first).all(-1).any())
+
+
+def _concatenated(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """Concatenate the tables of several laws."""
+    named = pd.concat(tables, names=["controller"]).reset_index("controller")
+    return named.reset_index(drop=True)

@@ -1,0 +1,61 @@
+"""The comparison of control laws on a robot, from Python."""
+
+import functools
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import pinn_dyn
+from pinn_dyn.control import Actuator, Regulation, Sensor, SetPoint, Sines, Tracking
+from pinn_dyn.evaluation import close_loops
+from pinn_dyn.systems import SoftArm
+
+TARGET = SetPoint([0.3, 0.2, 0.1])
+REST = torch.zeros(2, 3, dtype=torch.float64)
+
+
+def test_a_wrong_model_has_a_larger_error_than_the_truth(tmp_path):
+    law = functools.partial(Tracking, position_gain=20.0, velocity_gain=4.0)
+    reference = Sines([0.2, 0.1, 0.1], 0.05, 0.5)
+    heavy = SoftArm(mass=0.5).double()
+    result = pinn_dyn.close_loop(heavy, law, reference, SoftArm(), duration=0.5, rate=200.0)
+    errors = result.table.set_index("controller")["rms_error"]
+    assert list(errors.index) == ["learned", "truth"]
+    assert errors["learned"] > 10 * errors["truth"]
+    (motion,) = result.trajectories("learned")
+    np.testing.assert_array_equal(motion.q, result.records["learned"].q[0])
+    result.save(tmp_path)
+    assert pd.read_csv(tmp_path / "summary.csv")["rms_error"].tolist() == pytest.approx([*errors])
+    assert len(pd.read_csv(tmp_path / "coordinates.csv")) == 6
+    with np.load(tmp_path / "record_truth.npz") as record:
+        np.testing.assert_array_equal(record["u"], result.records["truth"].u)
+
+
+@pytest.mark.parametrize("rate", [200.0, None])
+def test_limits_and_initial_states_reach_the_loop(rate):
+    laws = {"law": Regulation(SoftArm(), 20.0, 4.0)}
+    settings = {"duration": 0.1, "rate": rate, "q0": REST, "v0": REST, "settled_after": 0.05}
+    result = close_loops(laws, TARGET, SoftArm(), actuator=Actuator(-0.5, 0.5), **settings)
+    record = result.records["law"]
+    assert torch.equal(record.q[:, 0], REST)
+    assert record.u.abs().max() == 0.5
+    assert {"saturated_samples", "step_error_after_0.05_s_mean_percent"} <= set(result.table)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rate": None, "delay": 1}, "neither delay nor sensor noise"),
+        ({"rate": None, "sensor": Sensor(0.1)}, "neither delay nor sensor noise"),
+        ({"settled_after": 3.0}, "settled_after is 3.0 s, expected at most duration, 0.1 s"),
+        ({"reference": SetPoint([0.1, 0.2])}, "reference has 2 coordinates, expected 3"),
+        ({"reference": SetPoint([0.0, 0.0, -0.3])}, "segment 1 of rest length 0.2 m shortens"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(settings, message):
+    settings = {"reference": TARGET, "duration": 0.1, "q0": REST, "v0": REST, **settings}
+    reference = settings.pop("reference")
+    with pytest.raises(ValueError, match=message):
+        close_loops({"law": Regulation(SoftArm(), 20.0, 4.0)}, reference, SoftArm(), **settings)
