@@ -136,30 +136,17 @@ class RowClock(Step):
 
     Args:
         longest: longest time between a stamp and the line, s: some bursts. More means lost rows.
-        rate: samples per second, Hz; None: from the stamps of the training runs.
+        rate: samples per second, Hz.
     """
 
     longest: PositiveFloat
-    rate: PositiveFloat | None = None
+    rate: PositiveFloat
 
     @property
     def repairs(self) -> Collection[str]:
         return ("bursts", "gaps", "repeated times")
 
-    @property
-    def learns(self) -> bool:
-        return self.rate is None
-
-    def fit(self, training: list[Recording]) -> Step:
-        if self.rate is not None:
-            return self
-        rows = [np.arange(len(item)) - (len(item) - 1) / 2 for item in training]
-        squares = sum(float(k @ k) for k in rows)
-        slope = sum(float(k @ item.t) for k, item in zip(rows, training, strict=True)) / squares
-        return replace(self, rate=1 / slope)
-
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        assert self.rate is not None
         rows, t, step = np.arange(len(recording)), recording.t - recording.t[0], 1 / self.rate
         line = step * rows + (t - step * rows).mean()
         distance = np.abs(t - line)

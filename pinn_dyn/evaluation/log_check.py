@@ -22,7 +22,6 @@ from pinn_dyn.data.logs import (
     MovingAverage,
     Recording,
     agreed_delays,
-    repeat_floor,
 )
 from pinn_dyn.data.logs.measurement import judged
 from pinn_dyn.data.whole import write_whole
@@ -50,7 +49,6 @@ _CONDITION = 1e3
 _INDEPENDENT = 0.01
 _FAR = 3.0
 _OUTSIDE = 0.05
-_MOST_REPEATS = 20  # stretches of the training that are compared with the others
 _ROWS = 20  # lines of a table in the terminal
 
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
@@ -258,18 +256,6 @@ def _coordinates(
             "independent share of a": [independent_share(regressor, k, size) for k in range(size)],
         }
     )
-    splits = source.load()
-    tests = [
-        Recording("", x.t.numpy(), x.q.numpy(), x.v.numpy(), x.u.numpy())
-        for x in (*splits.validation, *splits.test)
-    ]
-    some = training[:: max(1, len(training) // _MOST_REPEATS)]
-    middles = [item.rows(slice(len(item) // 4, 3 * len(item) // 4)) for item in some]
-    repeats, floor_q, floor_v = repeat_floor(
-        [*tests, *(x for x in middles if len(x) > 10)], training
-    )
-    if repeats:
-        frame["floor of q"], frame["floor of v"] = floor_q, floor_v
     scaled = regressor / np.linalg.norm(regressor, axis=0).clip(min=1e-300)
     return frame, float(np.linalg.cond(scaled))
 

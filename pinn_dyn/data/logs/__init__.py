@@ -17,7 +17,6 @@ from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.readers import READERS, Request
 from pinn_dyn.data.logs.recording import Recording
-from pinn_dyn.data.logs.repeats import repeat_floor
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part, default_split
 from pinn_dyn.data.logs.step import Step, window_samples
@@ -51,6 +50,5 @@ __all__ = [
     "common_motions",
     "default_split",
     "input_delays",
-    "repeat_floor",
     "window_samples",
 ]

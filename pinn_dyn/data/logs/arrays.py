@@ -93,10 +93,7 @@ def _table(path: Path, time: str, variables: Mapping[str, Any]) -> Table:
     if time not in arrays:
         hint = did_you_mean(time, arrays) or "."
         sizes = listed(f"{name} {value.shape}" for name, value in sorted(arrays.items()))
-        reason = f" {time!r} {unusable[time]}." if time in unusable else ""
-        raise LogError(
-            f"{path}: no variable {time!r} for the time{hint}{reason} The file has {sizes}"
-        )
+        raise LogError(f"{path}: no variable {time!r} for the time{hint} The file has {sizes}")
     samples = arrays[time].size
     columns: dict[str, np.ndarray] = {}
     for name in [key for key in variables if key in arrays]:

@@ -103,10 +103,8 @@ def check_second_clock(
     if (difference > typical).any():
         k = int((difference > typical).argmax())
         raise LogError(
-            f"{table.place(k)}: the clocks {columns[0]!r} and {columns[1]!r} disagree: "
-            f"{t[k] - t[0]:.9g} and {second[k] - second[0]:.9g} s have passed since the start of "
-            f"the run, {difference.max():.4g} s at most: check their units, and keep the clock of "
-            "the robot alone"
+            f"{table.place(k)}: the clocks {columns[0]!r} and {columns[1]!r} disagree by "
+            f"{difference[k]:.4g} s: check their units, and keep the clock of the robot alone"
         )
 
 
@@ -156,8 +154,7 @@ def _check_wrap(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.n
         row = int(wraps[0])
         raise LogError(
             f"{table.place(row + 1, name, 'q')}: the angle wraps from {q[row]:.5g} to "
-            f"{q[row + 1]:.5g} rad ({len(wraps)} times in this run), expected an angle that goes "
-            "on beyond a turn: unwrap the column (numpy.unwrap) before"
+            f"{q[row + 1]:.5g} rad ({len(wraps)} times): unwrap the column (numpy.unwrap) before"
         )
 
 
@@ -166,9 +163,8 @@ def _check_mixture(table: Table, name: str, q: np.ndarray, unit: str) -> None:
     one_row, two_rows = (float(np.median(np.abs(q[n:] - q[:-n]))) for n in (1, 2))
     if one_row > 0.02 * np.ptp(q) and two_rows < 0.2 * one_row:
         raise LogError(
-            f"{table.place(1, name, 'q')}: rows go to and fro by {one_row:.4g} {unit}, and every "
-            f"second row by {two_rows:.4g}: two runs share the clock; name the column that tells "
-            "them apart in 'trajectory', or write each to its own file"
+            f"{table.place(1, name, 'q')}: rows go to and fro by {one_row:.4g} {unit}: two runs "
+            "share the clock; name the column that tells them apart in 'trajectory'"
         )
 
 

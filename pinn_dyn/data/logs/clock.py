@@ -96,8 +96,7 @@ class Resample(Step):
         spacing = np.diff(t)
         if len(t) < 2 or not (spacing > 0).all():
             raise LogError(
-                f"{recording.place}: Resample needs at least two rows, in times that increase: put "
-                "Deduplicate or SplitGaps before it"
+                f"{recording.place}: Resample needs times that increase: put Deduplicate before it"
             )
         widest = int(spacing.argmax())
         if spacing[widest] > self.max_gap:

@@ -81,8 +81,7 @@ class Columns:
             values = getattr(self, key)
             if len(values) not in (1, len(self.columns)):
                 raise LogError(
-                    f"{key} has {len(values)} entries, expected one, or one for each of the "
-                    f"{len(self.columns)} columns"
+                    f"{key} has {len(values)} entries, expected one, or {len(self.columns)}"
                 )
             setattr(self, key, values * (len(self.columns) // len(values)))
         units = [to_si(name) for name in self.unit]
@@ -116,6 +115,5 @@ class Columns:
         for label, unit in zip(self.columns, self.units, strict=True):
             if unit not in expected:
                 raise LogError(
-                    f"{signal} has the column {label!r} in {unit}, expected {', '.join(expected)}: "
-                    "is it the right column, and its unit?"
+                    f"{signal} has the column {label!r} in {unit}, expected {', '.join(expected)}"
                 )

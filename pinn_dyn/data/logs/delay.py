@@ -1,18 +1,19 @@
-"""The delay between an input and the motion that it causes, found from the equation of motion.
+"""Delay between an input and its motion, estimated from the equation of motion.
 
-Correlating q with u measures the robot, whose own lag is in it. Here a candidate d is judged by
-what the equation of motion leaves unexplained. Three forms of it are tried, four of a rigid robot:
+A correlation of q with u includes the lag of the robot itself. Here a candidate d is judged by the
+share that the equation of motion leaves unexplained. Three forms of it are tried, and a fourth for
+rigid robots:
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
     increments          v = f(q) + B(u(t - d)),         overdamped robots
     acceleration        a = f(q, v) + B(u(t - d))
-    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    where the kinematics give Y,
-                                                                      and the others no answer
+    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if the kinematics are known
+                                                                      and no other form answers
 
 f and B are linear in their parameters (least squares). All signals are averaged by one Gaussian
-kernel g of width s, whose slopes give the derivatives: g * a = g'' * q. That keeps a linear
-equation true, the delay included, and needs no derivative of noise. Of the forms and widths the one
-counts whose estimate is the steadiest when tenths of the data are left out in turn (jackknife).
+kernel g of width s, whose slopes give the derivatives: g * a = g'' * q. A linear equation then
+stays true, the delay included, without a derivative of noise. The form and width count whose
+estimate varies least when tenths of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _CANDIDATES = 60  # at most: a parabola finds what is between them
 _DEPTH = 0.9
 _SPREAD = 0.6
 _UNEXPLAINED = 0.4
-_AS_WELL = 1.1  # times what delays of their own leave unexplained: a common one explains as well
+_AS_WELL = 1.1  # factor between residuals up to which a common delay explains as well
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _RIGID = "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
@@ -47,15 +48,15 @@ _ONE_LINE = 0.995  # of the power of a signal
 
 @dataclass(frozen=True)
 class DelayCurve:
-    """What the equation of motion leaves unexplained with the input taken d earlier.
+    """Share of the motion that its equation leaves unexplained, over the delay of an input.
 
     Attributes:
         candidates: d, ``(D,)``, s.
         residual: unexplained share of the variance at each d, ``(D,)``.
-        delay: the d of the least residual, s; None where the data do not tell.
+        delay: the d of the smallest residual, s; None if the data do not determine it.
         spread: standard deviation of the estimate by the jackknife, s.
-        form: the equation that was used.
-        reason: why there is no answer; "" where there is one.
+        form: equation of motion.
+        reason: reason why there is no delay, "" otherwise.
     """
 
     candidates: np.ndarray
@@ -67,7 +68,7 @@ class DelayCurve:
 
     def __str__(self) -> str:
         if self.delay is None:
-            return f"no delay found: {self.reason}"
+            return f"no delay: {self.reason}"
         best = int(np.argmin(self.residual))
         return (
             f"{1e3 * self.delay:.1f} ± {1e3 * self.spread:.1f} ms ({self.form}: "
@@ -83,17 +84,17 @@ def input_delays(
     common: bool = False,
     rigid: Regressor | None = None,
 ) -> list[DelayCurve]:
-    """The delay of each input, or one for all, from uniformly sampled stretches.
+    """Estimate the delay of each input, or one for all, from uniformly sampled stretches.
 
     Args:
         recordings: stretches of one sample time, q and u in them.
         longest: longest delay that is tried, s.
-        common: whether all inputs share one delay.
-        rigid: Y of a rigid robot with one input for each joint, where its kinematics are known.
-            Without it seven joints have more terms than minutes of data determine.
+        common: estimate one delay for all inputs.
+        rigid: regressor Y of a rigid robot with one input per joint, or None. Without it, seven
+            joints have more terms than minutes of data determine.
 
     Returns:
-        A curve per input; the same one for all where ``common``.
+        A curve per input; the same curve for all if ``common``.
 
     Raises:
         LogError: if a clock is not uniform.
@@ -105,64 +106,64 @@ def input_delays(
     widths = sorted({max(width, 1.5 * step) for width in _WIDTHS})
     forms: dict[str, list[list[DelayCurve]]] = {}
     for width in widths:
-        data = Smoothed.of(recordings, step, width, lags)
+        data = Smoothed.average(recordings, step, width, lags)
         if data is not None:
-            for form, curves in _trials(data, lags * step, inputs, common, rigid).items():
-                forms.setdefault(form, []).append(curves)
+            for form, trial in _trials(data, lags * step, inputs, common, rigid).items():
+                forms.setdefault(form, []).append(trial)
     if not forms:
         short = "the stretches are too short"
         return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
     best = {
-        form: [min((curves[i] for curves in trials), key=_rank) for i in range(inputs)]
+        form: [min((trial[i] for trial in trials), key=_rank) for i in range(inputs)]
         for form, trials in forms.items()
     }
     bodies = best.pop(_RIGID, None)
-    found = min(best.values(), key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
-    if bodies is not None:  # its friction is simpler than that of the others, so it comes last
-        found = [
-            of_bodies if of_bodies.delay is not None and _is_open(one) else one
-            for one, of_bodies in zip(found, bodies, strict=True)
+    curves = min(best.values(), key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
+    if bodies is not None:  # its friction is simpler than in the other forms, so it comes last
+        curves = [
+            of_bodies if of_bodies.delay is not None and _is_open(curve) else curve
+            for curve, of_bodies in zip(curves, bodies, strict=True)
         ]
     lines = [_is_one_line([item.u[:, i] for item in recordings]) for i in range(inputs)]
     if all(lines) or (any(lines) and not common):
         reason = "the input is a single sine, whose delay looks like damping"
-        found = [
+        curves = [
             replace(curve, delay=None, reason=reason) if line or common else curve
-            for curve, line in zip(found, lines, strict=True)
+            for curve, line in zip(curves, lines, strict=True)
         ]
-    return found
+    return curves
 
 
 def agreed_delays(
     recordings: Sequence[Recording], *, longest: float = 0.3, rigid: Regressor | None = None
 ) -> tuple[list[DelayCurve], bool]:
-    """The delay of each input; one for all where they have no good answers of their own.
+    """Estimate the delay of each input, or one for all where single answers are not good.
 
-    Delays are mostly of a bus or a filter that all inputs share, and searched for together they
-    have the data of all. So where an input has no answer, or where two lie more than a sample
-    apart, a common one is tried, but not where one is logged after the motion. It counts if it
-    is among those that were found, within a sample, and explains the motion about as well as all of
-    them do.
+    Most delays are those of a bus or a filter that all inputs share, and a common estimate uses the
+    data of all inputs. If an input has no answer, or two answers differ by more than a sample, a
+    common delay is tried, unless an input is logged after the motion. It counts if it lies within
+    a sample of the range of the single answers and explains the motion about as well.
 
     Arguments and errors are those of :func:`input_delays`.
 
     Returns:
-        A curve per input, and whether they are one.
+        A curve per input, and true if they are the common curve.
     """
-    own = input_delays(recordings, longest=longest, rigid=rigid)
-    found = [curve.delay for curve in own if curve.delay is not None]
-    whole = len(found) == len(own)
+    single = input_delays(recordings, longest=longest, rigid=rigid)
+    delays = [curve.delay for curve in single if curve.delay is not None]
+    complete = len(delays) == len(single)
     step = recordings[0].sample_time("a delay")
-    after = any(curve.reason == _AFTER for curve in own)
-    if len(own) == 1 or not found or after or (whole and max(found) - min(found) <= step):
-        return own, False
+    after = any(curve.reason == _AFTER for curve in single)
+    agree = complete and max(delays) - min(delays) <= step
+    if len(single) == 1 or not delays or after or agree:
+        return single, False
     common = input_delays(recordings, longest=longest, common=True, rigid=rigid)
-    left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (own, common))
+    left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (single, common))
     among = common[0].delay is not None and (
-        min(found) - step <= common[0].delay <= max(found) + step
+        min(delays) - step <= common[0].delay <= max(delays) + step
     )
-    if not among or (whole and left_in_common > _AS_WELL * left):
-        return own, False
+    if not among or (complete and left_in_common > _AS_WELL * left):
+        return single, False
     return common, True
 
 
@@ -171,12 +172,12 @@ def _rank(curve: DelayCurve) -> tuple[bool, float]:
 
 
 def _is_open(curve: DelayCurve) -> bool:
-    """Whether there is no answer, not even that the input comes after the motion."""
+    """Tell whether there is no answer, not even that the input comes after the motion."""
     return curve.delay is None and curve.reason != _AFTER
 
 
 def _is_one_line(signals: Sequence[np.ndarray]) -> bool:
-    """Whether nearly all power of every stretch of a signal is in one line of its spectrum."""
+    """Tell whether nearly all power of every stretch of a signal is in one spectral line."""
     for x in signals:
         power = np.abs(np.fft.rfft((x - x.mean()) * np.hanning(len(x)))) ** 2
         peak = int(power.argmax())
@@ -192,45 +193,46 @@ def _trials(
     common: bool,
     rigid: Regressor | None,
 ) -> dict[str, list[DelayCurve]]:
-    """A curve per input for every form of the equation, at one width."""
-    found = {}
+    """Return a curve per input for every form of the equation, at one width."""
+    results = {}
     torques = {}
     if inputs <= data.q.shape[1]:
         known = terms(data, inverse=True)
-        torques["inverse dynamics"] = Remainder.of(known, data, data.a[:, :0]).of_targets()
+        torques["inverse dynamics"] = Remainder.fit(known, data, data.a[:, :0]).of_targets()
     if rigid is not None and inputs == data.q.shape[1]:
         torques[_RIGID] = rigid_shares(data, rigid)
     for form, shares in torques.items():
         if common:
             shares = np.repeat(shares[..., :inputs].mean(axis=-1, keepdims=True), inputs, axis=-1)
-        found[form] = [_curve(candidates, shares[..., i], form) for i in range(inputs)]
+        results[form] = [_curve(candidates, shares[..., i], form) for i in range(inputs)]
     for form, target in (("increments", data.v), ("acceleration", data.a)):
         known = terms(data, inverse=False, first_order=form == "increments")
-        rest = Remainder.of(known, data, target)
+        remainder = Remainder.fit(known, data, target)
         lag = np.zeros(data.u.shape[2], dtype=int)
-        shares = rest.of_inputs(lag, range(len(lag)))
+        shares = remainder.of_inputs(lag, range(len(lag)))
         curves = [_curve(candidates, shares, form)] * inputs
         lag[:] = shares[0].argmin()
         for _ in range(0 if common or inputs == 1 else 2):
             for i in range(inputs):
-                mine = [k for k, p in enumerate(data.powers) if p[i] == sum(p)]
-                shares = rest.of_inputs(lag, mine)
-                lag[mine] = shares[0].argmin()
+                columns = [k for k, p in enumerate(data.powers) if p[i] == sum(p)]
+                shares = remainder.of_inputs(lag, columns)
+                lag[columns] = shares[0].argmin()
                 curves[i] = _curve(candidates, shares, form)
-        found[form] = curves
-    return found
+        results[form] = curves
+    return results
 
 
 def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
-    """The verdict on the shares that each delay leaves, ``(B + 1, D)``."""
+    """Return the curve of the shares that each delay leaves, ``(B + 1, D)``, with its verdict."""
     gap = candidates[1] - candidates[0]
-    whole, best = shares[0], int(shares[0].argmin())
-    each = np.array([_minimum(candidates, share) for share in shares[1:]])
-    spread = float(np.sqrt((BLOCKS - 1) * each.var()))
+    residual, best = shares[0], int(shares[0].argmin())
+    minima = np.array([_minimum(candidates, share) for share in shares[1:]])
+    spread = float(np.sqrt((BLOCKS - 1) * minima.var()))
     reason = ""
-    if whole[best] > _UNEXPLAINED:
-        reason = f"the equation of motion leaves {100 * whole[best]:.0f} % unexplained at any delay"
-    elif not whole[best] < _DEPTH * np.median(whole):
+    if residual[best] > _UNEXPLAINED:
+        share = 100 * residual[best]
+        reason = f"the equation of motion leaves {share:.0f} % unexplained at any delay"
+    elif not residual[best] < _DEPTH * np.median(residual):
         reason = "the residual is all but the same at every delay"
     elif spread > _SPREAD * max(gap, 0.01):
         reason = (
@@ -241,12 +243,12 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
         reason = f"the residual still falls at the longest delay, {candidates[-1]:.3g} s"
     elif best == 0:
         reason = _AFTER
-    delay = max(_minimum(candidates, whole), 0.0)
-    return DelayCurve(candidates, whole, None if reason else delay, spread, form, reason)
+    delay = max(_minimum(candidates, residual), 0.0)
+    return DelayCurve(candidates, residual, None if reason else delay, spread, form, reason)
 
 
 def _minimum(candidates: np.ndarray, residual: np.ndarray) -> float:
-    """Where a parabola through the least value and its neighbours is least."""
+    """Return the minimum of a parabola through the smallest value and its neighbors."""
     k = int(np.clip(np.argmin(residual), 1, len(residual) - 2))
     before, at, after = residual[k - 1 : k + 2]
     bend = before - 2 * at + after

@@ -1,4 +1,4 @@
-"""The least-squares regressions by which a delay is judged: averages, terms, remainders."""
+"""Least-squares regressions behind a delay curve: averages, terms, remainders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from pinn_dyn.data.logs.recording import Recording
 
 BLOCKS = 10
-"""Tenths of the data, of which one after the other is left out."""
+"""Number of parts of the data that are left out in turn."""
 _FEW = 3  # inputs, of which products are terms too
 _ROWS = 8_000  # of the regression, at most
 _CUT = 4.0  # the kernel ends at so many widths
@@ -40,7 +40,7 @@ class Smoothed:
     block: np.ndarray
 
     @classmethod
-    def of(
+    def average(
         cls, recordings: Sequence[Recording], step: float, width: float, lags: np.ndarray
     ) -> Smoothed | None:
         edge = int(np.ceil(_CUT * width / step))
@@ -50,8 +50,8 @@ class Smoothed:
         # Averages a quarter of a width apart are all but the same.
         stride = max(1, int(0.25 * samples), -(-total // _ROWS))
         rows = [np.arange(first, len(item) - end, stride) for item in recordings]
-        kept = [(item, r) for item, r in zip(recordings, rows, strict=True) if len(r) > 1]
-        count = sum(len(r) for _, r in kept)
+        pairs = [(item, r) for item, r in zip(recordings, rows, strict=True) if len(r) > 1]
+        count = sum(len(r) for _, r in pairs)
         if count < 20 * BLOCKS:
             return None
 
@@ -65,14 +65,14 @@ class Smoothed:
         u = np.concatenate(
             [
                 smooth(_monomials((item.u - mean) / spread, powers), 0)[r[:, None] - lags]
-                for item, r in kept
+                for item, r in pairs
             ]
         )
         return cls(q, v, a, u, powers, np.arange(count) * BLOCKS // count)
 
 
 def terms(data: Smoothed, *, inverse: bool, first_order: bool = False) -> np.ndarray:
-    """What a linear combination of explains the motion apart from the input, ``(R, P)``.
+    """Return the terms that explain the motion apart from the input, ``(R, P)``.
 
     1, q, sin q, cos q, v and friction; v_i v_j and (for inverse dynamics) a, times 1, sin q and
     cos q as far as the data are enough for so many.
@@ -95,26 +95,26 @@ def terms(data: Smoothed, *, inverse: bool, first_order: bool = False) -> np.nda
 
 
 def rigid_shares(data: Smoothed, rigid: Regressor) -> np.ndarray:
-    """Share of each input that bodies and the friction of its joint leave, ``(B + 1, D, N)``."""
+    """Return the share of each input that bodies and friction leave, ``(B + 1, D, N)``."""
     y = rigid(data.q, data.v, data.a)
     speed = data.v.std(axis=0).clip(min=1e-300)
     shares = []
     for i in range(data.q.shape[1]):
         v = data.v[:, i]
         drive = np.stack([data.a[:, i], v, np.tanh(10 * v / speed[i]), np.ones_like(v)], axis=1)
-        own = replace(data, u=data.u[..., [i]])
+        single = replace(data, u=data.u[..., [i]])
         known = _whitened(np.hstack([y[:, i], drive]))
-        shares.append(Remainder.of(known, own, data.a[:, :0]).of_targets())
+        shares.append(Remainder.fit(known, single, data.a[:, :0]).of_targets())
     return np.concatenate(shares, axis=-1)
 
 
 def _powers(inputs: int) -> list[tuple[int, ...]]:
-    """Powers of the inputs in B(u): each alone, and products up to the third of few inputs."""
+    """Return powers of the inputs in B(u): each alone, and of few inputs their products."""
     alone = [tuple(row) for row in np.eye(inputs, dtype=int)]
     if inputs > _FEW:
         return alone
-    every = itertools.product(range(4), repeat=inputs)
-    return alone + [p for p in every if 2 <= sum(p) <= 3]
+    products = itertools.product(range(4), repeat=inputs)
+    return alone + [p for p in products if 2 <= sum(p) <= 3]
 
 
 def _monomials(u: np.ndarray, powers: list[tuple[int, ...]]) -> np.ndarray:
@@ -126,7 +126,7 @@ def _products(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _whitened(x: np.ndarray) -> np.ndarray:
-    """Columns of unit size, without those that the others give."""
+    """Return independent columns of unit size that span the same space."""
     x = x / np.sqrt((x**2).mean(axis=0)).clip(min=1e-300)
     values, vectors = np.linalg.eigh(x.T @ x / len(x))
     keep = values > 1e-9 * values[-1]
@@ -135,9 +135,10 @@ def _whitened(x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Remainder:
-    """What the known terms leave of the inputs at every lag and of the motion, as inner products.
+    """Inner products of the remainders of the inputs at every lag and of the motion.
 
-    The first of the B + 1 entries is of all data, each other one leaves a tenth of them out.
+    The known terms are removed. The first of the B + 1 entries is of all data, each of the next
+    leaves a tenth of the data out.
 
     Attributes:
         inner: of the inputs, ``(B + 1, D M, D M)``.
@@ -154,7 +155,7 @@ class Remainder:
     inputs: int
 
     @classmethod
-    def of(cls, known: np.ndarray, data: Smoothed, target: np.ndarray) -> Remainder:
+    def fit(cls, known: np.ndarray, data: Smoothed, target: np.ndarray) -> Remainder:
         u = _standard(data.u.reshape(len(data.u), -1))
         y = _standard(target)
         both = np.hstack([known, u, y])
@@ -176,17 +177,17 @@ class Remainder:
         )
 
     def of_targets(self) -> np.ndarray:
-        """Share of each input that the known terms leave, ``(B + 1, D, M)``."""
+        """Return the share of each input that the known terms leave, ``(B + 1, D, M)``."""
         left = np.diagonal(self.inner, axis1=1, axis2=2)
         share = left / self.squares[0].clip(min=1e-300)
         return share.reshape(len(share), -1, self.inputs).clip(1e-12, 1)
 
     def of_inputs(self, lag: np.ndarray, moved: Sequence[int]) -> np.ndarray:
-        """Share of the motion that known terms and inputs leave, ``(B + 1, D)``.
+        """Return the share of the motion that known terms and inputs leave, ``(B + 1, D)``.
 
         Args:
-            lag: number of the candidate that each of the M inputs has, ``(M,)``.
-            moved: the inputs that take every candidate in turn instead.
+            lag: candidate of each of the M inputs, ``(M,)``.
+            moved: inputs that take every candidate in turn instead.
         """
         lags = self.inner.shape[1] // self.inputs
         at = np.tile(lag, (lags, 1))

@@ -67,19 +67,9 @@ class Butterworth(Step):
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         rate = 1 / recording.sample_time("Butterworth")
-        if self.cutoff >= rate / 2:
-            raise LogError(
-                f"{recording.run}: Butterworth has a cut-off of {self.cutoff} Hz, expected less "
-                f"than half the sample rate, {rate / 2:.4g} Hz"
-            )
         sections = butter(self.order, self.cutoff, fs=rate, output="sos")
         # A period of the cut-off at either end lets the start-up of the filter die out.
         padding = max(3 * (2 * len(sections) + 1), round(rate / self.cutoff))
-        if len(recording) <= padding:
-            raise LogError(
-                f"{recording.place}: {len(recording)} samples are too few for Butterworth, "
-                f"expected more than {padding}: raise the cut-off, or drop the run"
-            )
         smooth = recording.change(
             self.signals, lambda x: sosfiltfilt(sections, x, axis=0, padlen=padding)
         )
@@ -154,15 +144,9 @@ class _SavitzkyGolaySlope(Step):
 
     def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, int, float]:
         """Return the slope of each column of ``values``, the window in samples, the sample time."""
-        name = type(self).__name__
-        step = recording.sample_time(name)
+        step = recording.sample_time(type(self).__name__)
         # The shortest odd window that determines the polynomial.
         window = window_samples(self.window, recording, self.order + 1 + self.order % 2, odd=True)
-        if len(recording) < window:
-            raise LogError(
-                f"{recording.place}: {len(recording)} samples are too few for {name}, expected at "
-                f"least {window}"
-            )
         slope = savgol_filter(values, window, self.order, deriv=1, delta=step, axis=0)
         return slope, window, step
 
@@ -189,10 +173,7 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         if recording.v is not None:
-            raise LogError(
-                f"{recording.run}: the log has a velocity already, expected none: leave out "
-                "SavitzkyGolayVelocity, or v"
-            )
+            raise LogError("the log has a velocity already: leave out SavitzkyGolayVelocity, or v")
         v, window, step = self._slope(recording, recording.q)
         if self.causal:
             v = self._causal_slope(recording.q, window, step)

@@ -29,7 +29,7 @@ class Measurement:
     expected: str = ""
     verdict: Verdict = "ok"
     text: str = ""
-    section: str = "csv_logs.md#what-is-checked"
+    section: str = "csv_logs.md#checks-when-a-log-is-read"
 
 
 def judged(

@@ -78,8 +78,7 @@ def pieces_of(
     span = round(part.piece / step)
     if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
         raise LogError(
-            f"{name}.piece is {part.piece} s, expected a multiple of the sample time, {step:g} s, "
-            "or 'whole'"
+            f"{name}.piece is {part.piece} s, expected a multiple of the sample time, {step:g} s"
         )
     pieces = [
         replace(
@@ -90,11 +89,7 @@ def pieces_of(
         for first in _starts(len(item), span)
     ]
     if not pieces:
-        longest = max(item.duration for item in stretches)
-        raise LogError(
-            f"{name}: no stretch is as long as a piece of {part.piece} s, the longest has "
-            f"{longest:.6g} s: use a shorter piece"
-        )
+        raise LogError(f"{name}: no stretch is as long as a piece of {part.piece} s")
     unused = sum(item.duration for item in stretches) - len(pieces) * span * step
     note = f"{summary(pieces, step)}, each one roll-out; {max(unused, 0):.4g} s are left over"
     return pieces, f"{note} and dropped"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 
@@ -22,104 +21,46 @@ _CLEAR = 0.8
 _FACTORS_OF_A_RUN = (0.5, 2.0)
 # Share of the samples in which a robot may rest without a warning.
 _AT_REST = 0.9
-# Share that v leaves unexplained of the steps of q: of bad stamps, and of a uniform clock.
-_STAMPS_FAIL = 0.1
-_ROWS_AGREE = 0.25
 # A coordinate that moves less, m or rad, does not move.
 _STILL = 1e-12
 # A partial correlation of force and acceleration below this value is clear.
 _REVERSED = -0.5
-# Signals that correlate more strongly are equal but for rounding.
-_EQUAL = 1 - 1e-9
 # All columns of a signal are larger in one run: motions do not do that, degrees (57) or mm do.
 _OTHER_UNITS = 40.0
 _MOST_ROWS = 50_000
 
 
 def check_stamps(recordings: list[Recording], repairs: Collection[str]) -> list[Measurement]:
-    """Measure whether stamps come in bursts, or contradict q and v where row numbers do not.
-
-    By the stamps q moves by v (t_{k+1} - t_k) from row to row, by a uniform clock by v h. The share
-    of the squares of the steps of q that either leaves, by least squares, tells which is right.
-    """
-    long = [item for item in recordings if len(item) > 20 and item.t[-1] > item.t[0]]
-    if "bursts" in repairs or not long:
-        return []
-    cure = (
-        "if no row is missing, take the time from the row number, by the step "
+    """Measure whether stamps come in bursts, as of a logger that empties a buffer."""
+    shares = [burst_share(item.t) for item in recordings]
+    worst = int(np.argmax(shares))
+    bad = shares[worst] > BURSTS and "bursts" not in repairs
+    run = recordings[worst].run
+    text = (
+        f"{run}: stamps come in bursts, most rows follow the row before within a fifth of the mean "
+        "sample time: if no row is missing, take the time from the row number, by the step "
         "examples.cleaning_steps.RowClock"
     )
-    shares = [burst_share(item.t) for item in long]
-    worst = int(np.argmax(shares))
-    bursts = (
-        f"{long[worst].run}: stamps come in bursts, most rows follow the row before within a fifth "
-        f"of the mean sample time: {cure}"
-    )
-    results = [
-        judged(
-            "share of rows in bursts",
-            long[worst].run,
-            shares[worst],
-            f"below {BURSTS}",
-            shares[worst] > BURSTS,
-            bursts,
-        )
-    ]
-    if results[0].verdict != "ok" or long[0].v is None:
-        return results
-    stamped = np.concatenate([np.diff(item.t) for item in long])
-    uniform = np.concatenate(
-        [np.full(len(item) - 1, item.duration / (len(item) - 1)) for item in long]
-    )
-    for k in range(long[0].q.shape[1]):
-        steps = np.concatenate([np.diff(item.q[:, k]) for item in long])
-        speed = np.concatenate(
-            [0.5 * (item.v[1:, k] + item.v[:-1, k]) for item in long if item.v is not None]
-        )
-        by_stamps, by_rows = (_unexplained(steps, speed * h) for h in (stamped, uniform))
-        if by_stamps > _STAMPS_FAIL and by_rows < _ROWS_AGREE * by_stamps:
-            text = (
-                f"coordinate {k + 1}: by the stamps v leaves {100 * by_stamps:.0f} % of the steps "
-                f"of q unexplained, by a uniform clock {100 * by_rows:.2g} %: the stamps are not "
-                f"the times of the samples; {cure}"
-            )
-            results.append(
-                judged("steps of q that v and stamps leave", str(k + 1), by_stamps, "0", True, text)
-            )
-    return results
+    return [judged("share of rows in bursts", run, shares[worst], f"below {BURSTS}", bad, text)]
 
 
-def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
-    """Return the share of the squares of y that a multiple of x leaves."""
-    return 1 - float((x @ y) ** 2 / max((x @ x) * (y @ y), 1e-300))
-
-
-def check_inputs(recordings: list[Recording], u: Columns) -> list[Measurement]:
-    """Measure the range of each input; an input that never changes is a warning.
+def check_inputs(training: list[Recording], u: Columns) -> list[Measurement]:
+    """Measure the range of each input in the training.
 
     Raises:
         LogError: if no input ever changes.
     """
-    low, high = (
-        function([function(item.u, axis=0) for item in recordings], axis=0)
-        for function in (np.min, np.max)
-    )
-    if (low == high).all():
+    sizes = np.ptp(np.vstack([item.u[:, : len(u.columns)] for item in training]), axis=0)
+    if not sizes.any():
         raise LogError(
-            f"u: every input ({', '.join(u.columns)}) is constant in all runs, so nothing can be "
-            "learned about the input matrix: are these the right columns?"
+            f"u: every input ({', '.join(u.columns)}) is constant in the training runs: are these "
+            "the right columns?"
         )
-    return [
-        judged(
-            "range of the input",
-            name,
-            size,
-            "above 0",
-            size == 0,
-            f"input {name!r} is constant in all runs: its column of A cannot be learned",
-        )
-        for name, size in zip(u.columns, high - low, strict=True)
-    ]
+    results = []
+    for name, size in zip(u.columns, sizes, strict=True):
+        text = f"input {name!r} is constant in the training runs: its effect cannot be learned"
+        results.append(judged("range of the input", name, size, "above 0", size == 0, text))
+    return results
 
 
 def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
@@ -145,35 +86,6 @@ def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
                 section="csv_logs.md#columns",
             )
         )
-    return results
-
-
-def check_equal_signals(
-    recordings: list[Recording], signals: Mapping[str, Columns]
-) -> list[Measurement]:
-    """Warn of two columns that are the same signal but for a factor and an offset."""
-    thin = slice(None, None, max(1, sum(map(len, recordings)) // _MOST_ROWS))
-    names = [(signal, name) for signal, columns in signals.items() for name in columns.columns]
-    values = np.hstack(
-        [np.vstack([getattr(item, signal)[thin] for item in recordings]) for signal in signals]
-    )
-    if len(values) < 100:  # too few to tell
-        return []
-    values = values - values.mean(axis=0)
-    lengths = np.linalg.norm(values, axis=0)
-    products = np.abs(values.T @ values)
-    results = []
-    for i, j in itertools.combinations(range(len(names)), 2):
-        if lengths[i] and lengths[j] and products[i, j] > _EQUAL * lengths[i] * lengths[j]:
-            (first, a), (second, b) = names[i], names[j]
-            inputs = first == second == "u"
-            text = (
-                f"columns {a!r} ({first}) and {b!r} ({second}) are the same signal but for a "
-                "factor: "
-                + ("their columns of A cannot be told apart" if inputs else "is one the wrong one?")
-            )
-            correlation = products[i, j] / (lengths[i] * lengths[j])
-            results.append(judged("correlation", f"{a}, {b}", correlation, "below 1", True, text))
     return results
 
 
@@ -237,24 +149,6 @@ def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
     return results
 
 
-def check_unseen_inputs(
-    training: list[Recording], tests: list[Recording], u: Columns
-) -> list[Measurement]:
-    """Warn of inputs that stand still in the training runs and move in the validation or test."""
-    first = training[0].u[0]
-    results = []
-    for k, name in enumerate(u.columns):
-        still = all((item.u[:, k] == first[k]).all() for item in training)
-        moved = [item.run for item in tests if (item.u[:, k] != first[k]).any()]
-        if still and moved:
-            text = (
-                f"column {name!r} (u): is {first[k]:.4g} {u.units[k]} in all training runs and "
-                f"moves in {moved[0]}: its effect cannot be learned"
-            )
-            results.append(judged("range in the training", name, 0.0, "above 0", True, text))
-    return results
-
-
 def check_velocities(
     parts: Mapping[str, list[Recording]], q: Columns, v: Columns, step: float
 ) -> list[Measurement]:
@@ -274,28 +168,22 @@ def check_velocities(
     results = []
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
         correlation, factor = correlations[k, k], factors[k]
-        place = f"columns {a!r} and {b!r}"
-        text = ""
+        cause = ""
         if correlation >= _CLEAR and not low <= factor <= high:
-            degrees = any(
-                math.isclose(abs(factor), wrong, rel_tol=0.2)
-                for wrong in (180 / math.pi, math.pi / 180)
-            )
+            wrong = (180 / math.pi, math.pi / 180)
+            degrees = any(math.isclose(abs(factor), x, rel_tol=0.2) for x in wrong)
             cause = "one of them is in degrees" if degrees else "check unit, scale and sign of both"
-            text = f"{place}: the derivative of q is {factor:.4g} times v, expected 1: {cause}"
         elif correlation < _CLEAR and moves(training, k):
             match = int(correlations[k].argmax())
-            zero = all(not item.v[:, k].any() for item in training if item.v is not None)
-            cause = "v is zero throughout" if zero else "is this the right column?"
+            cause = "is this the right column?"
             if correlations[k, match] >= _CLEAR:
                 cause = f"{v.columns[match]!r} fits it: are columns of v exchanged?"
-            text = (
-                f"{place}: v is not the derivative of q, their correlation is {correlation:.2f}, "
-                f"expected nearly 1: {cause}"
-            )
-        results.append(
-            judged("dq/dt over v", f"{a}, {b}", factor, f"{low} to {high}", bool(text), text)
+        text = (
+            f"columns {a!r} and {b!r}: the derivative of q is {factor:.4g} times v, expected 1, "
+            f"with a correlation of {correlation:.2f}: {cause}"
         )
+        expected = f"{low} to {high}"
+        results.append(judged("dq/dt over v", f"{a}, {b}", factor, expected, bool(cause), text))
     return results + _velocities_of_runs(parts, q, v, step)
 
 
@@ -303,31 +191,29 @@ def _velocities_of_runs(
     parts: Mapping[str, list[Recording]], q: Columns, v: Columns, step: float
 ) -> list[Measurement]:
     """Warn of single runs whose v has another unit or sign than that of most runs."""
-    runs: dict[tuple[str, str], list[Recording]] = {}
+    runs: dict[str, list[Recording]] = {}
     for split, stretches in parts.items():
         for item in stretches:
-            runs.setdefault((item.run, split), []).append(item)
-    agreements = [_agreement(stretches, step) for stretches in runs.values()]
-    factors = np.array([np.where(np.diag(c) >= _CLEAR, f, np.nan) for c, f in agreements])
+            runs.setdefault(f"{item.run} ({split})", []).append(item)
+    rows = []
+    for stretches in runs.values():
+        correlations, values = _agreement(stretches, step)
+        clear = np.diag(correlations) >= _CLEAR
+        for k in range(len(values)):
+            zero = not any(x.v[:, k].any() for x in stretches if x.v is not None)
+            clear[k] |= zero and moves(stretches, k)
+        rows.append(np.where(clear, values, np.nan))
     low, high = _FACTORS_OF_A_RUN
     results = []
-    for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
-        clear = factors[~np.isnan(factors[:, k]), k]
-        if not len(clear):  # the training as a whole has a warning
-            continue
-        usual = float(np.median(clear))
-        for ((run, split), stretches), factor in zip(runs.items(), factors[:, k], strict=True):
-            place = f"{run} ({split}), columns {a!r} and {b!r}"
-            zero = not any(item.v[:, k].any() for item in stretches if item.v is not None)
-            text = ""
-            if zero and moves(stretches, k):
-                text = f"{place}: v is zero throughout this run, while q moves"
-            elif not np.isnan(factor) and not low <= factor / usual <= high:
+    for a, b, factors in zip(q.columns, v.columns, np.transpose(rows), strict=True):
+        usual = float(np.median(factors[~np.isnan(factors)])) if not np.isnan(factors).all() else 0
+        for run, factor in zip(runs, factors, strict=True):
+            if not np.isnan(factor) and not low * usual**2 <= factor * usual <= high * usual**2:
+                place = f"{run}, columns {a!r} and {b!r}"
                 text = (
-                    f"{place}: the derivative of q is {factor:.4g} times v in this run, and "
-                    f"{usual:.4g} times in most: has it other units or signs?"
+                    f"{place}: the derivative of q is {factor:.4g} times v in this run (0: v is "
+                    f"zero), and {usual:.4g} times in most: has it other units or signs?"
                 )
-            if text:
                 results.append(judged("dq/dt over v", place, factor, f"{usual:.3g}", True, text))
     return results
 

@@ -118,9 +118,8 @@ def read_table(path: Path, request: Request) -> Table:
     suffix = ".db3" if is_bag_folder(path) else path.suffix.lower()
     if suffix not in READERS:
         raise LogError(
-            f"{path}: no reader for {suffix or 'files without a suffix'}, expected one of "
-            f"{', '.join(READERS)}: convert it with pandas (to_csv, to_parquet), or add a "
-            "function to pinn_dyn.data.logs.READERS"
+            f"{path}: no reader for {suffix!r}, expected one of {', '.join(READERS)}: convert it "
+            "with pandas (to_csv, to_parquet), or add a function to pinn_dyn.data.logs.READERS"
         )
     try:
         table = READERS[suffix](path, request)
@@ -147,8 +146,8 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     folder = Path(root).expanduser()
     if not folder.is_dir():
         raise LogError(
-            f"root is {str(folder.absolute())!r}, which is no folder: give the folder of the logs "
-            "as dataset.root=..., or set the variable PINN_DYN_LOGS where the data set uses it"
+            f"root is {str(folder.absolute())!r}, which is no folder: set dataset.root, or the "
+            "environment variable PINN_DYN_LOGS"
         )
     files: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:

@@ -57,7 +57,7 @@ def check_repeats(
         pieces: the roll-outs.
         name: name of their split.
     """
-    pairs = Counter((piece.run, item.run) for piece, item, _ in _repeats(pieces, training))
+    pairs = Counter((piece.run, item.run) for piece, item in _repeats(pieces, training))
     title = f"motions of the {name} that repeat one of the training"
     results = [
         judged(
@@ -75,43 +75,10 @@ def check_repeats(
     return results or [judged(title, name, 0, "0", False, "")]
 
 
-def repeat_floor(
-    pieces: list[Recording], training: list[Recording]
-) -> tuple[int, np.ndarray, np.ndarray]:
-    """Measure by how much motions that occur twice differ: by noise, and by unrepeatable effects.
-
-    The floor is 1/√2 of the difference between a piece and the training stretch that it repeats,
-    at the nearest shift, without the part along v, which is a shift by a fraction of a sample.
-
-    Args:
-        pieces: motions that may repeat one of the training, with q and v.
-        training: stretches, with q and v; a piece is not compared with its own stretch.
-
-    Returns:
-        Number of repeats, and the floors of q and of v, ``(N,)`` each, NaN without a repeat.
-    """
-    squares = []
-    for piece, item, firsts in _repeats(pieces, training):
-        parts = [item.rows(slice(first, first + len(piece))) for first in firsts]
-        match = min(parts, key=lambda part: float(((part.q - piece.q) ** 2).sum()))
-        assert piece.v is not None
-        assert match.v is not None
-        dq, dv = piece.q - match.q, piece.v - match.v
-        shift = float((dq * match.v).sum() / max((match.v**2).sum(), 1e-300))
-        dq = dq - shift * match.v
-        if dq.any():  # a copy of a file tells nothing
-            squares.append([(x**2).mean(axis=0) for x in (dq, dv)])
-    if not squares:
-        nothing = np.full(training[0].q.shape[1], np.nan)
-        return 0, nothing, nothing
-    q, v = np.sqrt(np.mean(squares, axis=0) / 2)
-    return len(squares), q, v
-
-
 def _repeats(
     pieces: list[Recording], training: list[Recording]
-) -> Iterator[tuple[Recording, Recording, range]]:
-    """Yield each piece with each stretch that it repeats, and the samples where it may begin."""
+) -> Iterator[tuple[Recording, Recording]]:
+    """Yield each piece with each stretch that it repeats."""
     for piece in pieces:
         thin = max(1, len(piece) // _SAMPLES)
         q = piece.q[::thin]
@@ -120,18 +87,16 @@ def _repeats(
             cut_out = piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
             if spread == 0 or cut_out or len(item) < len(piece):
                 continue
-            distance, near = _nearest(q, item.q, thin)
-            if distance < _SAME**2 * spread:
-                last = min(near + thin, len(item) - len(piece))
-                yield piece, item, range(max(near - thin, 0), last + 1)
+            if _smallest_distance(q, item.q, thin) < _SAME**2 * spread:
+                yield piece, item
 
 
-def _nearest(q: np.ndarray, track: np.ndarray, thin: int) -> tuple[float, int]:
-    """Return the smallest mean square distance of q ``(T, N)`` from a track, and its first sample.
+def _smallest_distance(q: np.ndarray, track: np.ndarray, thin: int) -> float:
+    """Return the smallest mean square distance of q ``(T, N)`` from a track, over all shifts.
 
     Both are compared at every ``thin``-th sample of the track.
     """
-    smallest, start_of_match = np.inf, 0
+    smallest = np.inf
     center = q.mean(axis=0)
     q = q - center
     for start in range(0, thin, max(1, thin // 4)):
@@ -143,7 +108,5 @@ def _nearest(q: np.ndarray, track: np.ndarray, thin: int) -> tuple[float, int]:
                 fftconvolve(a, b[::-1], mode="valid") for a, b in zip(samples.T, q.T, strict=True)
             )
             distances = (energy - 2 * sum(products) + (q**2).sum()) / len(q)
-            k = int(distances.argmin())
-            if distances[k] < smallest:
-                smallest, start_of_match = float(distances[k]), start + k * thin
-    return smallest, start_of_match
+            smallest = min(smallest, float(distances.min()))
+    return smallest

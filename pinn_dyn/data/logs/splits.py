@@ -30,8 +30,6 @@ class Part:
             roll-out, and an evaluation takes the roll-outs that last as long as its horizon.
         runs: number of runs, drawn by the seed, or the names of the runs.
         seconds: the last so many seconds of every run that is not named elsewhere.
-        blocks: with ``seconds``, number of blocks of that length, spread evenly along every such
-            run instead of at its end.
 
     Raises:
         LogError: unless exactly one of ``runs`` and ``seconds`` is given.
@@ -40,16 +38,12 @@ class Part:
     piece: PositiveFloat | Literal["whole"]
     runs: PositiveInt | Sequence[str | int] | None = None
     seconds: PositiveFloat | None = None
-    blocks: PositiveInt | None = None
 
     def __post_init__(self) -> None:
         if (self.runs is None) == (self.seconds is None):
             raise LogError(
-                f"runs is {self.runs} and seconds is {self.seconds}, expected one of them: a "
-                "number or list of whole runs, or the seconds at the end of each run"
+                f"runs is {self.runs} and seconds is {self.seconds}, expected one of them"
             )
-        if self.blocks is not None and self.seconds is None:
-            raise LogError("blocks needs seconds, the length of each block")
         if self.seconds is not None and self.piece != "whole" and self.piece > self.seconds:
             raise LogError(f"piece is {self.piece} s, expected at most seconds, {self.seconds} s")
 
@@ -101,9 +95,7 @@ def split(
 ) -> dict[str, list[Recording]]:
     """Assign whole runs, and cut parts out of the other runs, before any filter sees them.
 
-    A run that is cut at its end consists of training, guard, validation, guard, test. Blocks lie
-    in the middles of equal parts of the run, blocks of validation and test in turns. A guard is
-    left out on both sides of each block, and training lies between them.
+    A run that is cut at its end consists of training, guard, validation, guard, test.
 
     Raises:
         LogError: on unknown or doubly used runs, or too few or too short ones.
@@ -114,9 +106,7 @@ def split(
         for run in part.names:
             if run not in names:
                 hint = did_you_mean(run, names) or "."
-                raise LogError(
-                    f"{name}.runs: there is no run {run!r}{hint} The runs are {listed(names)}"
-                )
+                raise LogError(f"{name}.runs: no run {run!r}{hint} The runs are {listed(names)}")
             if run in splits:
                 raise LogError(f"run {run!r} is in {splits[run]} and in {name}, expected in one")
             splits[run] = name
@@ -127,10 +117,9 @@ def split(
     }
     free = [run for run in dict.fromkeys(names) if run not in splits]
     if sum(counts.values()) >= len(free):
-        wanted = " and ".join(f"{count} for {name}" for name, count in counts.items())
         raise LogError(
-            f"there are {len(free)} runs to choose from, expected more than {wanted or 'none'}: "
-            "one run must be left for training; with a single run, split by 'seconds'"
+            f"{len(free)} runs to choose from, expected more than {sum(counts.values())}, so that "
+            "one is left for training; with a single run, split by 'seconds'"
         )
     order = np.random.default_rng(seed).permutation(len(free))
     for name, count in counts.items():
@@ -155,57 +144,19 @@ def _cut(
         return [("train", recording)]
     t = recording.t
     if not (np.diff(t) >= 0).all():
-        raise LogError(
-            f"{recording.run}: the time goes backwards, so its last seconds cannot be cut off: "
-            "give a trajectory column, or split by 'runs'"
-        )
+        raise LogError(f"{recording.run}: the time goes backwards: split by 'runs'")
     stretches = []
     end, last = t[-1], len(t)
     for name, part in (("test", test), ("validation", validation)):
-        if part.seconds is None or part.blocks:
+        if part.seconds is None:
             continue
         # From the row at or before the border, so that the stretch is not a row too short.
         first = int(np.searchsorted(t, end - part.seconds, side="right")) - 1
         border = end - part.seconds - guard
         left = int(np.searchsorted(t, border, side="right")) + 1
         if first < 0 or left < 2 or border <= t[0]:
-            raise LogError(
-                f"{recording.place}: too short to keep {part.seconds} s for {name} and a guard of "
-                f"{guard} s from training"
-            )
+            raise LogError(f"{recording.place}: too short to keep {part.seconds} s for {name}")
         stretches.append((name, recording.rows(slice(first, last))))
         end, last = border, min(left, first)
     # The row after the border only completes a stretch that is measured from its end.
-    start = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
-    return [*stretches, *_blocks(start, {"validation": validation, "test": test}, guard)]
-
-
-def _blocks(
-    recording: Recording, parts: Mapping[str, Part], guard: float
-) -> list[tuple[str, Recording]]:
-    """Return the blocks of one run, in turns, and the training before, between and after them."""
-    order = sorted(
-        ((k + 0.5) / part.blocks, name, part.seconds)
-        for name, part in parts.items()
-        if part.blocks and part.seconds
-        for k in range(part.blocks)
-    )
-    t, stretches, free = recording.t, [], 0
-    for number, (_, name, seconds) in enumerate(order):
-        if recording.duration / len(order) < seconds + 2 * guard:
-            raise LogError(
-                f"{recording.place}: too short for {len(order)} blocks, of which {name} has "
-                f"{seconds} s each, with a guard of {guard} s on both sides"
-            )
-        middle = t[0] + (number + 0.5) * recording.duration / len(order)
-        first = int(np.searchsorted(t, middle - seconds / 2, side="right")) - 1
-        # To the row at or after the end, so that the block is not a row too short.
-        last = int(np.searchsorted(t, t[first] + seconds - 1e-9)) + 1
-        before = int(np.searchsorted(t, t[first] - guard))
-        stretches.append((name, recording.rows(slice(first, last))))
-        if before > free:
-            stretches.append(("train", recording.rows(slice(free, before))))
-        free = int(np.searchsorted(t, t[min(last, len(t)) - 1] + guard, side="right"))
-    if free < len(t):
-        stretches.append(("train", recording.rows(slice(free, None))))
-    return stretches
+    return [*stretches, ("train", recording.rows(slice(0, max(last - 1, 1))))]

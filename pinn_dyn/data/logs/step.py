@@ -30,15 +30,6 @@ class Step(abc.ABC):
         """
         return ()
 
-    @property
-    def learns(self) -> bool:
-        """True if :meth:`fit` estimates something from the training runs."""
-        return False
-
-    def fit(self, training: list[Recording]) -> Step:
-        """Return the step with everything that it estimates from the training runs alone."""
-        return self
-
     @abc.abstractmethod
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         """Return the cleaned recordings, and a note on what was done.

@@ -54,16 +54,11 @@ class Table:
         if len(positions) == 1:
             return self.frame[name]
         if positions:
-            raise LogError(
-                f"{self.name}: {len(positions)} columns have the name {name!r}, which {signal} "
-                f"reads: numbers {', '.join(map(str, positions))}; expected distinct names"
-            )
+            raise LogError(f"{self.name}: {len(positions)} columns have the name {name!r}")
         for variable in (name, re.sub(r"_\d+$", "", name)):  # q_1 is the first column of q
             if variable in self.unusable:
-                raise LogError(
-                    f"{self.name}, variable {variable!r} ({signal}): {self.unusable[variable]}, "
-                    "expected a matrix of real numbers with as many rows as the time"
-                )
+                reason = self.unusable[variable]
+                raise LogError(f"{self.name}, variable {variable!r} ({signal}): {reason}")
         hint = did_you_mean(name, map(str, self.frame.columns)) or "."
         raise LogError(
             f"{self.name}: no column {name!r}, which {signal} reads{hint} "
@@ -87,17 +82,9 @@ class Table:
         k = int(bad.argmax())
         text = str(raw.iloc[k])
         what = "is empty or NaN" if pd.isna(raw.iloc[k]) else f"is {shown(text)}"
-        cure = "repair or remove these rows"
-        if re.fullmatch(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", text):
-            cure = "it has a decimal comma: replace every ',' by '.' in a file separated by ';'"
-        elif signal == "time" and re.search(r"\d:\d", text):
-            cure = (
-                "write seconds, as by (t - t.iloc[0]).dt.total_seconds() after "
-                "t = pandas.to_datetime(table[...])"
-            )
         raise LogError(
-            f"{self.place(k, name, signal)}: the value {what}, expected a number "
-            f"({int(bad.sum())} such rows in this column): {cure}"
+            f"{self.place(k, name, signal)}: the value {what}, expected a number with a decimal "
+            f"point, a time in seconds ({int(bad.sum())} such rows in this column)"
         )
 
     def runs(self, column: str) -> dict[str, np.ndarray]:
@@ -112,8 +99,6 @@ class Table:
         names = self.column(column, "trajectory")
         if names.isna().any():
             row = int(names.isna().to_numpy().argmax())
-            raise LogError(
-                f"{self.place(row, column, 'trajectory')}: is empty, expected the name of a run"
-            )
+            raise LogError(f"{self.place(row, column, 'trajectory')}: expected the name of a run")
         names = names.astype(str)
         return {run: (names == run).to_numpy() for run in names.unique()}

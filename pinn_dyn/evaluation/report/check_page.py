@@ -44,10 +44,8 @@ def check_report(check: LogCheck, *, command: str) -> str:
             "Coordinates",
             [
                 paragraph(
-                    "The noise is estimated from third differences. The floors of q and v, if "
-                    "motions occur twice, are 1/√2 of the difference between them: no model is "
-                    "more accurate. The independent share of an acceleration is the share that 1, "
-                    "q and v of the same coordinate and the other accelerations do not explain: "
+                    "The noise is estimated from third differences. The independent share of an "
+                    "acceleration is the share that 1, q and v of the same coordinate and the other accelerations do not explain: "
                     "below a hundredth its inertia cannot be identified."
                 ),
                 table(check.coordinates),
