@@ -138,7 +138,6 @@ def test_rows_that_the_cleaning_drops_or_moves_are_predicted_all_the_same():
 @pytest.mark.parametrize(
     ("step", "expected"),
     [
-        (InputDelay(), "steps.own: InputDelay.* is estimated on the training runs"),
         (PolynomialFit(degree=3, segment=1.0), "steps.own leaves 3 stretches"),
         (SplitGaps(longest=0.01), "steps.own leaves 0 stretches"),
     ],

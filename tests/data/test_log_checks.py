@@ -88,7 +88,7 @@ BAD = {
     "mixture": (alternating(motion(), motion(phase=2.0)), r"line 3, .*rows go to and fro"),
     "dates": (
         motion().assign(t=pd.date_range("2026-11-25", periods=1001, freq="10ms").astype(str)),
-        "write seconds, as by .*total_seconds",
+        "line 2, column 't' .*expected .* a time in seconds",
     ),
 }  # fmt: skip
 
@@ -104,7 +104,7 @@ def csv(**options):
 
 FILES = {
     "two of a name": (csv().replace("v2", "q1", 1).encode(), "2 columns have the name 'q1'"),
-    "decimal commas": (csv(sep=";", decimal=",").encode(), "line 2, column 't' .*decimal comma"),
+    "decimal commas": (csv(sep=";", decimal=",").encode(), "line 2, column 't' .*decimal point"),
     "long rows": (csv().replace("\n0.02", "\n9,0.02").encode(), "run.csv: cannot be read"),
     "a cut row": (csv()[:-40].rsplit(",", 2)[0].encode(), "line .* is empty or NaN"),
     "a binary file": (bytes(range(256)) * 40, "run.csv: cannot be read"),
@@ -203,7 +203,7 @@ def test_a_good_log_has_no_warning_and_a_warning_is_logged_once(tmp_path, caplog
     log.load()
     assert "input 'u2' is constant" in log.report
     assert [record.getMessage() for record in caplog.records] == [
-        "oscillator: input 'u2' is constant in all runs: its column of A cannot be learned"
+        "oscillator: input 'u2' is constant in the training runs: its effect cannot be learned"
     ]
     assert {x.name for x in log.measurements} >= {"dq/dt over v", "range of the input"}
 
@@ -211,13 +211,11 @@ def test_a_good_log_has_no_warning_and_a_warning_is_logged_once(tmp_path, caplog
 NOISE = np.random.default_rng(0).normal(size=(2, 1001))
 SWAPPED = motion().rename(columns={"v1": "v2", "v2": "v1"})
 SUSPICIOUS = {
-    "zero v": (dict(v2=0.0), "columns 'q2' and 'v2': v is not .*v is zero throughout"),
-    "v of noise": (dict(v1=NOISE[0]), "columns 'q1' and 'v1': v is not .*the right column"),
+    "zero v": (dict(v2=0.0), "columns 'q2' and 'v2': .* is 0 times v.*right column"),
+    "v of noise": (dict(v1=NOISE[0]), "columns 'q1' and 'v1': .*correlation.*the right column"),
     "exchanged v": (dict(v1=SWAPPED["v1"], v2=SWAPPED["v2"]), "'v2' fits it.*\n.*'v1' fits it"),
     "still": (dict(q1=0.3, v1=0.0), r"column 'q1' \(q\): never moves"),
     "only noise": (dict(q1=1e-3 * NOISE[0], v1=NOISE[1]), r"no more than its noise .* 0.000997"),
-    "one signal twice": (dict(u2=3 - 2 * motion()["u1"]), r"'u1' .u. and 'u2' .u. are the same"),
-    "an input is q": (dict(u1=motion()["q1"]), r"'q1' \(q\) and 'u1' \(u\) are the same"),
 }  # fmt: skip
 
 
@@ -271,7 +269,7 @@ def test_an_input_that_only_moves_in_the_test(tmp_path):
     table = motion()
     table.loc[:799, "u2"] = 0.25
     text = warned(tmp_path, table, validation=dict(seconds=1.0, piece=1.0))
-    assert "column 'u2' (u): is 0.25 Nm in all training runs and moves in run" in text
+    assert "input 'u2' is constant in the training runs" in text
 
 
 # Jumps and spikes.
@@ -321,13 +319,13 @@ def test_a_run_that_moves_one_input_alone_needs_no_warning(tmp_path):
 
 
 @pytest.mark.parametrize(("run", "split"), [("b", "validation"), ("c", "test"), ("d", "train")])
-@pytest.mark.parametrize(("factor", "said"), [(-1, "-1"), (180 / np.pi, "0.01745"), (0, "zero")])
+@pytest.mark.parametrize(("factor", "said"), [(-1, "-1"), (180 / np.pi, "0.01745"), (0, "0")])
 def test_velocities_of_one_run_have_another_unit_or_sign(tmp_path, run, split, factor, said):
     table = motion(phase=3.3)
     table["v2"] *= factor
     text = warned_of_runs(tmp_path, {run: table})
     assert f"{run} ({split}), columns 'q2' and 'v2': " in text
-    assert (f"is {said} times v" if factor else "v is zero throughout this run") in text
+    assert f"is {said} times v" in text
     assert "and 'v1'" not in text
 
 
@@ -389,21 +387,10 @@ def test_stamps_in_bursts_are_refused_or_warned_of(tmp_path):
 
 
 @pytest.mark.parametrize("apart", [0.0, 2e-5])
-@pytest.mark.parametrize("rate", [None, 100.0])
-def test_a_row_clock_repairs_bursts(tmp_path, apart, rate):
-    steps = {"clock": RowClock(longest=0.1, rate=rate)}
+def test_a_row_clock_repairs_bursts(tmp_path, apart):
+    steps = {"clock": RowClock(longest=0.1, rate=100.0)}
     assert warned(tmp_path, in_bursts(apart=apart), steps=steps) == ""
     splits = source(tmp_path, steps=steps).load()
     assert float(splits.train[0].t[1]) == pytest.approx(0.01, rel=1e-3)
     lost = in_bursts().drop(index=range(300, 360))
     refused(tmp_path, lost, r"RowClock found the stamp .* rows are missing.*SplitGaps", steps=steps)
-
-
-def test_a_clock_that_contradicts_the_velocities_is_told_from_jitter(tmp_path):
-    """Stamps that swing about the true times, and samples that were taken at such times."""
-    uniform = motion()["t"].to_numpy()
-    swing = uniform + 0.0115 * np.sin(0.5 * np.arange(len(uniform)))
-    text = warned(tmp_path, motion().assign(t=swing), steps=RESAMPLE)
-    assert "coordinate 1: by the stamps v leaves" in text
-    sampled = motion().drop(columns="t").apply(lambda x: np.interp(swing, uniform, x))
-    assert warned(tmp_path, sampled.assign(t=swing), steps=RESAMPLE) == ""

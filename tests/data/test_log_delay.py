@@ -57,28 +57,6 @@ def test_noise_for_an_input_gets_no_answer():
     assert all(curve.delay is None for curve in input_delays([replace(item, u=noise)]))
 
 
-def test_the_step_shifts_by_what_it_found_and_says_so():
-    item = log("pendulum", 1, 0.043)
-    step = InputDelay().fit([item])
-    (shifted,), text = step.apply(item)
-    assert len(shifted) == len(item) - 4
-    np.testing.assert_array_equal(shifted.u, item.u[:-4])
-    np.testing.assert_array_equal(shifted.q, item.q[4:])
-    assert "4 samples (0.04 s), estimated on the training runs" in text
-    assert "0 ms" in text  # the curve
-    assert not step.losses([item], [shifted])
-
-
-def test_the_step_warns_where_it_shifts_nothing():
-    item = log("pendulum", 1, 0.04, highest=0.1, number=1)
-    step = InputDelay().fit([item])
-    (shifted,), _ = step.apply(item)
-    np.testing.assert_array_equal(shifted.u, item.u)
-    (warning,) = step.losses([item], [shifted])
-    assert "input 1 is not shifted" in warning
-    assert "single sine" in warning
-
-
 def test_given_delays_shift_each_input():
     item = log("arm", 0, 0.0)
     (shifted,), _ = InputDelay(delay=[0.02, 0.05]).apply(item)

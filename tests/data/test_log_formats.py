@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pinn_dyn.data.logs import READERS, LogError, LogSource, Request, Resample
 from pinn_dyn.data.logs.bags import read_bag
+from pinn_dyn.data.logs.readers import read_table
 from tests.data import log_formats as formats
 from tests.data.logs_files import motion, source, write
 
@@ -130,7 +131,7 @@ def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
         ("/joint_states/angle/elbow", "no 'angle/elbow': their fields are header, name"),
         ("/joint_states/header/stamp", "'header/stamp' is a builtin_inter.*'<topic>/t'"),
         ("/joint_states/name/0", "'name/0' is a str, expected a number"),
-        ("/joint_states/position", "'position' is a ndarray.*'position/0', or by the name"),
+        ("/joint_states/position", "'position' is a ndarray.*name an entry of it"),
         ("/commands/data/7", "no message has a value of 'data/7'"),
     ],
 )
@@ -155,7 +156,7 @@ def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path, expected):
 
 def test_clocks_that_never_overlap_are_told(tmp_path):
     formats.write_bag(tmp_path / "run", TABLE, late=1e6)
-    with pytest.raises(LogError, match="/joint_states and /commands never overlap"):
+    with pytest.raises(LogError, match=r"no row is left: .* have none of /commands"):
         source(tmp_path, files="run", **formats.BAG).load()
 
 
@@ -182,8 +183,8 @@ def test_messages_of_an_unknown_type_are_told(tmp_path):
     with contextlib.closing(sqlite3.connect(database)) as connection:
         connection.execute("delete from message_definitions")
         connection.commit()
-    with pytest.raises(LogError, match=r"topic /number: its type my_msgs/msg/Own is unknown.*MCAP"):
-        read_bag(tmp_path / "run", request)
+    with pytest.raises(LogError, match="my_msgs/msg/Own"):
+        read_table(tmp_path / "run", request)
 
 
 MATRICES = dict(
@@ -294,7 +295,7 @@ def test_a_format_is_one_function(tmp_path, expected, monkeypatch):
     TABLE.to_pickle(tmp_path / "run.pkl")
     assert_same(trajectories(source(tmp_path, files="*.pkl")), expected)
     (tmp_path / "run.foo").touch()
-    with pytest.raises(LogError, match=r"no reader for \.foo, expected one of \.csv.*READERS"):
+    with pytest.raises(LogError, match=r"no reader for '\.foo', expected one of \.csv.*READERS"):
         source(tmp_path, files="*.foo").load()
 
 

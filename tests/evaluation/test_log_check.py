@@ -113,17 +113,6 @@ def test_coordinates_that_move_together_are_not_identified(good):
     assert verdicts(check)["independent share of a", "q1 [m]"] == "warning"
 
 
-def test_motions_that_occur_twice_tell_the_floor(good):
-    twice = good.copy()
-    noise = 1e-3 * np.random.default_rng(1).normal(size=(800, 2))
-    twice.loc[len(twice) - 800 :, ["q1", "q2"]] = (
-        good.loc[500:1299, ["q1", "q2"]].to_numpy() + noise
-    )
-    check = checked(twice)
-    floor = check.coordinates["floor of q"].to_numpy()
-    assert floor == pytest.approx([1e-3 / 2**0.5] * 2, rel=0.2)
-
-
 @given(st.floats(1e-6, 1e2), st.floats(0.2, 2.0))
 def test_white_noise_is_measured_beside_a_smooth_motion(size, frequency):
     t = np.arange(4000) / RATE

@@ -58,7 +58,7 @@ class Smoothed:
         def smooth(x: np.ndarray, order: int) -> np.ndarray:
             return gaussian_filter1d(x, samples, axis=0, order=order, truncate=_CUT) / step**order
 
-        q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in kept]) for order in range(3))
+        q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in pairs]) for order in range(3))
         powers = _powers(recordings[0].u.shape[1])
         centre = np.concatenate([item.u for item in recordings])
         mean, spread = centre.mean(axis=0), centre.std(axis=0).clip(min=1e-300)

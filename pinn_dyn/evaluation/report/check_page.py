@@ -45,8 +45,9 @@ def check_report(check: LogCheck, *, command: str) -> str:
             [
                 paragraph(
                     "The noise is estimated from third differences. The independent share of an "
-                    "acceleration is the share that 1, q and v of the same coordinate and the other accelerations do not explain: "
-                    "below a hundredth its inertia cannot be identified."
+                    "acceleration is the share that 1, q and v of the same coordinate and the "
+                    "other accelerations do not explain: below a hundredth its inertia cannot be "
+                    "identified."
                 ),
                 table(check.coordinates),
                 drawing(_coverage(check), "coverage of the test by the training"),
