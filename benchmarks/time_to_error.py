@@ -27,11 +27,13 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
+from configured import build_learner, build_validator
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.build import build_data, build_learner, build_model, build_validator, epochs
+from pinn_dyn.app.build import build_data, build_model
 from pinn_dyn.app.config import CONF, plain
 from pinn_dyn.app.provenance import provenance
+from pinn_dyn.app.trainer import epochs
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Predictor, Trajectory, stack
@@ -92,7 +94,7 @@ def ours(config: dict[str, Any], data: DynamicsData, goal: float, clock: Clock) 
     trainer = L.Trainer(
         accelerator="cpu",
         devices=1,
-        max_epochs=epochs(config)[0],
+        max_epochs=epochs(config["trainer"]["steps"], config["trainer"]["validations"])[0],
         limit_val_batches=0,
         inference_mode=False,
         logger=False,

@@ -35,14 +35,14 @@ from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
+import configured
 import lightning as L
 import torch
 from torch import Tensor
 
-from pinn_dyn.app import build
+from pinn_dyn.app import build, trainer, training
 from pinn_dyn.app.config import composed
 from pinn_dyn.app.provenance import provenance
-from pinn_dyn.app.train import describe
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.mechanics import Signal, Trajectory
@@ -172,13 +172,15 @@ def run_cell(
     if steps is None:  # an epoch has half of the usual steps; of large batches fewer will do
         most = min(max(200_000 // batch, 40), 500)
         steps = next(n for n in range(most, 0, -1) if STEPS_FOR_PROGRAM % n == 0)
-    build.LONGEST_EPOCH = steps
+    trainer.LONGEST_EPOCH = steps
     config = configuration(size, batch, loss, optimizer, members, device, compiled)
     L.seed_everything(0, verbose=False)
     data = build.build_data(config, Sines(size))
-    model = build.build_predictor(config, data.statistics)
-    validator = build.build_validator(config, data.statistics.step)
-    learner = build.build_learner(config, model, data.statistics, validator)
+    model = training.build_predictor(
+        build.model_builder(config), data.statistics, 0, config["ensemble"]
+    )
+    validator = configured.build_validator(config, data.statistics.step)
+    learner = configured.build_learner(config, model, data.statistics, validator)
     windows = data.windows.to(torch.device("cpu"), torch.float32)
     first = windows[next(batches(data, members))]
     if device == "gpu":
@@ -254,13 +256,10 @@ def fit(config: Any, data: Any, learner: Any, validator: Any, *callbacks: L.Call
     """Train as train.py does, in a folder that is thrown away."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        (place / "config.yaml").write_text("")
-        trainer = build.build_trainer(
-            config, place, data.source, validator, describe(place, config)
-        )
-        trainer.callbacks = [*callbacks, *trainer.callbacks]  # type: ignore[attr-defined]
+        lightning = configured.build_trainer(config, place)
+        lightning.callbacks = [*callbacks, *lightning.callbacks]  # type: ignore[attr-defined]
         members = config["ensemble"]
-        trainer.fit(learner, EnsembleData(data, members) if members > 1 else data)
+        lightning.fit(learner, EnsembleData(data, members) if members > 1 else data)
 
 
 def schedule(config: dict[str, Any], learner: Any) -> list[float]:
@@ -286,15 +285,17 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
     from training_step import named
 
     config = {**config, "compile": False}
-    build.LONGEST_EPOCH, steps = CHECKED, build.LONGEST_EPOCH
+    trainer.LONGEST_EPOCH, steps = CHECKED, trainer.LONGEST_EPOCH
     data = build.build_data(config, data.source)
     L.seed_everything(0, verbose=False)
-    model = build.build_predictor(config, data.statistics)
+    model = training.build_predictor(
+        build.model_builder(config), data.statistics, 0, config["ensemble"]
+    )
     start = {name: p.detach().clone() for name, p in model.named_parameters()}
-    validator = build.build_validator(config, data.statistics.step)
-    learner = build.build_learner(config, model, data.statistics, validator)
+    validator = configured.build_validator(config, data.statistics.step)
+    learner = configured.build_learner(config, model, data.statistics, validator)
     fit(config, data, learner, validator, Turns({}, 0))
-    build.LONGEST_EPOCH = steps
+    trainer.LONGEST_EPOCH = steps
     prefix = model.prefix if isinstance(model, Ensemble) else ""
     ours = dict(model.cpu().named_parameters())
     theirs = {f"{prefix}{key}": value for key, value in named(tree).items()}

@@ -1,6 +1,6 @@
 """Several models of one log, trained at once: where they disagree, do not trust them.
 
-python examples/ensemble_with_spread.py [--steps 300] [overrides]
+python examples/ensemble_with_spread.py [--steps 300]
 """
 
 import argparse
@@ -12,15 +12,14 @@ import pandas as pd
 import pinn_dyn
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--steps", type=int, help="of the optimizer")
+parser.add_argument("--steps", type=int, default=1000, help="steps of the optimizer")
 parser.add_argument("--members", type=int, default=4)
-args, overrides = parser.parse_known_args()
+args = parser.parse_args()
 
 log = pd.read_csv(Path(__file__).with_name("example_log.csv"))
 q = {"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]}
 u = {"columns": ["torque_x", "torque_y", "force"], "unit": ["Nm", "Nm", "N"]}
-overrides = [f"ensemble={args.members}", *overrides]
-ensemble = pinn_dyn.fit(log, q=q, u=u, run="run", steps=args.steps, overrides=overrides)
+ensemble = pinn_dyn.fit(log, q=q, u=u, run="run", steps=args.steps, ensemble=args.members)
 print(ensemble)
 
 run = log[log.run == ensemble.source.test.names[0]]

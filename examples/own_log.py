@@ -1,6 +1,6 @@
 """Learn a robot from a log in a data frame, and compare with a robot that keeps its velocity.
 
-python examples/own_log.py [--steps 300] [overrides]    leaves a run folder, runs/own_log
+python examples/own_log.py [--steps 300]    leaves a run folder, runs/own_log
 """
 
 import argparse
@@ -12,9 +12,9 @@ import pandas as pd
 import pinn_dyn
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--steps", type=int, help="of the optimizer")
-parser.add_argument("--folder", default="runs/own_log", help="the run folder")
-args, overrides = parser.parse_known_args()
+parser.add_argument("--steps", type=int, default=1000, help="steps of the optimizer")
+parser.add_argument("--folder", default="runs/own_log", help="run folder")
+args = parser.parse_args()
 
 log = pd.read_csv(Path(__file__).with_name("example_log.csv"))
 model = pinn_dyn.fit(
@@ -24,7 +24,6 @@ model = pinn_dyn.fit(
     run="run",
     steps=args.steps,
     folder=args.folder,
-    overrides=overrides,
 )
 print(model)
 

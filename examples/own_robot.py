@@ -1,11 +1,21 @@
-"""A pendulum with a motor as a robot of your own: write its four terms, simulate it, learn it."""
+"""A pendulum with a motor as a robot of your own: write its four terms, simulate it, learn it.
 
-import sys
+python examples/own_robot.py [--steps 2000]
+"""
+
+import argparse
+from functools import partial
 
 import torch
 
 import pinn_dyn
-from pinn_dyn.data import InitialStates, MultiSine, SimulatedSource
+from pinn_dyn.data import DynamicsData, InitialStates, MultiSine, SimulatedSource
+from pinn_dyn.models import FixedInput, LagrangianNetwork
+from pinn_dyn.training import MidpointLoss
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--steps", type=int, default=2000, help="steps of the optimizer")
+args = parser.parse_args()
 
 
 class Pendulum(pinn_dyn.MechanicalSystem):
@@ -39,9 +49,13 @@ source = SimulatedSource(
     input_labels=["torque [Nm]"],
 )
 # A motor in the joint: A = I, so that M, D and G are found in their own units.
-own = ["model/input=fixed", "model.angles=[0]", "loss=midpoint", "data.stride=1"]
-own += ["trainer.steps=2000", "trainer.validations=10"]
-model = pinn_dyn.fit(source, model="lnn", overrides=own + sys.argv[1:])
+model = pinn_dyn.train(
+    source,
+    partial(LagrangianNetwork, input=FixedInput, angles=[0]),
+    loss=MidpointLoss,
+    data=partial(DynamicsData, pairs=2000, stride=1),
+    steps=args.steps,
+)
 
 learned, true = model.terms([1.0]), source.system.double().terms(torch.ones(1).double())
 for name in ("M", "D", "G"):

@@ -1,24 +1,35 @@
 """Simulate a soft arm, learn it from its motions, compare learned and true matrices.
 
-python examples/simulate_and_learn.py [--steps 2000] [overrides]
+python examples/simulate_and_learn.py [--steps 2000]
 """
 
 import argparse
+from functools import partial
 
 import numpy as np
 import torch
 
 import pinn_dyn
+from pinn_dyn.data import DynamicsData
 from pinn_dyn.mechanics import rollout
+from pinn_dyn.training import MidpointLoss
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--steps", type=int, default=2000, help="of the optimizer")
-args, overrides = parser.parse_known_args()
+parser.add_argument("--steps", type=int, default=2000, help="steps of the optimizer")
+parser.add_argument("--duration", type=float, default=4.0, help="length of each motion, s")
+args = parser.parse_args()
 
-# 20 motions of 4 s, simulated on the first call, for the loss of cheap steps at a high rate.
-small = ["duration=4", "step=0.002", "train_initial_states=5", "train_inputs=4", "validation=2"]
-own = [*(f"dataset.{word}" for word in small), "loss=midpoint", "data.stride=1"]
-model = pinn_dyn.fit("soft_arm_1", model="lnn", steps=args.steps, overrides=[*own, *overrides])
+# 20 motions at 500 Hz, simulated on the first call. The midpoint loss needs a high rate.
+source = pinn_dyn.dataset(
+    "soft_arm_1",
+    duration=args.duration,
+    step=0.002,
+    train_initial_states=5,
+    train_inputs=4,
+    validation=2,
+)
+windows = partial(DynamicsData, stride=1)
+model = pinn_dyn.train(source, "lnn", loss=MidpointLoss, data=windows, steps=args.steps)
 print(model)
 
 # A motion of the true arm that no training saw, by the same roll-out.

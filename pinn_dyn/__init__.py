@@ -1,7 +1,7 @@
-"""Physics-informed neural networks that learn robot dynamics obeying mechanics.
+"""Physics-informed neural networks that learn robot dynamics.
 
-The names below are the front door; each room of the package has more. They are imported when they
-are asked for, so that ``import pinn_dyn`` takes no time.
+The names below are the public API; the packages contain more. A name is imported on first use, so
+that ``import pinn_dyn`` takes no time.
 """
 
 from __future__ import annotations
@@ -10,10 +10,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pinn_dyn.app.dataset import dataset as dataset
     from pinn_dyn.app.fit import fit as fit
-    from pinn_dyn.app.learned_model import LearnedModel as LearnedModel
-    from pinn_dyn.app.learned_model import load as load
+    from pinn_dyn.app.run import Run as Run
+    from pinn_dyn.app.run_folder import load as load
+    from pinn_dyn.app.training import train as train
     from pinn_dyn.data import DataSource as DataSource
+    from pinn_dyn.data import LogSource as LogSource
     from pinn_dyn.data import Splits as Splits
     from pinn_dyn.evaluation.closed_loops import close_loop as close_loop
     from pinn_dyn.mechanics import MechanicalSystem as MechanicalSystem
@@ -24,28 +27,31 @@ if TYPE_CHECKING:
 
 __version__ = "0.3.0"
 
-_HOMES = {
+_MODULES = {
     "DataSource": "pinn_dyn.data",
-    "LearnedModel": "pinn_dyn.app.learned_model",
+    "LogSource": "pinn_dyn.data",
     "MechanicalSystem": "pinn_dyn.mechanics",
+    "Run": "pinn_dyn.app.run",
     "Signal": "pinn_dyn.mechanics",
     "SoftArm": "pinn_dyn.systems",
     "Splits": "pinn_dyn.data",
     "Terms": "pinn_dyn.mechanics",
     "Trajectory": "pinn_dyn.mechanics",
     "close_loop": "pinn_dyn.evaluation.closed_loops",
+    "dataset": "pinn_dyn.app.dataset",
     "fit": "pinn_dyn.app.fit",
-    "load": "pinn_dyn.app.learned_model",
+    "load": "pinn_dyn.app.run_folder",
+    "train": "pinn_dyn.app.training",
 }
 
-__all__ = [*_HOMES]
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'pinn_dyn' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES])
+    return sorted([*globals(), *_MODULES])

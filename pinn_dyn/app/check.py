@@ -8,11 +8,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pinn_dyn.app.build import build_source
-from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.config import ConfigError, build_part, checked
 from pinn_dyn.app.known_data import check_structure
-from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.run_folder import write_config
-from pinn_dyn.app.words import command_line
+from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data.logs import LogError, LogSource
 from pinn_dyn.evaluation.log_check import check_log
 from pinn_dyn.models.known import Structure
@@ -39,7 +38,7 @@ def check(cfg: DictConfig) -> None:
                 f"model.structure is a {type(structure).__name__}, expected rigid bodies: "
                 "model/structure=urdf model.structure.urdf=my_robot.urdf, or leave it out"
             )
-        check_structure("model.structure", part, structure, source)
+        check_structure("model.structure", structure, source)
     try:
         report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     except LogError as error:

@@ -15,9 +15,8 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from pinn_dyn.app.build import build_law, build_reference, build_source
-from pinn_dyn.app.config import ConfigError, checked
+from pinn_dyn.app.config import ConfigError, build_part, checked
 from pinn_dyn.app.control_results import write_results, write_stability
-from pinn_dyn.app.parts import build_part
 from pinn_dyn.app.provenance import write_provenance
 from pinn_dyn.app.run_folder import load_run, write_config
 from pinn_dyn.app.trust import packages

@@ -15,10 +15,10 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.constants import read_constants
-from pinn_dyn.app.data_record import check_data
 from pinn_dyn.app.identification import identified
 from pinn_dyn.app.provenance import write_provenance
-from pinn_dyn.app.run_folder import CONFIG, Run, load_run
+from pinn_dyn.app.run import Run
+from pinn_dyn.app.run_folder import CONFIG, check_data, load_run
 from pinn_dyn.app.shared_data import RunData, shared_data
 from pinn_dyn.app.trust import packages
 from pinn_dyn.data.fastest_motion import too_long_for
@@ -69,7 +69,7 @@ def evaluate(
     """
     data = shared_data(runs, {"dataset": dataset, "split": split})
     for run, item in zip(runs, data, strict=True):
-        check_data(run.folder, item.trained_on)
+        check_data(run, item.trained_on)
     plain = next(k for k, item in enumerate(data) if not item.preparation)
     source, motions = data[plain].source, data[plain].trajectories
     horizon = horizon or default_horizon(stack_until(motions).duration)
@@ -107,7 +107,7 @@ def evaluate(
                 models[k],
                 seed=run.config["seed"],
                 figures=figures,
-                members=run.members(),
+                members=run.ensemble,
             )
         )
     training = data[plain].training

@@ -1,7 +1,8 @@
-"""Where the numbers of a report come from: command, commit, data, runs and configurations."""
+"""Origin of the numbers of a report: command, commit, data, runs and configurations."""
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
@@ -14,27 +15,28 @@ import torch
 import yaml
 
 from pinn_dyn import __version__
-from pinn_dyn.app.run_folder import Run, write_json
-from pinn_dyn.app.words import command_line
-from pinn_dyn.data import DataSource
+from pinn_dyn.app.run import Run
+from pinn_dyn.app.sweep import command_line
+from pinn_dyn.data import DataSource, data_identity
 from pinn_dyn.data.cache import cache_key
+from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.report import Origin
 
 
 def data_hash(source: DataSource) -> str:
-    """What tells one data set from another: 16 hexadecimal digits of its fingerprint."""
-    return cache_key(source.fingerprint())
+    """Return a hash of the trajectories of a source, 16 hexadecimal digits."""
+    return cache_key({split: part["hashes"] for split, part in data_identity(source).items()})
 
 
 def provenance() -> dict[str, str]:
-    """Commit, whether tracked files differ from it, software and hardware, for the records."""
+    """Return commit, changes since the commit, software and hardware, for records."""
     commit = _git("rev-parse", "--short", "HEAD")
     changed = _git("status", "--porcelain", "--untracked-files=no")
     return {
         "pinn_dyn": __version__,
         "commit": commit or "unknown",
         "uncommitted_changes": "unknown" if not commit else "yes" if changed else "no",
-        "torch": torch.__version__,
+        "torch": str(torch.__version__),
         "python": platform.python_version(),
         "hardware": f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} threads",
     }
@@ -47,17 +49,18 @@ def write_provenance(
     beside: dict[str, Any],
     folder: Path,
 ) -> Origin:
-    """Write ``provenance.json``; returns the same as the last section of a report.
+    """Write ``provenance.json``, and return its content as the last section of a report.
 
     Args:
-        runs: names of the runs as they are in the tables.
+        runs: the runs by their names in the tables.
         source: the data that they share.
         config: the resolved configuration of this program.
-        beside: what the file has beside that configuration.
-        folder: where it is written.
+        beside: further content of the file.
+        folder: folder of the file.
     """
     record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    write_json(folder / "provenance.json", {"config": config, **beside, **record})
+    record_file = {"config": config, **beside, **record}
+    write_whole(folder / "provenance.json", json.dumps(record_file, indent=2))
     rows = [
         {
             "run": name,
@@ -86,7 +89,7 @@ def _text(config: dict[str, Any]) -> str:
 
 
 def _git(*arguments: str) -> str:
-    """What git says of the code; nothing where there is no repository."""
+    """Return the output of git on the code; empty if there is no repository."""
     command = ["git", "-C", str(Path(__file__).parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 

@@ -1,24 +1,219 @@
-"""Nested configurations as flat tables of settings."""
+"""The keys of the programs: a dataclass each, whose fields a configuration must have or may have.
+
+The fields are annotated with the classes of the objects that the program builds, so that
+:mod:`~pinn_dyn.app.validation` can check them. ``X | Callable[..., X]`` describes an object that
+takes further arguments from the program, a learning rate schedule the optimizer, say.
+"""
 
 from __future__ import annotations
 
-Cell = str | int | float | bool
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import lightning as L
+from lightning.pytorch.loggers import Logger
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from pinn_dyn.app.search import EqualSearch
+from pinn_dyn.app.validation import SET_BY_PROGRAM, STAND_INS, Seed
+from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
+from pinn_dyn.data import DataSource, DynamicsData, InitialStates
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.mechanics import MechanicalSystem, Predictor
+from pinn_dyn.training import LeastSquares, WindowLoss
+
+Names = str | Sequence[str]
 
 
-def flatten(config: dict, prefix: str = "") -> dict[str, Cell]:
-    """Return nested sections as dotted keys.
+@dataclass(kw_only=True)
+class TrainSettings:
+    """Keys of train.py."""
 
-    A class path (``_target_``) becomes the name of the class, a list its text, None ``null``.
-    """
-    flat: dict[str, Cell] = {}
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, dict):
-            flat |= flatten(value, f"{name}.")
-        elif value is None:
-            flat[name] = "null"
-        elif key == "_target_":
-            flat[name] = str(value).rsplit(".", 1)[-1]
-        else:
-            flat[name] = value if isinstance(value, (bool, int, float, str)) else str(value)
-    return flat
+    name: str
+    model_name: str
+    seed: Seed
+    compile: bool | Literal["auto"]
+    ensemble: PositiveInt = 1
+    threads: PositiveInt
+    start_from: str | None = None
+    resume: str | None = None
+    resume_from: Literal["last", "best"] | None = None
+    trust: Names | None = None
+    search: EqualSearch | dict[str, int] | None = None  # a run folder holds the draw alone
+    dataset: DataSource
+    data: DynamicsData | Callable[..., DynamicsData]
+    model: Predictor | Callable[..., Predictor]
+    loss: WindowLoss | Callable[..., WindowLoss]
+    optimizer: Optimizer | LeastSquares | Callable[..., Optimizer]
+    scheduler: LRScheduler | Callable[..., LRScheduler]
+    validator: RolloutValidator | Callable[..., RolloutValidator]
+    trainer: L.Trainer | Callable[..., L.Trainer]
+    callbacks: Mapping[str, L.Callback | Callable[..., L.Callback] | None]
+    logger: Mapping[str, Logger | Callable[..., Logger]]
+
+
+@dataclass(kw_only=True)
+class TrainerArguments:
+    """Arguments of ``lightning.Trainer`` that a configuration may set."""
+
+    steps: PositiveInt | None = None
+    validations: PositiveInt | None = None
+    accelerator: Literal["cpu", "gpu", "cuda", "auto"] = "auto"
+    devices: PositiveInt | Sequence[NonNegativeInt] | Literal["auto"] = "auto"
+    num_nodes: PositiveInt = 1
+    strategy: str = "auto"
+    precision: Literal["32-true", "32", 32, "bf16-mixed", "bf16"] | None = None
+    gradient_clip_val: PositiveFloat | None = None
+    gradient_clip_algorithm: Literal["norm", "value"] | None = None
+    enable_progress_bar: bool = True
+    benchmark: bool | None = None
+    deterministic: bool | Literal["warn"] = False
+    detect_anomaly: bool = False
+    profiler: Literal["simple", "advanced"] | None = None
+
+
+STAND_INS[L.Trainer] = TrainerArguments
+_LENGTH = "trainer.steps and trainer.validations"
+_LENGTHS = ("max_epochs", "max_steps", "max_time", "min_epochs", "min_steps")
+_LENGTHS += ("limit_train_batches", "overfit_batches", "val_check_interval")
+SET_BY_PROGRAM.update(
+    {
+        **{f"trainer.{name}": _LENGTH for name in _LENGTHS},
+        "trainer.accumulate_grad_batches": "data.batch_size",
+        "trainer.callbacks": "callbacks",
+        "trainer.default_root_dir": "hydra.run.dir",
+        "trainer.limit_val_batches": "validator",
+        "trainer.logger": "logger",
+        "data.batches_per_epoch": "trainer.steps",
+        "data.source": "dataset",
+        "optimizer.maximize": "loss",
+        "optimizer.params": "model",
+        "plant.system": "robot",
+        "scheduler.optimizer": "optimizer",
+        "scheduler.total_steps": "trainer.steps",
+    }
+)
+
+
+@dataclass(kw_only=True)
+class EvaluateSettings:
+    """Keys of evaluate.py."""
+
+    runs: Names
+    checkpoint: Literal["best", "last"]
+    split: Literal["test", "validation"]
+    dataset: DataSource | None = None
+    horizon: PositiveFloat | None
+    step: PositiveFloat | None
+    windows: Sequence[PositiveFloat] | None
+    thresholds: Mapping[str, PositiveFloat]
+    trajectory: NonNegativeInt
+    threads: PositiveInt
+    trust: Names | None = None
+
+
+@dataclass(kw_only=True)
+class Gains:
+    """Gains of the control laws: one number, or one for each coordinate."""
+
+    position: PositiveFloat | Sequence[PositiveFloat]
+    velocity: PositiveFloat | Sequence[PositiveFloat]
+
+
+@dataclass(kw_only=True)
+class Law:
+    """A control law on the terms of the learned model or of the true system."""
+
+    terms: Literal["learned", "truth"]
+    law: Controller | Callable[..., Controller]
+    observer: Controller | Callable[..., Controller] | None = None
+
+
+@dataclass(kw_only=True)
+class Guard:
+    """Reaction to states far from the training data."""
+
+    threshold: PositiveFloat | None = None
+    fallback: bool = False
+
+
+@dataclass(kw_only=True)
+class Stability:
+    """Box of configurations in which the conditions of Proposition 1 are evaluated."""
+
+    region: str
+    q_low: Sequence[float]
+    q_high: Sequence[float]
+    samples: PositiveInt
+
+
+@dataclass(kw_only=True)
+class ControlSettings:
+    """Keys of control.py."""
+
+    run: str
+    checkpoint: Literal["best", "last"]
+    member: NonNegativeInt
+    gains: Gains | Mapping[str, Any]
+    duration: PositiveFloat
+    rate: PositiveFloat | None
+    samples_rate: PositiveFloat
+    initial_states: InitialStates | None
+    runs: PositiveInt
+    seed: Seed
+    robot: Mapping[str, Any]
+    actuator: Actuator
+    sensor: Sensor
+    delay: NonNegativeInt
+    guard: Guard | Mapping[str, Any]
+    stability: Stability | Mapping[str, Any] | None
+    export: str | None
+    settle_fraction: Annotated[float, Field(gt=0, lt=1)]
+    settled_after: NonNegativeFloat
+    trajectory: NonNegativeInt
+    animate: bool
+    threads: PositiveInt
+    trust: Names | None = None
+    controllers: Mapping[str, Law | Mapping[str, Any]]
+    reference: Reference | Callable[..., Reference]
+    plant: Plant | Callable[..., Plant]
+
+
+@dataclass(kw_only=True)
+class Kinematics:
+    """Known structure of the robot, before a model is chosen."""
+
+    structure: MechanicalSystem | None = None
+
+
+@dataclass(kw_only=True)
+class CheckSettings:
+    """Keys of check.py."""
+
+    dataset: DataSource
+    model: Kinematics | Mapping[str, Any]
+    longest_delay: PositiveFloat
+
+
+@dataclass(kw_only=True)
+class GatherSettings:
+    """Keys of gather.py."""
+
+    runs: Names
+    evaluations: Names | None
+    filter: Mapping[str, Any] | None
+    sort: str
+    plot: str | None
+    plot_column: str | None
+
+
+SETTINGS: dict[str, type] = {
+    "train": TrainSettings,
+    "evaluate": EvaluateSettings,
+    "control": ControlSettings,
+    "check": CheckSettings,
+    "gather": GatherSettings,
+}

@@ -1,35 +1,35 @@
-"""The data that runs are compared on: one truth, and the inputs as each run had them prepared."""
+"""Data that runs are compared on: one truth, with the inputs as each run had them prepared."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.run_folder import Run
-from pinn_dyn.app.settings import flatten
-from pinn_dyn.data import DataSource, LogSource, Splits
+from pinn_dyn.app.run import Run
+from pinn_dyn.app.run_folder import flattened
+from pinn_dyn.data import DataSource, LogSource, Splits, data_changes
 from pinn_dyn.data.logs import common_motions
 from pinn_dyn.mechanics import Trajectory
 
-# Keys of a data set that say how its signals are prepared, and how long the pieces are.
-_SETTINGS = ("u", "input_labels", "interpolation", "shortest")
-_PREPARATION = ("steps", *_SETTINGS, "validation.piece", "test.piece")
+# Keys of a log's data set that prepare its signals, and set the length of the pieces.
+_PREPARATION = ("steps", "u", "input_labels", "interpolation", "shortest")
+_PIECES = ("validation.piece", "test.piece")
 
 
 @dataclass(frozen=True)
 class RunData:
-    """What one run is evaluated on.
+    """Data that one run is evaluated on.
 
     Attributes:
         trained_on: its own data set.
         training: the splits of that.
         source: the data set of the truth, one for all runs.
-        trajectories: the motions of the truth under the inputs as the run knows them.
-        preparation: what is different from the data set of the truth, such as ``with delay``; ""
-            where nothing is.
+        trajectories: the motions of the truth under the inputs that the run knows.
+        preparation: differences from the data set of the truth, such as ``with delay``; "" if
+            there are none.
     """
 
     trained_on: DataSource
@@ -40,30 +40,28 @@ class RunData:
 
 
 def shared_data(runs: Sequence[Run], config: dict[str, Any]) -> list[RunData]:
-    """The data of each run.
+    """Return the data of each run.
 
-    Data sets of the same files, coordinates and splits may differ in how they were prepared. The
-    truth and the times are then those of the highest rate, of the first run among equals.
+    Data sets of the same files, coordinates and splits may differ in their preparation. The truth
+    and the times are then those of the highest rate, of the first run among equals.
 
     Raises:
-        ConfigError: if data sets differ in more than that, or another one is named to test on that
-            does not fit.
+        ConfigError: if data sets differ in more than that, or ``config["dataset"]`` names another
+            one to test on that does not fit.
         ValueError: on data that cannot be used.
     """
-    datasets: list[dict[str, Any]] = []
-    sources: list[DataSource] = []
-    which = []
+    own: list[Run] = []  # a run of each data set
+    indices = []
     for run in runs:
-        dataset = {key: value for key, value in run.config["dataset"].items() if key != "cache"}
-        if dataset not in datasets:
-            source = build_source(run.config)
-            prepared = _PREPARATION if isinstance(source, LogSource) else ()
-            _require_same_motions(run, runs[0], prepared)
-            datasets.append(dataset)
-            sources.append(source)
-        which.append(datasets.index(dataset))
+        k = next((k for k, other in enumerate(own) if _same_data(run, other)), len(own))
+        if k == len(own):
+            if own:
+                _require_same_motions(run, own[0])
+            own.append(run)
+        indices.append(k)
+    sources = [run.source for run in own]
     splits = [source.load() for source in sources]
-    first = min(range(len(sources)), key=lambda k: float(splits[k].train[0].t.diff()[0]))
+    first = min(range(len(own)), key=lambda k: float(splits[k].train[0].t.diff()[0]))
     source = sources[first]
     if config.get("dataset"):
         source = build_source(config)
@@ -74,45 +72,54 @@ def shared_data(runs: Sequence[Run], config: dict[str, Any]) -> list[RunData]:
     else:
         order = [first, *(k for k in range(len(sources)) if k != first)]
         logs = [x for k in order if isinstance(x := sources[k], LogSource)]
-        found = dict(zip(order, common_motions(logs, config["split"]), strict=True))
-        motions = [found[k] for k in range(len(sources))]
+        common = dict(zip(order, common_motions(logs, config["split"]), strict=True))
+        motions = [common[k] for k in range(len(sources))]
     names: list[str] = []
-    for dataset in datasets:
-        name = _differences(dataset, datasets[first])
-        again = sum(other.split(" (")[0] == name for other in names)
-        names.append(f"{name} ({again + 1})" if name and again else name)
-    return [RunData(sources[k], splits[k], source, motions[k], names[k]) for k in which]
+    for run in own:
+        name = _differences(run.config["dataset"], own[first].config["dataset"])
+        count = sum(earlier.split(" (")[0] == name for earlier in names)
+        names.append(f"{name} ({count + 1})" if name and count else name)
+    return [RunData(sources[k], splits[k], source, motions[k], names[k]) for k in indices]
 
 
-def _require_same_motions(run: Run, first: Run, preparation: Sequence[str]) -> None:
+def _same_data(run: Run, other: Run) -> bool:
+    ours, theirs = run.config["dataset"], other.config["dataset"]
+    if not (run.data and other.data):  # runs of earlier versions
+        return ours == theirs
+    same_name = ours["name"] == theirs["name"]
+    same_input = ours.get("interpolation") == theirs.get("interpolation")
+    return same_name and same_input and not data_changes(run.data, other.data)
+
+
+def _require_same_motions(run: Run, first: Run) -> None:
     """Refuse a run whose data differ from those of another by more than their preparation."""
-    here, there = (flatten({**one.config["dataset"], "cache": None}) for one in (run, first))
-    different = [
+    ours, theirs = (flattened(x.config["dataset"]) for x in (run, first))
+    prepared = isinstance(run.source, LogSource) and isinstance(first.source, LogSource)
+    differences = [
         key
-        for key in {**here, **there}
-        if here.get(key) != there.get(key)
-        and not key.startswith(tuple(f"{part}." for part in preparation))
-        and key not in preparation
+        for key in dict.fromkeys([*ours, *theirs])
+        if ours.get(key) != theirs.get(key)
+        and not (prepared and (key.split(".")[0] in _PREPARATION or key in _PIECES))
     ]
-    if different:
-        key = different[0]
-        more = f", and {len(different) - 1} more" if len(different) > 1 else ""
+    if differences:
+        key = differences[0]
         raise ConfigError(
             f"runs: {run.folder} was trained on another data set than {first.folder} "
-            f"(dataset.{key} is {here.get(key, 'absent')}, there {there.get(key, 'absent')}{more})"
-            ": evaluate them separately"
+            f"(dataset.{key} is {ours.get(key, 'absent')}, there {theirs.get(key, 'absent')}): "
+            "evaluate them separately"
         )
 
 
 def _require_alone(source: DataSource, trained_on: Sequence[DataSource]) -> None:
-    """Refuse another data set to test on that has other sizes, or where inputs differ by run."""
+    """Refuse another data set to test on that has other sizes, or if inputs differ by run."""
     if len(trained_on) > 1:
         raise ConfigError(
             "dataset: the inputs of the runs were prepared in different ways, expected one way "
-            "where another data set is named: evaluate them separately"
+            "if another data set is named: evaluate them separately"
         )
-    sizes = [len(source.labels), len(source.input_labels)]
-    expected = [len(trained_on[0].labels), len(trained_on[0].input_labels)]
+    sizes, expected = (
+        (len(item.labels), len(item.input_labels)) for item in (source, trained_on[0])
+    )
     if sizes != expected:
         raise ConfigError(
             f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, the runs "
@@ -120,16 +127,16 @@ def _require_alone(source: DataSource, trained_on: Sequence[DataSource]) -> None
         )
 
 
-def _differences(dataset: dict[str, Any], truth: dict[str, Any]) -> str:
-    """In a few words how a data set is prepared otherwise than that of the truth."""
-    here, there = (
-        {**{k: one.get(k) for k in _SETTINGS}, **(one.get("steps") or {})}
-        for one in (dataset, truth)
+def _differences(dataset: Mapping[str, Any], truth: Mapping[str, Any]) -> str:
+    """Describe in a few words how a data set is prepared differently from that of the truth."""
+    ours, theirs = (
+        {**{k: x.get(k) for k in _PREPARATION[1:]}, **(x.get("steps") or {})}
+        for x in (dataset, truth)
     )
-    words = []
-    for key in {**there, **here}:
-        own, other = here.get(key), there.get(key)
-        if own != other:
-            how = "with" if other is None else "without" if own is None else "other"
-            words.append(f"{how} {key}")
-    return ", ".join(words)
+    texts = []
+    for key in {**theirs, **ours}:
+        before, after = theirs.get(key), ours.get(key)
+        if before != after:
+            word = "with" if before is None else "without" if after is None else "other"
+            texts.append(f"{word} {key}")
+    return ", ".join(texts)

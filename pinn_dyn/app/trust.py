@@ -1,246 +1,165 @@
-"""Configurations of run folders, which may come from anyone: what they may build.
+"""Configurations of run folders, which may come from anyone: the classes that they may build.
 
 A ``_target_`` names code that is called with the keys beside it: ``os.system`` deletes files as
-readily as ``pinn_dyn.models.LagrangianNetwork`` builds a network. So a configuration that is read
-from a run folder is looked through before anything is built, at every depth: it may name the
-classes below, and those of a package that the user trusts by ``trust=my_package``.
+readily as ``pinn_dyn.models.LagrangianNetwork`` builds a network. So the configuration of a run
+folder is searched before anything is built, at every depth. It may name the classes below, and
+those of a package that the user trusts by ``trust=my_package``.
 """
 
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from pinn_dyn.app.keys import places
-from pinn_dyn.app.schema import ConfigError, find
+from pinn_dyn.app.validation import ConfigError, places
 
-# By libyaml where it is there: in a tenth of the time.
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml takes a tenth of the time
 
-_ROOMS = (
-    "control",
-    "data",
-    "data.logs",
-    "evaluation",
-    "mechanics",
-    "models",
-    "systems",
-    "training",
-)
-"""Rooms of this package whose public classes may be built: none writes files or loads code."""
+_PACKAGES = ("control", "data", "data.logs", "evaluation", "mechanics", "models", "systems")
+_PACKAGES += ("training",)
+"""Packages of pinn_dyn whose public classes may be built: none writes files or loads code."""
 
-_CALLBACKS = (
-    "EarlyStopping",
-    "EMAWeightAveraging",
-    "GradientAccumulationScheduler",
-    "LearningRateMonitor",
-    "ModelCheckpoint",
-    "StochasticWeightAveraging",
-    "Timer",
-    "WeightAveraging",
-)
-_LOGGERS = ("CSVLogger", "MLFlowLogger", "TensorBoardLogger")
-_OPTIMIZERS = ("Adadelta", "Adagrad", "Adam", "AdamW", "Adamax", "NAdam", "RAdam", "RMSprop", "SGD")
-_SCHEDULERS = (
-    "ConstantLR",
-    "CosineAnnealingLR",
-    "CosineAnnealingWarmRestarts",
-    "CyclicLR",
-    "ExponentialLR",
-    "LinearLR",
-    "MultiStepLR",
-    "OneCycleLR",
-    "PolynomialLR",
-    "StepLR",
-)
-ALLOWED = frozenset(
-    [
-        "pinn_dyn.training.one_cycle",
-        "pytorch_optimizer.SOAP",
-        "lightning.Trainer",
-        "lightning.pytorch.Trainer",
-        *(f"lightning.pytorch.callbacks.{name}" for name in _CALLBACKS),
-        *(f"lightning.pytorch.loggers.{name}" for name in _LOGGERS),
-        *(f"torch.optim.{name}" for name in _OPTIMIZERS),
-        *(f"torch.optim.lr_scheduler.{name}" for name in _SCHEDULERS),
-    ]
-)
+_CALLBACKS = "EarlyStopping EMAWeightAveraging GradientAccumulationScheduler LearningRateMonitor "
+_CALLBACKS += "ModelCheckpoint StochasticWeightAveraging Timer WeightAveraging"
+_OPTIMIZERS = "Adadelta Adagrad Adam AdamW Adamax NAdam RAdam RMSprop SGD"
+_SCHEDULERS = "ConstantLR CosineAnnealingLR CosineAnnealingWarmRestarts CyclicLR ExponentialLR "
+_SCHEDULERS += "LinearLR MultiStepLR OneCycleLR PolynomialLR StepLR"
+_CLASSES = {
+    "pinn_dyn.training": "one_cycle",
+    "pytorch_optimizer": "SOAP",
+    "lightning": "Trainer",
+    "lightning.pytorch": "Trainer",
+    "lightning.pytorch.callbacks": _CALLBACKS,
+    "lightning.pytorch.loggers": "CSVLogger MLFlowLogger TensorBoardLogger",
+    "torch.optim": _OPTIMIZERS,
+    "torch.optim.lr_scheduler": _SCHEDULERS,
+}
+ALLOWED = {f"{package}.{name}" for package, names in _CLASSES.items() for name in names.split()}
 
-# Arguments that say where something is written or sent to, with the values that our YAMLs have.
-_PLACES: dict[str, tuple[Any, ...]] = {
-    "cache": (),
+# Arguments that say where something is written or sent to, with the values in our own conf/.
+_DESTINATIONS: dict[str, tuple[Any, ...]] = {
+    **dict.fromkeys(("cache", "default_root_dir", "dirpath", "log_dir"), ()),
+    **dict.fromkeys(("plugins", "prefix", "root_dir", "save_dir", "sub_dir"), ()),
     "artifact_location": ("runs/mlflow/artifacts", None),
-    "default_root_dir": (),
-    "dirpath": (),
-    "log_dir": (),
-    "plugins": (),
-    "prefix": (),
-    "profiler": (None,),
-    "root_dir": (),
-    "save_dir": (),
-    "sub_dir": (),
+    "profiler": ("simple", "advanced", None),
     "tracking_uri": ("sqlite:///runs/mlflow/mlflow.db",),
 }
-
-_LONGEST_NAME = 100
-MOST_BYTES = 1_000_000
-MOST_DEPTH = 30
-MOST_NODES = 50_000
-"""A configuration of this program has some hundred values, 10 kB."""
+_FILE_NAMES = ("name", "filename", "version")
 
 
 def packages(trust: str | list[str] | None) -> tuple[str, ...]:
-    """The packages that the user trusts."""
+    """Return the packages that the user trusts."""
     return tuple([trust] if isinstance(trust, str) else trust or ())
 
 
 def read_foreign(path: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The configuration in a file, if all that it names may be built.
-
-    What says where a cache is written is left out.
+    """Read the configuration of a run folder, without the folder of its cache.
 
     Raises:
-        ConfigError: if it cannot be read, is too large, or names what may not be built.
+        ConfigError: if it cannot be read, or as :func:`require_trusted`.
     """
     config = read_yaml(path)
-    dataset = config.get("dataset")
-    if isinstance(dataset, dict):
+    if isinstance(dataset := config.get("dataset"), dict):
         dataset.pop("cache", None)
-    for where, value in places(config):
-        if isinstance(value, dict):
-            _check_mapping(path, where, value, trust)
-        elif isinstance(value, str) and "${" in value:
-            raise ConfigError(
-                f"{where} is {value[:80]!r}, an expression: the configuration in a run folder has "
-                "values only"
-            )
-    if isinstance(dataset, dict):
-        check_name(f"{path}: dataset.name", dataset.get("name"))
-        for name in dataset.get("configurations") or ():
-            check_name(f"{path}: dataset.configurations", name)
-    if "model_name" in config:
-        check_name(f"{path}: model_name", config["model_name"])
+    require_trusted(config, str(path), trust)
     return config
 
 
+def require_trusted(config: dict[str, Any], source: str, trust: tuple[str, ...] = ()) -> None:
+    """Refuse a configuration that names code other than the allowed classes.
+
+    Args:
+        config: plain values.
+        source: file of the configuration, for messages.
+        trust: packages whose classes are allowed too.
+
+    Raises:
+        ConfigError: naming the key.
+    """
+    for path, value in places(config):
+        if isinstance(value, dict):
+            _require_trusted_mapping(f"{source}: {path or 'the configuration'}", value, trust)
+        elif isinstance(value, str) and "${" in value:
+            raise ConfigError(f"{source}: {path} is the expression {value!r}, expected a value")
+    check_name(f"{source}: model_name", config.get("model_name", "model"))
+    for name in (config.get("dataset") or {}).get("configurations") or ():
+        check_name(f"{source}: dataset.configurations", name)
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A mapping from a YAML file of bounded size, also after its aliases are written out.
+    """Read a mapping from a YAML file, without tags that name Python objects.
 
     Raises:
         ConfigError: naming the file, if it cannot be read.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ConfigError(
-                f"{path} has {path.stat().st_size} bytes, expected a configuration of at most "
-                f"{MOST_BYTES}"
-            )
-        text = path.read_text(encoding="utf-8")
-        _check_depth(path, text)
-        values = yaml.load(text, _Loader)
-        count = _size(values, {})
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path} cannot be read, it may be damaged: {said}") from error
-    if count > MOST_NODES:
-        raise ConfigError(
-            f"{path} has more than {MOST_NODES} values once its aliases are written out, expected "
-            "a configuration that train.py wrote"
-        )
-    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path} cannot be read, it may be damaged: {error}") from error
+    if not isinstance(values, dict):
         raise ConfigError(f"{path} holds no configuration: expected a mapping of names to values")
     return values
 
 
-def _check_depth(path: Path, text: str) -> None:
-    """Refuse mappings in mappings in mappings without end, which take the parser for ever."""
-    depth = 0
-    for event in yaml.parse(text, Loader=_Loader):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > MOST_DEPTH:
-            raise ConfigError(
-                f"{path} has values more than {MOST_DEPTH} levels deep, expected a configuration "
-                "that train.py wrote"
-            )
-
-
-def _size(value: Any, known: dict[int, int]) -> int:
-    """Values in nested lists and mappings; one that stands in several places counts each time."""
-    if not isinstance(value, (dict, list)):
-        return 1
-    if id(value) not in known:
-        known[id(value)] = MOST_NODES + 1  # of one that holds itself
-        items = value.values() if isinstance(value, dict) else value
-        known[id(value)] = 1 + sum(_size(item, known) for item in items)
-    return known[id(value)]
-
-
-def _check_mapping(path: Path, where: str, part: dict[Any, Any], trust: tuple[str, ...]) -> None:
-    place = f"{path}: {where or 'the configuration'}"
+def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, ...]) -> None:
     for key in part:
-        if not isinstance(key, str) or (key[:1] == "_" and key not in ("_target_", "_partial_")):
-            raise ConfigError(f"{place} has the key {key!r}, which no configuration of a run has")
-        if "${" in key:
-            raise ConfigError(f"{place} has the key {key[:80]!r}, an expression")
-    if not isinstance(part.get("_partial_", True), bool):
-        raise ConfigError(f"{place}: _partial_ is {part['_partial_']!r}, expected true or false")
+        special = not isinstance(key, str) or key.startswith("_") or "${" in key
+        if special and key not in ("_target_", "_partial_"):
+            raise ConfigError(f"{path} has the key {key!r}, which no configuration of a run has")
     if "_target_" not in part:
         return
-    if not may_build(part["_target_"], trust):
+    target = part["_target_"]
+    if not may_build(target, trust):
         raise ConfigError(
-            f"{place}._target_ is {str(part['_target_'])[:80]!r}. What a configuration names is "
-            "run, so one from a run folder may name the classes of pinn_dyn and a few others only. "
-            "If this is a class of your own and you trust whoever wrote the folder, add "
-            f"trust={str(part['_target_']).split('.')[0][:40]} to the command (SECURITY.md)"
+            f"{path}._target_ is {target!r}. A configuration from a run folder may name the "
+            "classes of pinn_dyn and a few others only, because their code is run. If this is your "
+            "own class and you trust the author of the folder, add "
+            f"trust={str(target).split('.')[0]} to the command (SECURITY.md)"
         )
-    for key in _PLACES.keys() & part.keys():
-        if part[key] not in _PLACES[key] and not _trusted(part["_target_"], trust):
+    if _is_trusted(target, trust):
+        return
+    for key, allowed in _DESTINATIONS.items():
+        if key in part and part[key] not in allowed:
             raise ConfigError(
-                f"{place}.{key} is {str(part[key])[:80]!r}: a configuration from a run folder does "
-                f"not choose where something is written. If you trust it, add "
-                f"trust={part['_target_']} to the command (SECURITY.md)"
+                f"{path}.{key} is {part[key]!r}: a configuration from a run folder does not choose "
+                f"where something is written. If you trust it, add trust={target} to the command"
             )
+    for key in _FILE_NAMES:
+        if part.get(key) is not None:
+            check_name(f"{path}.{key}", part[key])
 
 
 def may_build(target: Any, trust: tuple[str, ...]) -> bool:
-    """Whether a configuration from a run folder may name this."""
+    """Return whether a configuration from a run folder may name a class."""
     if not isinstance(target, str):
         return False
-    if target in ALLOWED:
-        return True
     package, _, name = target.rpartition(".")
-    if package.removeprefix("pinn_dyn.") in _ROOMS and package.startswith("pinn_dyn."):
-        room = importlib.import_module(package)
-        found = getattr(room, name, None) if name in room.__all__ else None
-        return isinstance(found, type) and found.__module__.startswith("pinn_dyn.")
-    return _trusted(target, trust)
+    if package.startswith("pinn_dyn.") and package.removeprefix("pinn_dyn.") in _PACKAGES:
+        module = importlib.import_module(package)
+        value = getattr(module, name, None) if name in module.__all__ else None
+        if isinstance(value, type) and value.__module__.startswith("pinn_dyn."):
+            return True
+    return target in ALLOWED or _is_trusted(target, trust)
 
 
-def _trusted(target: str, trust: tuple[str, ...]) -> bool:
-    """Whether a name is in a trusted package, and what it names is defined there."""
+def _is_trusted(target: str, trust: tuple[str, ...]) -> bool:
+    """Return whether a class is defined in a trusted package, not only imported there."""
     for package in trust:
         if target == package or target.startswith(f"{package}."):
-            # Not a module's way out, as my_package.os.system.
-            home = getattr(find(target), "__module__", None) or ""
-            return home == package or f"{home}.".startswith(f"{package}.") or target == package
+            home = getattr(pkgutil.resolve_name(target), "__module__", None) or ""
+            return target == package or f"{home}.".startswith(f"{package}.")
     return False
 
 
-def check_name(where: str, name: Any) -> None:
-    """Refuse what would lead out of a folder: files are named by it.
+def check_name(path: str, name: Any) -> None:
+    """Refuse a name that would lead out of a folder: files are named by it.
 
     Raises:
-        ConfigError: saying where the name stands.
+        ConfigError: naming the key.
     """
-    unusable = not isinstance(name, str) or len(name) > _LONGEST_NAME or set(name) & set("/\\\0\n")
-    if unusable or name in ("", ".", ".."):
-        raise ConfigError(
-            f"{where} is {str(name)[:80]!r}, expected a name without separators of at most "
-            f"{_LONGEST_NAME} letters, as files are named by it"
-        )
+    if not isinstance(name, str) or set(name) & set("/\\\0\n") or name in ("", ".", ".."):
+        raise ConfigError(f"{path} is {name!r}, expected a name of a file, without separators")

@@ -1,8 +1,8 @@
 """Data: excitation signals, simulated data sets, logs, windows and the LightningDataModule."""
 
-from pinn_dyn.data.changes import fingerprint_changes, moments, same_moments
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
+from pinn_dyn.data.identity import data_changes, data_identity
 from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.logs import Cleaned, LogError, LogSource
 from pinn_dyn.data.robot import RobotSource
@@ -40,10 +40,9 @@ __all__ = [
     "TorqueMultiSine",
     "TrackedMultiSine",
     "Windows",
+    "data_changes",
+    "data_identity",
     "draw_windows",
-    "fingerprint_changes",
-    "moments",
-    "same_moments",
     "simulate",
     "store",
 ]

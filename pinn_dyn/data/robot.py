@@ -125,7 +125,7 @@ class RobotSource(DataSource):
         self.input_labels = [f"τ{i + 1} [Nm]" for i in range(size)]
 
     def load(self) -> Splits:
-        arrays = load_or_make(self.cache, self.name, self.fingerprint(), self.simulate)
+        arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
         t = torch.from_numpy(arrays["t"][:-1])
         splits: dict[str, list[Trajectory]] = {}
         for split in SPLITS:
@@ -137,8 +137,8 @@ class RobotSource(DataSource):
             ]
         return Splits(**splits)
 
-    def fingerprint(self) -> dict[str, object]:
-        """What the trajectories depend on, code included: the key of the cache."""
+    def describe(self) -> dict[str, object]:
+        """Return the settings that the trajectories depend on: the key of the cache."""
         return {
             "version": _VERSION,
             "robot": describe(self.robot),

@@ -194,7 +194,7 @@ class SimulatedSource(DataSource):
         return Splits(**splits)
 
     def describe(self) -> dict[str, object]:
-        """What the simulation depends on, the code of the system included: the key of the cache."""
+        """Return the settings that the simulation depends on: the key of the cache."""
         parts = {
             key: describe(getattr(self, key)) for key in ("system", "excitation", "initial_states")
         }
@@ -212,11 +212,6 @@ class SimulatedSource(DataSource):
             "rtol": self.rtol,
             "atol": self.atol,
         }
-
-    def fingerprint(self) -> dict[str, object]:
-        """What the trajectories depend on; the key of the cache where every sample is kept."""
-        kept = {} if self.keep_every == 1 else {"keep_every": self.keep_every}
-        return {**self.describe(), **kept}
 
     def simulate(self) -> Arrays:
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""

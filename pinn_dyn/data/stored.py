@@ -1,8 +1,7 @@
-"""Trajectories in a file: what a data source that Python made leaves in its run folder."""
+"""Trajectories in a file: the data of a run whose source was made in Python."""
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,20 +14,18 @@ from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.data.whole import whole
 from pinn_dyn.mechanics import Signal, Trajectory
 
-_FINGERPRINT = "fingerprint"
-
 
 class StoredSource(DataSource):
-    """The trajectories of another data source, from a file that :func:`store` wrote.
+    """Trajectories that another data source left in a file, see :func:`store`.
 
-    They have no momenta and no true system, as a file holds no code.
+    They have no momenta and no true system, since a file holds no code.
 
     Args:
-        path: the file.
-        name, labels, input_labels, angles: as of the other source.
+        path: the file, as written by :func:`store`.
+        name, labels, input_labels, angles: as in the other source.
 
     Raises:
-        ValueError: if there is no such file, or it does not hold what :func:`store` writes.
+        ValueError: if the file is missing or damaged, when it is read.
     """
 
     def __init__(
@@ -44,49 +41,33 @@ class StoredSource(DataSource):
         self.labels = list(labels)
         self.input_labels = list(input_labels)
         self.angles = tuple(angles)
-        if not self.path.is_file():
-            raise ValueError(
-                f"{name}: {self.path} does not exist, expected the trajectories that the run was "
-                "trained on: if its folder was moved, mend dataset.path in its config.yaml"
-            )
 
     def load(self) -> Splits:
         arrays = self._read()
-        try:
-            splits = {split: _unpacked(split, arrays) for split in SPLITS}
-        except (KeyError, IndexError) as error:
-            raise ValueError(f"{self.path} lacks {error}: it may be damaged") from error
-        return Splits(**splits)
+        return Splits(**{split: _unpack(split, arrays) for split in SPLITS})
 
-    def fingerprint(self) -> dict[str, object]:
-        """That of the other source."""
-        text = str(self._read()[_FINGERPRINT])
-        found: dict[str, object] = json.loads(text)
-        return found
+    def names(self) -> dict[str, list[str]]:
+        arrays = self._read()
+        return {split: arrays[f"{split}_names"].tolist() for split in SPLITS}
 
     def _read(self) -> dict[str, np.ndarray]:
         try:
             with np.load(self.path, allow_pickle=False) as file:
                 return dict(file)
         except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{self.path} cannot be read, it may be damaged: {error}") from error
+            raise ValueError(
+                f"{self.path}, the data that the run was trained on, cannot be read: {error}"
+            ) from error
 
 
-def store(source: DataSource, path: Path) -> dict[str, Any]:
-    """Write the trajectories of a source; returns the configuration that reads them.
-
-    Args:
-        source: any data source.
-        path: the file, in a folder that exists.
-
-    Raises:
-        OSError: where it cannot be written.
-    """
-    arrays: dict[str, Any] = {_FINGERPRINT: json.dumps(source.fingerprint())}
-    splits = source.load()
+def store(source: DataSource, path: Path) -> None:
+    """Write the trajectories of a source to a file."""
+    arrays: dict[str, Any] = {}
+    splits, names = source.load(), source.names()
     for split in SPLITS:
         trajectories: list[Trajectory] = getattr(splits, split)
         arrays[split] = [item.input.interpolation for item in trajectories]
+        arrays[f"{split}_names"] = names[split]
         for k, item in enumerate(trajectories):
             values = {"t": item.t, "q": item.q, "v": item.v, "u": item.u, "past": item.past}
             for key, value in values.items():
@@ -94,22 +75,14 @@ def store(source: DataSource, path: Path) -> dict[str, Any]:
                     arrays[f"{split}_{k}_{key}"] = value.numpy()
     with whole(path) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)
-    return {
-        "_target_": "pinn_dyn.data.StoredSource",
-        "path": str(path),
-        "name": source.name,
-        "labels": list(source.labels),
-        "input_labels": list(source.input_labels),
-        "angles": list(source.angles),
-    }
 
 
-def _unpacked(split: str, arrays: dict[str, np.ndarray]) -> list[Trajectory]:
-    made = []
+def _unpack(split: str, arrays: dict[str, np.ndarray]) -> list[Trajectory]:
+    trajectories = []
     for k, interpolation in enumerate(arrays[split].tolist()):
         q, v, u, t = (torch.from_numpy(arrays[f"{split}_{k}_{key}"]) for key in "qvut")
         past = arrays.get(f"{split}_{k}_past")
-        made.append(
+        trajectories.append(
             Trajectory(
                 q,
                 v,
@@ -117,4 +90,4 @@ def _unpacked(split: str, arrays: dict[str, np.ndarray]) -> list[Trajectory]:
                 past=None if past is None else torch.from_numpy(past),
             )
         )
-    return made
+    return trajectories

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Sampler
 
-from pinn_dyn.data import DynamicsData
+from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows
 from pinn_dyn.mechanics import Trajectory
 
@@ -26,6 +26,11 @@ class EnsembleData(L.LightningDataModule):
         super().__init__()
         self.data = data
         self.members = members
+
+    @property
+    def source(self) -> DataSource:
+        """The source of the trajectories."""
+        return self.data.source
 
     @property
     def windows(self) -> Windows:

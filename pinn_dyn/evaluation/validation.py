@@ -59,7 +59,7 @@ class RolloutValidator:
     def __init__(
         self,
         *,
-        horizon: PositiveFloat,
+        horizon: PositiveFloat = 2.0,
         step: PositiveFloat | None = None,
         training_step: PositiveFloat,
         window: PositiveFloat | None = None,
@@ -210,28 +210,10 @@ class RolloutFigures(L.Callback):
     Args:
         every_n_validations: number of validations between two drawings; the end of the training
             is always drawn.
-        validator: validator that makes the rollouts.
-        labels, input_labels: names and units of coordinates and inputs.
-        system: the true system, for its terms; None for measured data.
-        configurations: named configurations at which terms are compared, each ``(N,)``.
     """
 
-    def __init__(
-        self,
-        *,
-        every_n_validations: PositiveInt,
-        validator: RolloutValidator,
-        labels: list[str],
-        input_labels: list[str],
-        system: MechanicalSystem | None,
-        configurations: dict[str, list[float]],
-    ):
+    def __init__(self, *, every_n_validations: PositiveInt = 4):
         self.every_n_validations = every_n_validations
-        self.validator = validator
-        self.labels = labels
-        self.input_labels = input_labels
-        self.system = system
-        self.configurations = configurations
         self._validations = 0
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -248,24 +230,25 @@ class RolloutFigures(L.Callback):
     def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         datamodule = trainer.datamodule  # type: ignore[attr-defined]
         (truth,) = list(datamodule.val_dataloader())
-        model = pl_module.model
+        model, validator, source = pl_module.model, pl_module.validator, datamodule.source
         assert isinstance(model, Predictor)
-        predictions = {type(model).__name__: self.validator.predict(model, truth)}
+        assert isinstance(validator, RolloutValidator)
+        predictions = {type(model).__name__: validator.predict(model, truth)}
         figures: dict[str, Figure] = {
             "rollout/trajectory": trajectory_figure(
-                truth.until(self.validator.horizon),
+                truth.until(validator.horizon),
                 predictions,
                 trajectory=0,
-                title=f"Validation trajectory 0, {self.validator}",
-                labels=self.labels,
-                input_labels=self.input_labels,
+                title=f"Validation trajectory 0, {validator}",
+                labels=source.labels,
+                input_labels=source.input_labels,
             ),
-            "rollout/error": error_figure(predictions, title=f"Validation error, {self.validator}"),
+            "rollout/error": error_figure(predictions, title=f"Validation error, {validator}"),
         }
-        if self.system is not None and isinstance(model, MechanicalSystem) and self.configurations:
-            names = list(self.configurations)
-            q = torch.tensor([*self.configurations.values()], dtype=torch.float64)
-            comparison = compare_terms(model, self.system, q, names=names)
+        names = list(source.configurations)
+        if source.system is not None and isinstance(model, MechanicalSystem) and names:
+            q = torch.tensor([*source.configurations.values()], dtype=torch.float64)
+            comparison = compare_terms(model, source.system, q, names=names)
             for k, name in enumerate(names):
                 title = f"Learned and true terms at {name}"
                 figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)

@@ -36,7 +36,7 @@ class NextStateMLP(Predictor):
     def __init__(
         self,
         statistics: Statistics,
-        hidden: Sequence[PositiveInt],
+        hidden: Sequence[PositiveInt] = (128, 128, 128, 128, 128),
         activation: Activation = "softplus",
         angles: Sequence[NonNegativeInt] = (),
     ):
@@ -96,7 +96,7 @@ class AccelerationMLP(DelayedPredictor):
     def __init__(
         self,
         statistics: Statistics,
-        hidden: Sequence[PositiveInt],
+        hidden: Sequence[PositiveInt] = (128, 128, 128),
         activation: Activation = "softplus",
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,

@@ -15,6 +15,10 @@ from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.residual import NoResidual
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
+    DAMPING,
+    INPUT,
+    MASS,
+    POTENTIAL,
     CholeskyHead,
     FrictionHead,
     InputHead,
@@ -58,10 +62,10 @@ class HamiltonianNetwork(StructuredNetwork):
     def __init__(
         self,
         statistics: Statistics,
-        inverse_mass: CholeskyHead,
-        potential: PotentialHead,
-        damping: CholeskyHead,
-        input: InputHead,
+        inverse_mass: CholeskyHead = MASS,
+        potential: PotentialHead = POTENTIAL,
+        damping: CholeskyHead = DAMPING,
+        input: InputHead = INPUT,
         friction: FrictionHead = NoFriction,
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,

@@ -17,6 +17,10 @@ from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.residual import NoResidual, ResidualHead
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import (
+    DAMPING,
+    INPUT,
+    MASS,
+    POTENTIAL,
     CholeskyHead,
     FrictionHead,
     InputHead,
@@ -53,10 +57,10 @@ class LagrangianNetwork(StructuredNetwork):
     def __init__(
         self,
         statistics: Statistics,
-        mass: CholeskyHead,
-        potential: PotentialHead,
-        damping: CholeskyHead,
-        input: InputHead,
+        mass: CholeskyHead = MASS,
+        potential: PotentialHead = POTENTIAL,
+        damping: CholeskyHead = DAMPING,
+        input: InputHead = INPUT,
         friction: FrictionHead = NoFriction,
         residual: ResidualHead = NoResidual,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
-from pinn_dyn.models.cholesky import CholeskyFactor
+from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky
 from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
 from pinn_dyn.models.friction import Friction
-from pinn_dyn.models.input_matrix import InputMatrix
-from pinn_dyn.models.potential import Potential
+from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput
+from pinn_dyn.models.positivity import Positive
+from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
@@ -24,6 +26,13 @@ InputHead = Callable[[Scales], InputMatrix]
 """Builds an input head; the value of its scales is that of the columns of A."""
 FrictionHead = Callable[[Scales], Friction]
 """Builds a friction head; the value of its scales is a force."""
+
+
+MASS = partial(NetworkCholesky, hidden=(32, 32, 32))
+POTENTIAL = partial(NetworkPotential, hidden=(32, 32))
+DAMPING = partial(NetworkCholesky, hidden=(16, 16), positivity=Positive(floor=0.0))
+INPUT = partial(NetworkInput, hidden=(16, 16))
+"""Default heads, those of the options named ``network`` in conf/model."""
 
 
 class StructuredNetwork(DelayedPredictor, MechanicalSystem):

@@ -4,7 +4,6 @@ import contextlib
 import json
 import logging
 import os
-import re
 import runpy
 import sys
 from pathlib import Path
@@ -76,25 +75,15 @@ def own_logging():
 def run_script(script, *arguments, checked=False):
     """Run an entry script in this process, as ``python <script> <arguments>`` would.
 
-    A configuration is composed three times: for its keys, for a mode that ours leave to -m, and to
+    A configuration is composed three times: to be checked, for a mode that ours leave to -m, and to
     be used. Unless checked, only the last is done: a composition takes as long as a tiny training.
-    Keys then get their ``++`` whether they stand in a YAML or not.
     """
     with pytest.MonkeyPatch.context() as patch, own_logging():
         patch.setattr(sys, "argv", [script, *arguments])
         if not checked:
-            patch.setattr("pinn_dyn.app.command.completed", lambda _, words: [*map(added, words)])
+            patch.setattr("pinn_dyn.app.command.composed", lambda *_: None)
             patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
         runpy.run_path(str(ROOT / script), run_name="__main__")
-
-
-def added(word):
-    """An override that adds its key where it is not there."""
-    key = word.split("=")[0]
-    dotted = re.fullmatch(r"(?!hydra\.)\w+\.[\w.]+", key)
-    return (
-        f"++{word}" if dotted or key in ("start_from", "resume", "resume_from", "trust") else word
-    )
 
 
 def train(folder, *arguments):

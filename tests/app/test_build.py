@@ -2,8 +2,8 @@
 
 import pytest
 
-from pinn_dyn.app import build, parts
-from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app import build
+from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 
 
@@ -57,14 +57,13 @@ def test_true_without_a_compiler_says_what_to_install(compiler):
         build.compiles(config(True))
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_an_option_of_another_class_says_how_to_remove_it(nested):
-    config = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "scales": None}
-    key = "hidden"
-    if nested:
-        head = {**config, "_partial_": True}
-        config = {"_target_": "pinn_dyn.models.LagrangianNetwork", "initial_velocity": head}
-        key = "initial_velocity.hidden"
-    says = rf"part.*: MeasuredVelocity takes no 'hidden'.*remove it by '~part\.{key}'"
-    with pytest.raises(ConfigError, match=says):
-        parts.build_part("part", config)
+def test_arguments_of_a_part_and_of_the_parts_in_it_are_checked():
+    head = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "_partial_": True}
+    model = {"_target_": "pinn_dyn.models.LagrangianNetwork", "initial_velocity": head}
+    with pytest.raises(ConfigError, match=r"no key 'part\.initial_velocity\.hidden'"):
+        build_part("part", model)
+
+
+def test_a_missing_argument_is_named_with_its_part():
+    with pytest.raises(ConfigError, match=r"part: .*'amplitude'"):
+        build_part("part", {"_target_": "pinn_dyn.data.Chirp", "offset": [0.0]})

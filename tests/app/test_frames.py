@@ -4,10 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import yaml
 
 from examples.cleaning_steps import PolynomialFit, SubtractStart
-from pinn_dyn.app.frame import frame_dataset
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample, SplitGaps
@@ -24,59 +22,6 @@ def motion(runs, rate=50, seconds=4.0, start=0.0):
             pd.DataFrame({"run": f"r{k}", "t": t + start, "x": q, "f": np.cos(t * (k + 1))})
         )
     return pd.concat(tables, ignore_index=True)
-
-
-def dataset(folder, frame, run="run", seed=0):
-    """The data set that fit writes for a frame, and the settings that go with it."""
-    signals = {"time": "t", "q": {"columns": "x", "unit": "mm"}, "u": "f"}
-    words = frame_dataset(frame, signals, run, seed, folder)
-    settings = {key: float(value) for key, value in (w.split("=") for w in words[3:])}
-    values = yaml.safe_load((folder / "dataset" / "frame.yaml").read_text())
-    assert values.pop("defaults") == ["csv_log", "_self_"]
-    return LogSource(**values), settings
-
-
-@pytest.mark.parametrize("runs", [1, 3, 5, 12])
-def test_a_split_leaves_training_and_keeps_tests_apart(tmp_path, runs):
-    source, settings = dataset(tmp_path, motion(runs))
-    splits = source.load()
-    assert min(map(len, (splits.train, splits.validation, splits.test))) >= 1
-    parts = source.fingerprint()["splits"]
-    if runs >= 5:  # whole runs
-        names = {key: {place.split()[0] for place in places} for key, places in parts.items()}
-        assert not names["train"] & (names["test"] | names["validation"])
-        assert sum(map(len, names.values())) == runs
-        assert splits.test[0].duration == pytest.approx(4.0)
-    else:
-        assert splits.test[0].duration == pytest.approx(0.6)
-        assert sum(item.duration for item in splits.train) < runs * (4 - 1.2)
-    horizon = settings["validator.horizon"]
-    assert horizon <= splits.validation[0].duration + 1e-9
-    span = settings["data.steps"] * settings["data.stride"]
-    starts = sum(max(len(item.t) - span, 0) for item in splits.train)
-    assert 0.9 * starts <= settings["data.pairs"] <= starts
-    assert settings["data.batch_size"] <= settings["data.pairs"]
-
-
-def test_windows_last_as_long_at_any_rate(tmp_path):
-    for rate, stride in ((50, 1), (25, 1), (1000, 20)):
-        _, settings = dataset(tmp_path / str(rate), motion(5, rate=rate, seconds=2.0))
-        assert settings["data.stride"] == stride
-    assert settings["data.batch_size"] == 128
-
-
-def test_a_long_log_is_cut_into_pieces_and_short_runs_are_trained_on(tmp_path):
-    frame = pd.concat([motion(5, seconds=12.0), motion(2, seconds=1.0).assign(run="short")])
-    frame = frame[~((frame.run == "short") & frame.duplicated(["run", "t"]))]
-    source, _ = dataset(tmp_path, frame)
-    splits = source.load()
-    assert {item.duration for item in splits.test} == {5.0}
-    assert "short" not in source.test.names + source.validation.names
-
-
-def test_another_seed_draws_other_runs(tmp_path):
-    drawn = {tuple(dataset(tmp_path / str(k), motion(12), seed=k)[0].test.names) for k in range(4)}
-    assert len(drawn) > 1
 
 
 def log(**changes):

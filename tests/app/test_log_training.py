@@ -3,13 +3,16 @@
 import json
 import runpy
 import shutil
+from functools import partial
 
 import pandas as pd
 import pytest
 import torch
 from matplotlib.image import imread
 
-from pinn_dyn import fit
+import pinn_dyn
+from pinn_dyn.data import DynamicsData
+from pinn_dyn.evaluation import RolloutValidator
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -87,7 +90,7 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
 
 
 def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
-    monkeypatch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     run_script(
         "train.py",
         *TINY,
@@ -179,12 +182,15 @@ def test_a_bag_and_the_same_data_as_csv_give_the_same_weights(tmp_path):
     table = motion(6.0)
     formats.write_bag(tmp_path / "run", table)
     write(tmp_path, table)
-    small = ["data=multi_step", "data.pairs=64", "data.steps=2", "data.batch_size=32"]
-    small += ["validator.horizon=0.1", "trainer.validations=1", "compile=false"]
+    small = dict(
+        data=partial(DynamicsData, pairs=64, steps=2, stride=1, batch_size=32),
+        validator=partial(RolloutValidator, horizon=0.1),
+        steps=3,
+    )
     weights = []
     for log in (source(tmp_path, files="run", **formats.BAG), source(tmp_path)):
-        weights.append(fit(log, model="lnn", steps=3, overrides=small).model.state_dict())
+        weights.append(pinn_dyn.train(log, "lnn", **small).model.state_dict())
     for name, value in weights[0].items():
         torch.testing.assert_close(value, weights[1][name], rtol=1e-5, atol=1e-7)
-    moved = fit(log, model="lnn", steps=3, seed=1, overrides=small).model.state_dict()
+    moved = pinn_dyn.train(log, "lnn", seed=1, **small).model.state_dict()
     assert any(not torch.allclose(value, moved[name]) for name, value in weights[0].items())

@@ -27,7 +27,7 @@ def test_a_terminal_has_a_bar_instead(tmp_path, capsys, monkeypatch):
 
 
 def test_epochs_between_validations_have_lines_too(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pinn_dyn.app.build.LONGEST_EPOCH", 1)
+    monkeypatch.setattr("pinn_dyn.app.trainer.LONGEST_EPOCH", 1)
     train(tmp_path / "run", "model=lnn", "trainer.steps=2", NO_FIGURES)
     lines = re.findall(r"epoch \d of 2, step \d: (.*)", capsys.readouterr().out)
     assert ["validation" in line for line in lines] == [False, True]

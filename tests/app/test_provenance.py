@@ -1,24 +1,15 @@
-"""Where the reports of evaluate.py and control.py say that their numbers come from."""
+"""Origin of the numbers in the reports of evaluate.py and control.py."""
 
-from pinn_dyn.app.build import build_source
+import pinn_dyn
 from pinn_dyn.app.provenance import data_hash, provenance
-from pinn_dyn.app.run_folder import read_config
-from pinn_dyn.app.words import command_line
+from tests.app.entry import TINY_DATA
 
 
-def test_the_hash_of_a_simulation_is_that_of_its_cache_file(hnn_run, cache):
-    config = read_config(hnn_run)
-    key = data_hash(build_source(config)).split()[0]
-    assert (cache / f"soft_arm_1-{key}.npz").is_file()
-    config["dataset"]["seed"] = 1
-    assert data_hash(build_source(config)).split()[0] != key
-
-
-def test_the_command_line_can_be_pasted_into_a_shell(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["/somewhere/evaluate.py", "runs=[a b,c]", "horizon=5"])
-    assert command_line() == "python evaluate.py 'runs=[a b,c]' horizon=5"
-    monkeypatch.setattr("sys.argv", ["/venv/bin/pinn-dyn-evaluate", "runs=[a]"])
-    assert command_line() == "pinn-dyn-evaluate 'runs=[a]'"
+def test_the_hash_of_data_depends_on_their_numbers_alone():
+    settings = dict(word[8:].split("=") for word in TINY_DATA)
+    first, again = (data_hash(pinn_dyn.dataset("soft_arm_1", **settings)) for _ in range(2))
+    other = data_hash(pinn_dyn.dataset("soft_arm_1", **settings, seed=1))
+    assert first == again != other
 
 
 def test_uncommitted_changes_are_reported(monkeypatch):

@@ -4,10 +4,9 @@ import pandas as pd
 import pytest
 import yaml
 
-from pinn_dyn.app.config import composed
-from pinn_dyn.app.parts import build_part
-from pinn_dyn.app.schema import ConfigError
+from pinn_dyn.app.config import build_part, composed
 from pinn_dyn.app.search import EqualSearch
+from pinn_dyn.app.validation import ConfigError
 from tests.app.entry import NO_FIGURES, TINY, run_script
 
 RANGES = {

@@ -5,8 +5,8 @@ import yaml
 
 from pinn_dyn.app import trust
 from pinn_dyn.app.config import CONF, ConfigError
-from pinn_dyn.app.keys import places
 from pinn_dyn.app.run_folder import load_run
+from pinn_dyn.app.validation import places
 from tests.app.entry import run_script
 from tests.support.foreign_runs import foreign
 

@@ -2,7 +2,6 @@
 
 import gzip
 import io
-import json
 import os
 import zipfile
 
@@ -225,12 +224,6 @@ def test_files_that_are_no_names(tmp_path, given):
 def test_a_conversion_that_is_no_number(tmp_path, key, value):
     with pytest.raises(ValueError, match=rf"q: {key} is .*expected"):
         source(tmp_path, q=dict(columns=["q1", "q2"], unit="rad", **{key: value}))
-
-
-def test_a_bag_with_a_folder_in_it_has_a_fingerprint(tmp_path):
-    formats.write_bag(tmp_path / "run", TABLE)
-    (tmp_path / "run" / "notes").mkdir()
-    assert json.dumps(source(tmp_path, files="run", **formats.BAG).fingerprint())
 
 
 def test_pipes_and_devices_are_no_logs(tmp_path):

@@ -1,59 +1,68 @@
-"""Records beside a run, damaged or made up: read by gather.py, by evaluate.py and by a resume."""
+"""Files of a run that are damaged or of another run."""
 
-import json
 import shutil
 
 import pytest
+import torch
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run_folder import load_run, read_metrics
-from tests.app.entry import run_script
+from tests.app.entry import NO_FIGURES, TINY, refused_text, train
 
 RECORDS = {
     "empty": "",
     "cut": '{"seed": 0, "valid',
     "a list": "[1, 2]",
-    "a number": "7",
     "null": "null",
-    "deep": "[" * 100_000,
     "binary": "\ud800\x00",
     "a list of errors": '{"validation": [1]}',
-    "errors in words": '{"validation": {"val/error_mean": "small"}}',
-    "pairs in words": '{"pairs": "many", "validation": {}}',
-    "time in words": '{"training_seconds": "long", "validation": {}}',
-    "pairs of true": '{"pairs": true, "validation": {}}',
-    "endless digits": '{"pairs": ' + "9" * 5000 + "}",
-    "steps of null": '{"steps": null, "validation": {}}',
 }
 
 
 @pytest.fixture
 def run(tmp_path, lnn_run):
-    shutil.copytree(lnn_run, tmp_path / "run")
-    return tmp_path / "run"
+    return shutil.copytree(lnn_run, tmp_path / "run")
 
 
 @pytest.mark.parametrize("text", RECORDS.values(), ids=RECORDS)
-def test_a_record_that_is_none_is_named(run, text):
+def test_a_damaged_record_is_named_and_not_needed(run, text):
     (run / "metrics.json").write_bytes(text.encode("utf-8", "surrogatepass"))
-    for read in (read_metrics, lambda folder: load_run(folder, "best")):
-        with pytest.raises(ConfigError, match=r"cannot be read|holds no record") as caught:
-            read(run)
-        assert str(run / "metrics.json") in str(caught.value)
+    with pytest.raises(ConfigError, match=r"metrics.json cannot be read"):
+        read_metrics(run)
+    assert load_run(run).metrics["seed"] == 0
 
 
-def test_a_folder_of_damaged_and_whole_runs_is_gathered(tmp_path, run, capsys):
-    for name, file, content in [
-        ("a", "config.yaml", "a: &a [*a]"),
-        ("b", "config.yaml", "seed: [1"),
-        ("c", "metrics.json", "[]"),
-        ("d", "config.yaml", json.dumps({"trainer": {}, "seed": "x"})),
-        ("e", "metrics.json", ""),
-    ]:
-        shutil.copytree(run, tmp_path / "runs" / name)
-        (tmp_path / "runs" / name / file).write_text(content)
-    shutil.copytree(run, tmp_path / "runs" / "whole")
-    run_script("gather.py", f"runs={tmp_path / 'runs'}", f"hydra.run.dir={tmp_path / 'out'}")
-    text = capsys.readouterr().out
-    assert "1 runs" in text
-    assert "5 jobs have no result" in text
+@pytest.fixture(scope="module")
+def other_seed(tmp_path_factory):
+    return train(tmp_path_factory.mktemp("runs") / "other", "model=lnn", "seed=1", NO_FIGURES)
+
+
+def test_a_run_folder_is_what_its_checkpoint_says(run, other_seed):
+    shutil.copy(other_seed / "checkpoints" / "best.ckpt", run / "checkpoints" / "best.ckpt")
+    loaded = load_run(run)
+    assert loaded.config["seed"] == loaded.metrics["seed"] == 1
+
+
+def test_a_training_does_not_go_on_in_the_folder_of_another(run, other_seed, capsys):
+    shutil.copy(other_seed / "checkpoints" / "last.ckpt", run / "checkpoints" / "last.ckpt")
+    words = ["model=lnn", NO_FIGURES, f"hydra.run.dir={run}"]
+    text = refused_text(capsys, "train.py", *TINY, *words)
+    assert "holds a training of another configuration: seed=0 (there 1)" in " ".join(text.split())
+
+
+def test_weights_of_another_model_are_refused(run, hnn_run):
+    path = run / "checkpoints" / "best.ckpt"
+    saved = torch.load(path, weights_only=True)
+    other = torch.load(hnn_run / "checkpoints" / "best.ckpt", weights_only=True)
+    torch.save({**saved, "state_dict": other["state_dict"]}, path)
+    with pytest.raises(ConfigError, match=r"best.ckpt: weights of another model: .*Lagrangian"):
+        load_run(run)
+
+
+def test_weights_that_are_not_finite_are_refused(run):
+    path = run / "checkpoints" / "best.ckpt"
+    saved = torch.load(path, weights_only=True)
+    next(iter(saved["state_dict"].values())).fill_(torch.nan)
+    torch.save(saved, path)
+    with pytest.raises(ConfigError, match=r"are NaN or infinite, the training diverged"):
+        load_run(run)

@@ -98,7 +98,7 @@ def moved(robot, plan, steps):
 
 def recorded(source, split):
     """q, v and u as the simulator gave them, from the cache."""
-    arrays = load_or_make(source.cache, source.name, source.fingerprint(), source.simulate)
+    arrays = load_or_make(source.cache, source.name, source.describe(), source.simulate)
     return (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
 
 
@@ -200,11 +200,11 @@ def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
     ids=str,
 )
 def test_what_changes_the_motion_changes_the_key(source, cache, change):
-    assert build(cache, configurations=None, **change).fingerprint() != source.fingerprint()
+    assert build(cache, configurations=None, **change).describe() != source.describe()
 
 
 def test_workers_and_names_of_configurations_do_not_change_the_key(source, cache):
-    assert build(cache, workers=3, configurations=None).fingerprint() == source.fingerprint()
+    assert build(cache, workers=3, configurations=None).describe() == source.describe()
 
 
 def test_momenta_are_those_of_the_mass_matrix(source, splits):

@@ -14,12 +14,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from pinn_dyn.data.simulation import has_cpp_compiler
-from tests.app.entry import NO_FIGURES, ROOT, compose, own_logging
+from tests.app.entry import ROOT, compose, own_logging
 
 EXAMPLES = ROOT / "examples"
-TINY = [NO_FIGURES, "data.pairs=64", "data.batch_size=32", "trainer.enable_progress_bar=false"]
-TINY_LOG = [*TINY, "data.steps=2", "validator.horizon=0.1"]
-TINY_MOTIONS = ["dataset.duration=0.4", "dataset.train_initial_states=2", "dataset.train_inputs=2"]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,7 +28,7 @@ def home(tmp_path_factory):
         patch.setenv("HOME", str(folder))
         patch.setenv("PINN_DYN_CACHE", str(folder / "cache"))
         # The picture of the cleaning takes longer than the training.
-        patch.setattr("pinn_dyn.app.train._write_report", lambda source, folder: None)
+        patch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
         # One of the five seconds of each run: the examples predict whole runs.
         log = pd.read_csv(EXAMPLES / "example_log.csv")
         log[log.t <= 1.0].to_csv(folder / "example_log.csv", index=False)
@@ -50,7 +47,7 @@ def run(name, *arguments):
 def own_log(home):
     """What own_log.py prints; other examples load the run folder that it leaves."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
-        run("own_log.py", "--steps", "2", *TINY_LOG)
+        run("own_log.py", "--steps", "2")
     return out.getvalue()
 
 
@@ -67,7 +64,7 @@ def test_own_log(own_log, home):
 def test_load_and_predict(own_log, capsys):
     run("load_and_predict.py", RUN)
     text = capsys.readouterr().out
-    assert "LearnedModel(lnn" in text
+    assert "Run(lnn" in text
     assert "stretch [m]" in text
 
 
@@ -94,20 +91,20 @@ def test_export_and_call(own_log, home, capsys):
 
 
 def test_simulate_and_learn(capsys):
-    run("simulate_and_learn.py", "--steps", "2", *TINY, *TINY_MOTIONS, "validator.horizon=0.02")
+    run("simulate_and_learn.py", "--steps", "2", "--duration", "2.0")
     text = capsys.readouterr().out
     assert "mean error over 2 s: {'Δx [rad]'" in text
     assert "A^-1 M, true:" in text
 
 
 def test_own_robot(capsys):
-    run("own_robot.py", "trainer.steps=2", "trainer.validations=1", *TINY, "validator.horizon=0.2")
+    run("own_robot.py", "--steps", "2")
     assert "M learned" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_ensemble_with_spread(capsys):
-    run("ensemble_with_spread.py", "--members", "2", "--steps", "2", *TINY_LOG)
+    run("ensemble_with_spread.py", "--members", "2", "--steps", "2")
     lines = capsys.readouterr().out.splitlines()
     head = next(k for k, line in enumerate(lines) if line.split() == ["t", "error", "spread"])
     first, last = lines[head + 1].split(), lines[-1].split()

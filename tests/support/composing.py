@@ -1,4 +1,4 @@
-"""The configuration of a command, as it is composed before it is checked."""
+"""Compose the configuration of a command without checking it."""
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 
 from pinn_dyn.app.config import config_folder
 
-GIVEN = {
+REQUIRED = {
     "train": [],
     "evaluate": ["runs=[x]"],
     "control": ["run=x", "reference.q=[0,0,0]"],
@@ -18,8 +18,8 @@ GIVEN = {
 def compose(command, *overrides):
     folder = str(config_folder(command))
     with hydra.initialize_config_dir(version_base="1.3", config_dir=folder):
-        given = GIVEN[command][: None if not overrides else 1]  # experiments have references
-        cfg = hydra.compose(command, overrides=[*given, *overrides], return_hydra_config=True)
+        required = REQUIRED[command][: None if not overrides else 1]  # experiments have references
+        cfg = hydra.compose(command, overrides=[*required, *overrides], return_hydra_config=True)
     HydraConfig.instance().set_config(cfg)
     OmegaConf.set_struct(cfg, False)
     if command == "train":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +12,6 @@ import numpy as np
 import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.logs import plausibility
 from pinn_dyn.data.logs.checks import check_clock, check_rows, check_second_clock
 from pinn_dyn.data.logs.columns import Columns, described
@@ -32,12 +30,6 @@ from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
 log = logging.getLogger(__name__)
-
-# Settings that the trajectories depend on, beside the files.
-_SETTINGS = (
-    *("time", "q", "v", "u", "trajectory", "max_age", "steps", "validation", "test"),
-    *("guard", "shortest", "seed", "interpolation"),
-)
 
 
 class LogSource(DataSource):
@@ -235,25 +227,9 @@ class LogSource(DataSource):
             ((clean,), _) = SavitzkyGolayVelocity().apply(clean)
         return clean
 
-    def fingerprint(self) -> dict[str, object]:
-        """Files (name, size, SHA-256), rows, columns, cleaning, and the stretches of each split."""
-        if self._frames:
-            return {"files": {}, **super().fingerprint()}
-        root = Path(self.root).expanduser()
-        files = {
-            path.relative_to(root).as_posix(): {
-                "bytes": path.stat().st_size,
-                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-            }
-            for match in find_files(self.root, self.files)
-            for path in ([match] if match.is_file() else sorted(match.rglob("*")))
-            if path.is_file()
-        }
-        splits: dict[str, list[str]] = {split: [] for split in SPLITS}
-        for part in self.cleaned:
-            splits[part.split].append(f"{part.raw.place}, {len(part.raw)} rows")
-        settings = {key: describe(getattr(self, key)) for key in _SETTINGS}
-        return {"files": files, "splits": splits, **settings}
+    def names(self) -> dict[str, list[str]]:
+        self.load()
+        return self._names
 
     def _load(self) -> tuple[Splits, Report, list[Cleaned]]:
         if self._loaded is not None:
@@ -298,6 +274,7 @@ class LogSource(DataSource):
                 for name, items in pieces.items()
             }
         )
+        self._names = {name: [item.place for item in items] for name, items in pieces.items()}
         self._loaded = splits, report, cleaned
         return self._loaded
 

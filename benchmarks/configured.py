@@ -1,0 +1,48 @@
+"""Parts of a training by the configuration of train.py, for the benchmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+
+from pinn_dyn.app import trainer
+from pinn_dyn.app.config import build_part
+from pinn_dyn.evaluation import RolloutValidator, RunDescription
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models import Statistics
+from pinn_dyn.training import DynamicsLearner
+
+
+def build_validator(config: dict[str, Any], step: float) -> RolloutValidator:
+    """Build the validator of a configuration."""
+    return build_part("validator", config["validator"], training_step=step)
+
+
+def build_learner(
+    config: dict[str, Any], model: Predictor, statistics: Statistics, validator: RolloutValidator
+) -> DynamicsLearner:
+    """Build the LightningModule of a configuration."""
+    parts = ("loss", "optimizer", "scheduler")
+    settings = config["trainer"]
+    return trainer.build_learner(
+        model,
+        statistics,
+        validator,
+        **{name: build_part(name, config[name], partial_=True) for name in parts},
+        config=config,
+        compile=trainer.compiles(config["compile"], settings["steps"], settings),
+        clipping={k: x for k, x in settings.items() if k.startswith("gradient_clip")},
+    )
+
+
+def build_trainer(config: dict[str, Any], folder: Path) -> L.Trainer:
+    """Build the trainer of a configuration, with a TensorBoard log."""
+    settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
+    length = trainer.epochs(settings.pop("steps"), settings.pop("validations"))
+    description = RunDescription(
+        settings=trainer.few_settings(config), configuration="", provenance={}
+    )
+    loggers = [trainer.tensorboard(folder)]
+    return trainer.build_trainer(folder, settings, [], loggers, [description], length)

@@ -1,0 +1,56 @@
+"""Configuration of objects that were made in Python, as a YAML file would describe them."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def described(value: Any) -> Any:
+    """Return the configuration that builds a value: ``_target_`` and arguments.
+
+    A builder, that is a class or a ``functools.partial``, gets ``_partial_: true``. An object is
+    described by the attributes that have the names of its constructor's arguments.
+
+    Raises:
+        TypeError: on a value that no configuration can build, such as a lambda.
+    """
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, (torch.Tensor, np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): described(item) for key, item in value.items()}
+    if isinstance(value, Sequence):
+        return [described(item) for item in value]
+    if isinstance(value, partial):
+        if value.args:
+            raise TypeError(f"{value} has positional arguments, expected arguments by name")
+        return {**described(value.func), **described(value.keywords)}
+    if isinstance(value, type) or inspect.isfunction(value):
+        return {"_target_": _path(value), "_partial_": True}
+    arguments = {}
+    for name in inspect.signature(type(value)).parameters:
+        if not hasattr(value, name):
+            raise TypeError(f"{type(value).__name__} has no attribute {name!r}")
+        arguments[name] = described(getattr(value, name))
+    return {"_target_": _path(type(value)), **arguments}
+
+
+def _path(item: Any) -> str:
+    """Return the shortest dotted name by which a class or function can be imported."""
+    parts = item.__module__.split(".")
+    for count in range(min(2, len(parts)), len(parts) + 1):
+        module = ".".join(parts[:count])
+        if getattr(sys.modules.get(module), item.__qualname__, None) is item:
+            return f"{module}.{item.__qualname__}"
+    raise TypeError(f"{item} cannot be imported by its name")

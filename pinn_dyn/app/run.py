@@ -1,0 +1,363 @@
+"""A trained model as users meet it: arrays and data frames in, arrays and data frames out."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, overload
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from pinn_dyn.app.predict_frame import predict_frame
+from pinn_dyn.data import DataSource, LogSource, store
+from pinn_dyn.ensembles import Ensemble, posterior_draws
+from pinn_dyn.evaluation import half_widths
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
+from pinn_dyn.mechanics.arrays import require_finite
+from pinn_dyn.models import Statistics
+
+VALIDATION_ERROR = "val/error_mean"
+"""Metric that summarizes a training; sweeps minimize it."""
+BEST_BY = "val/error_windowed"
+"""Metric that chooses the best checkpoint. A long roll-out may err least before it learns."""
+TRAJECTORIES = "trajectories.npz"
+"""File in a run folder: the data of a source that was made in Python."""
+
+Values = ArrayLike | Tensor
+ModelBuilder = Callable[..., Predictor]
+
+
+class TermArrays(NamedTuple):
+    """The learned terms at configurations ``(*batch, N)``.
+
+    ``M`` mass matrix ``(*batch, N, N)``, ``D`` damping matrix ``(*batch, N, N)``,
+    ``G`` potential force ``(*batch, N)``, ``A`` input matrix ``(*batch, N, M)``.
+    """
+
+    M: np.ndarray
+    D: np.ndarray
+    G: np.ndarray
+    A: np.ndarray
+
+
+@dataclass(frozen=True, repr=False)
+class Run:
+    """A trained model with its configuration, its metrics and the identity of its data.
+
+    Numbers are in SI units and radians, except for data frames, which keep the units of their log.
+
+    Attributes:
+        folder: the run folder; temporary for a training in Python without one, see :meth:`save`.
+        config: configuration of the training as plain values.
+        model: the model in float64 and evaluation mode, for tensors: control laws, evaluations.
+        statistics: scales of the training data: means, spreads and ranges of q, v and u, and
+            ``step``, the step of the training windows, s.
+        metrics: record of the training; ``metrics["validation"]`` has the validation errors.
+        data: identity of the data, see :func:`~pinn_dyn.data.data_identity`; empty if unknown.
+        finished: whether the training has ended.
+        covariance: covariance of constants that least squares fitted, ``(P, P)``, or None.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    model: Predictor
+    statistics: Statistics
+    metrics: dict[str, Any]
+    data: dict[str, Any]
+    finished: bool = True
+    covariance: Tensor | None = None
+    _made_in_python: DataSource | None = None
+    _temporary: TemporaryDirectory[str] | None = None
+
+    def __repr__(self) -> str:
+        name, data = self.config["model_name"], self.config["dataset"].get("name")
+        members = f"{self.model.size} members, " if isinstance(self.model, Ensemble) else ""
+        error = self.metrics.get("validation", {}).get(VALIDATION_ERROR, math.nan)
+        return (
+            f"Run({name} of {data}: {members}"
+            f"q = ({', '.join(self.labels)}), u = ({', '.join(self.input_labels)}), "
+            f"predicts {' and '.join(self.model.state)}, validation error {error:.3g})"
+        )
+
+    @cached_property
+    def source(self) -> DataSource:
+        """The data that the run was trained on."""
+        from pinn_dyn.app.build import build_source
+
+        return self._made_in_python or build_source(self.config)
+
+    @cached_property
+    def log(self) -> LogSource | None:
+        """Columns, units and cleaning of the log that the run was trained on; None without a log.
+
+        Its data are read only when they are needed.
+        """
+        from pinn_dyn.app.build import build_source
+
+        if isinstance(self._made_in_python, LogSource):
+            return self._made_in_python
+        part = self.config.get("log") or self.config["dataset"]
+        if not str(part.get("_target_")).endswith(".LogSource"):
+            return None
+        source = build_source({"dataset": part})
+        assert isinstance(source, LogSource)
+        return source
+
+    @property
+    def labels(self) -> list[str]:
+        """Name and unit of each coordinate."""
+        return self._labels("labels", "q", self.model.num_coordinates)
+
+    @property
+    def input_labels(self) -> list[str]:
+        """Name and unit of each input."""
+        return self._labels("input_labels", "u", self.model.num_inputs)
+
+    def _labels(self, key: str, symbol: str, size: int) -> list[str]:
+        if self.log is not None:
+            return list(getattr(self.log, key))
+        return list(self.config["dataset"].get(key) or [f"{symbol}{k + 1}" for k in range(size)])
+
+    @property
+    def members(self) -> list[Run]:
+        """The members of an ensemble as single models; a single model is its only member."""
+        if not isinstance(self.model, Ensemble):
+            return [self]
+        return [replace(self, model=self.model.member(k)) for k in range(self.model.size)]
+
+    @property
+    def ensemble(self) -> Ensemble | None:
+        """The models whose spread gives prediction intervals; None for a single network.
+
+        They are the members of an ensemble, or draws of the constants that least squares fitted.
+
+        Raises:
+            ValueError: if the covariance of the constants does not fit the model.
+        """
+        if isinstance(self.model, Ensemble):
+            return self.model
+        return None if self.covariance is None else posterior_draws(self.model, self.covariance)
+
+    def save(self, folder: str | Path) -> None:
+        """Copy the run folder, with the data of a source that was made in Python.
+
+        Raises:
+            FileExistsError: if the folder exists.
+        """
+        target = Path(folder).expanduser()
+        shutil.copytree(self.folder, target, ignore=shutil.ignore_patterns(".lock"))
+        if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
+            store(self._made_in_python, target / TRAJECTORIES)
+
+    # Predictions.
+
+    @overload
+    def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...
+
+    @overload
+    def predict(self, start: Values, u: Values | Signal, t: Values | None = None) -> np.ndarray: ...
+
+    def predict(
+        self,
+        start: pd.DataFrame | Values,
+        u: Values | Signal | None = None,
+        t: Values | None = None,
+    ) -> pd.DataFrame | np.ndarray:
+        """Predict the motion from a start under an input, or along a data frame.
+
+        ``predict(start, u, t)`` returns the states x(t_k), ``(*batch, T, 2N)``. The input between
+        its samples is interpolated as in the training data: linearly by default.
+
+        ``predict(frame)`` returns q and v in the columns, units and index of a log. The frame needs
+        the columns of the log that the model was trained on, and is cleaned by the same steps.
+        Every run starts from its first row; later values of q and v are not used. Without measured
+        velocities the columns of v are named ``dq1/dt``. A model of fixed steps is interpolated
+        linearly between them. Rows that the cleaning drops at an end are NaN.
+
+        Args:
+            start: (q, v), ``(*batch, 2N)``, or (q, p) if ``model.state`` is ``"qp"``; or a frame.
+            u: inputs at the times t, ``(*batch, T, M)``, or a :class:`~pinn_dyn.Signal`.
+            t: increasing times, ``(T,)``, s; None takes those of a Signal.
+
+        Raises:
+            TypeError: if u or t is missing, or given for a frame.
+            ValueError: on shapes that do not fit the model, values that are not finite, times
+                outside the input, or a frame without the columns of the log.
+        """
+        if isinstance(start, pd.DataFrame):
+            if u is not None or t is not None:
+                raise TypeError("predict(frame) takes the inputs from the frame: leave out u and t")
+            if self.log is None:
+                raise ValueError(
+                    f"predict(frame): the model was trained on {self.config['dataset'].get('name')}"
+                    ", which has no columns of a log: use predict(start, u, t)"
+                )
+            return predict_frame(self.model, self.log, start)
+        x0, times, signal = self._motion(start, u, t)
+        return self.model.predict(x0, times, signal).numpy()
+
+    def predict_interval(
+        self,
+        start: Values,
+        u: Values | Signal,
+        t: Values | None = None,
+        level: float = 0.95,
+        factor: float = 1.0,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the interval that contains the motion with the probability ``level``::
+
+            x(t) +- factor c sqrt(1 + 1/E) s(t)
+
+        s is the spread of E predictions: those of the members of an ensemble, or of draws of the
+        constants that least squares fitted. c is the quantile of Student's t with E - 1 degrees of
+        freedom. Measurement noise and errors that all members share are not included; evaluate.py
+        reports the ``factor`` that validation motions needed (``calibration.csv``).
+
+        Args:
+            start, u, t: as in :meth:`predict`.
+            level: probability between 0 and 1.
+            factor: scale of the width.
+
+        Returns:
+            The lower and the upper ends, ``(*batch, T, 2N)`` each.
+
+        Raises:
+            TypeError: if the model is a single network, which has no spread.
+            ValueError: as :meth:`predict`.
+        """
+        if (ensemble := self.ensemble) is None:
+            raise TypeError(
+                f"model={self.config['model_name']} is a single network, whose prediction has no "
+                "spread: train an ensemble (ensemble=5), or model=known by least squares"
+            )
+        x0, times, signal = self._motion(start, u, t)
+        with torch.no_grad():
+            paths = double_copy(ensemble).member_increments(x0, times, signal)
+            mean = self.model.predict(x0, times, signal)
+        width = float(half_widths(len(paths), level)) * (1 + 1 / len(paths)) ** 0.5
+        reach = factor * width * paths.std(dim=0)
+        return (mean - reach).numpy(), (mean + reach).numpy()
+
+    def _motion(
+        self, start: Values, u: Values | Signal | None, t: Values | None
+    ) -> tuple[Tensor, Tensor, Signal]:
+        """Return start, times and input of a prediction, in one batch."""
+        x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
+        signal, times = self._input(u, t)
+        batch = torch.broadcast_shapes(x0.shape[:-1], signal.batch)
+        signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
+        return x0.expand(*batch, -1), times, signal
+
+    def _input(self, u: Values | Signal | None, t: Values | None) -> tuple[Signal, Tensor]:
+        """Return the input, and the times of the prediction."""
+        size = self.model.num_inputs
+        if isinstance(u, Signal):
+            self._array("u", u.u, size, "M")
+            signal = u.to("cpu", torch.float64)
+            times = signal.t if t is None else _tensor("t", t)
+            first, last = float(signal.t[0]), float(signal.t[-1])
+            outside = (times < first - 1e-9) | (times > last + 1e-9)
+            if outside.any():
+                raise ValueError(
+                    f"t has the time {float(times[outside][0]):g} s, outside the input, which is "
+                    f"known from {first:g} to {last:g} s"
+                )
+            return signal, times
+        if u is None or t is None:
+            raise TypeError("predict lacks the input: expected predict(start, u, t)")
+        times, samples = _tensor("t", t), self._array("u", u, size, "M")
+        if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
+            raise ValueError(
+                f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}, expected "
+                f"(*batch, T, {size}) and (T,): one input for each time"
+            )
+        part = self.config.get("log") or self.config["dataset"]
+        return Signal(times, samples, part.get("interpolation", "linear")), times
+
+    # Terms of the equation of motion.
+
+    @property
+    def system(self) -> MechanicalSystem:
+        """The model as a mechanical system, on tensors.
+
+        Raises:
+            TypeError: if the model is a black box or an ensemble.
+        """
+        if isinstance(self.model, Ensemble):
+            raise TypeError(
+                "an ensemble has no terms, since a mean of systems is no system: use a member"
+            )
+        if not isinstance(self.model, MechanicalSystem):
+            raise TypeError(
+                f"model={self.config['model_name']} is a black box and has no terms M, D, G and A: "
+                "train model=lnn or model=hnn"
+            )
+        return self.model
+
+    def terms(self, q: Values) -> TermArrays:
+        """Return M(q), D(q), G(q) and A(q) at configurations q ``(*batch, N)``.
+
+        Raises:
+            TypeError: if the model is a black box or an ensemble.
+            ValueError: on a q of the wrong size.
+        """
+        terms = self.system.terms(self._coordinates("q", q))
+        return TermArrays(*(term.numpy() for term in terms))
+
+    def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
+        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``, from q, v, a ``(*batch, N)``.
+
+        Raises:
+            TypeError: if the model is a black box or an ensemble.
+            ValueError: on an argument of the wrong size.
+        """
+        values = [self._coordinates(name, x) for name, x in (("q", q), ("v", v), ("a", a))]
+        return self.system.inverse_dynamics(*torch.broadcast_tensors(*values)).numpy()
+
+    def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
+        """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``.
+
+        Raises:
+            TypeError: if the model is a black box or an ensemble.
+            ValueError: on an argument of the wrong size.
+        """
+        system = self.system
+        x, rate = self._coordinates("q", q), self._coordinates("v", v)
+        force = self._array("u", u, self.model.num_inputs, "M")
+        return system.forward_dynamics(*torch.broadcast_tensors(x, rate), force).numpy()
+
+    def _coordinates(self, name: str, value: Values) -> Tensor:
+        return self._array(name, value, self.model.num_coordinates, "N")
+
+    def _array(self, name: str, value: Values, size: int, symbol: str) -> Tensor:
+        """Return a float64 tensor ``(*batch, size)`` of finite numbers."""
+        tensor = _tensor(name, value)
+        if tensor.ndim == 0 or tensor.shape[-1] != size:
+            labels: Sequence[str] = self.input_labels if symbol == "M" else self.labels
+            raise ValueError(
+                f"{name} has shape {tuple(tensor.shape)}, expected (*batch, {size}): "
+                f"{symbol} = {size} for {', '.join(labels)}"
+            )
+        return tensor
+
+
+def _tensor(name: str, value: Values) -> Tensor:
+    """Return finite numbers in float64."""
+    if isinstance(value, Tensor):
+        tensor = value.detach().cpu().double()
+    else:
+        array = np.asarray(value)
+        if array.dtype.kind in "mM":
+            raise ValueError(f"{name} holds dates or durations, expected numbers in SI units")
+        tensor = torch.from_numpy(np.array(array, dtype=float))
+    require_finite(name, tensor)
+    return tensor

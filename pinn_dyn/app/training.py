@@ -1,0 +1,455 @@
+"""Training in Python: built objects in, a trained run out. train.py calls the same function."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import lightning as L
+import torch
+import yaml
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities.seed import isolate_rng
+from pydantic import PositiveInt
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from pinn_dyn.app.command import hush
+from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.constants import write_constants
+from pinn_dyn.app.described import described
+from pinn_dyn.app.known_data import check_known
+from pinn_dyn.app.provenance import provenance
+from pinn_dyn.app.run import TRAJECTORIES, VALIDATION_ERROR, ModelBuilder, Run
+from pinn_dyn.app.run_folder import (
+    CHECKPOINTS,
+    DATA,
+    claimed,
+    finish,
+    is_finished,
+    load_run,
+    read_checkpoint,
+    require_same_data,
+)
+from pinn_dyn.app.trainer import (
+    CLIPPING,
+    Recorder,
+    build_learner,
+    build_trainer,
+    compiles,
+    epochs,
+    even_validations,
+    few_settings,
+    naming,
+    require_device,
+    tensorboard,
+)
+from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
+from pinn_dyn.data.fastest_motion import too_long_for
+from pinn_dyn.data.whole import write_whole
+from pinn_dyn.ensembles import Ensemble, EnsembleData
+from pinn_dyn.evaluation import (
+    RolloutFigures,
+    RolloutValidator,
+    RunDescription,
+    ValidationHistory,
+    cleaning_figure,
+    save,
+)
+from pinn_dyn.mechanics import Predictor, stack_until
+from pinn_dyn.models import (
+    AccelerationMLP,
+    HamiltonianNetwork,
+    KnownAndNetwork,
+    KnownMechanics,
+    LagrangianNetwork,
+    NextStateMLP,
+    Statistics,
+)
+from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.training import (
+    DynamicsLearner,
+    IncrementLoss,
+    LeastSquares,
+    LeastSquaresLearner,
+    WindowLoss,
+    one_cycle,
+)
+
+MODELS: dict[str, ModelBuilder] = {
+    "lnn": LagrangianNetwork,
+    "hnn": HamiltonianNetwork,
+    "acceleration": AccelerationMLP,
+    "mlp": partial(NextStateMLP, activation="silu"),
+}
+"""Models by their names in conf/model."""
+ADAMW = partial(AdamW, lr=0.005, weight_decay=1e-5, fused=True)
+TRAINER = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
+_COLUMNS = ("name", "time", "q", "u", "v", "trajectory", "steps", "interpolation", "angles")
+
+log = logging.getLogger(__name__)
+
+
+def train(
+    source: DataSource,
+    model: str | ModelBuilder | Predictor,
+    *,
+    loss: Callable[..., WindowLoss] = IncrementLoss,
+    optimizer: Callable[..., Optimizer] | LeastSquares = ADAMW,
+    scheduler: Callable[..., LRScheduler] = one_cycle,
+    data: Callable[..., DynamicsData] = DynamicsData,
+    validator: Callable[..., RolloutValidator] = RolloutValidator,
+    steps: PositiveInt = 20_000,
+    validations: PositiveInt | None = None,
+    seed: int = 0,
+    ensemble: PositiveInt = 1,
+    compile: bool | Literal["auto"] = "auto",
+    threads: PositiveInt = 1,
+    trainer: Mapping[str, Any] = TRAINER,
+    callbacks: Sequence[L.Callback] | None = None,
+    loggers: Sequence[Logger] | None = None,
+    start_from: Run | None = None,
+    folder: str | Path | None = None,
+    resume_from: Literal["last", "best"] = "last",
+    model_name: str | None = None,
+    config: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Run:
+    """Train a model on the data of a source, and return the run with the best checkpoint.
+
+    Some arguments are builders: classes, or :func:`functools.partial` of a class with keyword
+    arguments. The training completes them with what depends on the data, for example::
+
+        model=partial(LagrangianNetwork, mass=partial(NetworkCholesky, hidden=[64, 64]))
+        data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)
+        optimizer=partial(torch.optim.AdamW, lr=0.002)
+
+    A training into a folder that holds an interrupted training of the same arguments resumes it. A
+    finished one is loaded instead.
+
+    Args:
+        source: the data.
+        model: builder, called with ``statistics=``; or ``"lnn"``, ``"hnn"``, ``"acceleration"`` or
+            ``"mlp"`` for a network of default size; or a built predictor.
+        loss: builder, called with ``statistics=`` and ``model=``.
+        optimizer: builder, called with the parameters; or a least-squares fit.
+        scheduler: builder, called with the optimizer and ``total_steps=``.
+        data: builder of the training windows, called with ``source=``.
+        validator: builder of the validation, called with ``training_step=``.
+        steps: steps of the optimizer.
+        validations: number of validations, a divisor of ``steps``; None takes up to 4.
+        seed: seed of the weights and of the order of the windows.
+        ensemble: number of models trained at once, with the seeds seed, seed + 1, ...
+        compile: compile the dynamics; ``"auto"`` does in long trainings if there is a compiler.
+        threads: CPU threads; small networks are fastest with one.
+        trainer: arguments of :class:`lightning.Trainer`.
+        callbacks: callbacks; None draws figures of roll-outs if there is a folder.
+        loggers: loggers; None writes a TensorBoard log to the folder.
+        start_from: a run whose weights the training starts from.
+        folder: the run folder; None uses a temporary one, see :meth:`Run.save`.
+        resume_from: checkpoint to resume an interrupted training from.
+        model_name: short name of the model for tables; None takes that of ``model``.
+        config: description of the run that its checkpoint keeps; None describes the arguments.
+        settings: settings that loggers compare; None takes a few of the configuration.
+
+    Raises:
+        ValueError: if the data, the model or the settings do not fit together.
+        NonFiniteLossError: if the loss becomes NaN or infinite.
+        KeyboardInterrupt: if the training was interrupted; its last checkpoint is kept.
+    """
+    temporary = None
+    if folder is None:
+        temporary = TemporaryDirectory(prefix="pinn_dyn-")
+        folder, callbacks = temporary.name, callbacks or ()
+    place = Path(folder).expanduser()
+    if isinstance(optimizer, LeastSquares):
+        steps = validations = 1
+        trainer = {key: value for key, value in trainer.items() if key not in CLIPPING}
+    validations = validations or even_validations(steps, 4)
+    if isinstance(model, str):
+        model_name, model = model_name or model, MODELS[model]
+    made_in_python = config is None
+    if config is None:
+        config = {
+            "model_name": model_name or _name(model),
+            "seed": seed,
+            "compile": compile,
+            "ensemble": ensemble,
+            "threads": threads,
+            **({} if start_from is None else {"start_from": str(start_from.folder)}),
+            **_description(source),
+            "data": described(data),
+            "model": None if isinstance(model, Predictor) else described(model),
+            "loss": described(loss),
+            "optimizer": described(optimizer),
+            "scheduler": described(scheduler),
+            "validator": described(validator),
+            "trainer": {"steps": steps, "validations": validations, **trainer},
+        }
+        config["name"] = f"{source.name}/{config['model_name']}"
+    config = dict(config)
+    with contextlib.ExitStack() as stack:
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
+        torch.set_num_threads(threads)
+        stack.enter_context(isolate_rng())
+        stack.enter_context(warnings.catch_warnings())
+        hush()
+        stack.enter_context(claimed(place, config))
+        if is_finished(place):
+            log.info("already trained, to train again delete %s", place)
+        else:
+            if made_in_python and temporary is None:
+                store(source, place / TRAJECTORIES)
+            checkpoint = resumable(place, resume_from)
+            L.seed_everything(seed, verbose=False)
+            require_device(trainer)
+            count, batches, every = epochs(steps, validations)
+            windows = build_data(data, source, seed, batches)
+            statistics = _statistics(windows)
+            identity = data_identity(source)
+            if checkpoint is not None:
+                saved = read_checkpoint(checkpoint).get(DATA, {})
+                require_same_data(place, saved, source.name, identity)
+            if isinstance(source, LogSource):
+                _write_report(source, place)
+            with naming("validator"):
+                rollouts = validator(training_step=statistics.step)
+                rollouts.check(stack_until(windows.splits.validation))
+            with naming("model"):
+                predictor = build_predictor(model, statistics, seed, ensemble)
+                _check_windows(predictor, windows)
+            check_known(predictor, source)
+            if start_from is not None and checkpoint is None:
+                _take_weights(predictor, start_from)
+            learner = build_learner(
+                predictor,
+                statistics,
+                rollouts,
+                loss=loss,
+                optimizer=optimizer,
+                scheduler=scheduler,
+                config=config,
+                compile=compiles(compile, steps, trainer),
+                clipping={key: trainer[key] for key in CLIPPING if key in trainer},
+            )
+            if isinstance(learner, LeastSquaresLearner) and start_from is not None:
+                if start_from.covariance is None:
+                    raise ConfigError(
+                        f"start_from: {start_from.folder} has no covariance of its constants, "
+                        "which a fit by optimizer=least_squares leaves: fit it again"
+                    )
+                learner.covariance = start_from.covariance
+            description = RunDescription(
+                settings=few_settings(config) if settings is None else settings,
+                configuration=yaml.safe_dump(config, sort_keys=False, allow_unicode=True),
+                provenance=provenance(),
+            )
+            recorder = Recorder(config, len(windows.windows), identity, description)
+            _fit(
+                build_trainer(
+                    place,
+                    trainer,
+                    [RolloutFigures(every_n_validations=4)] if callbacks is None else callbacks,
+                    [tensorboard(place)] if loggers is None else loggers,
+                    [description, recorder],
+                    (count, batches, every),
+                ),
+                learner,
+                EnsembleData(windows, ensemble) if ensemble > 1 else windows,
+                checkpoint,
+                place,
+                source,
+            )
+    run = load_run(place, "best", trust=None, model=_reloadable(model))
+    return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
+
+
+def _name(model: ModelBuilder | Predictor) -> str:
+    while isinstance(model, partial):
+        model = model.func
+    return model.__name__ if isinstance(model, type) else type(model).__name__
+
+
+def _reloadable(model: ModelBuilder | Predictor) -> ModelBuilder:
+    """Return a builder that gives a model for the weights of a checkpoint."""
+    return (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
+
+
+def _description(source: DataSource) -> dict[str, Any]:
+    """Describe a source that was made in Python: its trajectories are stored in the run folder."""
+    labels = {"labels": list(source.labels), "input_labels": list(source.input_labels)}
+    stored = {
+        "_target_": "pinn_dyn.data.StoredSource",
+        "path": TRAJECTORIES,
+        "name": source.name,
+        **labels,
+        "angles": list(source.angles),
+    }
+    if not isinstance(source, LogSource):
+        return {"dataset": stored}
+    # Columns and cleaning, for predictions along a data frame.
+    columns = {name: described(getattr(source, name)) for name in _COLUMNS}
+    log_part = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
+    return {"dataset": stored, "log": log_part}
+
+
+def resumable(folder: Path, name: str = "last") -> Path | None:
+    """Return the checkpoint that the training of a folder resumes from; None for a new one.
+
+    Raises:
+        ConfigError: if the checkpoint is damaged; names the one to resume from instead.
+    """
+    path = folder / CHECKPOINTS / f"{name}.ckpt"
+    if not path.is_file():
+        return None
+    try:
+        step = _step(path)
+    except ConfigError as error:
+        best = path.with_name("best.ckpt")
+        try:
+            step = _step(best)
+        except ConfigError:
+            raise ConfigError(
+                f"{error}\n{best} is no better: delete {folder} and train again"
+            ) from error
+        raise ConfigError(
+            f"{error}\nResume from the best checkpoint, of step {step}: python train.py "
+            f"resume={folder} resume_from=best"
+        ) from error
+    log.info("resuming the training in %s from step %d", folder, step)
+    return path
+
+
+def _step(path: Path) -> int:
+    """Return the step of a checkpoint from which a training can resume."""
+    saved = read_checkpoint(path)
+    if missing := [key for key in ("global_step", "loops", "optimizer_states") if key not in saved]:
+        raise ConfigError(f"{path} has no {', '.join(missing)}")
+    return saved["global_step"]
+
+
+def build_data(
+    data: Callable[..., DynamicsData], source: DataSource, seed: int, batches: int
+) -> DynamicsData:
+    """Build the windows, with the seed of the training unless they have their own."""
+    seeds = {} if "seed" in getattr(data, "keywords", {}) else {"seed": seed}
+    with naming("data"):
+        return data(source=source, batches_per_epoch=batches, **seeds)
+
+
+def _statistics(windows: DynamicsData) -> Statistics:
+    log.info("%s: loading data", windows.source.name)
+    with naming("data"):
+        if warning := too_long_for(windows.splits.train, windows.step, windows.source.labels):
+            log.warning("%s: %s", windows.source.name, warning)
+        return windows.statistics
+
+
+def build_predictor(
+    model: ModelBuilder | Predictor, statistics: Statistics, seed: int, ensemble: int = 1
+) -> Predictor:
+    """Build the model, or an ensemble of models of the seeds seed, seed + 1, ..."""
+    if isinstance(model, Predictor):
+        return model
+    if ensemble == 1:
+        return model(statistics=statistics)
+    members = []
+    for k in range(ensemble):
+        L.seed_everything(seed + k, verbose=False)
+        members.append(model(statistics=statistics))
+    return Ensemble(members)
+
+
+def _check_windows(model: Predictor, windows: DynamicsData) -> None:
+    """Refuse windows without the momenta or the past inputs that the model needs."""
+    if model.state == "qp" and windows.windows.p.shape[-1] == 0:
+        raise ValueError(
+            f"it learns from momenta p = M(q) v, and {windows.source.name} has none, as they "
+            "cannot be measured: set model.state=qv, which learns from (q, v), or use model=lnn"
+        )
+    if model.input_history > windows.history:
+        raise ValueError(
+            f"it may look {model.input_history} s back (delay.longest), and data.history is "
+            f"{windows.history} s: set both to the same time"
+        )
+
+
+def _take_weights(model: Predictor, run: Run) -> None:
+    """Give the model the trained weights, and the scales, of another run."""
+    trained = copy.deepcopy(run.model)
+    set_output_limits(trained, {})
+    if isinstance(model, KnownAndNetwork) and isinstance(trained, KnownMechanics):
+        model = model.known
+    try:
+        model.load_state_dict(trained.state_dict())
+    except RuntimeError as error:
+        raise ConfigError(
+            f"start_from: the run {run.folder} trained another model than this configuration has, "
+            f"expected the same classes and sizes: {' '.join(str(error).split())[:300]}"
+        ) from error
+    log.info("starting from the weights of %s", run.folder)
+
+
+def _fit(
+    trainer: L.Trainer,
+    learner: DynamicsLearner,
+    data: L.LightningDataModule,
+    checkpoint: Path | None,
+    folder: Path,
+    source: DataSource,
+) -> None:
+    """Run the trainer, and write the record of the training."""
+    fitted = isinstance(learner, LeastSquaresLearner)
+    try:
+        with naming("optimizer") if fitted else contextlib.nullcontext():
+            trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
+    except SystemExit as stop:  # Lightning's end of an interrupted training
+        if fitted and learner.result is not None:
+            trainer.save_checkpoint(folder / CHECKPOINTS / "last.ckpt")
+            write_constants(learner.model, learner.result, source, folder)
+        raise KeyboardInterrupt from stop
+    if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
+        trainer.validate(learner, data, verbose=False)
+    if fitted and learner.result is not None:
+        write_constants(learner.model, learner.result, source, folder)
+    (recorder,) = (x for x in trainer.callbacks if isinstance(x, Recorder))  # type: ignore[attr-defined]
+    # Other processes have counted the steps of theirs.
+    last = read_checkpoint(folder / CHECKPOINTS / "last.ckpt")
+    record = recorder.record(trainer, learner.model, last["global_step"])
+    finish(folder, record)
+    (history,) = (x for x in trainer.callbacks if isinstance(x, ValidationHistory))  # type: ignore[attr-defined]
+    figures = learner.model.learned_figures()
+    log.info(
+        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s; %s%s",
+        record["name"],
+        record["seed"],
+        record["validation"].get(VALIDATION_ERROR, float("nan")),
+        learner.validator,
+        record["training_seconds"],
+        folder,
+        history.summary(),
+        "".join(f"; {key} {value:.4g}" for key, value in figures.items()),
+    )
+    if warning := history.warning():
+        log.warning("%s", warning)
+
+
+def _write_report(source: LogSource, folder: Path) -> None:
+    """Write a report and a figure of the cleaning of a log."""
+    write_whole(folder / "log_report.md", source.report)
+    figure = cleaning_figure(
+        source.cleaned[0],
+        title=f"{source.name}, raw and cleaned",
+        labels=source.labels,
+        input_labels=source.input_labels,
+    )
+    save(figure, folder / "log_cleaning.png")
+    log.info("the cleaning of the log is described in %s", folder / "log_report.md")

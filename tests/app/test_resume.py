@@ -1,0 +1,281 @@
+"""Interrupted trainings: checkpoints are whole, and a resumed training is an uninterrupted one."""
+
+import os
+import shutil
+import signal
+import time
+from functools import partial
+from pickle import UnpicklingError
+
+import lightning as L
+import pytest
+import torch
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import pinn_dyn
+from pinn_dyn.data import DynamicsData
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.training import WholeCheckpoints
+from tests.app.entry import (
+    NO_FIGURES,
+    TINY,
+    TINY_DATA,
+    fork_script,
+    refused_text,
+    run_script,
+    train,
+)
+
+
+class Interrupt(L.Callback):
+    """Ctrl-C in an epoch."""
+
+    def __init__(self, epoch):
+        self.epoch = epoch
+
+    def on_train_epoch_start(self, trainer, pl_module):
+        if trainer.current_epoch == self.epoch:
+            raise KeyboardInterrupt
+
+
+class Marker:
+    """A pickle that makes a folder when it is read as code."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def trained(folder, *callbacks):
+    """A training of six steps and three validations in Python."""
+    source = pinn_dyn.dataset("soft_arm_1", **dict(word[8:].split("=") for word in TINY_DATA))
+    return pinn_dyn.train(
+        source,
+        "lnn",
+        data=partial(DynamicsData, pairs=64, batch_size=32, stride=5),
+        validator=partial(RolloutValidator, horizon=0.1),
+        steps=6,
+        validations=3,
+        folder=folder,
+        callbacks=callbacks,
+    )
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
+    """A training that was interrupted after its second validation."""
+    folder = tmp_path_factory.mktemp("interrupted") / "run"
+    with pytest.raises(KeyboardInterrupt):
+        trained(folder, Interrupt(epoch=2))
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, interrupted):
+    monkeypatch.chdir(tmp_path)
+    return shutil.copytree(interrupted, tmp_path / "run")
+
+
+def checkpoint(run, name="last"):
+    return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+def change(run, name="last", **values):
+    saved = {**checkpoint(run, name), **values}
+    kept = {key: value for key, value in saved.items() if value is not None}
+    torch.save(kept, run / "checkpoints" / f"{name}.ckpt")
+
+
+def cut(run, name="last"):
+    path = run / "checkpoints" / f"{name}.ckpt"
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
+    assert not pinn_dyn.load(run).finished
+    assert not (run / "metrics.json").exists()
+    resumed, whole = trained(run), trained(tmp_path / "whole")
+    assert resumed.finished
+    for name in ("best", "last"):
+        first, second = (checkpoint(folder, name) for folder in (run, tmp_path / "whole"))
+        assert first["global_step"] == second["global_step"]
+        for key, value in first["state_dict"].items():
+            assert torch.equal(value, second["state_dict"][key]), key
+    names = {"val/error_mean", "val/error_windowed", "train/loss"}
+    for name in names:
+        assert resumed.metrics["validation"][name] == whole.metrics["validation"][name]
+
+
+def test_a_finished_training_is_not_repeated(run, monkeypatch):
+    finished = trained(run)
+    monkeypatch.setattr("pinn_dyn.app.training._fit", lambda *_: pytest.fail("trained again"))
+    assert trained(run).metrics == finished.metrics
+    (run / "metrics.json").unlink()  # a copy
+    assert trained(run).metrics == finished.metrics
+
+
+def test_copies_for_people_are_not_read(run):
+    finished = trained(run)
+    (run / "config.yaml").write_text("seed: 7")
+    (run / "metrics.json").write_text("damaged")
+    loaded = pinn_dyn.load(run)
+    assert loaded.config["seed"] == 0
+    assert loaded.metrics == finished.metrics
+    assert loaded.data.keys() == {"train", "validation", "test"}
+
+
+def test_a_terminated_training_ends_with_a_status_and_can_be_resumed(tmp_path):
+    folder, log = tmp_path / "run", tmp_path / "log.txt"
+    last = folder / "checkpoints" / "last.ckpt"
+    with log.open("w") as output:
+        length = ["trainer.steps=50000", "trainer.validations=1000", "compile=false", "model=lnn"]
+        words = [*TINY, *length, NO_FIGURES, f"hydra.run.dir={folder}"]
+        process = fork_script("train.py", *words, folder=tmp_path, output=output)
+        try:
+            while not last.is_file() and process.is_alive():
+                time.sleep(0.05)
+            process.terminate()
+            process.join(120)
+        finally:
+            process.kill()
+    assert process.exitcode == 128 + signal.SIGTERM, log.read_text()
+    assert f"train.py resume={folder}" in log.read_text()
+    assert torch.load(last, weights_only=True)["global_step"] > 0
+    assert not list(folder.rglob("*.partial"))
+
+
+# The command line.
+
+
+@pytest.fixture(scope="module")
+def diverging(tmp_path_factory):
+    """A training whose best checkpoint is an early one."""
+    folder = tmp_path_factory.mktemp("diverging") / "run"
+    length = ["trainer.steps=30", "trainer.validations=6", "optimizer.lr=0.5"]
+    train(folder, "model=lnn", *length, NO_FIGURES)
+    for name in ("best", "last"):
+        change(folder, name, finished=None)
+    return folder
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, diverging):
+    """An unfinished run of train.py."""
+    monkeypatch.chdir(tmp_path)
+    return shutil.copytree(diverging, tmp_path / "run")
+
+
+def test_a_training_resumes_from_the_best_checkpoint(command, capsys):
+    cut(command)
+    step = checkpoint(command, "best")["global_step"]
+    assert step < 30
+    before = set(command.rglob("events.out.tfevents.*"))
+    run_script("train.py", f"resume={command}", "resume_from=best")
+    assert f"resuming the training in {command} from step {step}" in capsys.readouterr().out
+    assert pinn_dyn.load(command).finished
+    assert checkpoint(command)["global_step"] == 30
+    (log,) = set(command.rglob("events.out.tfevents.*")) - before
+    events = EventAccumulator(str(log)).Reload().Scalars("val/error_mean")
+    assert [event.step for event in events] == list(range(step + 4, 30, 5))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (cut, "last.ckpt cannot be read, it may be cut short"),
+        (lambda run: change(run, optimizer_states=None), "has no optimizer_states"),
+        (lambda run: change(run, state_dict=None), "last.ckpt cannot be read"),
+        (lambda run: change(run, payload=Marker("was_here")), "last.ckpt cannot be read"),
+    ],
+)
+def test_a_damaged_last_checkpoint_names_the_best_one(command, capsys, damage, message):
+    damage(command)
+    text = refused_text(capsys, "train.py", f"resume={command}")
+    assert message in text
+    assert f"python train.py resume={command} resume_from=best" in " ".join(text.split())
+    cut(command, "best")
+    text = refused_text(capsys, "train.py", f"resume={command}")
+    assert "best.ckpt is no better: delete" in text
+    assert not os.path.exists("was_here")
+
+
+def test_lightning_reads_no_code_from_a_checkpoint(command, monkeypatch):
+    """Behind the check of the checkpoint, which is replaced here."""
+    change(command, payload=Marker("was_here"))
+    good = checkpoint(command, "best")
+    monkeypatch.setattr("pinn_dyn.app.training.read_checkpoint", lambda path: good)
+    monkeypatch.setattr("pinn_dyn.app.run_folder.read_checkpoint", lambda path: good)
+    monkeypatch.setattr("pinn_dyn.app.train.read_checkpoint", lambda path: good)
+    monkeypatch.setattr("pinn_dyn.app.training.is_finished", lambda folder: False)
+    with pytest.raises(UnpicklingError, match="Weights only load failed"):
+        run_script("train.py", f"resume={command}")
+    assert not os.path.exists("was_here")
+
+
+def test_a_resumed_training_writes_to_its_own_folder(command, tmp_path):
+    """Whatever the configuration in the checkpoint says about places and names."""
+    saved = checkpoint(command)
+    logger = {"_target_": "lightning.pytorch.loggers.CSVLogger", "_partial_": True}
+    parts = saved["hyper_parameters"]
+    parts["config"]["logger"] = {"csv": {**logger, "name": "elsewhere", "version": "x"}}
+    keep = {"_target_": "lightning.pytorch.callbacks.ModelCheckpoint", "monitor": "val/error_mean"}
+    parts["config"]["callbacks"] = {"keep": {**keep, "filename": "stolen"}}
+    change(command, hyper_parameters=parts)
+    run_script("train.py", f"resume={command}")
+    assert not list(tmp_path.rglob("*elsewhere*")) + list(tmp_path.rglob("*stolen*"))
+    assert list(command.rglob("metrics.csv"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["resume={run}", "seed=1"], "leave out"),
+        (["resume=nowhere"], "nowhere/checkpoints/last.ckpt does not exist"),
+    ],
+)
+def test_what_resume_cannot_use_is_named(command, capsys, words, message):
+    text = refused_text(capsys, "train.py", *(word.format(run=command) for word in words))
+    assert message in " ".join(text.split())
+
+
+def test_resume_refuses_changed_data(command, capsys):
+    data = checkpoint(command)["data"]
+    data["train"]["hashes"][1] = "0" * 16
+    data["train"]["moments"][1, 0, 0] += 0.1
+    change(command, data=data)
+    text = refused_text(capsys, "train.py", f"resume={command}")
+    assert "soft_arm_1 has changed since" in text
+    assert "train trajectory 1 in train has other values" in text
+
+
+def test_the_configuration_of_a_run_is_written_for_people(diverging):
+    config = yaml.safe_load((diverging / "config.yaml").read_text())
+    assert config == checkpoint(diverging)["hyper_parameters"]["config"]
+
+
+# Writing.
+
+
+def test_a_checkpoint_is_replaced_only_by_a_whole_one(tmp_path, monkeypatch):
+    path = tmp_path / "last.ckpt"
+    writer = WholeCheckpoints()
+    writer.save_checkpoint({"step": 1}, path)
+    before = path.stat().st_ino
+    with path.open("rb") as open_before:
+        writer.save_checkpoint({"step": 2}, path)
+        # A reader of the old file still reads it whole: the new one is another file.
+        assert torch.load(open_before, weights_only=True) == {"step": 1}
+    assert path.stat().st_ino != before
+
+    def fails_midway(checkpoint, file):
+        file.write(b"half of it")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", fails_midway)
+    with pytest.raises(OSError, match="No space left"):
+        writer.save_checkpoint({"step": 3}, path)
+    assert torch.load(path, weights_only=True) == {"step": 2}
+    assert list(tmp_path.iterdir()) == [path]

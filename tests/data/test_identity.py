@@ -1,0 +1,172 @@
+"""Identity of data, and the description that is the key of a simulation in the cache."""
+
+import itertools
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pinn_dyn.data import DataSource, Splits, StoredSource, data_changes, data_identity, store
+from pinn_dyn.data.fingerprint import describe
+from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.systems import SoftArm
+
+# Identity.
+
+
+class Swings(DataSource):
+    """Random motions with momenta; ``change`` edits the trajectories of each split."""
+
+    name, labels, input_labels = "swings", ["q [rad]"], ["u [Nm]"]
+
+    def __init__(self, change=lambda splits: None, mass=2.0):
+        self.change, self.mass = change, mass
+
+    def load(self):
+        random = torch.Generator().manual_seed(0)
+
+        def motion(samples):
+            q, v, u = torch.randn(3, samples, 1, generator=random, dtype=torch.float64)
+            t = torch.arange(samples, dtype=torch.float64)
+            return Trajectory(q, v, Signal(t, u), momentum=lambda q, v: self.mass * v)
+
+        splits = {
+            "train": [motion(50), motion(60)],
+            "validation": [motion(40)],
+            "test": [motion(30)],
+        }
+        self.change(splits)
+        return Splits(**splits)
+
+
+def changes(change=lambda splits: None, **arguments):
+    recorded = json_like(data_identity(Swings()))
+    return data_changes(recorded, data_identity(Swings(change, **arguments)))
+
+
+def json_like(identity):
+    """The identity as a checkpoint keeps it."""
+    for part in identity.values():
+        for key in ("names", "lengths", "hashes"):
+            assert json.loads(json.dumps(part[key])) == part[key]
+    return identity
+
+
+def edited(signal, size):
+    def change(splits):
+        getattr(splits["train"][1], signal)[17] += size
+
+    return change
+
+
+def test_the_same_data_have_no_changes():
+    assert changes() == []
+
+
+@pytest.mark.parametrize("signal", ["q", "v", "u"])
+@given(size=st.floats(1e-3, 1e3), sign=st.sampled_from([-1, 1]))
+def test_a_changed_number_is_found(signal, size, sign):
+    assert changes(edited(signal, sign * size)) == ["train trajectory 1 in train has other values"]
+
+
+def test_rounding_is_no_change():
+    assert changes(edited("q", 1e-12)) == []
+
+
+def test_momenta_of_another_mass_are_found():
+    assert "train trajectory 0 in train has other momenta p" in changes(mass=2.1)
+    without = data_identity(Swings())
+    for part in without.values():
+        part["momenta"] = torch.zeros(0)
+    assert data_changes(without, data_identity(Swings())) == []
+
+
+def test_trajectories_that_came_went_or_were_cut_are_named():
+    assert changes(lambda s: s["train"].pop()) == ["train trajectory 1 is no longer in train"]
+    assert changes(lambda s: s["test"].append(s["train"][0])) == [
+        "test trajectory 1 is new in test"
+    ]
+    shorter = changes(lambda s: s.update(test=[s["test"][0].until(20)]))
+    assert shorter == ["test trajectory 0 in test has 21 samples, it had 30"]
+
+
+def test_stored_data_have_the_identity_of_their_source(tmp_path):
+    store(Swings(), tmp_path / "data.npz")
+    stored = StoredSource(str(tmp_path / "data.npz"), "swings", ["q [rad]"], ["u [Nm]"])
+    assert data_changes(data_identity(Swings()), data_identity(stored)) == []
+
+
+# Description of a simulation.
+
+MODULE = """
+class Pendulum:
+    def __init__(self, masses=(1.0, 2.0)):
+        self.masses = list(masses)
+
+    def inertia(self):
+        return sum(self.masses) * 0.3**2
+"""
+names = (f"pendulum_of_test_{k}" for k in itertools.count())
+
+
+def pendulum(tmp_path, monkeypatch, text=MODULE, **arguments):
+    """The description of a user's system, imported as a new process would import it."""
+    folder = tmp_path / next(names)
+    folder.mkdir()
+    (folder / "my_pendulum.py").write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "my_pendulum", raising=False)
+    import my_pendulum
+
+    return json.dumps(describe(my_pendulum.Pendulum(**arguments)))
+
+
+def test_an_edited_file_of_the_user_is_another_system(tmp_path, monkeypatch):
+    before = pendulum(tmp_path, monkeypatch)
+    assert pendulum(tmp_path, monkeypatch) == before
+    assert pendulum(tmp_path, monkeypatch, MODULE.replace("0.3**2", "0.3**3")) != before
+    assert pendulum(tmp_path, monkeypatch, masses=[1.0, 2.5]) != before
+
+
+def test_a_class_of_a_session_is_known_by_its_methods():
+    def spring(factor):
+        scope = {"__name__": "__main__"}
+        exec(f"class Spring:\n    def force(self, q):\n        return {factor} * q\n", scope)
+        return describe(scope["Spring"]())
+
+    assert spring(2.0) == spring(2.0) != spring(3.0)
+
+
+def test_settings_of_any_depth_are_described():
+    class Part:
+        def __init__(self, **values):
+            self.__dict__.update(values)
+
+    def described(**changes):
+        values = dict(a=[1, {"b": (2.0, None)}], c=np.eye(9), d=Part(e={"f"}), g=torch.ones(3))
+        return describe(Part(**{**values, **changes}))
+
+    json.dumps(described(), allow_nan=False)
+    assert described() == described()
+    for change in (
+        dict(a=[1, {"b": (2.0, 0)}]),
+        dict(c=np.eye(9) * 2),
+        dict(d=Part(e={"h"})),
+        dict(g=torch.ones(4)),
+        dict(a=[1, {"b": (float("nan"), None)}]),
+    ):
+        assert described(**change) != described()
+
+
+def test_our_own_robots_are_described_by_their_settings():
+    assert describe(SoftArm()) == describe(SoftArm().eval()) != describe(SoftArm(mass=[0.31]))
+    assert describe(SoftArm())["class"] == "SoftArm"
+
+
+def test_an_object_without_attributes_is_refused_by_name():
+    with pytest.raises(TypeError, match=r"_thread.lock has no attributes .* method describe\(\)"):
+        describe([__import__("threading").Lock()])
