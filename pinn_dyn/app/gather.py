@@ -111,8 +111,8 @@ def test_errors(folders: Sequence[str], patterns: Sequence[str] | None) -> pd.Da
         except ValueError as error:
             log.warning("left out: %s cannot be read: %s", path, error)
             continue
-        if "folder" in table and (known := table["folder"].isin(folders)).any():
-            tables.append(table[known])
+        if "folder" in table and (matches := table["folder"].isin(folders)).any():
+            tables.append(table[matches])
             if patterns is None:
                 break
     if not tables:
@@ -142,7 +142,7 @@ def gather(cfg: DictConfig) -> None:
     if len(runs):
         chosen = filtered(pd.json_normalize(configs), config["filter"] or {})
         runs = runs[chosen]
-        settings = varied_settings([c for c, kept in zip(configs, chosen, strict=True) if kept])
+        settings = varied_settings([configs[k] for k in chosen.to_numpy().nonzero()[0]])
         runs = runs.join(settings.set_index(runs.index))
         runs = runs.join(test_errors([*runs["folder"]], config["evaluations"]), on="folder")
         repeated = runs.duplicated([*settings, "seed"], keep="last")

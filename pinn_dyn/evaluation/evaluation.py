@@ -380,8 +380,9 @@ def _force_figures(
 
 def _terms(model: Predictor, source: DataSource) -> TermComparison | None:
     """Compare the terms of a mechanical model with the true ones, where these are known."""
-    known = source.system is not None and source.configurations
-    if not known or not isinstance(model, MechanicalSystem):
+    if source.system is None or not source.configurations:
+        return None
+    if not isinstance(model, MechanicalSystem):
         return None
     q = torch.tensor([*source.configurations.values()], dtype=torch.float64)
     return compare_terms(model, source.system, q, names=[*source.configurations])

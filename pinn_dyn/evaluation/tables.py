@@ -70,7 +70,7 @@ def model_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> l
     settings = varied_settings(configs).map(str)
     labels = []
     for name, (_, row) in zip(names, settings.iterrows(), strict=True):
-        same = settings[[other == name for other in names]]
+        same = settings[[label == name for label in names]]
         differing = [f"{key}={row[key]}" for key in same if same[key].nunique() > 1]
         labels.append(" ".join([name, *differing]))
     return labels
