@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pinn_dyn.app.dataset import dataset as dataset
+    from pinn_dyn.app.evaluation import evaluate as evaluate
     from pinn_dyn.app.fit import fit as fit
     from pinn_dyn.app.run import Run as Run
     from pinn_dyn.app.run_folder import load as load
@@ -39,6 +40,7 @@ _MODULES = {
     "Trajectory": "pinn_dyn.mechanics",
     "close_loop": "pinn_dyn.evaluation.closed_loops",
     "dataset": "pinn_dyn.app.dataset",
+    "evaluate": "pinn_dyn.app.evaluation",
     "fit": "pinn_dyn.app.fit",
     "load": "pinn_dyn.app.run_folder",
     "train": "pinn_dyn.app.training",

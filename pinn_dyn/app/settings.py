@@ -207,7 +207,6 @@ class GatherSettings:
     filter: Mapping[str, Any] | None
     sort: str
     plot: str | None
-    plot_column: str | None
 
 
 SETTINGS: dict[str, type] = {

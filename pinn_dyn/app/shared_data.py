@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import flattened
@@ -39,15 +38,17 @@ class RunData:
     preparation: str
 
 
-def shared_data(runs: Sequence[Run], config: dict[str, Any]) -> list[RunData]:
+def shared_data(
+    runs: Sequence[Run], split: str, test_source: DataSource | None = None
+) -> list[RunData]:
     """Return the data of each run.
 
     Data sets of the same files, coordinates and splits may differ in their preparation. The truth
     and the times are then those of the highest rate, of the first run among equals.
 
     Raises:
-        ConfigError: if data sets differ in more than that, or ``config["dataset"]`` names another
-            one to test on that does not fit.
+        ConfigError: if data sets differ in more than that, or ``test_source`` has other
+            coordinates or inputs.
         ValueError: on data that cannot be used.
     """
     own: list[Run] = []  # a run of each data set
@@ -63,16 +64,16 @@ def shared_data(runs: Sequence[Run], config: dict[str, Any]) -> list[RunData]:
     splits = [source.load() for source in sources]
     first = min(range(len(own)), key=lambda k: float(splits[k].train[0].t.diff()[0]))
     source = sources[first]
-    if config.get("dataset"):
-        source = build_source(config)
+    if test_source is not None:
+        source = test_source
         _require_alone(source, sources)
-        motions = [getattr(source.load(), config["split"])]
+        motions = [getattr(source.load(), split)]
     elif len(sources) == 1:
-        motions = [getattr(splits[0], config["split"])]
+        motions = [getattr(splits[0], split)]
     else:
         order = [first, *(k for k in range(len(sources)) if k != first)]
         logs = [x for k in order if isinstance(x := sources[k], LogSource)]
-        common = dict(zip(order, common_motions(logs, config["split"]), strict=True))
+        common = dict(zip(order, common_motions(logs, split), strict=True))
         motions = [common[k] for k in range(len(sources))]
     names: list[str] = []
     for run in own:

@@ -129,7 +129,9 @@ def _save_gif(images: Sequence[Image.Image], path: Path) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = images[-1].quantize(64)
-    first, *following = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    first, *following = [
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    ]
     times = [_FRAME] * len(following) + [_LAST_FRAME]
     first.save(path, format="GIF", save_all=True, append_images=following, duration=times, loop=0)
 

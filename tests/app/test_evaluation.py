@@ -9,8 +9,7 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from pinn_dyn.app.build import build_source
-from pinn_dyn.app.run_folder import read_config
+import pinn_dyn
 from tests.app.entry import NO_FIGURES, TINY_DATA, refused_text, run_script, train
 from tests.app.pages import assert_says_how_it_came_about, page_of
 
@@ -66,7 +65,7 @@ def test_the_tables_have_runs_and_baselines(evaluation):
 
 def test_the_baselines_are_those_of_the_test_motions(evaluation, hnn_run):
     """Computed again from the data, without the code that predicts."""
-    test = build_source(read_config(hnn_run)).load().test
+    test = pinn_dyn.load(hnn_run).source.load().test
     still = [torch.linalg.vector_norm(x.q - x.q[:1], dim=-1)[:51:5] for x in test]
     moving = [
         torch.linalg.vector_norm(x.q - x.q[:1] - x.v[:1] * x.t[:, None], dim=-1)[:51:5]
@@ -76,6 +75,16 @@ def test_the_baselines_are_those_of_the_test_motions(evaluation, hnn_run):
     for name, errors in (("hold position", still), ("constant velocity", moving)):
         expected = float(torch.stack(errors).mean())
         assert rows.loc[name, "error_mean"] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_python_gives_the_numbers_of_the_command(evaluation, hnn_run, tmp_path):
+    result = pinn_dyn.evaluate(pinn_dyn.load(hnn_run), horizon=0.1, windows=[0.02])
+    table = pd.read_csv(evaluation / "summary.csv").set_index("run")
+    errors = result.summary.set_index("run")["error_mean"]
+    assert errors["hnn"] == pytest.approx(table.loc["hnn", "error_mean"], rel=1e-9)
+    result.save(tmp_path / "results")
+    assert (tmp_path / "results" / "summary.csv").is_file()
 
 
 def test_figures_and_the_page_are_written(evaluation, hnn_run):

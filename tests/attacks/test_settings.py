@@ -237,7 +237,6 @@ MISTAKES = {
         filter=[a]
         sort=3
         plot=[x]
-        plot_column=3
         sorted=x
     """,
     "check": """

@@ -1,0 +1,141 @@
+"""Comparison of trained models on trajectories that no training saw."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+from pinn_dyn.app.constants import read_constants
+from pinn_dyn.app.identification import identified
+from pinn_dyn.app.run import Run
+from pinn_dyn.app.run_folder import check_data
+from pinn_dyn.app.shared_data import shared_data
+from pinn_dyn.data import DataSource
+from pinn_dyn.data.fastest_motion import too_long_for
+from pinn_dyn.evaluation import (
+    Entry,
+    Evaluation,
+    build_baselines,
+    common_stride,
+    default_horizon,
+    default_windows,
+    evaluate_models,
+    model_names,
+)
+from pinn_dyn.mechanics import stack_until
+
+log = logging.getLogger(__name__)
+
+THRESHOLDS = {"small": 0.01, "large": 0.1}
+"""Thresholds of the valid prediction times, in the units of q."""
+_COLUMNS = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
+
+
+def evaluate(
+    runs: Run | Sequence[Run],
+    *,
+    source: DataSource | None = None,
+    split: str = "test",
+    horizon: float | None = None,
+    step: float | None = None,
+    windows: Sequence[float] | None = None,
+    thresholds: Mapping[str, float] = THRESHOLDS,
+) -> Evaluation:
+    """Compare trained models on the same test trajectories, beside the baselines.
+
+    Example::
+
+        evaluation = pinn_dyn.evaluate([pinn_dyn.load("runs/lnn"), pinn_dyn.load("runs/mlp")])
+        print(evaluation)  # evaluation.summary is a data frame
+        evaluation.save("results")
+
+    Args:
+        runs: loaded runs that were trained on the same data.
+        source: another data set to test on; None takes the data of the training.
+        split: ``test``, or ``validation`` for choosing settings.
+        horizon: length of the rollouts, s; None takes the shortest trajectory, 5 s at most.
+        step: step of the rollouts, s; None takes the training step of each run.
+        windows: times between two resets to the measured state, s, one windowed error each; None
+            takes those of 0.1, 0.5 and 1 s that fit.
+        thresholds: names and values of the valid prediction times, in the units of q.
+
+    Raises:
+        ValueError: if the runs were trained on different data, if the data have changed since, or
+            if the settings do not fit the data.
+    """
+    runs = [runs] if isinstance(runs, Run) else list(runs)
+    data = shared_data(runs, split, source)
+    for run, item in zip(runs, data, strict=True):
+        check_data(run, item.trained_on)
+    plain = next(k for k, item in enumerate(data) if not item.preparation)
+    source, motions = data[plain].source, data[plain].trajectories
+    horizon = horizon or default_horizon(stack_until(motions).duration)
+    truths = [stack_until(item.trajectories, horizon) for item in data]
+    truth = truths[plain]
+    if len(truth.q) < len(motions):
+        log.warning(
+            "%d of %d trajectories of %s are shorter than horizon=%g and left out",
+            *(len(motions) - len(truth.q), len(motions), source.name, horizon),
+        )
+    steps = [run.model.fixed_step or step or run.statistics.step for run in runs]
+    if message := too_long_for(motions, max(steps), source.labels):
+        log.warning("%s: %s", source.name, message)
+    stride = common_stride(steps, truth.t)
+    grid = stride * truth.duration / (len(truth.t) - 1)
+
+    prepared = [
+        f"{run.config['model_name']} {item.preparation}".rstrip()
+        for run, item in zip(runs, data, strict=True)
+    ]
+    models = model_names(prepared, [run.config for run in runs])
+    names = _run_names(runs, models)
+    entries = []
+    for k, run in enumerate(runs):
+        figures = {name: run.metrics[name] for name in _COLUMNS if name in run.metrics}
+        figures |= {"folder": str(run.folder), **run.model.learned_figures()}
+        entries.append(
+            Entry(
+                names[k],
+                run.model,
+                truths[k],
+                data[k].training,
+                steps[k],
+                models[k],
+                seed=run.config["seed"],
+                figures=figures,
+                members=run.ensemble,
+            )
+        )
+    training = data[plain].training
+    predictors = build_baselines(training.train, training.validation, step=grid)
+    baselines = [Entry(name, x, truth, training, grid, name) for name, x in predictors.items()]
+    for k, model in identified(runs, data).items():
+        name = f"identification of {names[k]}"
+        baselines.append(Entry(name, model, truths[k], data[k].training, steps[k], name))
+    evaluation = evaluate_models(
+        entries,
+        baselines,
+        source,
+        split=split,
+        stride=stride,
+        windows=default_windows(horizon, grid) if windows is None else windows,
+        thresholds=thresholds,
+    )
+    folders = {name: run.folder for name, run in zip(names, runs, strict=True)}
+    evaluation.constants = read_constants(folders)
+    evaluation.notes = [
+        f"{text}: trained and tested on inputs as prepared in its own data set; motions and times "
+        f"are of {source.name}."
+        for text in dict.fromkeys(item.preparation for item in data if item.preparation)
+    ]
+    return evaluation
+
+
+def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
+    """Return short names: the model, with seed and folder where these tell runs apart."""
+    pairs = zip(runs, models, strict=True)
+    seeds = [f"{name} seed {run.config['seed']}" for run, name in pairs]
+    for names in (models, seeds):
+        if len(set(names)) == len(names):
+            return list(names)
+    return [f"{name} {run.folder.name}" for run, name in zip(runs, seeds, strict=True)]
