@@ -216,7 +216,8 @@ def _is_object(hint: Any) -> bool:
         return True
     plain = (bool, int, float, str, Path, type(None), list, tuple, *_LISTS, *_MAPPINGS)
     array = getattr(hint, "__name__", "") in ("Tensor", "ndarray")
-    return isinstance(hint, type) and get_origin(hint) is None and hint not in plain and not array
+    simple = hint is Any or hint in plain or array  # since Python 3.11 Any is a class
+    return isinstance(hint, type) and get_origin(hint) is None and not simple
 
 
 def _union(options: Sequence[Any]) -> Any:
