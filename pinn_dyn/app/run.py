@@ -132,7 +132,8 @@ class Run:
         """The members of an ensemble as single models; a single model is its only member."""
         if not isinstance(self.model, Ensemble):
             return [self]
-        return [replace(self, model=self.model.member(k)) for k in range(self.model.size)]
+        members = [double_copy(self.model.member(k)) for k in range(self.model.size)]
+        return [replace(self, model=member.requires_grad_(False)) for member in members]
 
     @property
     def ensemble(self) -> Ensemble | None:

@@ -20,7 +20,7 @@ def trained(tmp_path_factory):
     """A log and a run on it."""
     place = tmp_path_factory.mktemp("log")
     shutil.copy(ROOT / "examples" / LOG, place)
-    words = ["experiment=example_log/lnn", "compile=false", *TINY_TRAINING, NO_FIGURES]
+    words = ["experiment=example_log", "compile=false", *TINY_TRAINING, NO_FIGURES]
     words += [f"dataset.root={place}", "dataset.files='*.csv'", f"hydra.run.dir={place / 'run'}"]
     run_script("train.py", *words)
     return place

@@ -1,9 +1,7 @@
 """Progress without a terminal: a line per epoch, nothing that is drawn over."""
 
 import re
-from types import SimpleNamespace
 
-from pinn_dyn.app.progress import EpochLines
 from tests.app.entry import NO_FIGURES, train
 
 LENGTH = ["trainer.steps=6", "trainer.validations=3", "trainer.enable_progress_bar=true"]
@@ -31,22 +29,3 @@ def test_epochs_between_validations_have_lines_too(tmp_path, capsys, monkeypatch
     train(tmp_path / "run", "model=lnn", "trainer.steps=2", NO_FIGURES)
     lines = re.findall(r"epoch \d of 2, step \d: (.*)", capsys.readouterr().out)
     assert ["validation" in line for line in lines] == [False, True]
-
-
-def test_an_epoch_without_validation_has_no_error(caplog):
-    caplog.set_level("INFO")
-    trainer = SimpleNamespace(
-        callback_metrics={"train/loss": 0.5, "val/error_mean": 0.25},
-        current_epoch=1,
-        max_epochs=4,
-        check_val_every_n_epoch=2,
-        global_step=10,
-        is_global_zero=True,
-    )
-    lines = EpochLines("val/error_mean")
-    lines.on_train_epoch_end(trainer, None)
-    trainer.current_epoch = 2
-    lines.on_train_epoch_end(trainer, None)
-    first, second = (record.message for record in caplog.records)
-    assert first == "epoch 2 of 4, step 10: training loss 0.5, validation error 0.25"
-    assert second == "epoch 3 of 4, step 10: training loss 0.5"

@@ -5,8 +5,6 @@ import pytest
 import yaml
 
 from pinn_dyn.app.config import build_part, composed
-from pinn_dyn.app.search import EqualSearch
-from pinn_dyn.app.validation import ConfigError
 from tests.app.entry import NO_FIGURES, TINY, run_script
 
 RANGES = {
@@ -91,21 +89,8 @@ def test_runs_of_a_search_are_ordinary_ones_told_apart_by_their_draw(tmp_path, m
     assert "optimizer.lr" not in table
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"lr": [1e-2, 1e-3]}, "lr is .*, expected the smallest and the largest"),
-        ({"weight_decay": [0.1]}, "weight_decay is .*, expected the smallest and the largest"),
-        ({"width": []}, "width is empty, expected at least one choice"),
-    ],
-)
-def test_ranges_that_are_none(settings, said):
-    with pytest.raises(ConfigError, match=said):
-        EqualSearch(**{**RANGES, **settings})
-
-
 def test_a_fit_without_a_learning_rate_is_the_same_at_every_draw(caplog):
     caplog.set_level("INFO")
     before, after = drawn("experiment=known dataset=emps model.structure.urdf=x", 1)
     assert after == before
-    assert "draw 1 changes nothing, as the optimizer has no learning rate" in caplog.text
+    assert "draw 1 changes nothing, there is no learning rate" in caplog.text

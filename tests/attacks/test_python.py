@@ -1,11 +1,10 @@
-"""Arguments of load, predict, fit and load_law that cannot be used are named."""
+"""Arguments of load, predict and fit that cannot be used are named."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import pinn_dyn
-from pinn_dyn.control import load_law
 
 
 @pytest.mark.parametrize(
@@ -19,25 +18,6 @@ def test_load(tmp_path, lnn_run, arguments, message):
     (tmp_path / "run").symlink_to(lnn_run)
     with pytest.raises(ValueError, match=message):
         pinn_dyn.load(*arguments)
-
-
-LAWS = {
-    "None": ((None,), TypeError, "path is None, expected that of a file"),
-    "a list": ((["x"],), TypeError, "path is"),
-    "nowhere": (("nowhere.pt2",), FileNotFoundError, "nowhere.pt2 is no file"),
-    "a folder": ((".",), FileNotFoundError, "is no file"),
-    "NUL": (("a\0b",), FileNotFoundError, "is no file"),
-    "a text": (("x.pt2",), ValueError, "x.pt2 is no exported law"),
-    "half a checksum": (("x.pt2", "abc"), ValueError, "sha256 is 'abc', expected the 64 hexa"),
-    "no checksum": (("x.pt2", 3), ValueError, "sha256 is 3, expected"),
-}
-
-
-@pytest.mark.parametrize(("arguments", "kind", "message"), LAWS.values(), ids=LAWS)
-def test_load_law(tmp_path, arguments, kind, message):
-    (tmp_path / "x.pt2").write_text("x")
-    with pytest.raises(kind, match=message):
-        load_law(*arguments)
 
 
 T, X0, U = np.linspace(0, 0.1, 11), np.zeros(6), np.zeros((11, 3))
