@@ -4,8 +4,9 @@ And the closed formulas of the linear system, which many tests move.
 """
 
 import pytest
+import torch
 
-from pinn_dyn.testing import MechanicalSystemContract, damped_oscillators
+from pinn_dyn.testing import LinearSystem, MechanicalSystemContract, damped_oscillators
 from tests.support.cart_pole import CartPole
 
 
@@ -13,6 +14,23 @@ class TestLinearSystem(MechanicalSystemContract):
     @pytest.fixture
     def system(self):
         return damped_oscillators()
+
+
+class SlidingMasses(LinearSystem):
+    """Masses with dry friction, which a linear system does not have."""
+
+    def _friction_force(self, v):
+        return 0.8 * torch.tanh(v / 0.3)
+
+    def _friction_slope(self, v):
+        return 0.8 / 0.3 * (1 - torch.tanh(v / 0.3) ** 2)
+
+
+class TestDryFriction(MechanicalSystemContract):
+    @pytest.fixture(params=["qv", "qp"])
+    def system(self, request):
+        values = [[2.0, 0.3], [0.3, 1.0]]
+        return SlidingMasses(values, values, values, [[1.0], [0.5]], state=request.param)
 
 
 class TestCartPole(MechanicalSystemContract):

@@ -5,6 +5,8 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import CubicHermiteSpline
 
@@ -129,6 +131,33 @@ def test_it_is_linear_in_its_samples_also_for_autograd(kind):
     time = float(signal.t[3:5].mean())
     (slope,) = torch.autograd.grad(Signal(signal.t, u, kind)(time).sum(), u)
     assert float((slope * u).sum()) == pytest.approx(float(signal(time)), rel=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    kind=st.sampled_from(KINDS),
+    count=st.integers(2, 8),
+    seed=st.integers(0, 1000),
+    shift=st.floats(-100, 100),
+    cut=st.integers(0, 6),
+)
+def test_shifts_parts_and_means_are_those_of_the_same_function(kind, count, seed, shift, cut):
+    """u(t - d), a part, a stack and the means over adjacent steps agree with the signal itself."""
+    signal = make_signal(kind, count, seed=seed)
+    grid = torch.linspace(float(signal.t[0]), float(signal.t[-1]), 9, dtype=torch.float64)
+    values = signal.at(grid)
+    delayed = signal.since(torch.tensor(-shift, dtype=torch.float64))
+    if kind != "hold":  # a held input jumps at a sample that a shift may round
+        torch.testing.assert_close(delayed.at(grid + shift), values, rtol=0, atol=1e-9)
+    torch.testing.assert_close(signal.at(signal.t), signal.u.movedim(-2, 0))
+    part = signal.part(slice(min(cut, count - 2), None))
+    inside = grid[grid >= part.t[0]]
+    torch.testing.assert_close(part.at(inside), signal.at(inside), rtol=0, atol=1e-12)
+    doubled = signal.mapped(lambda u: 2 * u)
+    torch.testing.assert_close(doubled.at(grid), 2 * values)
+    means, length = signal.means(grid), grid.diff()[:, None, None]
+    whole = signal.means(grid[[0, -1]])[0]
+    torch.testing.assert_close((means * length).sum(0), whole * (grid[-1] - grid[0]))
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,19 @@ def test_state_in_momentum_says_that_the_mass_is_not_known():
         trajectory(momentum=None).states("qp")
 
 
+@pytest.mark.parametrize("known", [0, 2, 5])
+def test_input_history_is_the_latest_input_before_the_start(known):
+    """Three samples of 0.1 s are needed. Where fewer are known, the earliest value is held."""
+    item = trajectory()
+    past = torch.arange(2.0 * known, dtype=torch.float64).reshape(known, 2)
+    signal = dataclasses.replace(item, past=past if known else None).input_since(0.25)
+    torch.testing.assert_close(signal.t[:4], torch.tensor([-0.3, -0.2, -0.1, 0.0]).double())
+    assert torch.equal(signal.u[3:], item.u)
+    latest = past[-3:] if known else item.u[:1]
+    expected = torch.cat([latest[:1].expand(3 - len(latest), 2), latest])
+    assert torch.equal(signal.u[:3], expected)
+
+
 @pytest.mark.parametrize(("horizon", "samples"), [(1.0, 11), (0.5, 6), (0.3, 4), (0.1, 2)])
 @pytest.mark.parametrize("start", [0.0, 7.3])
 def test_until_keeps_the_sample_at_the_horizon(horizon, samples, start):

@@ -62,7 +62,7 @@ class TestWithAngles(CholeskyHeadContract):
     def head(self):
         return make(HEADS["softplus"], angles=[1])
 
-    def test_far_outside_the_data_it_is_as_large_as_near_them(self, head, q):
+    def test_matrix_is_bounded_over_all_configurations(self, head, q):
         """Bounded, but not at rest: the angle turns on."""
         largest = float(head.matrix(1e3 * q).abs().max())
         assert float(head.matrix(1e5 * q).abs().max()) < 2 * largest
@@ -152,6 +152,24 @@ def test_a_transposed_head_has_the_scale_in_its_columns(q):
     )
     unscaled = plain(q) / SCALE[:, None]
     assert_near(transposed(q), unscaled * SCALE, 1e-12)
+
+
+def test_outputs_far_from_the_data_end_at_the_margin_of_their_kind(q):
+    """The margin is 0.2 for the diagonal, and a tenth of the range on the data elsewhere."""
+    head = make(partial(NetworkCholesky, hidden=[5], positivity=Positive(0.0)), spread=8.0)
+    with torch.no_grad():
+        low, high = head.network(q).aminmax(dim=0)
+        head.output_limits = head.limits_at(q)
+        far = MEAN + 30 * (q.repeat(50, 1) - MEAN) * torch.randn(2000, SIZE)
+        factor = head(far) / SCALE[:, None]
+    rows, columns = torch.tril_indices(SIZE, SIZE, offset=-1)
+    diagonal = factor.diagonal(dim1=-2, dim2=-1).expm1().log()  # the inverse of the softplus
+    y = torch.cat([diagonal, factor[:, rows, columns]], dim=-1)
+    margin = torch.cat([torch.full((SIZE,), 0.2).double(), 0.1 * (high - low)[SIZE:]])
+    beyond = torch.maximum(y.amax(0) - high, low - y.amin(0))
+    assert (margin[SIZE:] > 0.4).all()
+    assert (beyond <= margin * (1 + 1e-6)).all()
+    assert (beyond > 0.9 * margin).all()
 
 
 @pytest.mark.parametrize("factor", [0.5, 4.0])

@@ -1,5 +1,6 @@
 """Known mechanics with learned constants: physical for every parameter, and passive."""
 
+import dataclasses
 import math
 
 import pytest
@@ -111,6 +112,21 @@ def test_standardized_constants():
     assert real().tolist() == [-8.0]
     with pytest.raises(ValueError, match=r"start is .* expected positive"):
         PositiveConstants(torch.tensor([0.0]), 0.5, ["a"], ["kg"])
+
+
+def test_drives_start_at_the_scales_of_the_data():
+    """Armature ~ f/a, viscous friction ~ f/v and offset ~ f, with the typical torque f = k u."""
+    scales = dataclasses.replace(
+        statistics(4),
+        v_std=torch.tensor([0.5, 1.0, 2.0, 4.0]).double(),
+        u_std=torch.tensor([2.0, 6.0, 10.0, 20.0]).double(),
+        qv_increment_std=torch.tensor([[1.0] * 4 + [0.1, 0.3, 0.2, 0.4]]).double(),
+    )
+    model = KnownMechanics(scales, RigidChain(TREE, locked_joints=["wrist"]), drive_gain=3.0)
+    force, acceleration = 3 * scales.u_std, scales.qv_increment_std[0, 4:] / scales.step
+    torch.testing.assert_close(model.armature().double(), 0.03 * force / acceleration)
+    torch.testing.assert_close(model.viscous().double(), 0.1 * force / scales.v_std)
+    torch.testing.assert_close(model.offset.spread.double(), 0.3 * force)
 
 
 def test_names_and_units_of_all_constants():

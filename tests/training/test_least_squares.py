@@ -187,6 +187,19 @@ def test_the_filter_keeps_the_motion_and_takes_its_derivative(runs):
     assert (a - expected)[inner].norm() < 0.1 * expected[inner].norm()
 
 
+def test_every_signal_passes_the_same_filter():
+    """A linear law holds for filtered motion only if q, v and u are filtered alike."""
+    t = torch.arange(1000, dtype=torch.float64)[:, None] / 200
+    slow, noise = torch.sin(2 * torch.pi * t), torch.sin(2 * torch.pi * 60 * t)
+    noisy = slow + noise
+    run = Trajectory(noisy, noisy, Signal(t[:, 0], noisy))
+    motion = filtered_motion([run], 10.0, samples=1000)
+    edge = (len(t) - len(motion.q)) // 2
+    for name in "qvu":
+        error = (getattr(motion, name) - slow[edge:-edge])[100:-100]
+        assert float(error.abs().max()) < 0.01, name
+
+
 def test_data_that_do_not_fit_the_filter_are_refused(runs):
     with pytest.raises(ValueError, match="less than half the sample rate"):
         filtered_motion(runs, 50.0, samples=10)
