@@ -1,4 +1,4 @@
-"""Ensembles: many members trained, and predicting, at once."""
+"""Ensembles: many members that are trained and evaluated together."""
 
 from pinn_dyn.ensembles.data import EnsembleData
 from pinn_dyn.ensembles.ensemble import Ensemble

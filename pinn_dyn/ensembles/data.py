@@ -15,10 +15,10 @@ from pinn_dyn.mechanics import Trajectory
 
 
 class EnsembleData(L.LightningDataModule):
-    """The windows of a data module, for each member in an order of its own.
+    """Data module that gives each member the training windows in a different order.
 
     Args:
-        data: the windows; member k has them in the order of the seed ``data.seed + k``.
+        data: data module of the windows. Member k has the order of the seed ``data.seed + k``.
         members: E.
     """
 
@@ -34,7 +34,7 @@ class EnsembleData(L.LightningDataModule):
 
     @property
     def windows(self) -> Windows:
-        """The training windows, the same for all members."""
+        """Training windows, the same for all members."""
         return self.data.windows
 
     def prepare_data(self) -> None:
@@ -42,18 +42,18 @@ class EnsembleData(L.LightningDataModule):
         self.data.prepare_data()
 
     def train_dataloader(self) -> WindowLoader:
-        """Batches ``(E, B, ...)``."""
-        self.data.trainer = self.trainer  # knows the device and the processes
+        """Return batches ``(E, B, ...)``."""
+        self.data.trainer = self.trainer  # for the device and the processes
         seeds = range(self.data.seed, self.data.seed + self.members)
         return self.data.loader(MemberSampler([self.data.sampler(seed) for seed in seeds]))
 
     def val_dataloader(self) -> DataLoader[Trajectory]:
-        """One batch: all validation trajectories."""
+        """Return a single batch of all validation trajectories."""
         return self.data.val_dataloader()
 
 
 class MemberSampler(Sampler[Tensor]):
-    """Batches for the members of an ensemble, ``(E, batch_size)``: each has an order of its own.
+    """Sampler of batches ``(E, batch_size)``, in a different order for each member.
 
     Args:
         samplers: the order of each member.
@@ -63,7 +63,7 @@ class MemberSampler(Sampler[Tensor]):
         self.samplers = samplers
 
     def set_epoch(self, epoch: int) -> None:
-        """Called by the trainer at the start of each epoch."""
+        """Set the epoch, as the trainer does at its start."""
         for sampler in self.samplers:
             sampler.set_epoch(epoch)
 

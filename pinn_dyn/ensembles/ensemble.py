@@ -1,4 +1,4 @@
-"""Ensembles: models of one kind that differ in their weights, evaluated as one batched model."""
+"""Ensembles: models that differ in their weights only, evaluated as one batched model."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from pinn_dyn.models.output_limits import (
 
 
 class Ensemble(Predictor):
-    """The mean prediction of E models of one kind::
+    """Mean prediction of E models of the same architecture::
 
         x^(t) = mean over members i of x^_i(t)
 
-    The members are not kept one by one: each parameter is stacked over them, ``(E, ...)``, and one
-    pass through the stack (:class:`ContinuousStack` or :class:`DiscreteStack`) moves all of them.
+    Each parameter is stacked over the members, ``(E, ...)``. One pass through the stack
+    (:class:`ContinuousStack` or :class:`DiscreteStack`) computes all members.
 
     Args:
-        members: models of the same classes and sizes, with the same scales of the data.
+        members: models of the same classes and sizes, built from the same statistics.
 
     Raises:
-        ValueError: on fewer than two members, or members of different parameters or scales.
+        ValueError: if there are fewer than two members, or if parameters or scales differ.
 
     Attributes:
         size: E.
-        stack: the members as one model with a leading dimension E, as training uses it.
-        prefix: of the names in a member, in the ensemble's own.
+        stack: the members as one model with a leading dimension E, for training.
+        prefix: prefix of the names of a member's parameters in the ensemble.
     """
 
     prefix = "stack.template.model."
@@ -54,23 +54,23 @@ class Ensemble(Predictor):
 
     @property
     def fixed_step(self) -> float | None:  # type: ignore[override]
-        """The one step in s that the members predict in, or None."""
+        """Step of discrete-time members in s, or None."""
         return self.stack.template.model.fixed_step
 
     def member(self, index: int) -> Predictor:
-        """A copy of one member as a model of its own.
+        """Return a copy of a member as an independent model.
 
         Raises:
-            ValueError: if there is no such member.
+            ValueError: if the index is out of range.
         """
         if not 0 <= index < self.size:
             raise ValueError(
                 f"member is {index}, expected one of the {self.size} members, 0 to {self.size - 1}"
             )
-        return self.stack.template.taken_apart(index)
+        return self.stack.template.member(index)
 
     def member_increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Increments of each member, ``(E, *batch, T, 2N)``; arguments of :meth:`increments`."""
+        """Return increments of each member, ``(E, *batch, T, 2N)``."""
 
         def for_each(value: Tensor) -> Tensor:
             return value.expand(self.size, *value.shape)
@@ -78,7 +78,7 @@ class Ensemble(Predictor):
         return self.stack.increments(for_each(x0), t, input.mapped(for_each))
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Mean increment over the members, ``(*batch, T, 2N)``."""
+        """Return mean increment over the members, ``(*batch, T, 2N)``."""
         return self.member_increments(x0, t, input).mean(0)
 
     @staticmethod
@@ -86,13 +86,13 @@ class Ensemble(Predictor):
         first = members[0]
         shapes = {name: value.shape for name, value in first.named_parameters()}
         scales = free_weights(dict(first.named_buffers()))
-        for k, other in enumerate(members):
-            if {name: value.shape for name, value in other.named_parameters()} != shapes:
+        for k, member in enumerate(members):
+            if {name: value.shape for name, value in member.named_parameters()} != shapes:
                 raise ValueError(
-                    f"member {k} has other parameters than member 0: expected one kind of model"
+                    f"member {k} has other parameters than member 0: expected the same architecture"
                 )
-            own = free_weights(dict(other.named_buffers()))
-            if any(not torch.equal(value, scales[name]) for name, value in own.items()):
+            buffers = free_weights(dict(member.named_buffers()))
+            if any(not torch.equal(value, scales[name]) for name, value in buffers.items()):
                 raise ValueError(
                     f"member {k} has other scales (buffers) than member 0: build all members from "
                     "the same statistics"

@@ -15,16 +15,16 @@ from pinn_dyn.training.parameter_vector import ParameterVector
 
 
 class CompiledMembers:
-    """The losses ``(E,)`` of an ensemble, and the gradient of each in its member's parameters.
+    """Engine for the losses ``(E,)`` of an ensemble and their gradients.
 
-    Where a window costs few evaluations of the dynamics, one program for the loss and the gradient
-    of a single model serves all members, side by side on the threads of torch; on a GPU it is one
-    program for all. Elsewhere the dynamics of all members are compiled as one.
+    If a window needs few evaluations of the dynamics, a compiled program for the loss and gradient
+    of a single model runs for all members in parallel threads. On a GPU one program computes all
+    members. Otherwise the dynamics of all members are compiled together.
 
     Args:
-        loss: of a model, or of stacked members.
+        loss: loss of a model, or of stacked members.
         stack: the members.
-        vector: their parameters.
+        vector: parameters of the members.
     """
 
     def __init__(self, loss: WindowLoss, stack: ContinuousStack, vector: ParameterVector):
@@ -32,12 +32,12 @@ class CompiledMembers:
         self.stack = stack
         self.vector = vector
         self._integrator = CompiledDynamics(stack.integrator, stack)
-        of_one = stack.template.model
-        self._program = LossProgram(loss, stack if vector.values.is_cuda else of_one, vector)
-        self._evaluations = EvaluationCount(loss, stack.template.taken_apart(0))
+        model = stack if vector.values.is_cuda else stack.template.model
+        self._program = LossProgram(loss, model, vector)
+        self._evaluations = EvaluationCount(loss, stack.template.member(0))
 
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        """The losses on windows ``(E, B, ...)``, and their gradients."""
+        """Return the losses on windows ``(E, B, ...)`` and their gradients."""
         if self._evaluations(next(windows.unbind())) > MOST_EVALUATIONS:
             with integrated_by(self.stack, self._integrator):
                 losses = self.loss(self.stack, windows)
@@ -45,6 +45,6 @@ class CompiledMembers:
         if windows.q.is_cuda:
             return self._program(windows, len(windows))
         batches = [windows[index] for index in torch.arange(len(windows))]
-        taken = self._program.side_by_side(self.vector.values.detach().unbind(), batches)
-        losses, gradients = map(torch.stack, zip(*taken, strict=True))
+        results = self._program.in_parallel(self.vector.values.detach().unbind(), batches)
+        losses, gradients = map(torch.stack, zip(*results, strict=True))
         return losses, gradients

@@ -15,27 +15,27 @@ from pinn_dyn.training.gradients import Eager, Engine
 
 
 class EnsembleLearner(DynamicsLearner):
-    """Trains the members of an :class:`Ensemble` side by side, each as if it were alone.
+    """LightningModule that trains the members of an :class:`Ensemble` together and independently.
 
-    A batch of windows has a leading dimension E, one batch for each member. The loss is the sum of
-    the members' losses, so that each member's gradient is that of its own loss; gradients are
-    clipped by each member's own norm; the optimizer moves every weight by itself, or with the
-    others of its member (:class:`MemberSOAP`). Validation rolls out the ensemble.
+    A batch of windows has a leading dimension E, with a batch for each member. The loss is the sum
+    of the losses of the members, so the gradients are independent. Gradients are clipped by the
+    norm of each member. The optimizer treats every weight, or every member, separately
+    (:class:`MemberSOAP`). Validation rolls out the ensemble.
 
     Args and errors: as :class:`DynamicsLearner`.
 
     Raises:
         ValueError: at the start of the training, if the optimizer mixes the entries of a tensor,
-            and so the members.
+            and therefore the members.
     """
 
     model: Ensemble
 
     def output_limits(self, model: Predictor, q: Tensor) -> dict[str, Tensor]:
-        """Those that hold for all members."""
+        """Return the limits that hold for all members."""
         assert isinstance(model, Ensemble)
-        each = [output_limits(model.member(k), q) for k in range(model.size)]
-        return {f"{model.prefix}{name}": x for name, x in joint_limits(each).items()}
+        limits = [output_limits(model.member(k), q) for k in range(model.size)]
+        return {f"{model.prefix}{name}": x for name, x in joint_limits(limits).items()}
 
     def parameter_vector(self) -> ParameterVector:
         return ParameterVector(self.model.parameters(), self.model.size)
@@ -52,25 +52,25 @@ class EnsembleLearner(DynamicsLearner):
         self.log("train/loss_spread", losses.std(), on_step=False, on_epoch=True, batch_size=1)
 
     def built_optimizer(self, vector: ParameterVector) -> Optimizer:
-        """The optimizer, SOAP with preconditioners of each member's own."""
+        """Build the optimizer. SOAP has preconditioners for each member."""
         optimizer = super().built_optimizer(vector)
         if type(optimizer) is SOAP:
             return MemberSOAP(vector.parameters, **optimizer.defaults)
         if type(optimizer) not in ELEMENTWISE:
             raise ValueError(
-                f"optimizer is {type(optimizer).__name__}, which mixes the weights of a tensor, "
-                "here those of different members: take optimizer=adamw or soap, or train the seeds "
-                "one by one (train.py -m seed=0,1,2)"
+                f"optimizer is {type(optimizer).__name__}, which mixes the weights of different "
+                "members: use optimizer=adamw or soap, or train the seeds one by one "
+                "(train.py -m seed=0,1,2)"
             )
         return optimizer
 
 
 class MemberSOAP(SOAP):
-    """SOAP on parameters ``(E, ...)``: each of the E members has preconditioners of its own.
+    """SOAP on parameters ``(E, ...)`` with preconditioners for each of the E members.
 
-    Where a gradient leaves directions open, as the first one of a matrix that is not square does,
-    rounding chooses the basis there: a member's training is then another one than that of a single
-    model of its seed, and as good.
+    The gradient of a matrix that is not square does not determine the whole basis. Rounding then
+    chooses the basis, so a member may be trained differently, but equally well, than a single model
+    of the same seed.
     """
 
     leading = 1

@@ -1,4 +1,4 @@
-"""Draws from what a least-squares fit left open, as an ensemble."""
+"""Draws from the posterior of a least-squares fit, as an ensemble."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ DRAWS = 20
 
 
 def posterior_draws(model: Predictor, covariance: Tensor, size: int = DRAWS) -> Ensemble:
-    """E models whose parameters are drawn from N(z, C), the same draws every time.
+    """Draw E models with parameters from N(z, C). The draws are the same every time.
 
-    The spread of their predictions is what the fitted constants leave open; it has no part of the
-    noise of the measured start, nor of forces that the model does not have.
+    The spread of their predictions shows the uncertainty of the fitted constants. It includes
+    neither the noise of the measured initial state nor forces that the model lacks.
 
     Args:
-        model: at the z that a fit found.
-        covariance: C of the z, ``(P, P)``.
+        model: model with the fitted z.
+        covariance: C, ``(P, P)``.
         size: E.
 
     Raises:
-        ValueError: if C is no covariance of the P parameters.
+        ValueError: if C is not a covariance of the P parameters.
     """
     z = parameters_to_vector(model.parameters()).detach().double()
     if covariance.shape != (len(z), len(z)):
         raise ValueError(
-            f"the covariance is of {len(covariance)} constants, expected of the {len(z)} of the "
-            "model: its checkpoint is damaged, fit it again"
+            f"the covariance has {len(covariance)} rows, but the model has {len(z)} constants: "
+            "the checkpoint is damaged, fit the model again"
         )
     root, failed = torch.linalg.cholesky_ex(covariance.double())
     if failed or not root.isfinite().all():
         raise ValueError(
-            "the covariance of the constants is no positive definite matrix of finite numbers: its "
-            "checkpoint is damaged, fit it again"
+            "the covariance of the constants is not positive definite: the checkpoint is damaged, "
+            "fit the model again"
         )
     noise = torch.randn(size, len(z), generator=torch.Generator().manual_seed(0)).double()
     members = [copy.deepcopy(model) for _ in range(size)]

@@ -16,7 +16,7 @@ Model = TypeVar("Model", bound=Predictor)
 
 
 class Template(nn.Module, Generic[Model]):
-    """One model whose parameters have a leading dimension E; buffers are shared by all members."""
+    """A model whose parameters have a leading dimension E. All members share the buffers."""
 
     def __init__(self, members: Sequence[Model]):
         super().__init__()
@@ -26,19 +26,19 @@ class Template(nn.Module, Generic[Model]):
             self._set(self.model, name, values)
 
     def forward(self, evaluate: Callable[..., Tensor], arguments: tuple[Any, ...]) -> Tensor:
-        """Something of the model, with a member's parameters in the place of the stacked ones."""
+        """Evaluate a function of the model with the parameters of a member."""
         return evaluate(self.model, *arguments)
 
     def mapped(self, evaluate: Callable[..., Tensor], *stacked: Any) -> Tensor:
-        """``evaluate(model, *arguments)`` of all members; arguments have a leading dimension E."""
+        """Return ``evaluate(model, *arguments)`` of all members, for arguments ``(E, ...)``."""
 
-        def one(parameters: dict[str, Tensor], *own: Any) -> Tensor:
-            return functional_call(self, parameters, (evaluate, own))
+        def member_value(parameters: dict[str, Tensor], *arguments: Any) -> Tensor:
+            return functional_call(self, parameters, (evaluate, arguments))
 
-        return vmap(one)(dict(self.named_parameters()), *stacked)
+        return vmap(member_value)(dict(self.named_parameters()), *stacked)
 
-    def taken_apart(self, index: int) -> Model:
-        """One member."""
+    def member(self, index: int) -> Model:
+        """Return a copy of a member."""
         model = copy.deepcopy(self.model)
         for name, value in self.model.named_parameters():
             self._set(model, name, value.detach()[index].clone())
@@ -51,7 +51,7 @@ class Template(nn.Module, Generic[Model]):
 
 
 class ContinuousStack(ContinuousPredictor):
-    """E models given by state derivatives, as one: x ``(E, *batch, 2N)``, u ``(E, *batch, M)``."""
+    """E continuous models as one model with x ``(E, *batch, 2N)`` and u ``(E, *batch, M)``."""
 
     def __init__(self, members: Sequence[ContinuousPredictor]):
         first = members[0]
@@ -68,15 +68,15 @@ class ContinuousStack(ContinuousPredictor):
         self.template: Template[ContinuousPredictor] = Template(members)
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Of each member, ``(E,)``."""
+        """Return the penalty of each member, ``(E,)``."""
         return self.template.mapped(lambda model, *at: model.penalty(*at), q, v, a, u)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """dx/dt of every member, ``(E, *batch, S)``."""
+        """Return dx/dt of every member, ``(E, *batch, S)``."""
         return self.template.mapped(lambda model, *xu: model.state_derivative(*xu), x, u)
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """Where each member starts, ``(E, *batch, S)``."""
+        """Return the initial state of each member, ``(E, *batch, S)``."""
         if not self.learns_initial_state:
             return x0
         return self.template.mapped(lambda model, *xu: model.initial_state(*xu), x0, u0)
@@ -84,10 +84,10 @@ class ContinuousStack(ContinuousPredictor):
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """A step of all members."""
-        # The members of the inputs (stages, E, *batch, M) come second.
+        """Take a step of all members."""
+        # The inputs are (stages, E, *batch, M).
         return self.template.mapped(
-            lambda model, *own: model.integration_step(*own, h),
+            lambda model, *arguments: model.integration_step(*arguments, h),
             increment,
             start,
             inputs.movedim(1, 0),
@@ -95,7 +95,7 @@ class ContinuousStack(ContinuousPredictor):
 
 
 class DiscreteStack(Predictor):
-    """E models that predict in steps of their own, as one; as :class:`ContinuousStack`."""
+    """E discrete-time models as one model, with tensors as in :class:`ContinuousStack`."""
 
     def __init__(self, members: Sequence[Predictor]):
         first = members[0]
@@ -103,10 +103,10 @@ class DiscreteStack(Predictor):
         self.template: Template[Predictor] = Template(members)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Increments of every member, ``(E, *batch, T, 2N)``."""
+        """Return increments of every member, ``(E, *batch, T, 2N)``."""
 
-        def of_one(model: Predictor, x0: Tensor, *samples: Tensor) -> Tensor:
+        def member_increments(model: Predictor, x0: Tensor, *samples: Tensor) -> Tensor:
             return model.increments(x0, t, input.with_samples(*samples))
 
         samples = [input.u] if input.rate is None else [input.u, input.rate]
-        return self.template.mapped(of_one, x0, *samples)
+        return self.template.mapped(member_increments, x0, *samples)

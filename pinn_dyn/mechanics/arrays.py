@@ -1,4 +1,4 @@
-"""Checks and small linear algebra on batched tensors, shared by every room."""
+"""Checks and small linear algebra on batched tensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def require_last_dim(name: str, value: Tensor, size: int, symbol: str) -> None:
     """Check that ``value`` has shape ``(*batch, size)``.
 
     Raises:
-        ValueError: if the last dimension differs; the message names the argument.
+        ValueError: if the last dimension differs. The message names the argument.
     """
     if value.ndim == 0 or value.shape[-1] != size:
         raise ValueError(
@@ -25,7 +25,7 @@ def require_finite(name: str, value: Tensor) -> None:
     """Check that ``value`` holds neither NaN nor infinity.
 
     Raises:
-        ValueError: naming the argument, how many entries are bad and where the first one is.
+        ValueError: if an entry is not finite. The message names the argument and the first index.
     """
     bad = ~torch.isfinite(value)
     if bad.any():
@@ -37,20 +37,21 @@ def require_finite(name: str, value: Tensor) -> None:
 
 
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Batched product: matrix ``(*batch, n, m)`` times vector ``(*batch, m)``."""
+    """Multiply matrices ``(*batch, n, m)`` and vectors ``(*batch, m)``."""
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
 def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
     """Solve ``matrix x = vector`` for a symmetric positive definite matrix, by Cholesky.
 
-    NaN where it is not positive definite, as in a roll-out that diverges: the others go on.
+    The solution is NaN for a matrix that is not positive definite, so that a diverging roll-out
+    does not stop the rest of its batch.
     """
     return spd_solver(matrix)(vector)
 
 
 def spd_solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
-    """:func:`spd_solve` for one matrix and many vectors: the matrix is factored once."""
+    """Return :func:`spd_solve` for a fixed matrix, which is factored once."""
     factor, failed = torch.linalg.cholesky_ex(matrix)
 
     def solve(vector: Tensor) -> Tensor:

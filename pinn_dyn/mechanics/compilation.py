@@ -1,4 +1,4 @@
-"""Compiled programs: functions with all that they call, integrators, and when they pay."""
+"""Compiled functions and integrators, and thresholds from which compiling pays off."""
 
 from __future__ import annotations
 
@@ -22,45 +22,46 @@ from pinn_dyn.mechanics.integrators.integrator import BLOCK
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 
-# When compiling pays. Each number is from benchmarks/training_step.py or, for roll-outs,
+# Thresholds for compiling. Each number is from benchmarks/training_step.py or, for roll-outs,
 # benchmarks/long_rollout.py, on two cores; benchmarks/README.md has the tables.
 
 STEPS_FOR_DERIVATIVE = 5_000
-"""Training steps from which it pays to compile the derivative: at batch 256 and N = 3 that saves 11
-ms of a step and takes 19 to 33 s."""
+"""Training steps from which compiling the state derivative pays off. At batch 256 and N = 3 it
+saves 11 ms per step and takes 19 to 33 s."""
 STEPS_FOR_PROGRAM = 20_000
-"""Training steps from which it pays to compile loss and gradient as one program: that saves another
-4 ms of a step, and takes 54 s longer at N = 3 (made up for in 14,000 steps), 124 s at N = 7 (28,000
-steps). For the members of an ensemble it always pays."""
+"""Training steps from which compiling loss and gradient as one program pays off. It saves another
+4 ms per step, and takes 54 s longer at N = 3 (14,000 steps) and 124 s at N = 7 (28,000 steps). For
+ensembles it always pays off."""
 MOST_EVALUATIONS = 4
-"""Evaluations of the dynamics in a window up to which it is compiled as one program: the time to
-compile grows with them."""
+"""Largest number of evaluations of the dynamics in a window that is compiled as one program. The
+time to compile grows with this number."""
 CHUNK = 256
-"""Windows of MOST_EVALUATIONS that are taken at once, four times as many of one evaluation: what
-they keep for the gradient stays in the cache (8,192 by the midpoint loss in parts of 256 took 76 ms
-at N = 3, of 1,024 55 ms). Less than twice as many are not cut."""
+"""Number of windows with MOST_EVALUATIONS that are computed at once, so that the values for the
+gradient stay in the cache. With one evaluation the number is four times larger (8,192 windows of
+the midpoint loss at N = 3: 76 ms in parts of 256, 55 ms in parts of 1,024). Batches of less than
+twice this number are not split."""
 WORK_FOR_LOOP = 4_500_000
-"""Steps times (batch + 300) from which a compiled loop pays in a roll-out: it saves 2 ms of a step
-and 7 us for each trajectory, and takes 20 s to compile."""
+"""Steps times (batch + 300) from which a compiled loop pays off in a roll-out. It saves 2 ms per
+step and 7 us per trajectory, and takes 20 s to compile."""
 
-# Products over at most so many numbers are sums that the compiler fuses with their neighbours.
+# Products over at most this many numbers become sums that the compiler can fuse.
 _SHORT = 8
-# A loop over fewer numbers runs in one thread: starting others takes longer than its work.
+# A loop over fewer numbers runs in one thread, since starting threads takes longer than its work.
 _WORTH_THREADS = 1024
 
 
 @contextmanager
 def integrated_by(model: ContinuousPredictor, integrator: Integrator) -> Iterator[None]:
-    """The model with another integrator, for a while."""
-    own, model.integrator = model.integrator, integrator
+    """Replace the integrator of a model within a context."""
+    original, model.integrator = model.integrator, integrator
     try:
         yield
     finally:
-        model.integrator = own
+        model.integrator = original
 
 
 class _Wrapped(Integrator):
-    """The steps of another integrator."""
+    """Integrator that takes the steps of an inner integrator."""
 
     def __init__(self, inner: Integrator):
         super().__init__(inner.substeps)
@@ -74,24 +75,24 @@ class _Wrapped(Integrator):
 
 
 class Unrolled(_Wrapped):
-    """Paths by operations that can be traced: those of the contract, whatever the method has."""
+    """Integrator whose paths are the traceable loop of the base class."""
 
 
 class CompiledDynamics(_Wrapped):
-    """Paths of compiled dynamics, with gradients.
+    """Integrator of compiled dynamics, with gradients.
 
-    Only the derivative is compiled, or a step, not the unrolled integrator: that keeps compilation
-    short.
+    Only the state derivative or a step is compiled, not the whole path. This keeps the time to
+    compile short.
 
     Args:
-        inner: the method.
-        dynamics: what it integrates, from now on at one batch shape.
+        inner: the integration method.
+        dynamics: the dynamics to compile, for a fixed batch shape.
     """
 
     def __init__(self, inner: Integrator, dynamics: Dynamics):
         super().__init__(inner)
         _keep_rows()
-        # Each is compiled when it is first called: a method calls one of the two.
+        # Compiled at the first call. A method calls only one of the two.
         self._compiled = SimpleNamespace(
             state_derivative=torch.compile(dynamics.state_derivative),
             integration_step=torch.compile(dynamics.integration_step),
@@ -102,10 +103,10 @@ class CompiledDynamics(_Wrapped):
 
 
 class CompiledLoop(_Wrapped):
-    """Paths by one compiled loop, without gradients: for long roll-outs.
+    """Integrator that runs a path as one compiled loop, without gradients, for long roll-outs.
 
-    Without the thousands of small operations of a long roll-out. Compiling takes half a minute to a
-    minute for a new model, some 15 s for one of the same shape (the compiler's cache on disk).
+    Compiling takes 30 to 60 s for a new model, and about 15 s for a model of the same shape by the
+    compiler's cache on disk.
     """
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
@@ -114,19 +115,19 @@ class CompiledLoop(_Wrapped):
         loop = compile_loop(dynamics.integration_step, torch.zeros_like(start), start, arguments)
         blocks = [torch.zeros_like(start)[None]]
         for inputs, lengths in self.blocks(grid, signal):
-            # The loop has BLOCK steps; the last block is filled up with steps of length zero.
-            lacking = BLOCK - lengths.shape[0]
-            filled = torch.cat([inputs, inputs[-1:].expand(lacking, *inputs.shape[1:])])
-            path = loop(blocks[-1][-1], start, filled, F.pad(lengths, (0, lacking)))
+            # The loop has BLOCK steps. The last block is padded with steps of length zero.
+            missing = BLOCK - lengths.shape[0]
+            padded = torch.cat([inputs, inputs[-1:].expand(missing, *inputs.shape[1:])])
+            path = loop(blocks[-1][-1], start, padded, F.pad(lengths, (0, missing)))
             blocks.append(path[: lengths.shape[0]])
         return torch.cat(blocks)
 
 
 class RecordedSteps(_Wrapped):
-    """Paths on a GPU by steps that are replayed from a CUDA graph, without gradients.
+    """Integrator that replays steps from a CUDA graph on a GPU, without gradients.
 
-    A step is some hundred small kernels, and to launch one takes longer than its work. Dynamics
-    that wait for the GPU, which cannot be recorded, are integrated as the inner method does.
+    A step consists of some hundred small kernels, and launching a kernel takes longer than its
+    work. Dynamics that wait for the GPU cannot be recorded; they use the inner integrator.
     """
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
@@ -144,7 +145,7 @@ class RecordedSteps(_Wrapped):
 
 
 class _RecordedStep:
-    """A step as a CUDA graph, which goes on from the increment that it ended with before."""
+    """A step as a CUDA graph, which continues from its last increment."""
 
     def __init__(self, dynamics: Dynamics, start: Tensor, inputs: Tensor, h: Tensor):
         self._increment = torch.zeros_like(start)
@@ -165,7 +166,7 @@ class _RecordedStep:
 
 @contextmanager
 def _refusing_to_wait() -> Iterator[None]:
-    """Within it, an operation that waits for the GPU raises RuntimeError."""
+    """Raise RuntimeError for operations that wait for the GPU, within a context."""
     before = torch.cuda.get_sync_debug_mode()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's, that this mode is a prototype
@@ -179,30 +180,30 @@ def _refusing_to_wait() -> Iterator[None]:
 def compile_graph(
     function: Callable[..., Any], arguments: tuple[Tensor, ...]
 ) -> Callable[..., Any]:
-    """The function, compiled for arguments of these shapes and types alone.
+    """Compile a function for arguments of fixed shapes and types.
 
-    It is traced once: numbers and tensors that are not arguments become constants of the program.
-    The program checks nothing when called. On a CPU it runs in one thread; on a GPU it is recorded
-    as a CUDA graph, and one call launches all its kernels.
+    The function is traced once. Numbers and tensors that are not arguments become constants of the
+    program. The program has no checks. On a CPU it runs in one thread. On a GPU it is recorded as a
+    CUDA graph, so that a call launches all kernels.
     """
     _keep_rows()
     graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
-    for node in graph.graph.nodes:  # shapes are taken from the arguments: those noted do not fit
+    for node in graph.graph.nodes:  # the recorded shapes do not fit; use those of the arguments
         node.meta.clear()
     if arguments[0].is_cuda:
-        # Kernels of independent heads become one: a launch takes as long as their work.
+        # Combine kernels of independent heads, since a launch takes as long as the work.
         program = compile_fx_graph(graph, list(arguments), {"combo_kernels": True})
         return _Recorded(program, arguments)
-    # Past torch.compile: between two steps its wrappers are out of the cache, and take 0.15 ms.
+    # Without the wrappers of torch.compile, which take 0.15 ms per call.
     return compile_fx_graph(graph, list(arguments), {"cpp.threads": 1, **_OPTIONS})
 
 
 class _Recorded:
-    """A program of a GPU as a CUDA graph: arguments are copied to where those of it lie."""
+    """A GPU program as a CUDA graph. Arguments are copied into its memory."""
 
     def __init__(self, program: Callable[..., list[Tensor]], arguments: tuple[Tensor, ...]):
         self._arguments = [value.clone() for value in arguments]
-        program(*self._arguments)  # loads the kernels, which can't be done while recording
+        program(*self._arguments)  # loads the kernels, which is not possible during recording
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
             self._results = program(*self._arguments)
@@ -216,23 +217,22 @@ class _Recorded:
 def compile_loop(
     step: Callable[..., Tensor], state: Tensor, constant: Tensor, inputs: tuple[Tensor, ...]
 ) -> Callable[..., Tensor]:
-    """The loop x_{k+1} = step(x_k, c, *inputs_k), compiled into one program without gradients.
+    """Compile the loop x_{k+1} = step(x_k, c, *inputs_k) into one program without gradients.
 
-    Compiled for arguments of these shapes and types alone, as by :func:`compile_graph`.
+    The program is for arguments of fixed shapes and types, as by :func:`compile_graph`.
 
     Args:
-        step: what is repeated.
+        step: the repeated function.
         state: x, ``(...)``.
         constant: c, the same in all steps.
         inputs: the inputs of all steps, each ``(T, ...)``.
 
     Returns:
-        A function of the same four, with the inputs one by one, that gives x_1 to x_T,
-        ``(T, ...)``.
+        A function of x, c and the unpacked inputs that returns x_1 to x_T, ``(T, ...)``.
     """
-    # make_fx does not see that a method has its first argument already.
+    # make_fx does not support bound methods.
     graph = make_fx(lambda *arguments: step(*arguments), _DECOMPOSITIONS)(
-        state, constant, *[each[0] for each in inputs]
+        state, constant, *[values[0] for values in inputs]
     )
 
     def loop(state: Tensor, constant: Tensor, *inputs: Tensor) -> Tensor:
@@ -242,22 +242,22 @@ def compile_loop(
 
         return scan(body, state, inputs)[1]
 
-    # The compiler keeps its programs with the code of a function, which all loops here share.
-    own = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
-    program = _compile(own, {"cpp.threads": 1} if state.numel() < _WORTH_THREADS else {})
-    # The counter of the loop is a number that the compiler must not ask for the value of.
+    # The compiler stores programs by the code of a function, which all loops share: copy the code.
+    copied = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
+    program = _compile(copied, {"cpp.threads": 1} if state.numel() < _WORTH_THREADS else {})
+    # The compiler must treat the counter of the loop as symbolic.
     with dynamo_config.patch(capture_scalar_outputs=True), torch.no_grad():
         program(state, constant, *inputs)
     return program
 
 
 def _keep_rows() -> None:
-    """Let the compiler hand matrices to triangular solves in rows, as they are given.
+    """Make the compiler pass matrices to triangular solves in row-major order.
 
-    It leaves the order open, and takes columns, of which each solve makes a copy: at N = 48 a sixth
-    of a step.
+    Otherwise it chooses column-major order, and each solve makes a copy: a sixth of a step at
+    N = 48.
     """
-    from torch._inductor import lowering  # takes a second, and only compiling needs it
+    from torch._inductor import lowering  # the import takes a second
 
     solve = torch.ops.aten.linalg_solve_triangular.default
     lowering.add_layout_constraint(solve, lowering.constrain_to_fx_strides)
@@ -274,9 +274,9 @@ def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Callable[
 
 def _mm(a: Tensor, b: Tensor) -> Tensor:
     if b.shape[1] == 1 and a.shape[0] > 1:
-        # The compiler turns products with a single row into loops that it fuses.
+        # The compiler fuses products with a single row.
         return (b.T @ a.T).T
-    # Not for a single row: the compiler would evaluate what it is made of for every column.
+    # Not for a single row: the compiler would evaluate its inputs for every column.
     if a.shape[1] <= _SHORT and b.shape[1] > _SHORT and a.shape[0] > 1:
         total = a[:, :1] * b[:1]
         for k in range(1, a.shape[1]):
@@ -299,7 +299,7 @@ def _softplus(z: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
 def _sigmoid(z: Tensor) -> Tensor:
     if z.shape[-1:] == (1,):
         return NotImplemented
-    # The same exponential as in _softplus: beside it, it costs none.
+    # The same exponential as in _softplus, which the compiler shares.
     decay = torch.exp(-z.abs())
     share = 1 / (1 + decay)
     return torch.where(z >= 0, share, decay * share)
@@ -309,7 +309,7 @@ def _softplus_backward(gradient: Tensor, z: Tensor, beta: float, threshold: floa
     return NotImplemented if z.shape[-1:] == (1,) else gradient * _sigmoid(z)
 
 
-# Long vectors gain by these; a single column, evaluated again for each row that needs it, loses.
+# These are faster for long vectors, and slower for a single column.
 _DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     torch.ops.aten.mm.default: _mm,
     torch.ops.aten.addmm.default: _addmm,

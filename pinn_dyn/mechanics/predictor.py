@@ -1,4 +1,4 @@
-"""The prediction contract: what every model, mechanical or black box, can do."""
+"""The prediction contract of every model, mechanical or black box."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ from pinn_dyn.mechanics.trajectory import State, Trajectory
 
 
 class Predictor(nn.Module, abc.ABC):
-    """Predicts how a state moves under a given input.
+    """Model that predicts the motion of a state under an input.
 
     Attributes:
         num_coordinates: N, the dimension of q.
         num_inputs: M, the dimension of u.
-        state: what the state x ``(*batch, 2N)`` is that it starts from and predicts: ``"qv"`` for
-            (q, v), ``"qp"`` for (q, p).
-        fixed_step: the one step in s that the model predicts in, or None if it takes any.
-        penalized: whether its freedom costs something in a training, see :meth:`penalty`.
-        input_history: how long before the start the model may look at the input, s.
+        state: the predicted state x ``(*batch, 2N)``: ``"qv"`` for (q, v), ``"qp"`` for (q, p).
+        fixed_step: step of a discrete-time model in s, or None if any step is possible.
+        penalized: true if training adds :meth:`penalty` to the loss.
+        input_history: time before the start in which the model uses the input, s.
     """
 
     fixed_step: float | None = None
@@ -43,41 +42,42 @@ class Predictor(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Increments x(t_k) - x(t_0), ``(*batch, T, 2N)``, from x0 ``(*batch, 2N)``, unchecked.
+        """Return increments x(t_k) - x(t_0), ``(*batch, T, 2N)``, without checks.
 
-        ``t`` ``(T,)`` are the times of the solution, s; ``input`` is u, of the same batch.
+        ``x0`` is ``(*batch, 2N)``, ``t`` ``(T,)`` are the times of the solution, s, and ``input``
+        is u of the same batch.
         """
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """A scalar that training adds to the error of prediction, where ``penalized``.
+        """Return a scalar that training adds to the prediction error if ``penalized`` is true.
 
-        q, v and a ``(B, N)`` and u ``(B, M)`` are states, accelerations and inputs of the data.
+        States q, v, accelerations a ``(B, N)`` and inputs u ``(B, M)`` are those of the data.
         """
         return q.new_zeros(())
 
     def acting_input(self, input: Signal) -> Signal:
-        """The input as it acts on the robot; here as it is, in a model of a delay later."""
+        """Return the input that acts on the robot. A model with a delay shifts it."""
         return input
 
     @final
     def acting_samples(self, truth: Trajectory) -> Tensor:
-        """The input as it acts at the samples of a trajectory, ``(*batch, T, M)``."""
+        """Return the acting input at the samples of a trajectory, ``(*batch, T, M)``."""
         if not self.input_history:
             return truth.u
         input = self.acting_input(truth.input_since(self.input_history))
         return input.at(truth.t).movedim(0, -2)
 
     def learned_figures(self) -> dict[str, float]:
-        """Learned numbers to be reported by their names, such as an input delay in s."""
+        """Return learned numbers to report by name, such as an input delay in s."""
         return {}
 
     @final
     def predict(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """States x(t_k), ``(*batch, T, 2N)``; arguments as for :meth:`increments`.
+        """Return states x(t_k), ``(*batch, T, 2N)``. The arguments are those of :meth:`increments`.
 
         Raises:
-            ValueError: on a start or an input of the wrong size, times that do not increase, or a
-                start that is not finite.
+            ValueError: if the initial state or the input has a wrong size, the times do not
+                increase, or the initial state is not finite.
         """
         require_last_dim("x0", x0, 2 * self.num_coordinates, "2N")
         require_last_dim("u", input.u, self.num_inputs, "M")
@@ -86,15 +86,14 @@ class Predictor(nn.Module, abc.ABC):
 
 
 class ContinuousPredictor(Predictor):
-    """A predictor given by a state derivative dx/dt = f(x, u), and integrated.
+    """Predictor that integrates a state derivative dx/dt = f(x, u).
 
-    The state that is integrated, ``(*batch, S)``, begins with the 2N numbers of (q, v) or (q, p).
-    A model of more, such as the states of actuators, gives the others in :meth:`initial_state`;
-    they stay inside a roll-out.
+    The integrated state ``(*batch, S)`` begins with the 2N numbers of (q, v) or (q, p). A model
+    with more states, such as those of actuators, initializes them in :meth:`initial_state`.
 
     Attributes:
-        integrator: the method, and its steps in a step of the data.
-        learns_initial_state: whether roll-outs start at another state than the measured one.
+        integrator: the integration method.
+        learns_initial_state: true if roll-outs start at a learned state.
     """
 
     integrator: Integrator = RK4()
@@ -102,33 +101,33 @@ class ContinuousPredictor(Predictor):
 
     @abc.abstractmethod
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """dx/dt, ``(*batch, S)``, of the state x ``(*batch, S)`` under u ``(*batch, M)``."""
+        """Return dx/dt, ``(*batch, S)``, of the state x ``(*batch, S)`` under u ``(*batch, M)``."""
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Maps r to the k with (1 - s J) k = r, both ``(*batch, S)``.
+        """Return a function from r to k with (1 - s J) k = r, both ``(*batch, S)``.
 
-        s is the ``step``, and J what is stiff of df/dx at x. Here J = 0: nothing is.
+        s is the ``step``, and J the stiff part of df/dx at x. The default has J = 0.
         """
         return lambda rate: rate
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """Where a roll-out from the measured x0 starts, ``(*batch, S)``, under u0 ``(*batch, M)``.
+        """Return the initial state of a roll-out from the measured x0, ``(*batch, S)``.
 
-        Here it is x0 itself.
+        u0 ``(*batch, M)`` is the input at the start. The default is x0 itself.
         """
         return x0
 
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """One step of the integrator; arguments as of :meth:`Integrator.step`."""
+        """Take a step of the integrator. The arguments are those of :meth:`Integrator.step`."""
         return self.integrator.step(self, increment, start, inputs, h)
 
     @final
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """Integrate the state derivative.
 
-        Increments count from the measured ``x0``, wherever the roll-out starts.
+        Increments are relative to the measured ``x0``, even if the roll-out starts elsewhere.
         """
         input = self.acting_input(input)
         first = input.u[..., 0, :]
@@ -147,5 +146,5 @@ _Model = TypeVar("_Model", bound=Predictor)
 
 
 def double_copy(model: _Model, device: torch.device | str = "cpu") -> _Model:
-    """A copy of the model in float64 and evaluation mode; the model itself stays as it is."""
+    """Return a copy of the model in float64 and evaluation mode."""
     return copy.deepcopy(model).to(device=device, dtype=torch.float64).eval()

@@ -21,7 +21,7 @@ def rollout(
     *,
     substeps: int = 1,
 ) -> Tensor:
-    """States x(t_k), ``(*batch, T, S)``, of dx/dt = f(x, u(t)) from ``x0``, by RK4.
+    """Return states x(t_k), ``(*batch, T, S)``, of dx/dt = f(x, u(t)) from ``x0``, by RK4.
 
     Args:
         derivative: f, maps x ``(*batch, S)`` and u ``(*batch, M)`` to ``(*batch, S)``.
@@ -31,7 +31,7 @@ def rollout(
         substeps: steps of the integrator between two times of ``t``.
 
     Raises:
-        ValueError: as :func:`require_start`, and on substeps below 1.
+        ValueError: see :func:`require_start`.
     """
     require_start(x0, t, input)
     path = path_between(_Flow(derivative), RK4(substeps), x0, t, input)
@@ -39,11 +39,11 @@ def rollout(
 
 
 def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
-    """Check what a roll-out starts from.
+    """Check the arguments of a roll-out.
 
     Raises:
-        ValueError: on fewer than 2 times, times that do not increase, an input of another batch
-            than the initial state, or a state that is not finite.
+        ValueError: if there are fewer than 2 times, the times do not increase, the batches of
+            input and initial state differ, or the initial state is not finite.
     """
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"t has shape {tuple(t.shape)}, expected (T,) with at least 2 times")
@@ -60,17 +60,17 @@ def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
 def path_between(
     dynamics: Dynamics, integrator: Integrator, x0: Tensor, t: Tensor, input: Signal
 ) -> Tensor:
-    """Increments x(t_k) - x(t_0), ``(*batch, T, S)``, unchecked: for what is called in a training.
+    """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks, as in training.
 
     Args:
-        dynamics: what is integrated.
+        dynamics: the state derivative.
         integrator: the method, with its substeps between two times of ``t``.
         x0: initial state, ``(*batch, S)``.
         t: times of the solution, ``(T,)``, s.
         input: u, of the same batch.
     """
-    # Times count from the start, in the recording's own precision, and are cast only then: one
-    # dtype throughout, so that the solver's times and the input's times compare exactly.
+    # Times are made relative to the start before they are cast, so that the times of the solver and
+    # of the input have the same dtype and compare exactly.
     input = input.since(t[0])
     grid = step_grid(t - t[0], input.t.detach(), integrator.substeps).to(x0.dtype)
     path = integrator.path(dynamics, x0, grid, input.to(x0.device, x0.dtype))
@@ -78,10 +78,10 @@ def path_between(
 
 
 def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
-    """Times of the integrator's steps, ``(substeps (T - 1) + 1,)``: ``substeps`` in each interval.
+    """Return the times of the integrator's steps, ``(substeps (T - 1) + 1,)``.
 
-    A step that ends at a sample of the input, within rounding, ends at that very number: a held
-    input tells the sides apart.
+    There are ``substeps`` steps in each interval of t. A step that ends at a sample of the input up
+    to rounding ends at exactly that time, since a held input jumps there.
     """
     fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
     inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions
@@ -95,7 +95,7 @@ def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
 
 @dataclass(frozen=True)
 class _Flow:
-    """A state derivative of which nothing else is known."""
+    """Dynamics given by a state derivative only."""
 
     state_derivative: Callable[[Tensor, Tensor], Tensor]
 

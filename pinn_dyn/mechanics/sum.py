@@ -12,39 +12,39 @@ from pinn_dyn.mechanics.system import MechanicalSystem
 
 
 def _total(name: str) -> Callable[..., Tensor]:
-    """The method that adds what those of the parts give."""
+    """Build a method that adds the results of the parts."""
 
     def method(self: Sum, *values: Tensor) -> Tensor:
-        first, *others = (getattr(part, name)(*values) for part in self._systems())
-        for other in others:
-            first = first + other
-        return first
+        total, *terms = (getattr(part, name)(*values) for part in self._systems())
+        for term in terms:
+            total = total + term
+        return total
 
     return method
 
 
 class Sum(MechanicalSystem):
-    """The mechanical system whose terms are the sums of those of its parts::
+    """Mechanical system whose terms are the sums of the terms of its parts::
 
-        X = sum over parts k of X_k,     X one of M, V, D, F, A and r
+        X = sum over parts k of X_k,     for X = M, V, D, F, A and r
 
-    The kinetic energy is that of all parts at the same q and v, so the Coriolis force adds too. M
-    is positive definite if one M_k is and the others are semi-definite; passive parts have a
-    passive sum.
+    All parts have the same q and v, so the Coriolis forces add up, too. M is positive definite if
+    one M_k is positive definite and all others are semi-definite. The sum of passive parts is
+    passive.
 
     Args:
         parts: the systems by name, all of the same N and M.
-        integrator: the method of integration of the sum.
+        integrator: the integration method.
 
     Raises:
-        ValueError: on no parts, or parts of different sizes.
+        ValueError: if there are no parts, the sizes of the parts differ, or a part learns a delay.
     """
 
     def __init__(self, parts: Mapping[str, MechanicalSystem], integrator: Integrator | None = None):
         sizes = {name: (part.num_coordinates, part.num_inputs) for name, part in parts.items()}
         if len(set(sizes.values())) != 1:
-            found = ", ".join(f"{name}: {size}" for name, size in sizes.items()) or "none"
-            raise ValueError(f"the parts of a sum have (N, M) {found}; expected the same for all")
+            text = ", ".join(f"{name}: {size}" for name, size in sizes.items()) or "none"
+            raise ValueError(f"the parts of a sum have (N, M) {text}; expected the same for all")
         for name, part in parts.items():
             if part.input_history:
                 raise ValueError(
@@ -73,9 +73,9 @@ class Sum(MechanicalSystem):
     _momentum = _total("_momentum")
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        (mass, bias), *others = (part._mass_and_bias(q, v) for part in self._systems())
-        for other_mass, other_bias in others:
-            mass, bias = mass + other_mass, bias + other_bias
+        (mass, bias), *terms = (part._mass_and_bias(q, v) for part in self._systems())
+        for part_mass, part_bias in terms:
+            mass, bias = mass + part_mass, bias + part_bias
         return mass, bias
 
     def _systems(self) -> list[MechanicalSystem]:

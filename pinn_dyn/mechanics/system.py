@@ -1,4 +1,4 @@
-"""The one contract that truth and learned models share: the mechanical system."""
+"""The contract of mechanical systems, analytic and learned."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pinn_dyn.mechanics.predictor import ContinuousPredictor
 
 
 class Terms(NamedTuple):
-    """The terms of the equation of motion at one configuration.
+    """Terms of the equation of motion at a configuration.
 
     ``M`` mass matrix ``(*batch, N, N)``, ``D`` damping matrix ``(*batch, N, N)``,
     ``G`` potential force ``(*batch, N)``, ``A`` input matrix ``(*batch, N, M)``.
@@ -37,19 +37,18 @@ class MechanicalSystem(ContinuousPredictor):
 
         dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) v - F(v) + A(q) u + r,  v = dH/dp
 
-    F(v) is dry friction, with v^T F(v) >= 0, and r(q, v, u) a residual force, what is not
-    mechanical; both are zero, as in the paper, unless a subclass has them (``has_residual``).
+    F(v) is dry friction, with v^T F(v) >= 0. r(q, v, u) is a residual force for effects that are
+    not mechanical (``has_residual``). Both are zero by default, as in the paper.
 
     Symbols: q configuration ``(*batch, N)``, v velocity ``(*batch, N)``, a acceleration
     ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
     force ``(*batch, N)``; SI units and radians.
 
-    A robot that is moved by the positions of its motors may have a force that is not linear in
-    them; then A depends on u, ``input_affine`` is false, and :meth:`input_matrix` is A at some
-    typical input.
+    If the force is not linear in the input, as for a robot driven by motor positions, A depends on
+    u, ``input_affine`` is false, and :meth:`input_matrix` is A at a typical input.
 
-    A subclass gives the four abstract terms. The ``_``-methods below derive everything else by
-    automatic differentiation; a subclass that knows closed formulas may override those.
+    A subclass implements the four abstract terms. The ``_``-methods below derive all other
+    quantities by automatic differentiation. A subclass with closed formulas may override them.
     """
 
     input_affine: bool = True
@@ -57,37 +56,37 @@ class MechanicalSystem(ContinuousPredictor):
 
     @abc.abstractmethod
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q), ``(*batch, N, N)``, symmetric positive definite."""
+        """Return M(q), ``(*batch, N, N)``, symmetric positive definite."""
 
     @abc.abstractmethod
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
+        """Return V(q), ``(*batch,)``, J."""
 
     @abc.abstractmethod
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D(q), ``(*batch, N, N)``, symmetric positive semi-definite."""
+        """Return D(q), ``(*batch, N, N)``, symmetric positive semi-definite."""
 
     @abc.abstractmethod
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
+        """Return A(q), ``(*batch, N, M)``."""
 
-    # What a subclass may replace by closed formulas.
+    # Methods that a subclass may override by closed formulas.
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return torch.func.grad(lambda x: self.potential_energy(x).sum())(q)
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """M(q) a + C(q, v) v, with C(q, v) v = (dM/dt) v - d(v^T M v / 2)/dq."""
+        """Return M(q) a + C(q, v) v, with C(q, v) v = (dM/dt) v - d(v^T M v / 2)/dq."""
         mass, mass_rate = torch.func.jvp(self.mass_matrix, (q,), (v,))  # type: ignore[misc]
         return matvec(mass, a) + matvec(mass_rate, v) - self._kinetic_gradient(q, v)
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        """The a that solves M(q) a + C(q, v) v + G(q) = force."""
+        """Return the a that solves M(q) a + C(q, v) v + G(q) = force."""
         mass, bias = self._mass_and_bias(q, v)
         return spd_solve(mass, force - bias)
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """M(q) and C(q, v) v + G(q)."""
+        """Return M(q) and C(q, v) v + G(q)."""
         bias = self._inertial_force(q, v, torch.zeros_like(v)) + self._potential_force(q)
         return self.mass_matrix(q), bias
 
@@ -98,7 +97,7 @@ class MechanicalSystem(ContinuousPredictor):
         return torch.zeros_like(v)
 
     def _friction_slope(self, v: Tensor) -> Tensor:
-        """dF_i/dv_i, ``(*batch, N)``."""
+        """Return dF_i/dv_i, ``(*batch, N)``."""
         return torch.zeros_like(v)
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
@@ -108,12 +107,12 @@ class MechanicalSystem(ContinuousPredictor):
         return torch.zeros_like(v)
 
     def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """A(q) u + r(q, v, u)."""
+        """Return A(q) u + r(q, v, u)."""
         force = self._input_force(q, u)
         return force + self._residual_force(q, v, u) if self.has_residual else force
 
     def _hamiltonian_gradient(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        """(dH/dq, dH/dp): dH/dp = M^-1 p = v and dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v."""
+        """Return dH/dq = G(q) - d(v^T M v / 2)/dq at fixed v, and dH/dp = M^-1 p = v."""
         v = self._velocity(q, p)
         return self._potential_force(q) - self._kinetic_gradient(q, v), v
 
@@ -124,14 +123,14 @@ class MechanicalSystem(ContinuousPredictor):
         return spd_solve(self.mass_matrix(q), p)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        """d(v^T M(q) v / 2)/dq at fixed v, one reverse pass through the mass matrix."""
+        """Return d(v^T M(q) v / 2)/dq at fixed v, by one reverse pass through the mass matrix."""
         return torch.func.grad(lambda x: 0.5 * (v * matvec(self.mass_matrix(x), v)).sum())(q)
 
     # What every mechanical system can then do.
 
     @final
     def terms(self, q: Tensor) -> Terms:
-        """M(q), D(q), G(q) and A(q) together."""
+        """Return M(q), D(q), G(q) and A(q) together."""
         self._check(q=q)
         return Terms(
             self.mass_matrix(q),
@@ -142,19 +141,19 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def potential_force(self, q: Tensor) -> Tensor:
-        """G(q) = dV/dq, ``(*batch, N)``."""
+        """Return G(q) = dV/dq, ``(*batch, N)``."""
         self._check(q=q)
         return self._potential_force(q)
 
     @final
     def dissipative_force(self, q: Tensor, v: Tensor) -> Tensor:
-        """D(q) v + F(v), ``(*batch, N)``; its power v^T D v + v^T F(v) is never negative."""
+        """Return D(q) v + F(v), ``(*batch, N)``; its power v^T D v + v^T F(v) is never negative."""
         self._check(q=q, v=v)
         return self._damping_force(q, v) + self._friction_force(v)
 
     @final
     def coriolis_matrix(self, q: Tensor, v: Tensor) -> Tensor:
-        """C(q, v), ``(*batch, N, N)``, from the Christoffel symbols of the first kind::
+        """Return C(q, v), ``(*batch, N, N)``, from the Christoffel symbols of the first kind::
 
             C_ij = sum_k (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k / 2
 
@@ -174,62 +173,62 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """r(q, v, u), ``(*batch, N)``; it may have any power."""
+        """Return r(q, v, u), ``(*batch, N)``; it may have any power."""
         self._check(q=q, v=v, u=u)
         return self._residual_force(q, v, u)
 
     @final
     def forward_dynamics(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """a = M^-1 (A u + r - C v - G - D v - F), ``(*batch, N)``; paper eq. (armdynamics)."""
+        """Return M^-1 (A u + r - C v - G - D v - F), ``(*batch, N)``; paper eq. (armdynamics)."""
         self._check(q=q, v=v, u=u)
         force = self._applied_force(q, v, u) - self.dissipative_force(q, v)
         return self._acceleration(q, v, force)
 
     @final
     def inverse_dynamics(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """tau = M a + C v + G + D v + F, ``(*batch, N)``: the A u + r that gives ``a``."""
+        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``, the force A u + r for ``a``."""
         self._check(q=q, v=v, a=a)
         conservative = self._inertial_force(q, v, a) + self._potential_force(q)
         return conservative + self.dissipative_force(q, v)
 
     @final
     def momentum(self, q: Tensor, v: Tensor) -> Tensor:
-        """p = M(q) v, ``(*batch, N)``."""
+        """Return p = M(q) v, ``(*batch, N)``."""
         self._check(q=q, v=v)
         return self._momentum(q, v)
 
     @final
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        """v = M(q)^-1 p, ``(*batch, N)``."""
+        """Return v = M(q)^-1 p, ``(*batch, N)``."""
         self._check(q=q, p=p)
         return self._velocity(q, p)
 
     @final
     def kinetic_energy(self, q: Tensor, v: Tensor) -> Tensor:
-        """T = v^T M(q) v / 2, ``(*batch,)``, J."""
+        """Return T = v^T M(q) v / 2, ``(*batch,)``, J."""
         return 0.5 * (self.momentum(q, v) * v).sum(-1)
 
     @final
     def total_energy(self, q: Tensor, v: Tensor) -> Tensor:
-        """E = T + V, ``(*batch,)``, J."""
+        """Return E = T + V, ``(*batch,)``, J."""
         return self.kinetic_energy(q, v) + self.potential_energy(q)
 
     @final
     def power(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """dE/dt = v^T (A u + r) - v^T (D v + F), ``(*batch,)``, W: what enters less losses."""
+        """Return dE/dt = v^T (A u + r) - v^T (D v + F), ``(*batch,)``, W: supply less losses."""
         self._check(q=q, v=v, u=u)
         supplied = self._applied_force(q, v, u) - self.dissipative_force(q, v)
         return (v * supplied).sum(-1)
 
     @final
     def velocity_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """d(q, v)/dt, ``(*batch, 2N)``, Lagrangian form; the argument of a (q, v) roll-out."""
+        """Return d(q, v)/dt, ``(*batch, 2N)``, in Lagrangian form."""
         q, v = x.chunk(2, dim=-1)
         return torch.cat([v, self.forward_dynamics(q, v, u)], dim=-1)
 
     @final
     def momentum_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """d(q, p)/dt, ``(*batch, 2N)``, Hamiltonian form; the argument of a (q, p) roll-out."""
+        """Return d(q, p)/dt, ``(*batch, 2N)``, in Hamiltonian form."""
         q, p = x.chunk(2, dim=-1)
         self._check(q=q, p=p, u=u)
         grad_q, v = self._hamiltonian_gradient(q, p)
@@ -238,14 +237,14 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """dx/dt of the system's own state, (q, v) or (q, p)."""
+        """Return dx/dt of the state of this system, (q, v) or (q, p)."""
         if self.state == "qp":
             return self.momentum_derivative(x, u)
         return self.velocity_derivative(x, u)
 
     @final
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Maps r to the k with (1 - s J) k = r, where J holds the dissipation, the stiff part::
+        """Return a function from r to k with (1 - s J) k = r, where J is the stiff dissipation::
 
             (q, v):  J = [[0, 1], [0, -M^-1 D']]       (q, p):  J = [[0, M^-1], [0, -D' M^-1]]
 

@@ -1,4 +1,4 @@
-"""Trajectories: what is simulated, measured, predicted and compared."""
+"""Trajectories: simulated, measured or predicted motions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from pinn_dyn.mechanics.signal import Signal, stacked
 
 State = Literal["qv", "qp"]
-"""What a state x is made of: (q, v), or (q, p) with p = M(q) v."""
+"""Name of a state x: (q, v), or (q, p) with p = M(q) v."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,13 @@ class Trajectory:
     Attributes:
         q: configuration, ``(*batch, T, N)``.
         v: velocity dq/dt, ``(*batch, T, N)``.
-        input: u at T times, ``(*batch, T, M)``, and how it moves between them.
-        momentum: p = M(q) v where the truth is known, ``(*batch, N), (*batch, N) -> (*batch, N)``
-            on the CPU; None for measured data.
-        past: u right before the first sample at the same sample time, ``(*batch, K, M)``, or None
-            where it is not known.
+        input: u at T times, ``(*batch, T, M)``, and its interpolation.
+        momentum: function from (q, v) to p = M(q) v on the CPU, ``(*batch, N)``, for simulated
+            data; None for measured data.
+        past: the K samples of u before the first sample, ``(*batch, K, M)``, or None if unknown.
 
     Raises:
-        ValueError: on fewer than two samples, or shapes that do not match.
+        ValueError: if there are fewer than two samples, or shapes do not match.
     """
 
     q: Tensor
@@ -67,13 +66,13 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last sample in s."""
+        """Time from the first to the last sample, s."""
         return float(self.t[-1] - self.t[0])
 
     def input_since(self, history: float) -> Signal:
-        """u from ``history`` seconds before the start on; where it is not known, its first value.
+        """Return u from ``history`` seconds before the start on. Unknown input has the first value.
 
-        The samples before the start are whole sample times apart.
+        The samples before the start are a sample time apart.
         """
         step = self.t[1] - self.t[0]
         count = math.ceil(history / float(step) - 1e-6)
@@ -88,10 +87,10 @@ class Trajectory:
         )
 
     def states(self, state: State, samples: slice = slice(None)) -> Tensor:
-        """States ``(*batch, T, 2N)`` at the chosen samples: (q, v) or (q, p).
+        """Return states (q, v) or (q, p) at the chosen samples, ``(*batch, T, 2N)``.
 
         Raises:
-            ValueError: if momenta are asked for and M is not known.
+            ValueError: if momenta are needed and M is unknown.
         """
         q, v = self.q[..., samples, :], self.v[..., samples, :]
         if state == "qv":
@@ -99,21 +98,21 @@ class Trajectory:
         if self.momentum is None:
             raise ValueError(
                 "this trajectory has no momentum p, which a Hamiltonian model needs: use "
-                "simulated data, which have it, or a Lagrangian model"
+                "simulated data or a Lagrangian model"
             )
         return torch.cat([q, self.momentum(q.cpu(), v.cpu()).to(q)], dim=-1)
 
     def to(self, device: torch.device | str) -> Trajectory:
-        """The trajectory on another device."""
+        """Move the trajectory to a device."""
         moved = {name: getattr(self, name).to(device) for name in ("q", "v", "input")}
         past = None if self.past is None else self.past.to(device)
         return replace(self, **moved, past=past)
 
     def until(self, horizon: float) -> Trajectory:
-        """The part of the trajectory up to ``horizon`` seconds after its start.
+        """Return the part up to ``horizon`` seconds after the start.
 
         Raises:
-            ValueError: if the trajectory is shorter than the horizon, or its step longer.
+            ValueError: if the horizon is longer than the trajectory, or shorter than a step.
         """
         step = float(self.t[1] - self.t[0])
         if self.duration < horizon - 0.5 * step:
@@ -137,27 +136,27 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
     """Stack trajectories that share their sample times into one batched trajectory.
 
     Raises:
-        ValueError: on an empty list, or on trajectories whose sample times differ.
+        ValueError: if the list is empty, or sample times or interpolations differ.
     """
     if not trajectories:
         raise ValueError("trajectories is empty: expected at least one")
     first = trajectories[0]
-    for index, other in enumerate(trajectories):
-        kind, expected = other.input.interpolation, first.input.interpolation
+    for index, item in enumerate(trajectories):
+        kind, expected = item.input.interpolation, first.input.interpolation
         if kind != expected:
             raise ValueError(
                 f"trajectory {index} has interpolation {kind!r}, trajectory 0 {expected!r}: "
                 "expected the same"
             )
-        # Sample times are compared from each trajectory's own start.
-        resolution = 4 * torch.finfo(other.t.dtype).eps * float(other.t.abs().max())
-        same = other.t.shape == first.t.shape and torch.allclose(
-            other.t - other.t[0], first.t - first.t[0], rtol=0, atol=max(1e-9, resolution)
+        # Sample times are compared relative to the start of each trajectory.
+        resolution = 4 * torch.finfo(item.t.dtype).eps * float(item.t.abs().max())
+        same = item.t.shape == first.t.shape and torch.allclose(
+            item.t - item.t[0], first.t - first.t[0], rtol=0, atol=max(1e-9, resolution)
         )
         if not same:
             raise ValueError(
                 f"trajectory {index} has other sample times than trajectory 0 "
-                f"({other.t.shape[0]} and {first.t.shape[0]} samples): resample them first"
+                f"({item.t.shape[0]} and {first.t.shape[0]} samples): resample them first"
             )
     return replace(
         first,
@@ -169,14 +168,14 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
 
 
 def stack_until(trajectories: Sequence[Trajectory], duration: float | None = None) -> Trajectory:
-    """Those that last so long, cut to it, as one batched trajectory.
+    """Stack the trajectories that are long enough, cut to a duration.
 
     Args:
-        trajectories: of any lengths, with one sample time.
-        duration: in s; None: of the shortest, so that all of them are kept.
+        trajectories: trajectories of any length with the same sample time.
+        duration: duration in s. The default is that of the shortest trajectory.
 
     Raises:
-        ValueError: if none lasts so long, or they cannot be stacked; see :func:`stack`.
+        ValueError: if no trajectory is long enough, or they cannot be stacked, see :func:`stack`.
     """
     if not trajectories:
         return stack([])
@@ -189,15 +188,15 @@ def stack_until(trajectories: Sequence[Trajectory], duration: float | None = Non
 
 
 def _stacked_past(trajectories: list[Trajectory]) -> Tensor | None:
-    """The inputs before each start, as far back as that of any is known."""
-    known = [item.u[..., :0, :] if item.past is None else item.past for item in trajectories]
-    count = max(past.shape[-2] for past in known)
-    extended = [_extended(p, item.u, count) for p, item in zip(known, trajectories, strict=True)]
+    """Stack the inputs before each start, to the longest known history."""
+    pasts = [item.u[..., :0, :] if item.past is None else item.past for item in trajectories]
+    count = max(past.shape[-2] for past in pasts)
+    extended = [_extended(p, item.u, count) for p, item in zip(pasts, trajectories, strict=True)]
     return torch.stack(extended) if count else None
 
 
 def _extended(past: Tensor, u: Tensor, count: int) -> Tensor:
-    """The last ``count`` samples before u, the earliest one that is known in place of others."""
+    """Return the last ``count`` samples before u, filled up with the earliest known sample."""
     past = past[..., max(past.shape[-2] - count, 0) :, :]
     first = torch.cat([past, u], dim=-2)[..., :1, :]
     missing = count - past.shape[-2]
@@ -205,10 +204,10 @@ def _extended(past: Tensor, u: Tensor, count: int) -> Tensor:
 
 
 def samples_of(name: str, duration: float, t: Tensor) -> int:
-    """How many sample times of t, ``(T,)``, a duration in s holds.
+    """Return the number of sample times of t ``(T,)`` in a duration in s.
 
     Raises:
-        ValueError: unless that is a positive integer, and the sample time constant.
+        ValueError: if the number is not a positive integer, or the sample time is not constant.
     """
     steps = t.double().diff()
     sample_time = float(steps.mean())

@@ -1,4 +1,4 @@
-"""Black boxes: the rivals, which know no mechanics."""
+"""Black-box models, the baselines without mechanics."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from pinn_dyn.models.statistics import Statistics
 
 
 class NextStateMLP(Predictor):
-    """x_{k+1} = x_k + s * network(x_k, u_k, u_{k+1}), the paper's black box.
+    """x_{k+1} = x_k + s * network(x_k, u_k, u_{k+1}), the black box of the paper.
 
     The state is x = (q, v). Inputs are normalized by mean and standard deviation, the output by
-    the standard deviation s of the state increment over one step. A step has one length, that of
-    the windows it was trained on.
+    the standard deviation s of the state increment over one step. The step is that of the training
+    windows.
 
     Args:
         statistics: scales of the data.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        angles: which coordinates are angles; the network sees their sine and cosine.
+        angles: coordinates that are angles. The network uses their sine and cosine.
     """
 
     scale: Tensor
@@ -49,14 +49,14 @@ class NextStateMLP(Predictor):
 
     @property
     def fixed_step(self) -> float:  # type: ignore[override]
-        """The step of the windows that it was trained on, s."""
+        """Step of the training windows, s."""
         return float(self.step)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """Apply the network step by step.
 
         Raises:
-            ValueError: if ``t`` does not advance by the step the model was trained on.
+            ValueError: if the step of ``t`` is not that of the training windows.
         """
         step = self.fixed_step
         spacing = (t[1:] - t[:-1]).double()
@@ -67,7 +67,7 @@ class NextStateMLP(Predictor):
             )
         x = torch.zeros_like(x0)
         path = [x]
-        # The input at both ends of each step; of a held one the end still has the step's own.
+        # The input at both ends of each step. A held input has the same value at both.
         for before, after in input.stages(t, (0.0, 1.0)).to(x0):
             x = x + self.scale * self.network(torch.cat([x0 + x, before, after], dim=-1))
             path.append(x)
@@ -77,18 +77,18 @@ class NextStateMLP(Predictor):
 class AccelerationMLP(DelayedPredictor):
     """dv/dt = s * network(q, v, u), integrated by the same RK4 as the structured models.
 
-    A fairer rival than :class:`NextStateMLP`: it knows that v is the rate of q, and it is not
-    tied to one step. s is the standard deviation of the velocity increment over a step, divided
-    by the step.
+    This is a stronger baseline than :class:`NextStateMLP`: dq/dt = v holds by construction, and any
+    step is possible. s is the standard deviation of the velocity increment over a step, divided by
+    the step.
 
     Args:
         statistics: scales of the data.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        angles: which coordinates are angles; the network sees their sine and cosine.
-        integrator: the method of integration.
-        initial_velocity: builder of the head for the velocity at which roll-outs start.
-        delay: of the input; None: there is none.
+        angles: coordinates that are angles. The network uses their sine and cosine.
+        integrator: the integration method.
+        initial_velocity: builder of the head for the initial velocity.
+        delay: delay of the input. The default has no delay.
     """
 
     scale: Tensor

@@ -15,21 +15,19 @@ from pinn_dyn.models.positivity import Positive, Positivity
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.triangular import UNROLLED, square
 
-# Beyond the outputs on the data: a softplus far below zero is an exponential, exp(-0.2) = 0.82.
+# Margins of the outputs beyond their values on the data. A softplus far below zero is an
+# exponential, so the margin changes a diagonal entry by at most a factor exp(-0.2) = 0.82.
 _DIAGONAL_MARGIN = 0.2
-_MARGIN = 0.1
+_MARGIN = 0.1  # in units of the range on the data
 
 
 class CholeskyFactor(nn.Module, abc.ABC):
-    """A lower triangular L(q) ``(*batch, N, N)``, for a matrix L L^T that is never indefinite.
-
-    ``linearize`` returns L and a tape; ``pushforward`` gives dL for a tangent dq, ``pullback``
-    gives the gradient in q for a cotangent of L, ``linearize_along`` the first two at once.
+    """Lower triangular factor L(q) ``(*batch, N, N)`` of a positive semi-definite matrix L L^T.
 
     Attributes:
-        transposed: the matrix is L^T L instead, with L^T the upper triangular factor.
-        chain: column j of L depends on the coordinates after q_j alone.
-        constant: L is the same at every q.
+        transposed: true if the matrix is L^T L.
+        chain: true if column j of L depends only on the coordinates after q_j.
+        constant: true if L is the same at every q.
     """
 
     transposed: bool = False
@@ -38,31 +36,31 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
-        """L(q), ``(*batch, N, N)``, and the tape for the passes below."""
+        """Return L(q), ``(*batch, N, N)``, and the tape for the passes below."""
 
     @abc.abstractmethod
     def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """dL, ``(*batch, N, N)``, for dq ``(*batch, N)``."""
+        """Return dL, ``(*batch, N, N)``, for dq ``(*batch, N)``."""
 
     @abc.abstractmethod
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
-        """Gradient of <cotangent, L(q)> in q, ``(*batch, N)``."""
+        """Return the gradient of <cotangent, L(q)> in q, ``(*batch, N)``."""
 
     def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """L(q), dL for dq, and the tape."""
+        """Return L(q), dL for dq, and the tape."""
         factor, tape = self.linearize(q)
         return factor, self.pushforward(tape, dq), tape
 
     def forward(self, q: Tensor) -> Tensor:
-        """L(q), ``(*batch, N, N)``."""
+        """Return L(q), ``(*batch, N, N)``."""
         return self.linearize(q)[0]
 
     def matrix(self, q: Tensor) -> Tensor:
-        """L(q) L(q)^T, or L(q)^T L(q) if transposed, ``(*batch, N, N)``."""
+        """Return L(q) L(q)^T, or L(q)^T L(q) if transposed, ``(*batch, N, N)``."""
         return square(self(q).transpose(-1, -2) if self.transposed else self(q))
 
     def product(self, q: Tensor, x: Tensor) -> Tensor:
-        """The matrix times x, ``(*batch, N)``, by its factor: N^2 operations, not N^3."""
+        """Return the matrix times x, ``(*batch, N)``, by its factor: N^2 operations, not N^3."""
         factor = self(q).transpose(-1, -2) if self.transposed else self(q)
         return matvec(factor, matvec(factor.transpose(-1, -2), x))
 
@@ -70,34 +68,34 @@ class CholeskyFactor(nn.Module, abc.ABC):
 class NetworkCholesky(CholeskyFactor):
     """L(q) = diag(scale) * tril(network(q)), with a positive diagonal.
 
-    The network has N (N + 1)/2 outputs, the first N for the diagonal (paper, section Sub-Network
-    Structures); ``positivity`` makes the entries of them. What the network sees of q saturates
-    outside the data. Once trained, its outputs y saturate too, beyond what they were on the data,
-    as in the corners of a box around the data no motion may ever have been: with c = y clipped to
-    its smallest and largest value on the data and a margin m of 0.2 (diagonal) or a tenth of that
-    range (others), y becomes c + m tanh((y - c)/m). So by construction every entry of L is nearly
-    within what the data showed, and the eigenvalues of the matrix are bounded on either side.
+    The network has N (N + 1)/2 outputs y, the first N for the diagonal (paper, section Sub-Network
+    Structures). ``positivity`` maps them to the entries of L. The input of the network saturates
+    outside the data. After training, its outputs saturate, too, since no motion may have visited
+    the corners of a box around the data: with c = y clipped to its range on the data and a margin m
+    (0.2 on the diagonal, a tenth of the range elsewhere), y is replaced by c + m tanh((y - c)/m).
+    So every entry of L is nearly within its range on the data, and the eigenvalues of the matrix
+    are bounded from both sides.
 
-    In a chain of bodies row i of L in M = L^T L (``transposed``) describes the bodies from joint i
-    to the tip, so that most entries are simpler functions than those of L in M = L L^T
-    (Featherstone 2005, "Efficient factorization of the joint-space inertia matrix for branched
-    kinematic trees"). The scale is then that of the columns of L.
+    In a chain of bodies, row i of L in M = L^T L (``transposed``) describes the bodies from joint i
+    to the tip. Most entries are then simpler functions of q than in M = L L^T (Featherstone 2005,
+    "Efficient factorization of the joint-space inertia matrix for branched kinematic trees"). The
+    scale is then that of the columns of L.
 
-    In a serial chain of rigid bodies, whose coordinates are the joints from base to tip, M_ij with
-    i >= j depends on the joints after j alone: turning the joints up to j moves all bodies that the
-    two move like one. Then so does column j of L in M = L^T L, and in M^-1 = L L^T. With ``chain``
-    the network cannot say otherwise: its weights are masked.
+    In a serial chain of rigid bodies with the joints ordered from base to tip, M_ij with i >= j
+    depends only on the joints after j, since the joints up to j move all bodies beyond as one.
+    Column j of L in M = L^T L, and in M^-1 = L L^T, has the same property. ``chain`` enforces this
+    property by masked weights.
 
     Args:
-        scales: of the data; the value is the typical size of the rows of L, ``(N,)``.
+        scales: scales of the data. The value is the typical size of the rows of L, ``(N,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        positivity: what keeps the diagonal positive.
-        transposed: use L for L^T L.
-        chain: let column j of L depend on the coordinates after q_j alone.
+        positivity: map from outputs to entries with a positive diagonal.
+        transposed: true for the matrix L^T L.
+        chain: true if column j of L depends only on the coordinates after q_j.
 
     Raises:
-        ValueError: with ``chain`` on hidden layers of too few units.
+        ValueError: if ``chain`` needs wider hidden layers.
     """
 
     placement: Tensor
@@ -124,11 +122,11 @@ class NetworkCholesky(CholeskyFactor):
         after = [*range(size), *column.tolist()] if chain else None
         self.network = scales.network(size * (size + 1) // 2, hidden, activation, after)
         with torch.no_grad():
-            # Start near a diagonal matrix: a random off-diagonal part only has to be unlearned.
+            # Start near a diagonal matrix, so that no random off-diagonal part has to be unlearned.
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
             last.bias[:size] = positivity.start
-        # vec(L) = y S, where S holds the scales and says which entry of y goes where.
+        # vec(L) = y S, where S contains the scale and the position of each entry.
         order = torch.cat([torch.arange(size) * (size + 1), row * size + column])
         placement = torch.zeros(len(order), size * size)
         placement[torch.arange(len(order)), order] = scales.value.float()[
@@ -136,7 +134,7 @@ class NetworkCholesky(CholeskyFactor):
         ]
         self.register_buffer("placement", placement)
         self.register_buffer("order", order.unsqueeze(1), persistent=False)
-        self.register_buffer("output_limits", None)  # while it learns
+        self.register_buffer("output_limits", None)  # none during training
 
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
         y, tape = self.network.linearize(q)
@@ -144,7 +142,7 @@ class NetworkCholesky(CholeskyFactor):
         return _matrices(self._assemble(values), q), (*tape, slopes)
 
     def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """L(q), dL for dq, and the tape, by one pass through the network."""
+        """Return L(q), dL for dq, and the tape, by one pass through the network."""
         y, dy, tape = self.network.linearize_along(q, dq)
         values, slopes = self._entries(columns(y))
         rate = self._assemble(slopes * columns(dy))
@@ -159,7 +157,7 @@ class NetworkCholesky(CholeskyFactor):
         return self.network.pullback(tape[:-1], rows(dy, cotangent[..., 0]))
 
     def limits_at(self, q: Tensor) -> Tensor:
-        """Smallest and largest outputs at q ``(B, N)``, and the margin beyond, ``(3, K)``."""
+        """Return the smallest and largest outputs at q ``(B, N)``, and the margins, ``(3, K)``."""
         with torch.no_grad():
             y = self.network(q)
         low, high = y.amin(0), y.amax(0)
@@ -168,7 +166,7 @@ class NetworkCholesky(CholeskyFactor):
         return torch.stack([low, high, margin])
 
     def _entries(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Entries of L in units of its scale, the diagonal first, and their slopes in y."""
+        """Return the entries of L in units of its scale, diagonal first, and their slopes in y."""
         if self.output_limits is None:
             return self._free_entries(y)
         low, high, margin = self.output_limits.reshape(3, -1, *[1] * (y.ndim - 1)).unbind()
@@ -183,11 +181,11 @@ class NetworkCholesky(CholeskyFactor):
         return torch.cat([diagonal, lower]), torch.cat([diagonal_slope, lower_slope])
 
     def _scales(self, y: Tensor) -> Tensor:
-        """Scale of the row of L that each entry is in, to multiply y ``(K, ...)`` with."""
+        """Scale of each entry, shaped to be multiplied with y ``(K, ...)``."""
         return self.placement.gather(1, self.order).reshape(-1, *[1] * (y.ndim - 1))
 
     def _assemble(self, values: Tensor) -> Tensor:
-        """L, ``(N, N, ...)``, from its entries ``(K, ...)``; cheaper than indexing backwards."""
+        """Build L ``(N, N, ...)`` from its entries ``(K, ...)``. Indexing has a slower gradient."""
         values = values * self._scales(values)
         if self.size > UNROLLED:
             flat = values.new_zeros(self.size**2, *values.shape[1:])
@@ -201,7 +199,7 @@ class NetworkCholesky(CholeskyFactor):
         return torch.cat(pieces).unflatten(0, (self.size, self.size))
 
     def _take(self, matrix: Tensor) -> Tensor:
-        """The transpose of :meth:`_assemble`: entries ``(K, B)`` of a matrix ``(N * N, B)``."""
+        """Apply the transpose of :meth:`_assemble` to ``(N * N, B)``; return entries ``(K, B)``."""
         size = self.size
         if size > UNROLLED:
             entries = matrix.index_select(0, self.order[:, 0])
@@ -212,15 +210,15 @@ class NetworkCholesky(CholeskyFactor):
 
 
 def _matrices(square: Tensor, like: Tensor) -> Tensor:
-    """``(N, N, B)`` as ``(*batch, N, N)``, for ``like`` ``(*batch, k)``; a view of small ones."""
+    """Reshape ``(N, N, B)`` to ``(*batch, N, N)``, with the batch of ``like`` ``(*batch, k)``."""
     size = square.shape[0]
     matrices = rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
-    # The library copies what is not in rows, at every solve.
+    # The library would copy a matrix that is not contiguous at every solve.
     return matrices.contiguous() if size > UNROLLED else matrices
 
 
 class _ConstantFactor(CholeskyFactor):
-    """An L that is the same at every q."""
+    """Factor that is the same at every q."""
 
     constant = True
 
@@ -236,8 +234,8 @@ class ConstantCholesky(_ConstantFactor):
     """L = diag(scale) * tril(parameters), the same at every q.
 
     Args:
-        scales: of the data; the value is the typical size of the rows of L, ``(N,)``.
-        positivity: what keeps the diagonal positive.
+        scales: scales of the data. The value is the typical size of the rows of L, ``(N,)``.
+        positivity: map from parameters to entries with a positive diagonal.
     """
 
     scale: Tensor
@@ -257,14 +255,14 @@ class ConstantCholesky(_ConstantFactor):
 
 
 class FixedCholesky(_ConstantFactor):
-    """L = the Cholesky factor of a given constant matrix, not learned.
+    """L = the Cholesky factor of a fixed constant matrix.
 
     Args:
-        scales: of the data.
-        value: the symmetric positive semi-definite matrix, ``(N, N)``.
+        scales: scales of the data.
+        value: symmetric positive semi-definite matrix, ``(N, N)``.
 
     Raises:
-        ValueError: if the matrix is not N x N, not symmetric or not positive semi-definite.
+        ValueError: if the matrix is not N x N, symmetric and positive semi-definite.
     """
 
     factor: Tensor
@@ -284,7 +282,7 @@ class FixedCholesky(_ConstantFactor):
                 f"FixedCholesky: value has the eigenvalue {float(eigenvalues[0]):.4g}, expected "
                 "a positive semi-definite matrix"
             )
-        # A QR factor of the square root is a Cholesky factor that also exists for a singular one.
+        # A QR factor of the square root is a Cholesky factor, also of a singular matrix.
         root = (vectors * eigenvalues.clamp(min=0).sqrt()).T
         upper = torch.linalg.qr(root).R
         sign = torch.where(upper.diagonal() < 0, -1.0, 1.0).to(upper)

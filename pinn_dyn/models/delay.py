@@ -1,4 +1,4 @@
-"""Delays between an input, as it is logged or commanded, and its action: none, or a learned one."""
+"""Delays between a logged or commanded input and its action: none, or learned."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from pinn_dyn.mechanics import ContinuousPredictor, Signal
 
 
 class Delay(nn.Module, abc.ABC):
-    """The delay d >= 0 of an input, one for all its entries: u(t - d) acts at t.
+    """Delay d >= 0 of all inputs: u(t - d) acts at t.
 
     Attributes:
-        longest: the longest d that it may have, s; as much input before a start is needed.
+        longest: largest possible d, s. Roll-outs need the input this long before the start.
     """
 
     longest: float
 
     @abc.abstractmethod
     def forward(self, input: Signal) -> Signal:
-        """u(t - d)."""
+        """Return u(t - d)."""
 
     def figures(self) -> dict[str, float]:
-        """What is learned, by name: nothing here."""
+        """Return learned numbers by name. The default has none."""
         return {}
 
 
@@ -39,19 +39,18 @@ class NoDelay(Delay):
 
 
 class LearnedDelay(Delay):
-    """One learned delay of all inputs, trained with the terms that they drive::
+    """A learned delay of all inputs, trained together with the dynamics::
 
         d = longest * clamp(z, 0, 1),      dL/dd = -sum over stages of dL/du . du/dt
 
-    The clamp lets gradients through, so that a d at 0 can grow again. The slope du/dt is that of
-    the lines or cubics between the samples. A length of ``longest`` is crossed in some 1/lr steps
-    of Adam. Delays that differ between inputs are shifted apart before (the step InputDelay); the
-    data determine d only where the input changes faster than the motion that it causes, and
-    ``check.py`` shows the curve.
+    The clamp passes gradients, so that a d at 0 can grow again. The slope du/dt is that of the
+    interpolation. Adam needs about 1/lr steps to change d by ``longest``. Inputs with different
+    delays must be shifted before (the cleaning step InputDelay). The data determine d only if the
+    input changes faster than the motion that it causes; ``check.py`` shows the curve.
 
     Args:
         longest: the longest delay that can be learned, s.
-        initial: d at the start of the training, s; what ``check.py`` suggests, or 0.
+        initial: initial d, s, for example the delay that ``check.py`` measures.
 
     Raises:
         ValueError: if the initial delay is longer than the longest.
@@ -67,7 +66,7 @@ class LearnedDelay(Delay):
         self.share = nn.Parameter(torch.tensor(initial / longest))
 
     def seconds(self) -> Tensor:
-        """d, ``()``, s."""
+        """Return d, ``()``, s."""
         inside = self.share.clamp(0, 1)
         return self.longest * (self.share + (inside - self.share).detach())
 
@@ -79,7 +78,7 @@ class LearnedDelay(Delay):
 
 
 class DelayedPredictor(ContinuousPredictor):
-    """A predictor whose input acts as late as its head says.
+    """Predictor with a head for the delay of its input.
 
     Attributes:
         delay: the head.
@@ -89,12 +88,12 @@ class DelayedPredictor(ContinuousPredictor):
 
     @property
     def input_history(self) -> float:  # type: ignore[override]
-        """The longest delay of its head, s."""
+        """Longest delay of the head, s."""
         return self.delay.longest
 
     def acting_input(self, input: Signal) -> Signal:
         return self.delay(input)
 
     def learned_figures(self) -> dict[str, float]:
-        """The delay of the input, if it is learned."""
+        """Return the delay of the input if it is learned."""
         return self.delay.figures()

@@ -1,4 +1,4 @@
-"""The Hamiltonian network: learns the inverse mass, V, D and A; its state is (q, p) or (q, v)."""
+"""Hamiltonian network with a learned inverse mass, V, D and A, in the state (q, p) or (q, v)."""
 
 from __future__ import annotations
 
@@ -31,32 +31,32 @@ from pinn_dyn.models.triangular import lower_solve, upper_solve
 class HamiltonianNetwork(StructuredNetwork):
     """Hamiltonian network with dissipation and a learned input matrix.
 
-    The mass head gives W(q) = L L^T = M(q)^-1, as the paper's tables show; with
+    The mass head gives W(q) = L L^T = M(q)^-1, as in the tables of the paper. With
     H = p^T W p / 2 + V, paper eq. (hamiltonian_dyn) reads::
 
         dq/dt = W p,    dp/dt = -G - d(p^T W p / 2)/dq - D W p + A u
 
-    One reverse pass through the mass head gives the gradient; nothing is solved or inverted.
+    One reverse pass through the mass head gives the gradient. No system of equations is solved.
 
-    Momenta cannot be measured. With ``state="qv"`` the same equations, in the state
-    (q, v) with p = W^-1 v, learn and predict from (q, v) alone::
+    Momenta cannot be measured. With ``state="qv"`` the same equations are written in the state
+    (q, v), with p = W^-1 v, and need no momenta::
 
         dq/dt = v,    dv/dt = (dW/dt) p + W dp/dt
 
-    That costs two triangular solves and a tangent pass more. The scale of the energies is then
-    free where A is learned: W / c with c V, c D, c A moves in the same way.
+    This takes two more triangular solves and a tangent pass. If A is learned, the scale of the
+    energies is then arbitrary: W / c with c V, c D and c A gives the same motion.
 
     Args:
         statistics: scales of the data.
         inverse_mass, potential, damping, input, friction: builders of the heads.
-        angles: which coordinates are angles; the heads see their sine and cosine.
-        integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
-            damping outweighs inertia.
+        angles: coordinates that are angles. The heads use their sine and cosine.
+        integrator: the integration method; :class:`~pinn_dyn.mechanics.Rosenbrock` if damping
+            dominates inertia.
         state: "qp" for (q, p), which needs data with momenta, or "qv" for (q, v).
-        delay: of the input; None: there is none.
+        delay: delay of the input. The default has no delay.
 
     Raises:
-        ValueError: on another state, or a transposed head.
+        ValueError: if the head of the inverse mass is transposed.
     """
 
     def __init__(
@@ -87,22 +87,22 @@ class HamiltonianNetwork(StructuredNetwork):
         if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std
         else:
-            # As in the Lagrangian network: what an acceleration takes, without a momentum.
+            # The force for a typical acceleration, as in the Lagrangian network.
             force = self.input.typical_force(statistics.u_rms)
             inverse_mass_scale = statistics.acceleration / force
         self.inverse_mass = inverse_mass(self._scales(statistics, inverse_mass_scale.sqrt()))
         if self.inverse_mass.transposed:
             raise ValueError(
-                "inverse_mass.transposed is true, expected false: M^-1 = L L^T is already M = R^T "
-                "R with the lower triangular R = L^-1, the form that suits a chain of bodies"
+                "inverse_mass.transposed is true, expected false: M^-1 = L L^T already means "
+                "M = R^T R with the lower triangular R = L^-1, the form for a chain of bodies"
             )
 
     def inverse_mass_matrix(self, q: Tensor) -> Tensor:
-        """W(q) = M(q)^-1 = L L^T, ``(*batch, N, N)``."""
+        """Return W(q) = M(q)^-1 = L L^T, ``(*batch, N, N)``."""
         return self.inverse_mass.matrix(q)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q) = W(q)^-1, ``(*batch, N, N)``."""
+        """Return M(q) = W(q)^-1, ``(*batch, N, N)``."""
         # Not cholesky_inverse: torch 2.13 gets its forward-mode derivative wrong.
         factor = self.inverse_mass(q)
         eye = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
@@ -123,25 +123,25 @@ class HamiltonianNetwork(StructuredNetwork):
         return self.inverse_mass.product(q, p)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        """d(v^T M v / 2)/dq at fixed v = -d(p^T W p / 2)/dq at fixed p = M v."""
+        """Return d(v^T M v / 2)/dq at fixed v = -d(p^T W p / 2)/dq at fixed p = M v."""
         factor, tape = self.inverse_mass.linearize(q)
         w = lower_solve(factor, v)
         p = upper_solve(factor, w)
         return -self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """M a + C v = M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
+        """Return M a + C v = M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
         factor, bias, mass_rate_p = self._factor_and_rates(q, v)
         return upper_solve(factor, lower_solve(factor, a - mass_rate_p)) + bias
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        """a = (dW/dt) p + W dp/dt."""
+        """Return the acceleration (dW/dt) p + W dp/dt."""
         factor, bias, rate_p = self._factor_and_rates(q, v)
-        rest = force - bias - self._potential_force(q)
-        return rate_p + matvec(factor, matvec(factor.transpose(-1, -2), rest))
+        net_force = force - bias - self._potential_force(q)
+        return rate_p + matvec(factor, matvec(factor.transpose(-1, -2), net_force))
 
     def _factor_and_rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """L, d(p^T W p / 2)/dq and (dW/dt) p, with p = M v and the rate along v."""
+        """Return L, d(p^T W p / 2)/dq and (dW/dt) p, with p = M v and the rate along v."""
         factor, rate, tape = self.inverse_mass.linearize_along(q, v)
         w = lower_solve(factor, v)
         p = upper_solve(factor, w)

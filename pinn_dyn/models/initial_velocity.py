@@ -1,4 +1,4 @@
-"""Heads for the velocity at which a roll-out starts: the measured one, or a learned correction."""
+"""Heads for the initial velocity of a roll-out: measured, or with a learned correction."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from pinn_dyn.models.scales import Scales
 
 
 class InitialVelocity(nn.Module, abc.ABC):
-    """The velocity v_0 ``(*batch, N)`` at which a roll-out from a measured state starts.
+    """Initial velocity v_0 ``(*batch, N)`` of a roll-out from a measured state.
 
     Attributes:
-        learned: whether v_0 is other than the measured velocity.
+        learned: true if v_0 differs from the measured velocity.
     """
 
     learned: bool
 
     @abc.abstractmethod
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """v_0 at the measured q, v ``(*batch, N)`` and the input u ``(*batch, M)`` there."""
+        """Return v_0 at the measured q, v ``(*batch, N)`` and the input u ``(*batch, M)``."""
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """(q, v_0), ``(*batch, 2N)``, at the measured x0 = (q, v) and the input u0 there."""
+        """Return (q, v_0), ``(*batch, 2N)``, at the measured x0 = (q, v) and the input u0."""
         q, v = x0.chunk(2, dim=-1)
         return torch.cat([q, self(q, v, u0)], dim=-1)
 
 
 InitialVelocityHead = Callable[[Scales], InitialVelocity]
-"""Builds a head for the velocity at which roll-outs start."""
+"""Builder of a head for the initial velocity."""
 
 
 class MeasuredVelocity(InitialVelocity):
-    """v_0 = v.
+    """v_0 = v, the measured velocity.
 
     Args:
-        scales: of the data.
+        scales: scales of the data.
     """
 
     learned = False
@@ -53,17 +53,17 @@ class MeasuredVelocity(InitialVelocity):
 
 
 class LearnedVelocity(InitialVelocity):
-    """v_0 = v + s_v * network(q, v, u): where the state is estimated, not measured.
+    """v_0 = v + s_v * network(q, v, u), for velocities that are estimated instead of measured.
 
-    A velocity derived from the last few samples of q carries noise, and damped motion forgets it
-    within a step or two, so that the dynamics cannot average over it. The network knows where
-    noise is likely, as where the motors rest. What follows obeys the equation of motion as before.
-    It starts at v_0 = v, and is trained with the dynamics (an encoder of the initial state, as in
-    Beintema, Schoukens and Toth 2023, "Deep subspace encoders for nonlinear system
-    identification").
+    A velocity derived from a few samples of q is noisy, and a strongly damped motion forgets the
+    initial velocity within a step or two, so the dynamics cannot average over the noise. The
+    network learns where noise is likely, for example while the motors rest. The motion after the
+    start obeys the equation of motion. The head starts at v_0 = v and is trained together with the
+    dynamics. Source: an encoder of the initial state as in Beintema, Schoukens and Toth (2023),
+    "Deep subspace encoders for nonlinear system identification".
 
     Args:
-        scales: of the data; the value is s_v, ``(N,)``.
+        scales: scales of the data. The value is s_v, ``(N,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
     """

@@ -1,4 +1,4 @@
-"""Heads for the input matrix: learned or fixed, or one that depends on the input."""
+"""Heads for the input matrix: learned, fixed, or dependent on the input."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pinn_dyn.models.scales import Scales
 
 
 class InputMatrix(nn.Module, abc.ABC):
-    """A(q) ``(*batch, N, M)``.
+    """Input matrix A(q) ``(*batch, N, M)``.
 
     Args:
-        scales: of the data.
+        scales: scales of the data.
 
     Attributes:
-        affine: whether the force is A(q) u, with an A that does not depend on u.
+        affine: true if A does not depend on u.
     """
 
     affine: bool = True
@@ -32,16 +32,16 @@ class InputMatrix(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def forward(self, q: Tensor) -> Tensor:
-        """A(q), ``(*batch, N, M)``."""
+        """Return A(q), ``(*batch, N, M)``."""
 
     def force(self, q: Tensor, u: Tensor) -> Tensor:
-        """The generalized force A(q) u, ``(*batch, N)``."""
+        """Return the generalized force A(q) u, ``(*batch, N)``."""
         return matvec(self(q), u)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Root mean square of each generalized force, ``(N,)``, before anything is learned.
+        """Return the initial root mean square of each generalized force, ``(N,)``.
 
-        While A is unknown, every coordinate gets the root mean square over all inputs, ``(M,)``.
+        The default for an unknown A is the root mean square over all inputs ``(M,)``.
         """
         return u_rms.square().mean().sqrt().expand(self.shape[0])
 
@@ -49,10 +49,10 @@ class InputMatrix(nn.Module, abc.ABC):
 class NetworkInput(InputMatrix):
     """A(q) = scale_j * network(q), reshaped to N x M (paper, figure A-NN).
 
-    What the network sees of q saturates outside the data, so that A is bounded.
+    The input of the network saturates outside the data, so that A is bounded.
 
     Args:
-        scales: of the data; the value is the typical size of the entries of each column, ``(M,)``.
+        scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
     """
@@ -73,23 +73,23 @@ class NetworkInput(InputMatrix):
 class NonlinearInput(InputMatrix):
     """tau = A(q, u) u with A(q, u) = scale_j * network(q, u), reshaped to N x M.
 
-    The columns of the ``linear`` inputs are constants instead, and the network does not see those
-    inputs. Of the rates of motors a log often says no more than that, and a network that depends on
-    them finds more than there is.
+    This head is for inputs that are positions instead of forces. For example, a tendon that is
+    tightened becomes stiffer and pulls in a different direction. With the rates of the motors among
+    the inputs (the cleaning step :class:`pinn_dyn.data.logs.InputRates`), the force is that of
+    nonlinear springs and dampers between motors and body. Controllers need an A(q) and refuse this
+    head.
 
-    For inputs that are positions, not forces: a tendon that its motor tightens gets stiffer and
-    pulls in another direction. With the motors' rates among the inputs (the step
-    :class:`pinn_dyn.data.logs.InputRates`) the force on the robot is that of springs and dampers
-    between motors and body, none of them linear. The controllers need an A(q) and refuse it.
+    The columns of the ``linear`` inputs are constants, and the network does not depend on these
+    inputs. This prevents overfitting to inputs with little information, such as motor rates.
 
     Args:
-        scales: of the data; the value is the typical size of the entries of each column, ``(M,)``.
+        scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
         linear: inputs with a constant column.
 
     Raises:
-        ValueError: if ``linear`` names an input twice, one that is not there, or all of them.
+        ValueError: if ``linear`` contains an input twice, an unknown input, or all inputs.
     """
 
     affine = False
@@ -110,20 +110,22 @@ class NonlinearInput(InputMatrix):
         if len(self.curved) + len(linear) != inputs or not self.curved:
             raise ValueError(
                 f"linear is {list(linear)}, expected some but not all of the {inputs} inputs, 0 to "
-                f"{inputs - 1}, each once"
+                f"{inputs - 1}, without repetition"
             )
-        data, seen = scales.statistics, len(self.curved)
+        data, curved = scales.statistics, len(self.curved)
         mean = torch.cat([data.q_mean, data.u_mean[self.curved]])
         std = torch.cat([data.q_std, data.u_std[self.curved]])
-        self.network = MLP(size + seen, size * seen, hidden, activation, mean, std, scales.angles)
+        self.network = MLP(
+            size + curved, size * curved, hidden, activation, mean, std, scales.angles
+        )
         self.constant = nn.Parameter(torch.zeros(size, len(linear))) if linear else None
-        # Where each column of [curved, linear] belongs.
+        # Position of each input in [curved, linear].
         self.order = sorted(range(inputs), key=[*self.curved, *linear].__getitem__)
         self.register_buffer("scale", scales.value.float())
         self.register_buffer("u_mean", data.u_mean.float())
 
     def forward(self, q: Tensor) -> Tensor:
-        """A(q, u) at the mean input, ``(*batch, N, M)``."""
+        """Return A(q, u) at the mean input, ``(*batch, N, M)``."""
         return self._matrix(q, self.u_mean.expand(*q.shape[:-1], -1))
 
     def force(self, q: Tensor, u: Tensor) -> Tensor:
@@ -143,7 +145,7 @@ class ConstantInput(InputMatrix):
     """A = scale * parameters, the same at every q.
 
     Args:
-        scales: of the data; the value is the typical size of the entries of each column, ``(M,)``.
+        scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
     """
 
     scale: Tensor
@@ -159,10 +161,10 @@ class ConstantInput(InputMatrix):
 
 
 class NoInput(InputMatrix):
-    """A = 0: the part of a sum that another part drives.
+    """A = 0, for a part of a sum that has no drives.
 
     Args:
-        scales: of the data.
+        scales: scales of the data.
     """
 
     def forward(self, q: Tensor) -> Tensor:
@@ -172,16 +174,16 @@ class NoInput(InputMatrix):
         return torch.zeros_like(q)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """The inputs themselves, where there is one for each coordinate."""
+        """Return the inputs themselves if there is an input for each coordinate."""
         return u_rms if self.shape[0] == self.shape[1] else super().typical_force(u_rms)
 
 
 class FixedInput(InputMatrix):
-    """A = a given constant matrix, not learned.
+    """A = a fixed constant matrix.
 
     Args:
-        scales: of the data.
-        value: the matrix, ``(N, M)``; the identity if None, which needs N = M.
+        scales: scales of the data.
+        value: the matrix, ``(N, M)``. The default is the identity, which needs N = M.
 
     Raises:
         ValueError: if the matrix is not N x M.
@@ -203,7 +205,7 @@ class FixedInput(InputMatrix):
         return self.value.expand(*q.shape[:-1], *self.value.shape)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Root mean square of A u for uncorrelated inputs, ``(N,)``."""
+        """Return the root mean square of A u for uncorrelated inputs, ``(N,)``."""
         force = (self.value.to(u_rms).square() @ u_rms.square()).sqrt()
-        # A coordinate that no input reaches directly is moved by the others.
+        # A coordinate without a direct input is moved by its neighbours.
         return torch.where(force > 0, force, super().typical_force(u_rms))

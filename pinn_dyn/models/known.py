@@ -1,4 +1,4 @@
-"""Known mechanics with learned constants: an analytic structure as a model."""
+"""Rigid bodies with known kinematics and learned constants."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "
 """Names of the ten inertial parameters of a body, in the order of the regressor's columns."""
 
 Start = Literal["generic", "prior"]
-"""Where the bodies start: plausible rods along the links, or those of the description."""
+"""Initial bodies: plausible rods along the links, or the bodies of the description."""
 
 
 @runtime_checkable
 class Structure(Protocol):
-    """Rigid bodies with known kinematics: what :class:`KnownMechanics` needs of an analytic system.
+    """Interface of rigid bodies with known kinematics for :class:`KnownMechanics`.
 
-    ``turning`` says of each joint whether it turns, else it slides; ``inertia`` are
-    pseudo-inertias ``(n, 4, 4)`` of the n bodies, in which all terms are linear.
+    ``turning`` is true for each revolute joint and false for each prismatic joint. ``inertia`` are
+    the pseudo-inertias ``(n, 4, 4)`` of the n bodies. All terms are linear in them.
     """
 
     num_coordinates: int
@@ -61,38 +61,37 @@ class Structure(Protocol):
 
 
 class KnownMechanics(LearnedConstants):
-    """Rigid bodies with known kinematics, on drives; all constants are learned::
+    """Rigid bodies with known kinematics and drives, and learned constants::
 
         (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = T(v, diag(k) u)
 
-    T is the force k u, or what a gear with friction by load transmits of it. M, C and G of the
-    ``structure`` with bodies of learned pseudo-inertia; r armature (inertia of the rotors, seen at
-    the joint), o constant torque (a potential -o^T q), D = diag(d) viscous and F dry friction, k
-    drive gains from the input to the torque: Nm/A where currents are logged. Every value of the
-    parameters is a physical robot: bodies of positive density, r, d, k > 0.
+    T is the drive force k u after transmission losses. M, C and G are those of the ``structure``
+    with learned pseudo-inertias. r is the armature (inertia of the rotors at the joint), o a
+    constant torque (a potential -o^T q), D = diag(d) viscous friction and F dry friction. k are the
+    drive gains from the input to the torque, for example in Nm/A. All values of the parameters are
+    physical: bodies have a positive density, and r, d, k > 0.
 
     Each parameter is a standard normal variate a priori (:mod:`.known_constants`). The scales of
-    the drives come from the data: with f_i the typical torque k_i u_i, d ~ f/v, F and o ~ f and
+    the drives come from the data: with the typical torque f = k u, d ~ f/v, F ~ f, o ~ f and
     r ~ f/a.
 
     Args:
         statistics: scales of the data.
         structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
         start: ``"generic"`` starts from rods along the links, ``"prior"`` from the bodies of the
-            structure's description. For a simulated robot the latter would be the truth.
-        spread: how far bodies may be from their start, see :class:`PhysicalBodies`; 0.3 for a data
-            sheet, 3 for generic ones, whose intervals are too narrow with 1
+            description. For a simulated robot these bodies are the ground truth.
+        spread: prior standard deviation of the bodies, see :class:`PhysicalBodies`: 0.3 for a data
+            sheet, 3 for generic bodies. With 1 the intervals of generic bodies are too narrow
             (``benchmarks/random_chains.py``).
         friction: builder of the dry friction.
-        drive_gain: k at its start, one number or N; learned if ``gain_spread`` is positive.
-        gain_spread: standard deviation of log k a priori; 0 where the input is a torque.
-        integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
-            friction outweighs inertia.
+        drive_gain: initial k, one number or N. It is learned if ``gain_spread`` is positive.
+        gain_spread: prior standard deviation of log k; 0 if the input is a torque.
+        integrator: the integration method; :class:`~pinn_dyn.mechanics.Rosenbrock` if friction
+            dominates inertia.
 
     Raises:
-        ValueError: if the structure has no rigid bodies, the data have other coordinates than it,
-            on bodies that are not physical, a spread or gains that are not positive, or a negative
-            ``gain_spread``.
+        ValueError: if the structure has no rigid bodies, its coordinates are not those of the data,
+            a body is not physical, or the number of gains is wrong.
     """
 
     def __init__(
@@ -109,15 +108,15 @@ class KnownMechanics(LearnedConstants):
         if not isinstance(structure, Structure):
             raise ValueError(
                 f"structure is a {type(structure).__name__}, expected rigid bodies such as a "
-                "RigidChain: constants of other systems are learned by model=known_system"
+                "RigidChain: use model=known_system for the constants of other systems"
             )
         size = structure.num_coordinates
         if (statistics.num_coordinates, statistics.num_inputs) != (size, size):
             raise ValueError(
                 f"the data have {statistics.num_coordinates} coordinates and "
                 f"{statistics.num_inputs} inputs, the structure has the {size} joints "
-                f"{', '.join(structure.joint_names)}: expected one coordinate and one input for "
-                "each; lock the others (structure.locked_joints)"
+                f"{', '.join(structure.joint_names)}: expected one coordinate and one input "
+                "per joint; lock the remaining joints (structure.locked_joints)"
             )
         super().__init__(size, size)
         self.structure = structure
@@ -154,64 +153,64 @@ class KnownMechanics(LearnedConstants):
         self.fixed_gain: Tensor
         self.float()
 
-    # What is learned.
+    # Learned constants.
 
     def drive_gain(self) -> Tensor:
-        """k, ``(N,)``."""
+        """Return k, ``(N,)``."""
         return self.fixed_gain if self.gain is None else self.gain()
 
     def physical_constants(self) -> list[Named]:
-        """All constants in SI units: masses, m c, moments of inertia, drives, friction, gains."""
+        """Return bodies (mass, m c, moments of inertia), drives, friction and gains in SI units."""
         table = self.body_parameters()
-        found = []
+        constants = []
         for column, label in enumerate(INERTIAL):
             unit = "kg" if column == 0 else "kg m" if column < 4 else "kg m^2"
             names = [f"{label} of {body}" for body in self.structure.body_names]
             lower = 0.0 if label in ("mass", "Ixx", "Iyy", "Izz") else -float("inf")
-            found.append(Named(names, [unit] * len(names), table[:, column], lower))
+            constants.append(Named(names, [unit] * len(names), table[:, column], lower))
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
         gains = [] if self.gain is None else [self.gain.named()]
-        return [*found, *drives, *self.friction.physical_constants(), *gains]
+        return [*constants, *drives, *self.friction.physical_constants(), *gains]
 
     def body_parameters(self) -> Tensor:
-        """pi ``(n, 10)``: the inertial parameters, with M a + C v + G = Y(q, v, a) pi."""
+        """Return the inertial parameters pi ``(n, 10)``, with M a + C v + G = Y(q, v, a) pi."""
         return self.structure.parameters_of(self.bodies())
 
     def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``: all but the bodies, on one side.
+        """Return r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``, all terms except the bodies.
 
-        The equation of motion is Y pi + drive force = 0. The drive of a joint depends on the
-        constants of that joint alone.
+        The equation of motion is Y pi + drive force = 0. The drive force of a joint depends only on
+        the constants of that joint.
         """
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
         return resistance - self.offset() - self.friction.transmitted(v, self.drive_gain() * u)
 
     def slopes(self) -> KnownSlopes:
-        """The derivatives of the missing force, by closed formulas."""
+        """Return the derivatives of the missing force by closed formulas."""
         return KnownSlopes(self)
 
     def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> KnownSamples:
-        """e at fixed samples, by their regressor."""
+        """Return the missing force at fixed samples, by their regressor."""
         return KnownSamples(self, q, v, a, u)
 
     # The contract of a mechanical system.
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q) + diag(r), ``(*batch, N, N)``."""
+        """Return M(q) + diag(r), ``(*batch, N, N)``."""
         self._check(q=q)
         return self.structure.mass_matrix(q, self.bodies()) + torch.diag(self.armature())
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """V(q) - o^T q, ``(*batch,)``, J."""
+        """Return V(q) - o^T q, ``(*batch,)``, J."""
         self._check(q=q)
         return self.structure.potential_energy(q, self.bodies()) - (self.offset() * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D = diag(d), ``(*batch, N, N)``."""
+        """Return D = diag(d), ``(*batch, N, N)``."""
         return torch.diag_embed(self.viscous().expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """A = diag(k), ``(*batch, N, N)``."""
+        """Return A = diag(k), ``(*batch, N, N)``."""
         return torch.diag_embed(self.drive_gain().expand_as(q))
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
@@ -225,10 +224,9 @@ class KnownMechanics(LearnedConstants):
         return force + self.armature() * a
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        rest = torch.zeros_like(q)
-        return (
-            self.structure.rigid_force(q, rest, rest, self.bodies(), gravity=True) - self.offset()
-        )
+        zero = torch.zeros_like(q)
+        gravity = self.structure.rigid_force(q, zero, zero, self.bodies(), gravity=True)
+        return gravity - self.offset()
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())

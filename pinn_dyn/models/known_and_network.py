@@ -1,4 +1,4 @@
-"""Known mechanics, and a network for what they cannot say."""
+"""Sum of known mechanics and a network for the remaining forces."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from pinn_dyn.models.statistics import Statistics
 
 
 class KnownAndNetwork(Sum):
-    """The sum of known mechanics and a Lagrangian network, with a residual force::
+    """Sum of known mechanics and a Lagrangian network, with a residual force::
 
         (M_k + M_n) a + (C_k + C_n) v + G_k + G_n + (D_k + D_n) v + F_k + F_n = A_k u + r
 
-    Known terms have the index k, those of the network n. The network has no input matrix of its
-    own (``input: none``) and small terms at the start; what it contributes is penalized, so that it
-    learns only what the known mechanics cannot say::
+    Known terms have the index k, terms of the network n. The network has no input matrix
+    (``input: none``) and small initial terms. Its force is penalized, so that the network only
+    learns forces that the known mechanics cannot represent::
 
         penalty = w mean over the batch and i of (tau_i / f_i)^2
         tau = M_n a + C_n v + G_n + D_n v + F_n
 
-    f is the typical torque of the drives.
+    f are the typical torques of the drives.
 
     Args:
         statistics: scales of the data.
@@ -36,11 +36,11 @@ class KnownAndNetwork(Sum):
         network: builder of the learned part.
         residual: builder of the residual force.
         weight: w.
-        integrator: the method of integration.
+        integrator: the integration method.
 
     Raises:
-        ValueError: on a weight that is negative or not finite, or a network with an input matrix, a
-            residual force or a learned start.
+        ValueError: if the network has an input matrix, a residual force or a learned initial
+            velocity.
     """
 
     def __init__(
@@ -53,19 +53,19 @@ class KnownAndNetwork(Sum):
         integrator: Integrator | None = None,
     ):
         first = known(statistics=statistics)
-        # The network works on forces: its scales are those of the torques, not of the currents.
+        # The network computes forces, so its scales are those of torques instead of currents.
         gain = first.drive_gain().detach().to(statistics.u_mean)
         forces = replace(statistics, u_mean=gain * statistics.u_mean, u_std=gain * statistics.u_std)
         second = network(statistics=forces)
         drives = second.input(statistics.q_mean[None].float()).any()
-        for head, there, reason in (
+        for head, present, reason in (
             ("input", drives, "the known part drives the robot"),
             ("residual", second.has_residual, "the sum has it (model/residual=network)"),
-            ("initial_velocity", second.learns_initial_state, "a sum learns no start"),
+            ("initial_velocity", second.learns_initial_state, "a sum learns no initial velocity"),
         ):
-            if there:
+            if present:
                 raise ValueError(
-                    f"network.{head} is a head that a sum leaves out, as {reason}: remove it"
+                    f"network.{head} is a head that a sum does not use, since {reason}: remove it"
                 )
         super().__init__({"known": first, "network": second}, integrator)
         self.weight = weight
@@ -78,13 +78,13 @@ class KnownAndNetwork(Sum):
 
     @property
     def known(self) -> KnownMechanics:
-        """The known part."""
+        """Known part."""
         part = self.parts["known"]
         assert isinstance(part, KnownMechanics)
         return part
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Of the network's part, and of the residual force."""
+        """Return the penalty of the network's force and of the residual force."""
         network = self.parts["network"]
         assert isinstance(network, LagrangianNetwork)
         share = network.inverse_dynamics(q, v, a) / self.force

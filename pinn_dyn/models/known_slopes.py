@@ -1,4 +1,4 @@
-"""Closed formulas for how the force of known mechanics depends on its parameters."""
+"""Closed formulas for the derivatives of the force of known mechanics."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ _BODIES = "model.bodies.z"
 
 
 class KnownSlopes(Slopes):
-    """Derivatives of :class:`~.known.KnownMechanics`, by the regressor Y of its bodies::
+    """Derivatives of :class:`~.known.KnownMechanics` by the regressor Y of its bodies::
 
         e = Y(q, v, a) pi(z) + drive force(v, a, u; z)
         de/dz = Y dpi/dz + d(drive force)/dz
 
-    The bodies need Y alone; the drive of a joint depends on its own constants, so one reverse pass
-    through drives with constants of their own for each sample gives all of the rest.
+    The first term only needs Y. The drive of a joint depends only on the constants of that joint,
+    so one reverse pass through all drives, with a copy of the constants for each sample, gives the
+    second term.
 
     Args:
-        model: at the z of interest.
+        model: model at the z of interest.
     """
 
     def __init__(self, model: LearnedConstants):
@@ -35,12 +36,12 @@ class KnownSlopes(Slopes):
         return self.by_regressor(self.model.structure.regressor(q, v, a), v, a, u)
 
     def by_regressor(self, regressor: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """The same from Y ``(*batch, N, 10 n)``."""
+        """Return de/dz from the regressor Y ``(*batch, N, 10 n)``."""
         drives = self._drive_slopes(lambda m: m.drive_force(v, a, u), v)
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        # Of the drive of a joint, by its own v alone.
+        # The drive of a joint depends only on the v of that joint.
         by_q, by_v = self.model.structure.force_slopes(q, v, a, self.model.bodies())
         speed = v.clone().requires_grad_()
         with torch.enable_grad():
@@ -49,12 +50,12 @@ class KnownSlopes(Slopes):
 
     def gain(self) -> Tensor:
         gain = self.model.fixed_gain
-        # The zero keeps the sum differentiable where the gain is not learned.
+        # The zero term keeps the sum differentiable if the gain is not learned.
         drives = self._drive_slopes(lambda m: m.drive_gain() + 0 * m.offset(), gain)
         return torch.cat([gain.new_zeros(len(gain), len(self._bodies)), drives], dim=-1)
 
     def _body_slopes(self) -> Tensor:
-        """dpi/dz of the bodies, ``(10 n, 10 n)``: a block for each body."""
+        """Return dpi/dz of the bodies, ``(10 n, 10 n)``, block-diagonal."""
         z = self.model.bodies.z.detach()
         copies = z.expand(10, *z.shape).clone().requires_grad_()
         with torch.enable_grad():
@@ -64,7 +65,7 @@ class KnownSlopes(Slopes):
         return torch.block_diag(*slopes.movedim(0, 1))
 
     def _drive_slopes(self, function: Callable[[Any], Tensor], like: Tensor) -> Tensor:
-        """d function_i / dz, ``(*batch, N, P - 10 n)``, of a function of the shape of ``like``."""
+        """Return d function_i / dz, ``(*batch, N, P - 10 n)``, for values shaped like ``like``."""
         called = Called(self.model, function)
         values = {
             name: z.detach().expand_as(like).clone().requires_grad_()
@@ -78,7 +79,7 @@ class KnownSlopes(Slopes):
 
 
 class KnownSamples(Samples):
-    """Samples whose Y is computed once, as no parameter is in it."""
+    """Samples whose regressor Y is computed once, since Y does not depend on the parameters."""
 
     def __init__(self, model: LearnedConstants, q: Tensor, v: Tensor, a: Tensor, u: Tensor):
         super().__init__(model, v, a, u)

@@ -1,4 +1,4 @@
-"""Any analytic system as a model: its structure is known, its constants are learned."""
+"""Analytic systems with known structure and learned constants."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from pinn_dyn.models.statistics import Statistics
 
 @runtime_checkable
 class HasConstants(Protocol):
-    """A mechanical system that names its physical constants.
+    """Interface of a mechanical system that names its physical constants.
 
     Attributes:
-        constants: for each buffer that is one, the units of its entries: {"mass": ["kg"]}.
+        constants: units of the entries of each buffer that is a constant: {"mass": ["kg"]}.
     """
 
     constants: dict[str, list[str]]
@@ -32,7 +32,7 @@ def _term(system: MechanicalSystem, name: str, *values: Tensor) -> Tensor:
 
 
 def _of_structure(name: str) -> Callable[..., Any]:
-    """The method of the structure, with the learned constants in the place of its own."""
+    """Build a method that calls the structure with the learned constants as its buffers."""
 
     def method(self: KnownSystem, *values: Tensor) -> Any:
         learned = {f"model.{key}": part().view(self.shapes[key]) for key, part in self.parts()}
@@ -42,22 +42,21 @@ def _of_structure(name: str) -> Callable[..., Any]:
 
 
 class KnownSystem(LearnedConstants):
-    """A mechanical system with known terms, linear or not in its constants c, which are learned::
+    """Mechanical system with known terms and learned constants c::
 
         c_i = start_i exp(spread z_i) > 0,      z_i standard normal a priori
 
     Args:
         statistics: scales of the data.
-        structure: a :class:`HasConstants`, such as :class:`~pinn_dyn.systems.SoftArm`. The
-            constants that it is built with are guesses, where the fit starts.
-        spread: standard deviation of log c a priori: 1.5 if a guess may be off by a factor of ten,
+        structure: a :class:`HasConstants`, such as :class:`~pinn_dyn.systems.SoftArm`. Its
+            constants are the initial guesses of the fit.
+        spread: prior standard deviation of log c: 1.5 if a guess may be off by a factor of ten,
             0.3 for a data sheet.
-        integrator: the method of integration.
+        integrator: the integration method.
 
     Raises:
-        ValueError: if the data have other coordinates or inputs than the structure, the structure
-            names no constants, those are no buffers, lack units, or are not positive, or the spread
-            is not positive.
+        ValueError: if the coordinates or inputs are not those of the data, or if the constants are
+            not positive buffers with units.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class KnownSystem(LearnedConstants):
             raise ValueError(
                 f"the data have {statistics.num_coordinates} coordinates and "
                 f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
-                f"{size} and {inputs}: take the structure of this robot"
+                f"{size} and {inputs}: use the structure of this robot"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()
@@ -87,7 +86,7 @@ class KnownSystem(LearnedConstants):
         self.structure = Called(structure, _term)
 
     def parts(self) -> list[tuple[str, PositiveConstants]]:
-        """The constants by the names of the structure."""
+        """Return the constants by their names in the structure."""
         return list(self.learned.items())  # type: ignore[arg-type]
 
     mass_matrix = _of_structure("mass_matrix")
@@ -111,32 +110,31 @@ class KnownSystem(LearnedConstants):
 
 
 def _constants_of(structure: MechanicalSystem) -> list[tuple[str, Tensor, list[str]]]:
-    """Name, start and units of each."""
+    """Return name, initial value and units of each constant."""
     kind = type(structure).__name__
     if not isinstance(structure, HasConstants) or not structure.constants:
         raise ValueError(
-            f"structure {kind} names no constants that could be learned: give it an attribute "
-            "constants, the units of its buffers by their names, as {'mass': ['kg']}; rigid chains "
-            "are learned by model=known"
+            f"structure {kind} names no constants to learn: add an attribute constants with the "
+            "units of each buffer, such as {'mass': ['kg']}; for rigid chains use model=known"
         )
-    if owned := [name for name, _ in structure.named_parameters()]:
+    if parameters := [name for name, _ in structure.named_parameters()]:
         raise ValueError(
-            f"structure {kind} has the parameters {', '.join(owned)}, expected constants that are "
-            "buffers (register_buffer), named in its attribute constants"
+            f"structure {kind} has the parameters {', '.join(parameters)}, expected constants that "
+            "are buffers (register_buffer), named in the attribute constants"
         )
     buffers = dict(structure.named_buffers())
-    found = []
+    constants = []
     for name, units in structure.constants.items():
         if name not in buffers:
             raise ValueError(
-                f"structure {kind}: constants names {name}, which is no buffer; expected one of "
+                f"structure {kind}: constants names {name}, which is not a buffer; expected one of "
                 f"{', '.join(buffers) or 'none'} (register_buffer)"
             )
         start = buffers[name]
         if len(units) != start.numel():
             raise ValueError(
-                f"structure {kind}: constants has {len(units)} units of {name}, which has "
-                f"{start.numel()} entries: expected as many"
+                f"structure {kind}: constants has {len(units)} units of {name}, expected "
+                f"{start.numel()}, one for each entry"
             )
-        found.append((name, start, units))
-    return found
+        constants.append((name, start, units))
+    return constants

@@ -1,4 +1,4 @@
-"""The Lagrangian network: learns M, V, D and A; its state is (q, v)."""
+"""Lagrangian network with learned M, V, D and A, in the state (q, v)."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ class LagrangianNetwork(StructuredNetwork):
         M a = A u + r - D v - F(v) - G - (dM/dt) v + d(v^T M v / 2)/dq
 
     One tangent pass (dL/dt) and one reverse pass (the last term, through |L^T v|^2 / 2) through the
-    mass head take the place of the Hessian of the Lagrangian, and two triangular solves with the
-    head's own factor L that of the inverse of M.
+    mass head replace the Hessian of the Lagrangian. Two triangular solves with the factor L replace
+    the inverse of M.
 
     Args:
         statistics: scales of the data.
         mass, potential, damping, input, friction, residual, initial_velocity: builders of heads.
-        angles: which coordinates are angles; the heads see their sine and cosine.
-        integrator: the method of integration; :class:`~pinn_dyn.mechanics.Rosenbrock` where
-            damping outweighs inertia.
-        delay: of the input; None: there is none.
+        angles: coordinates that are angles. The heads use their sine and cosine.
+        integrator: the integration method; :class:`~pinn_dyn.mechanics.Rosenbrock` if damping
+            dominates inertia.
+        delay: delay of the input. The default has no delay.
 
     Raises:
-        ValueError: on a mass head for a chain that is not transposed.
+        ValueError: if the mass head is for a chain but not transposed.
     """
 
     def __init__(
@@ -84,8 +84,8 @@ class LagrangianNetwork(StructuredNetwork):
         self.mass = mass(self._scales(statistics, inertia.sqrt()))
         if self.mass.chain and not self.mass.transposed:
             raise ValueError(
-                "mass.chain is true and mass.transposed false, expected both: only in M = L^T L "
-                "does a column of L depend on the joints after it alone"
+                "mass.chain is true and mass.transposed is false, expected both true: only in "
+                "M = L^T L does a column of L depend on later joints alone"
             )
 
         self.initial_velocity = initial_velocity(self._scales(statistics, statistics.v_std))
@@ -95,7 +95,7 @@ class LagrangianNetwork(StructuredNetwork):
         return self.initial_velocity.initial_state(x0, u0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""
+        """Return M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""
         return self.mass.matrix(q)
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
@@ -123,7 +123,7 @@ class LagrangianNetwork(StructuredNetwork):
         return self._energy_gradient(tape, v, matvec(self._root(factor), v))
 
     def _factor_and_coriolis_force(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq, M = R^T R, with dR along v."""
+        """Return L and C v = (dR^T R + R^T dR) v - d(|R v|^2 / 2)/dq; M = R^T R, dR along v."""
         if self.mass.constant:
             return self.mass(q), torch.zeros_like(q)
         factor, factor_rate, tape = self.mass.linearize_along(q, v)
@@ -134,16 +134,16 @@ class LagrangianNetwork(StructuredNetwork):
         return factor, mass_rate_v - self._energy_gradient(tape, v, w)
 
     def _root(self, factor: Tensor) -> Tensor:
-        """R with M = R^T R: L^T, or L with a transposed head."""
+        """Return R with M = R^T R: L^T, or L with a transposed head."""
         return factor if self.mass.transposed else factor.transpose(-1, -2)
 
     def _energy_gradient(self, tape: Tape, v: Tensor, w: Tensor) -> Tensor:
-        """d(|R v|^2 / 2)/dq, with w = R v."""
+        """Return d(|R v|^2 / 2)/dq, with w = R v."""
         left, right = (w, v) if self.mass.transposed else (v, w)
         return self.mass.pullback(tape, left.unsqueeze(-1) * right.unsqueeze(-2))
 
     def _solve(self, factor: Tensor, force: Tensor) -> Tensor:
-        """M^-1 force, by the two triangular solves."""
+        """Return M^-1 force, by the two triangular solves."""
         if self.mass.transposed:
             return lower_solve(factor, upper_solve(factor, force))
         return upper_solve(factor, lower_solve(factor, force))

@@ -1,4 +1,4 @@
-"""Mechanical systems whose parameters are physical constants: what a least-squares fit works on."""
+"""Mechanical systems whose parameters are physical constants, for least-squares fits."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pinn_dyn.models.known_constants import Constants, Named
 
 
 class LearnedConstants(MechanicalSystem):
-    """A mechanical system whose only parameters are :class:`~.known_constants.Constants`.
+    """Mechanical system whose parameters are :class:`~.known_constants.Constants`.
 
-    Its equation of motion is that of every mechanical system, as a force that is missing::
+    The equation of motion is written as a missing force::
 
         e(q, v, a, u; z) = M a + C v + G + D v + F - A u - r = 0
 
-    z ``(P,)`` are the standardized parameters, in the order of ``parameters()``. All below follows
-    from the terms; what has closed formulas may override it.
+    z ``(P,)`` are the standardized parameters, in the order of ``parameters()``. All methods below
+    follow from the terms. A subclass with closed formulas may override them.
     """
 
     def parameter_names(self) -> list[str]:
@@ -41,33 +41,34 @@ class LearnedConstants(MechanicalSystem):
         return names
 
     def physical_constants(self) -> list[Named]:
-        """All constants in their units."""
+        """Return all constants in physical units."""
         return [part.named() for part in self._constants()]
 
     def drive_gain(self) -> Tensor:
-        """k ``(N,)``, a factor of the force of each input: one, unless gains are learned.
+        """Return the gain k ``(N,)`` of each input: 1, unless gains are learned.
 
-        An identification divides by it: it could shrink all constants, the gains too, otherwise.
+        An identification divides the missing force by k. Otherwise it could reduce the error by
+        shrinking all constants and gains.
         """
         return torch.ones(self.num_coordinates, dtype=next(self.parameters()).dtype)
 
     def missing_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """e, ``(*batch, N)``: what the input lacks for the acceleration."""
+        """Return e, ``(*batch, N)``, the force that the input lacks for the acceleration."""
         return self.inverse_dynamics(q, v, a) - self._applied_force(q, v, u)
 
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Spread of A u / k over samples ``(K, N)``, of M a / k where no input acts, ``(N,)``."""
+        """Return the spread of A u / k over samples, ``(N,)``, or of M a / k without an input."""
         driven = (self._applied_force(q, v, u) / self.drive_gain()).std(0)
         inertial = (matvec(self.mass_matrix(q), a) / self.drive_gain()).std(0)
         scale = torch.where(driven > 1e-9 * inertial, driven, inertial)
-        return torch.where(scale > 0, scale, 1.0)  # what stays at rest has none
+        return torch.where(scale > 0, scale, 1.0)  # no scale for a joint at rest
 
     def slopes(self) -> Slopes:
-        """The derivatives of e at the present z."""
+        """Return the derivatives of e at the present z."""
         return Slopes(self)
 
     def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Samples:
-        """e at fixed samples of motion, each ``(K, N)`` or ``(K, M)``, as z changes."""
+        """Return e as a function of z at fixed samples of motion, ``(K, N)`` and ``(K, M)``."""
         return Samples(self, q, v, a, u)
 
     def _constants(self) -> Iterator[Constants]:
@@ -76,48 +77,48 @@ class LearnedConstants(MechanicalSystem):
 
 
 class Slopes:
-    """Derivatives of the missing force e, one reverse pass for each of its N entries.
+    """Derivatives of the missing force e, by a reverse pass for each of its N entries.
 
     Args:
-        model: at the z of interest.
+        model: model at the z of interest.
     """
 
     def __init__(self, model: LearnedConstants):
         self.model: Any = model
 
     def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """de/dz, ``(B, N, P)``, from samples ``(B, N)`` and ``(B, M)``."""
-        of, z = self._of_parameters(lambda model, *sample: model.missing_force(*sample))
-        return vmap(jacrev(of), in_dims=(None, 0, 0, 0, 0))(z, q, v, a, u)
+        """Return de/dz, ``(B, N, P)``, from samples ``(B, N)`` and ``(B, M)``."""
+        function, z = self._of_parameters(lambda model, *sample: model.missing_force(*sample))
+        return vmap(jacrev(function), in_dims=(None, 0, 0, 0, 0))(z, q, v, a, u)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """de/d(q, v), ``(B, N, 2N)``, from samples ``(B, N)`` and ``(B, M)``."""
+        """Return de/d(q, v), ``(B, N, 2N)``, from samples ``(B, N)`` and ``(B, M)``."""
         return torch.cat(vmap(jacrev(self.model.missing_force, (0, 1)))(q, v, a, u), dim=-1)
 
     def gain(self) -> Tensor:
-        """dk/dz, ``(N, P)``, of the drive gains."""
-        of, z = self._of_parameters(lambda model: model.drive_gain())
-        return jacrev(of)(z)
+        """Return dk/dz, ``(N, P)``, of the drive gains."""
+        function, z = self._of_parameters(lambda model: model.drive_gain())
+        return jacrev(function)(z)
 
     def _of_parameters(
         self, function: Callable[..., Tensor]
     ) -> tuple[Callable[..., Tensor], Tensor]:
-        """A function of the model as one of z and its arguments, and the present z ``(P,)``."""
+        """Convert a function of the model to a function of z ``(P,)``; return it and z."""
         called = Called(self.model, function)
         names, values = zip(*called.named_parameters(), strict=True)
 
-        def of(z: Tensor, *arguments: Tensor) -> Tensor:
+        def function_of_z(z: Tensor, *arguments: Tensor) -> Tensor:
             parts = z.split([value.numel() for value in values])
             shaped = (part.view_as(value) for part, value in zip(parts, values, strict=True))
             return functional_call(called, dict(zip(names, shaped, strict=True)), arguments)
 
-        return of, parameters_to_vector(values).detach()
+        return function_of_z, parameters_to_vector(values).detach()
 
 
 class Samples:
-    """The missing force e at K fixed samples of motion, for whatever z the model has by then.
+    """Missing force e at K fixed samples of motion, for the present z of the model.
 
-    What does not depend on z may be computed once.
+    A subclass may compute quantities that do not depend on z once.
     """
 
     def __init__(self, model: LearnedConstants, *at: Tensor):
@@ -125,11 +126,11 @@ class Samples:
         self.at = at
 
     def missing_force(self) -> Tensor:
-        """e, ``(K, N)``."""
+        """Return e, ``(K, N)``."""
         return self.model.missing_force(*self.at)
 
     def by_parameters(self) -> Tensor:
-        """de/dz, ``(K, N, P)``."""
+        """Return de/dz, ``(K, N, P)``."""
         return self.model.slopes().by_parameters(*self.at)
 
 

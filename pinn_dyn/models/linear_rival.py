@@ -1,4 +1,4 @@
-"""Linear rivals: ARX and EDMDc, fitted by ridge regression in a fraction of a second."""
+"""Linear baselines, ARX and EDMDc, fitted by ridge regression in a fraction of a second."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory, samples_of, stack_until
 
-_ROWS = 10_000  # windows of a fit, at most
-_FEATURES = 300  # of a fit, at most
-_STEPS = 500  # of the roll-outs that choose the lags
-_LAGS = {1: (1, 2, 4, 8), 2: (1, 2)}  # tried, by degree
-_RIDGES = (1e-12, 1e-7, 1e-3)  # tried, relative to the variance of the features
+_ROWS = 10_000  # largest number of windows in a fit
+_FEATURES = 300  # largest number of features
+_STEPS = 500  # length of the roll-outs that select the lags
+_LAGS = {1: (1, 2, 4, 8), 2: (1, 2)}  # candidates by degree
+_RIDGES = (1e-12, 1e-7, 1e-3)  # candidates, relative to the variance of the features
 
 
 class LinearRival(Predictor):
@@ -25,14 +25,13 @@ class LinearRival(Predictor):
         x_{k+1} = x_k + W (phi(s_k), u_k, u_{k+1}) + b,      x = (q, v)
         s_k     = (x_k, x_{k-1}, ... x_{k-L+1}, u_{k-1}, ... u_{k-L+1})
 
-    L are the lags; phi(s) is s itself for degree 1, and s with all products of two of its entries
-    for degree 2. u_{k+1} is the input at the end of the step, seen from within it: held inputs
-    have not jumped there yet. W and b come from ridge regression on standardized features.
+    L is the number of lags. phi(s) is s for degree 1, and s with all products of two entries for
+    degree 2. u_{k+1} is the left value of the input at the end of the step. W and b come from ridge
+    regression on standardized features.
 
-    A roll-out is given the state (q, v) at its start and the input from there on, as every other
-    model is; what lies before the start is not known to it. The missing past of s_0 is estimated
-    from (x_0, u_0) by a linear map, fitted to the same training windows. So no rival sees a
-    measurement that a network does not see.
+    A roll-out uses the initial state (q, v) and the input from the start on, as for all models. The
+    state history before the start is not observed. It is estimated from (x_0, u_0) by a linear map
+    fitted on the training windows. So the baseline uses the same measurements as a network.
 
     Sources: Ljung (1999), "System Identification", section 4.2 (ARX); Korda and Mezic (2018),
     "Linear predictors for nonlinear dynamical systems" (EDMDc), here projected onto the state
@@ -42,13 +41,13 @@ class LinearRival(Predictor):
     Args:
         train: training trajectories, each q ``(T, N)`` at a constant sample time.
         step: step of the model, s, an integer multiple of the sample time.
-        lags: L, at least 1.
+        lags: L.
         degree: 1 or 2.
         ridge: weight of the squared coefficients, relative to the variance of the features.
 
     Raises:
-        ValueError: if no training trajectory is ``lags`` steps long, the step is no multiple of
-            the sample time, or there are more features than are worth fitting.
+        ValueError: if no training trajectory is ``lags`` steps long, the step is not a multiple of
+            the sample time, or there are too many features.
     """
 
     mean: Tensor
@@ -82,9 +81,9 @@ class LinearRival(Predictor):
         weight, bias = _ridge(features, target, ridge)
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
-        # The past of the first state, from the start alone: its columns in s are the later ones.
-        known = torch.cat([state[:, : 2 * self.num_coordinates], ends[:, : self.num_inputs]], 1)
-        past, past_bias = _ridge(known, state[:, 2 * self.num_coordinates :], 1e-12)
+        # Map from (x_0, u_0) to the unobserved history, which is the last part of s.
+        start = torch.cat([state[:, : 2 * self.num_coordinates], ends[:, : self.num_inputs]], 1)
+        past, past_bias = _ridge(start, state[:, 2 * self.num_coordinates :], 1e-12)
         self.register_buffer("past", past)
         self.register_buffer("past_bias", past_bias)
 
@@ -92,7 +91,7 @@ class LinearRival(Predictor):
         """Apply the linear map step by step.
 
         Raises:
-            ValueError: if ``t`` does not advance by the step the model was fitted for.
+            ValueError: if the step of ``t`` is not that of the model.
         """
         spacing = t.double().diff()
         step = self.fixed_step
@@ -102,11 +101,11 @@ class LinearRival(Predictor):
                 f"this linear model predicts in steps of {step:g} s, but t advances by "
                 f"{float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
             )
-        # The input at both ends of each step; of a held one the end still has the step's own.
+        # The input at both ends of each step. A held input has the same value at both.
         ends = input.stages(t, (0.0, 1.0)).to(x0)
         size, inputs = x0.shape[-1], self.num_inputs
-        known = torch.cat([x0, ends[0, 0]], dim=-1)
-        past_x, past_u = (known @ self.past + self.past_bias).split(
+        start = torch.cat([x0, ends[0, 0]], dim=-1)
+        past_x, past_u = (start @ self.past + self.past_bias).split(
             [(self.lags - 1) * size, (self.lags - 1) * inputs], dim=-1
         )
         x = x0
@@ -122,7 +121,7 @@ class LinearRival(Predictor):
         return torch.stack(path, dim=-2)
 
     def _lift(self, state: Tensor) -> Tensor:
-        """phi(s), standardized, ``(*batch, F)``."""
+        """Return phi(s), standardized, ``(*batch, F)``."""
         z = (state - self.mean) / self.scale
         if self.degree == 1:
             return z
@@ -137,13 +136,12 @@ def fit_linear_rival(
     step: float,
     degree: Literal[1, 2],
 ) -> LinearRival:
-    """The rival whose lags and ridge have the smallest error over the validation trajectories.
+    """Fit the baseline whose lags and ridge have the smallest validation error.
 
-    The error is the mean of |q_hat - q| of open-loop roll-outs over their whole length, up to 500
-    steps, started as the tests are.
+    The error is the mean of |q_hat - q| over open-loop roll-outs of up to 500 steps.
 
     Raises:
-        ValueError: if no number of lags can be fitted; see :class:`LinearRival`.
+        ValueError: if no number of lags can be fitted, see :class:`LinearRival`.
     """
     truth = stack_until(validation)
     stride = samples_of("step", step, truth.t)
@@ -171,7 +169,7 @@ def fit_linear_rival(
 
 
 def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tensor, Tensor, Tensor]:
-    """States s, inputs (u_k, u_{k+1}) and increments x_{k+1} - x_k, a row for each window."""
+    """Return states s, inputs (u_k, u_{k+1}) and increments x_{k+1} - x_k, a row per window."""
     strides = [samples_of("step", step, item.t) for item in train]
     counts = [len(item.t) - lags * k for item, k in zip(train, strides, strict=True)]
     total = sum(max(count, 0) for count in counts)
@@ -195,10 +193,10 @@ def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tenso
 
 
 def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
-    """W and b that minimize the mean of |y - z W - b|^2 + ridge |W s|^2, s the spread of z."""
+    """Return W and b that minimize mean |y - z W - b|^2 + ridge |W s|^2, s the spread of z."""
     centre, scale = features.mean(0), _spread(features)
     z, mean = (features - centre) / scale, target.mean(0)
-    # z = Q R: only R and Q^T y are needed of the many rows, whose digits a Gram matrix would lose.
+    # z = Q R: a fit only needs R and Q^T y, and a Gram matrix would lose precision.
     rows = torch.linalg.qr(torch.cat([z, target - mean], dim=1), mode="r").R[: z.shape[1]]
     left, size, right = torch.linalg.svd(rows[:, : z.shape[1]], full_matrices=False)
     shrunk = size / (size.square() + ridge * len(z))
@@ -207,7 +205,7 @@ def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tens
 
 
 def _spread(values: Tensor) -> Tensor:
-    """Standard deviations of columns, 1 where a column does not vary."""
+    """Return the standard deviations of columns, or 1 for a constant column."""
     spread = values.std(0, correction=0)
     size = values.abs().amax(0)
     return torch.where(spread > 1e-12 * size, spread, 1.0)

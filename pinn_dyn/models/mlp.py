@@ -12,7 +12,7 @@ from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 Tape = tuple[Tensor, ...]
-"""Slopes of the features and hidden activations at one input, for the passes below."""
+"""Slopes of the features and hidden activations, for the passes below."""
 
 
 def _softplus(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,29 +43,30 @@ ACTIVATIONS: dict[Activation, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 class MLP(nn.Module):
     """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
 
-    An entry x_i that is an angle goes in as sin(x_i) and cos(x_i) instead, so that y has its
-    period of 2 pi. With ``limits`` the others go in as z = (c - mean)/std + tanh((x - c)/std) with
-    c = x clipped to its limits: unchanged within them, never more than a standard deviation beyond
-    them, and smooth (its second derivative is continuous). So y has no value far outside the data
-    that it does not have near them.
+    The features of an angle x_i are sin(x_i) and cos(x_i), so that y has a period of 2 pi. With
+    ``limits`` the features of all other entries are z = (c - mean)/std + tanh((x - c)/std), with
+    c = x clipped to its limits. They are unchanged within the limits, at most one standard
+    deviation beyond them, and twice continuously differentiable. So y far outside the data only has
+    values that it also has near the data.
 
-    With ``after`` the output y_o depends on the entries x_i, i > after_o, alone: the weights W_k
-    are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on, and
-    more units read many entries than few.
+    With ``after`` the output y_o depends only on the entries x_i with i > after_o. The weights W_k
+    are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on.
+    More units read many entries than few.
 
-    :meth:`linearize` runs the network once and keeps the slopes of its activations; from these
-    :meth:`pushforward` gives J dx (tangent pass) and :meth:`pullback` J^T dy (reverse pass), as
-    ordinary tensor operations: they can be differentiated again and compiled.
+    :meth:`linearize` evaluates the network and returns the slopes of its activations. With these,
+    :meth:`pushforward` computes J dx (tangent pass) and :meth:`pullback` J^T dy (reverse pass) by
+    ordinary tensor operations, which can be differentiated again and compiled.
 
     Args:
         inputs: size of x.
         outputs: size of y.
         hidden: widths of the hidden layers.
         activation: one of softplus, tanh, silu.
-        mean, std: normalization of x, ``(inputs,)``; none if left out.
+        mean, std: normalization of x, ``(inputs,)``. The default is no normalization.
         angles: positions of the angles in x.
-        after: for each output the position in x after which it reads; all of x if None.
-        limits: smallest and largest x in the data, ``(inputs,)`` each; no limits if None.
+        after: for each output, the position in x after which the output depends on x. The default
+            is all of x.
+        limits: smallest and largest x in the data, ``(inputs,)`` each. The default is no limits.
 
     Raises:
         ValueError: if ``angles`` contains a position that x does not have or a position twice, or
@@ -92,7 +93,7 @@ class MLP(nn.Module):
         super().__init__()
         if any(not 0 <= index < inputs for index in angles) or len({*angles}) < len(angles):
             raise ValueError(
-                f"angles is {list(angles)}, expected positions from 0 to {inputs - 1}, each once"
+                f"angles is {list(angles)}, expected different positions from 0 to {inputs - 1}"
             )
         self._activation = ACTIVATIONS[activation]
         self._has_angles = len(angles) > 0
@@ -116,24 +117,25 @@ class MLP(nn.Module):
 
     @property
     def linears(self) -> list[nn.Linear]:
-        """The layers, from input to output."""
+        """Layers from input to output."""
         return cast("list[nn.Linear]", list(self.layers))
 
     def _mask(self, inputs: int, after: Sequence[int]) -> None:
-        """Masks for the weights, and initial weights that make up for what the masks take away."""
-        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)  # entry a unit reads from
+        """Register masks for the weights, and scale the initial weights to compensate."""
+        # The first entry that each unit reads.
+        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)
         masks = []
         for layer in self.linears[:-1]:
             width = layer.out_features
-            # As many units that read from x_i on as there are entries to read.
+            # The number of units that read from x_i on is proportional to the number of entries.
             share = torch.arange(inputs - 1, 0, -1).cumsum(0).double()
-            place = (torch.arange(width) + 0.5) / width * inputs * (inputs - 1) / 2
-            below, first = first, 1 + torch.searchsorted(share, place.double())
+            position = (torch.arange(width) + 0.5) / width * inputs * (inputs - 1) / 2
+            below, first = first, 1 + torch.searchsorted(share, position.double())
             masks.append(below >= first[:, None])
             if set(first.tolist()) < set(range(1, inputs)):
                 raise ValueError(
                     f"hidden has a layer of {width} units, expected at least "
-                    f"{inputs * (inputs - 1) // 2}, some that read from each of the entries on"
+                    f"{inputs * (inputs - 1) // 2}, so that some units read from each entry on"
                 )
         masks.append(first > torch.tensor(after)[:, None])
         for k, (layer, mask) in enumerate(zip(self.linears, masks, strict=True)):
@@ -143,19 +145,19 @@ class MLP(nn.Module):
                 layer.weight.mul_((mask.shape[1] / read).sqrt())
 
     def _weights(self) -> list[Tensor]:
-        """The weight matrices, masked where there are masks."""
+        """Return the weight matrices, masked if ``after`` is used."""
         weights = [layer.weight for layer in self.linears]
         if not self._masked:
             return weights
         return [weight * self.get_buffer(f"mask_{k}") for k, weight in enumerate(weights)]
 
     def _layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights ``(a, b)`` and biases ``(a, 1)``, from input to output."""
+        """Return weights ``(a, b)`` and biases ``(a, 1)``, from input to output."""
         biases = [layer.bias[:, None] for layer in self.linears]
         return list(zip(self._weights(), biases, strict=True))
 
     def forward(self, x: Tensor) -> Tensor:
-        """y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
+        """Return y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
         h, _ = self._normalized(x)
         if self._has_angles:
             cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
@@ -166,7 +168,7 @@ class MLP(nn.Module):
         return F.linear(h, last[0], last[1].bias)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
-        """y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
+        """Return y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
         h, slopes = self._features(columns(x))
         tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
@@ -176,9 +178,9 @@ class MLP(nn.Module):
         return rows(torch.addmm(last_bias, last, h), x), tuple(tape)
 
     def linearize_along(self, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """y, J dx and the tape: :meth:`linearize` and :meth:`pushforward` in one pass.
+        """Return y, J dx and the tape: :meth:`linearize` and :meth:`pushforward` in one pass.
 
-        Both meet every layer side by side, as one product of twice as many columns.
+        Each layer is a single product of twice as many columns.
         """
         features, slopes = self._features(columns(x))
         tangent = self._tangent(columns(dx), slopes)
@@ -193,7 +195,7 @@ class MLP(nn.Module):
         return rows(y + last_bias, x), rows(dy, x), tuple(tape)
 
     def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
-        """J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
+        """Return J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
         *hidden, last = self._weights()
         h = self._tangent(columns(dx), tape[0])
         for weight, slope in zip(hidden, tape[1:], strict=True):
@@ -201,14 +203,14 @@ class MLP(nn.Module):
         return rows(last @ h, dx)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
-        """J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
+        """Return J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
         *hidden, last = self._weights()
-        first, *rest = tape
+        first, *slopes = tape
         h = columns(dy)
-        # One output: a product of columns, not of matrices. Inductor (torch 2.13) compiles
-        # ones(B, 1) @ W to a wrong gradient at some small sizes.
+        # For one output use elementwise products: Inductor (torch 2.13) compiles ones(B, 1) @ W to
+        # a wrong gradient at some small sizes.
         h = last.T * h if last.shape[0] == 1 else last.T @ h
-        for weight, slope in zip(reversed(hidden), reversed(rest), strict=True):
+        for weight, slope in zip(reversed(hidden), reversed(slopes), strict=True):
             h = weight.T @ (h * slope)
         h = h * first
         if self._has_angles:
@@ -217,7 +219,7 @@ class MLP(nn.Module):
         return rows(h, dy)
 
     def _normalized(self, x: Tensor, in_columns: bool = False) -> tuple[Tensor, Tensor]:
-        """z and its slope in x, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
+        """Return z and its slope in x, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
         mean, std, limits = self.mean, self.std, self.limits
         if in_columns:
             mean, std = mean[:, None], std[:, None]
@@ -229,11 +231,11 @@ class MLP(nn.Module):
         return (clipped - mean) / std + beyond, (1 - beyond * beyond) / std
 
     def _features(self, column: Tensor) -> tuple[Tensor, Tensor]:
-        """What the first layer sees of x, and its slopes in x, each ``(n, B)``."""
+        """Return the features of the first layer, and their slopes in x, each ``(n, B)``."""
         z, slope = self._normalized(column, in_columns=True)
         if not self._has_angles:
             return z, slope
-        # Twice as many features as entries: z or sin(x), and 0 or cos(x); no indexing.
+        # Twice as many features as entries, without indexing: z or sin(x), and 0 or cos(x).
         is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
         sine, cosine = torch.sin(column), torch.cos(column)
         features = [torch.where(is_angle, sine, z), torch.where(is_angle, cosine, zero)]
@@ -241,26 +243,26 @@ class MLP(nn.Module):
         return torch.cat(features), torch.cat(slopes)
 
     def _tangent(self, dx: Tensor, slopes: Tensor) -> Tensor:
-        """What the first layer sees of a tangent dx, ``(n, B)``."""
+        """Return the tangent of the features for a tangent dx, ``(n, B)``."""
         return (torch.cat([dx, dx]) if self._has_angles else dx) * slopes
 
 
 def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor]:
-    """W h and W dh, each ``(n, B)``, by one product."""
+    """Return W h and W dh, each ``(n, B)``, by one product."""
     both = weight @ torch.stack([h, dh], dim=1).flatten(1)
     value, tangent = both.unflatten(1, (2, -1)).unbind(1)
     return value, tangent
 
 
 def columns(x: Tensor) -> Tensor:
-    """``(*batch, n)`` as ``(n, B)``, a view: the layout in which the passes compute.
+    """Return ``(*batch, n)`` as a view ``(n, B)``, the layout of all passes.
 
-    With the batch along memory every product of small matrices and every triangular solve becomes
-    a few operations on long vectors.
+    With the batch contiguous in memory, products of small matrices and triangular solves become a
+    few operations on long vectors.
     """
     return x.reshape(-1, x.shape[-1]).T
 
 
 def rows(column: Tensor, like: Tensor) -> Tensor:
-    """``(n, B)`` as ``(*batch, n)``, a view; the batch is that of ``like`` ``(*batch, k)``."""
+    """Return ``(n, B)`` as a view ``(*batch, n)``, with the batch of ``like`` ``(*batch, k)``."""
     return column.T.reshape(*like.shape[:-1], column.shape[0])

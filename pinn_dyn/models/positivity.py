@@ -1,4 +1,4 @@
-"""What keeps the diagonal of a Cholesky factor positive, and its other entries in their range."""
+"""Maps from free numbers to the entries of a Cholesky factor with a positive diagonal."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from torch import Tensor
 
 
 class Positivity(abc.ABC):
-    """Entries of a triangular factor from free numbers y; each method gives values and slopes.
-
-    All entries are in units of the scale of their row.
+    """Map from free numbers y to the entries of a triangular factor, in units of their scale.
 
     Attributes:
-        floor: no entry of the diagonal is below it.
-        start: the y of a diagonal entry before training.
+        floor: lower limit of the diagonal entries.
+        start: initial y of the diagonal entries.
     """
 
     floor: float
@@ -27,11 +25,11 @@ class Positivity(abc.ABC):
 
     @abc.abstractmethod
     def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """L_ii and its slope in y_ii, at y of any shape."""
+        """Return L_ii and its slope in y_ii, at y of any shape."""
 
     @abc.abstractmethod
     def lower(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """L_ij, i > j, and its slope in y_ij."""
+        """Return L_ij, i > j, and its slope in y_ij."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +38,8 @@ class Positive(Positivity):
 
     Args:
         floor: smallest diagonal entry, in units of the scale; 0 allows a semi-definite matrix.
-        initial: what the floor is added to before training; below 1 in the mass matrix of a robot
-            that moves almost without inertia.
+        initial: initial diagonal entry without the floor. Choose a value below 1 for the mass
+            matrix of a robot with little inertia.
     """
 
     floor: NonNegativeFloat = 1e-3
@@ -49,7 +47,7 @@ class Positive(Positivity):
 
     @property
     def start(self) -> float:  # type: ignore[override]
-        """The inverse of the softplus at ``initial``."""
+        """Inverse of the softplus at ``initial``."""
         return math.log(math.expm1(self.initial))
 
     def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -63,7 +61,8 @@ class Positive(Positivity):
 class Bounded(Positivity):
     """L_ii = b sigmoid(y_ii) + floor,   L_ij = b (2 sigmoid(y_ij) - 1),   b the limit.
 
-    The paper's scaled sigmoid for a real arm, b = 3.5. The diagonal starts at 0.63 b.
+    This is the scaled sigmoid of the paper for a real arm, with b = 3.5. The initial diagonal is
+    0.63 b.
 
     Args:
         limit: b, in units of the scale.

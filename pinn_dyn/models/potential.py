@@ -14,31 +14,31 @@ from pinn_dyn.models.scales import Scales
 
 
 class Potential(nn.Module, abc.ABC):
-    """V(q) and its gradient."""
+    """Potential energy V(q) and its gradient."""
 
     @abc.abstractmethod
     def forward(self, q: Tensor) -> Tensor:
-        """V(q), ``(*batch,)``, J."""
+        """Return V(q), ``(*batch,)``, J."""
 
     @abc.abstractmethod
     def gradient(self, q: Tensor) -> Tensor:
-        """G(q) = dV/dq, ``(*batch, N)``."""
+        """Return G(q) = dV/dq, ``(*batch, N)``."""
 
 
 class NetworkPotential(Potential):
     """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
 
-    K = S S^T is a learned constant: an elastic or gravity well is mostly quadratic, and the
-    network then only has to learn what is left. Angles are left out of z, as V is periodic in them.
-    What the network sees of q saturates outside the data, so that V is bounded from below.
+    K = S S^T is a learned constant. An elastic or gravity well is mostly quadratic, so the network
+    only learns the difference. z has zeros for angles, since V is periodic in them. The input of
+    the network saturates outside the data, so that V is bounded from below.
 
     Args:
-        scales: of the data; the value is a typical energy, J.
+        scales: scales of the data. The value is a typical energy, J.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        quadratic: whether the K term is there; false is the paper's plain network.
-        initial: factor of the last layer before training; 0 starts from V = 0 where another part
-            of a sum has a potential.
+        quadratic: true for the term with K; false is the plain network of the paper.
+        initial: factor of the initial weights of the last layer; 0 starts from V = 0, for a part
+            of a sum.
     """
 
     scale: Tensor
@@ -68,7 +68,7 @@ class NetworkPotential(Potential):
         return self.scale * value
 
     def gradient(self, q: Tensor) -> Tensor:
-        """G(q) = dV/dq, ``(*batch, N)``, by one reverse pass."""
+        """Return G(q) = dV/dq, ``(*batch, N)``, by one reverse pass."""
         y, tape = self.network.linearize(q)
         force = self.network.pullback(tape, torch.ones_like(y))
         if self.stiffness_root is not None:
@@ -78,27 +78,29 @@ class NetworkPotential(Potential):
         return self.scale * force
 
     def _lengths(self, q: Tensor) -> Tensor:
-        """z, with zero in the place of angles."""
+        """Return z, with zeros for angles."""
         z = (q - self.network.mean) / self.network.std
         return z.masked_fill(self.network.is_angle, 0.0)
 
 
 class ChainPotential(Potential):
-    """V(q) of a serial chain of revolute joints, from base to tip: linear in each sine and cosine.
+    """Potential of a serial chain of revolute joints, linear in each sine and cosine.
 
     ::
 
         V = scale * e^T w_1,    w_k = (T_k + S_k sin q_k + C_k cos q_k) w_k+1 + h_k
 
-    with w_N+1 = h_N+1, and T, S, C, h and e learned.
+    with w_N+1 = h_N+1, and learned T, S, C, h and e. Joints are ordered from base to tip.
 
     In a chain of rigid bodies w_k is the first moment of mass of the bodies from joint k to the
-    tip, in the frame before joint k: what lies beyond the joint, turned by it, and what the body
-    adds. Three rows are enough to write that potential exactly; more make it easier to learn.
+    tip, in the frame before joint k: the moment of the bodies beyond, rotated by the joint, plus
+    the moment of the body. Three rows represent this potential exactly. More rows are easier to
+    train.
 
     Args:
-        scales: of the data, with all coordinates angles; the value is a typical energy, J.
-        rank: rows of the vectors w, h and e.
+        scales: scales of the data. The value is a typical energy, J, and all coordinates are
+            angles.
+        rank: number of rows of the vectors w, h and e.
 
     Raises:
         ValueError: if a coordinate is not an angle.
@@ -111,8 +113,8 @@ class ChainPotential(Potential):
         size, angles = scales.size, scales.angles
         if set(angles) != set(range(size)):
             raise ValueError(
-                f"angles is {list(angles)}, expected all {size} coordinates: the chain potential "
-                "is that of revolute joints; for others take NetworkPotential"
+                f"angles is {list(angles)}, expected all {size} coordinates: ChainPotential is "
+                "for revolute joints; use NetworkPotential"
             )
         self.rank = rank
 
@@ -124,7 +126,7 @@ class ChainPotential(Potential):
         self.base = normal(rank, 1)
         with torch.no_grad():
             for turn in self.turns:
-                turn.mul_(0.7)  # w keeps its size along the chain
+                turn.mul_(0.7)  # keeps the size of w along the chain
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor) -> Tensor:
@@ -132,7 +134,7 @@ class ChainPotential(Potential):
         return self.scale * (self.base * w).sum(0).reshape(q.shape[:-1])
 
     def gradient(self, q: Tensor) -> Tensor:
-        """G(q) = dV/dq, ``(*batch, N)``, by one pass from the tip and one from the base."""
+        """Return G(q) = dV/dq, ``(*batch, N)``, by one pass from the tip and one from the base."""
         x = columns(q)
         sine, cosine = torch.sin(x), torch.cos(x)
         _, turned = self._moments(x)
@@ -143,7 +145,7 @@ class ChainPotential(Potential):
         return self.scale * rows(torch.stack(force), q)
 
     def _moments(self, x: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """w_1, ``(rank, B)``, and S_k w_k+1 and C_k w_k+1 of each joint."""
+        """Return w_1, ``(rank, B)``, and S_k w_k+1 and C_k w_k+1 of each joint."""
         sine, cosine = torch.sin(x), torch.cos(x)
         w, turned = self.offsets[-1].expand(-1, x.shape[1]), []
         for k in reversed(range(len(x))):

@@ -1,4 +1,4 @@
-"""Heads for a residual force: none, or a network of everything that a log holds."""
+"""Heads for a residual force: none, or a network of q, v and u."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
 _REACH = 3.0
-"""Standard deviations of v and u beyond which the network sees no more."""
+"""Standard deviations of v and u at which the input of the network saturates."""
 
 
 class Residual(nn.Module, abc.ABC):
-    """A generalized force r(q, v, u) ``(*batch, N)`` that no mechanical term can say.
+    """Generalized force r(q, v, u) ``(*batch, N)`` of effects that are not mechanical.
 
     Attributes:
-        learned: whether there is one.
+        learned: true if the force is not zero.
     """
 
     learned: bool
 
     @abc.abstractmethod
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """r, ``(*batch, N)``, at q, v ``(*batch, N)`` and u ``(*batch, M)``."""
+        """Return r, ``(*batch, N)``, at q, v ``(*batch, N)`` and u ``(*batch, M)``."""
 
     @abc.abstractmethod
     def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """What r costs at states ``(B, N)`` and inputs ``(B, M)`` of the data, a scalar."""
+        """Return the penalty of r at states ``(B, N)`` and inputs ``(B, M)``, a scalar."""
 
 
 ResidualHead = Callable[[Scales], Residual]
-"""Builds a residual head; the value of its scales is a force."""
+"""Builder of a residual head. The value of its scales is a force."""
 
 
 class NoResidual(Residual):
-    """r = 0: the robot is mechanical, as in the paper.
+    """r = 0, as in the paper.
 
     Args:
-        scales: of the data.
+        scales: scales of the data.
     """
 
     learned = False
@@ -58,19 +58,19 @@ class NoResidual(Residual):
 
 
 class NetworkResidual(Residual):
-    """r_i = f_i network_i(q, v, u), zero before training, and penalized::
+    """Residual force r_i = f_i network_i(q, v, u), initially zero, with a penalty::
 
         penalty = w mean over the batch and i of (r_i / f_i)^2
 
-    f is a typical generalized force. So r grows only where it buys accuracy that no M, V, D, F or A
-    can: hysteresis, forces that depend on the past, losses of a drive. It may do any work, and is
-    not passive. What the network sees saturates outside the data, so that r is bounded.
+    f is a typical generalized force. Due to the penalty, r only represents effects that M, V, D, F
+    and A cannot represent, such as hysteresis and drive losses. The force is not passive. The input
+    of the network saturates outside the data, so that r is bounded.
 
     Args:
-        scales: of the data; the value is a typical generalized force, ``(N,)``.
+        scales: scales of the data. The value is a typical generalized force, ``(N,)``.
         hidden: widths of the hidden layers.
         activation: activation of the hidden layers.
-        weight: w; the loss of the prediction is near one before anything is learned.
+        weight: w. The initial loss of the prediction is near one.
     """
 
     learned = True

@@ -1,4 +1,4 @@
-"""Scales of the data, from which models and losses take their normalization."""
+"""Scales of the data for the normalization of models and losses."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Statistics:
         q_mean, q_std: configuration, ``(N,)``.
         q_low, q_high: smallest and largest configuration, ``(N,)``.
         v_std: velocity, ``(N,)``.
-        p_std: momentum, ``(N,)``; ones where the data have none.
+        p_std: momentum, ``(N,)``; ones if the data have no momenta.
         u_mean, u_std: input, ``(M,)``.
-        qv_increment_std: of (q, v) over the 1st ... H-th step of a window, ``(H, 2N)``.
-        qp_increment_std: the same of (q, p), ``(H, 2N)``; ones where the data have no momenta.
+        qv_increment_std: increments of (q, v) over 1 to H steps of a window, ``(H, 2N)``.
+        qp_increment_std: increments of (q, p), ``(H, 2N)``; ones if the data have no momenta.
         step: length of a window's step, s.
     """
 
@@ -56,7 +56,7 @@ class Statistics:
         return (self.u_mean.square() + self.u_std.square()).sqrt()
 
     def increment_std(self, state: State) -> Tensor:
-        """Of (q, v) or (q, p) over the 1st ... H-th step of a window, ``(H, 2N)``."""
+        """Return the standard deviations of increments of (q, v) or (q, p), ``(H, 2N)``."""
         return self.qv_increment_std if state == "qv" else self.qp_increment_std
 
     @property
@@ -65,24 +65,24 @@ class Statistics:
         return self.qv_increment_std[0, self.num_coordinates :] / self.step
 
     def network_input(self, repeat_input: int) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of (q, v, u, ... u), for a black box."""
+        """Return the mean and standard deviation of (q, v, u, ... u), for a black box."""
         zero = torch.zeros_like(self.v_std)
         mean = torch.cat([self.q_mean, zero, *[self.u_mean] * repeat_input])
         std = torch.cat([self.q_std, self.v_std, *[self.u_std] * repeat_input])
         return mean, std
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists and floats, as a checkpoint stores them."""
+        """Convert to lists and floats, as stored in a checkpoint."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in values.items()}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Statistics:
-        """The inverse of :meth:`to_dict`.
+        """Build from the result of :meth:`to_dict`.
 
         Raises:
-            ValueError: on numbers that are missing, of the wrong size, not finite, or a spread or
-                step that is not positive; names them.
+            ValueError: if a field is missing, has a wrong size, is not finite, or must be positive
+                and is not. The message names the field.
         """
         names = [item.name for item in fields(cls)]
         if sorted(values) != sorted(names):

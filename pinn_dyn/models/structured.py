@@ -1,4 +1,4 @@
-"""What the Lagrangian and the Hamiltonian network share: heads for V, D, F and A."""
+"""Base class of the Lagrangian and the Hamiltonian network, with heads for V, D, F and A."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[[Scales], CholeskyFactor]
-"""Builds a Cholesky head; the value of its scales is that of the rows of L."""
+"""Builder of a Cholesky head. The value of its scales is that of the rows of L."""
 PotentialHead = Callable[[Scales], Potential]
-"""Builds a potential head; the value of its scales is an energy."""
+"""Builder of a potential head. The value of its scales is an energy."""
 InputHead = Callable[[Scales], InputMatrix]
-"""Builds an input head; the value of its scales is that of the columns of A."""
+"""Builder of an input head. The value of its scales is that of the columns of A."""
 FrictionHead = Callable[[Scales], Friction]
-"""Builds a friction head; the value of its scales is a force."""
+"""Builder of a friction head. The value of its scales is a force."""
 
 
 MASS = partial(NetworkCholesky, hidden=(32, 32, 32))
@@ -36,11 +36,11 @@ INPUT = partial(NetworkInput, hidden=(16, 16))
 
 
 class StructuredNetwork(DelayedPredictor, MechanicalSystem):
-    """A mechanical system with learned V, D, F, A and residual force; subclasses add the mass.
+    """Mechanical system with learned V, D, F, A and residual force. Subclasses add the mass.
 
-    The scales of the heads come from the data, so that every network works on numbers near one:
-    with f the root mean square of the input, A ~ f/u, and with f_i the typical force that this
-    gives on coordinate i, D ~ f_i/v_i, F and r ~ f_i, V ~ f q.
+    The scales of the heads come from the data, so that every network works on numbers near one.
+    With the root mean square f of the input, A ~ f/u. With the resulting typical force f_i of
+    coordinate i, D ~ f_i/v_i, F ~ f_i, r ~ f_i and V ~ f q.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return self.potential(q)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """D(q) = L_D L_D^T, ``(*batch, N, N)``."""
+        """Return D(q) = L_D L_D^T, ``(*batch, N, N)``."""
         return self.damping.matrix(q)
 
     def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return self.residual(q, v, u)
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Of the residual force."""
+        """Return the penalty of the residual force."""
         return self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Training: the LightningModule, losses, gradients, schedule."""
+"""Training: LightningModules, losses, gradient engines, optimizers and schedules."""
 
 from pinn_dyn.training.checkpoints import WholeCheckpoints
 from pinn_dyn.training.constants_fit import Fit, StoppedFit

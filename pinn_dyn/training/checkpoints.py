@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or absent, whenever a training is killed."""
+"""Atomic checkpoint writes, so that a killed training leaves no partial file."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from pinn_dyn.data.whole import whole
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes a file beside the checkpoint and moves it into place.
+    """Checkpoint writer that writes a file next to the checkpoint and renames it.
 
-    Lightning itself writes to the folder of temporary files and moves the file from there, which
-    is no single step where that is another file system.
+    Lightning writes to the folder of temporary files. Moving a file from another file system is not
+    atomic.
     """
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
-        """Write a checkpoint, replacing the one of that name."""
+        """Write a checkpoint, and replace an existing one."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()  # torch.save itself says nothing of a full disk

@@ -1,4 +1,4 @@
-"""What a least-squares fit found: constants, how certain they are, and how far from their start."""
+"""Result of a least-squares fit: constants, their covariance, and their distance from the prior."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 _FAR = 3.0
-"""Standard deviations a priori: of a thousand constants three are farther from their start."""
-_MOST_NAMED = 5
+"""Prior standard deviations from which a constant is reported: 3 of 1,000 by chance."""
+_REPORTED = 5
 _CHECKS = {
     "drive gain": "units and sign of its input",
     **dict.fromkeys(("torque offset", "force offset"), "sign of its input"),
 }
-"""What to look at first; else the units of the columns."""
+"""Advice by the kind of the constant. The default is to check the units of the columns."""
 
 
 class Prior(NamedTuple):
-    """What is known of the parameters before: their mean ``(P,)``, and a root of P ``(P, P)``."""
+    """Prior of the parameters: mean ``(P,)``, and a root of the precision ``(P, P)``."""
 
     mean: Tensor
     root: Tensor
@@ -28,16 +28,16 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """What a least-squares fit found.
+    """Result of a least-squares fit.
 
     Attributes:
-        covariance: of the standardized parameters z, ``(P, P)``, prior included.
-        information: of z from the data alone, ``(P, P)``.
-        prior: what was known of z before.
+        covariance: posterior covariance of the standardized parameters z, ``(P, P)``.
+        information: information about z in the data, without the prior, ``(P, P)``.
+        prior: prior of z.
         residual: root mean square of the normalized data residuals.
-        iterations: of Gauss-Newton.
-        stopped_in: number of the stage in which the fit was stopped, None if it is finished. The
-            rest is then of the last stage that was finished, or of the prior.
+        iterations: number of Gauss-Newton steps.
+        stopped_in: stage in which the fit was interrupted, or None if it is finished. All other
+            values are then those of the last finished stage, or of the prior.
     """
 
     covariance: Tensor
@@ -48,16 +48,16 @@ class Fit:
     stopped_in: int | None = None
 
     def state(self) -> dict[str, Any]:
-        """As tensors and numbers, for a checkpoint."""
+        """Convert to tensors and numbers for a checkpoint."""
         values = {key: value for key, value in vars(self).items() if key != "prior"}
         return values | self.prior._asdict()
 
     @classmethod
     def from_state(cls, state: Any, count: int) -> Fit:
-        """The fit of ``count`` parameters that a checkpoint holds.
+        """Build the fit of ``count`` parameters from a checkpoint.
 
         Raises:
-            ValueError: if it is none.
+            ValueError: if the checkpoint has no valid fit.
         """
         numbers = {"residual": (float,), "iterations": (int,), "stopped_in": (int, type(None))}
         square = {key: [count, count] for key in ("covariance", "information", "root")}
@@ -73,18 +73,18 @@ class Fit:
             or bool(torch.linalg.inv_ex(state["root"]).info)
         ):
             raise ValueError(
-                f"the checkpoint has no fit of the model's {count} constants: it is damaged or of "
-                "another model, fit again in a new folder"
+                f"the checkpoint has no fit of the model's {count} constants: it is damaged or "
+                "belongs to another model; fit again in a new folder"
             )
         values = {key: state[key] for key in state if key not in Prior._fields}
         return cls(prior=Prior(state["mean"], state["root"]), **values)
 
 
 class StoppedFit(KeyboardInterrupt):
-    """A fit was interrupted; the model has the best constants so far.
+    """Interrupt of a fit. The model has the best constants so far.
 
     Attributes:
-        fit: what was found by then, to go on from.
+        fit: result so far, from which the fit can continue.
     """
 
     def __init__(self, fit: Fit):
@@ -93,9 +93,9 @@ class StoppedFit(KeyboardInterrupt):
 
 
 def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
-    """(I + R^T R)^-1, ``(P, P)``, from information I and the root R of the prior's precision.
+    """Return (I + R^T R)^-1, ``(P, P)``, with information I and the root R of the prior precision.
 
-    By the eigenvalues of R^-T I R^-1: of data without noise I + R^T R cannot be inverted as it is.
+    The eigenvalues of R^-T I R^-1 are used, since I + R^T R is nearly singular without noise.
     """
     back = torch.linalg.inv(root)
     values, vectors = torch.linalg.eigh(back.T @ information @ back)
@@ -104,16 +104,16 @@ def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
 
 
 def far_from_start(names: Sequence[str], z: Tensor, prior: Prior) -> list[str]:
-    """In words, the parameters z ``(P,)`` that the prior holds for all but impossible."""
+    """Describe the parameters z ``(P,)`` that are very unlikely under the prior."""
     spread = torch.linalg.inv(prior.root).norm(dim=1)
     deviation = ((z - prior.mean) / spread).abs()
     far = [k for k in deviation.argsort(descending=True).tolist() if deviation[k] > _FAR]
-    found = []
-    for k in far[:_MOST_NAMED]:
-        first = (what for kind, what in _CHECKS.items() if names[k].startswith(kind))
-        found.append(
-            f"{names[k]} is {float(deviation[k]):.1f} prior deviations from its start: check "
-            f"{next(first, 'the units of the columns')}"
+    lines = []
+    for k in far[:_REPORTED]:
+        checks = (check for kind, check in _CHECKS.items() if names[k].startswith(kind))
+        lines.append(
+            f"{names[k]} is {float(deviation[k]):.1f} prior standard deviations from its start: "
+            f"check {next(checks, 'the units of the columns')}"
         )
-    more = len(far) - _MOST_NAMED
-    return [*found, f"and {more} more"] if more > 0 else found
+    more = len(far) - _REPORTED
+    return [*lines, f"and {more} more"] if more > 0 else lines

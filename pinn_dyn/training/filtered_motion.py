@@ -1,4 +1,4 @@
-"""Motion without noise: what an identification by inverse dynamics works on."""
+"""Low-pass filtered motion for identification by inverse dynamics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pinn_dyn.mechanics import Trajectory
 
 
 class Motion(NamedTuple):
-    """Samples of filtered motion, ``(K, N)`` each: what inverse dynamics is compared on."""
+    """Samples of filtered motion, ``(K, N)`` each."""
 
     q: Tensor
     v: Tensor
@@ -23,11 +23,11 @@ class Motion(NamedTuple):
 
 
 def correlation_length(errors: np.ndarray) -> float:
-    """How many successive errors ``(K, N)`` say as much as one that is independent, at least 1.
+    """Return the number of successive errors ``(K, N)`` that are worth one independent error.
 
-    1 + 2 sum over k of rho_k, the autocorrelation up to its first sign change; the mean over the N
-    columns, each weighted by its square. Source: Sokal 1997, "Monte Carlo methods in statistical
-    mechanics", the integrated autocorrelation time.
+    The length is 1 + 2 sum over k of rho_k, with the autocorrelation rho up to its first sign
+    change, averaged over the N columns with their squares as weights. It is at least 1. Source:
+    integrated autocorrelation time, Sokal (1997), "Monte Carlo methods in statistical mechanics".
     """
     count = len(errors)
     spectrum = np.fft.rfft(errors, 2 * count, axis=0)
@@ -40,15 +40,15 @@ def correlation_length(errors: np.ndarray) -> float:
 
 
 def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
-    """At most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
+    """Return at most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
 
-    A Butterworth filter of fourth order, forwards and backwards, on each trajectory; a is the
-    derivative of the filtered v, by differences. Half a period of the cutoff is left out at both
-    ends. Samples are spread evenly.
+    Each trajectory is filtered forwards and backwards by a Butterworth filter of fourth order. a is
+    the derivative of the filtered v by differences. Half a period of the cutoff is removed at both
+    ends. The samples are evenly spaced.
 
     Raises:
         ValueError: if the cutoff is above half the sample rate, or no trajectory is longer than
-            three periods of it.
+            three periods of the cutoff.
     """
     parts: list[Motion] = []
     for item in trajectories:
@@ -73,5 +73,5 @@ def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: 
             f"three periods of the cutoff of {cutoff} Hz"
         )
     joined = Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-    keep = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
-    return Motion(*(x[keep] for x in joined))
+    index = torch.linspace(0, len(joined.q) - 1, min(samples, len(joined.q))).long()
+    return Motion(*(x[index] for x in joined))

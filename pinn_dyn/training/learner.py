@@ -1,4 +1,4 @@
-"""The LightningModule: trains any predictor on windows."""
+"""The LightningModule that trains any predictor on windows."""
 
 from __future__ import annotations
 
@@ -26,39 +26,40 @@ from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.losses import Penalized, WindowLoss
 from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
 
-# What is said to be wrong by them, such as the counts of batches, is put right below.
+# Lightning warns that batch counts are wrong with dataloader_iter; training_step corrects them.
 warnings.filterwarnings("ignore", ".*`dataloader_iter` (argument|step flavor)")
 
-MOST_SECONDS = 0.5
-"""Of steps in a row, until the progress is shown."""
+BLOCK_SECONDS = 0.5
+"""Longest time between updates of the progress bar."""
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
-"""Maps a model and true trajectories ``(K, T, N)`` to named figures of merit."""
+"""Function from a model and true trajectories ``(K, T, N)`` to named metrics."""
 
 
 class NonFiniteLossError(RuntimeError):
-    """The training loss became NaN or infinite."""
+    """Error: the training loss became NaN or infinite."""
 
 
 class DynamicsLearner(L.LightningModule):
-    """Trains a predictor: windows in, loss on them, roll-outs to validate.
+    """LightningModule that trains a predictor on windows and validates it by roll-outs.
 
-    A training step of Lightning is many steps of the optimizer, as its own hundreds of calls take
-    as long as the step of a small network. It ends where something may be due: before and after
-    each ``log_every_n_steps`` steps, at a validation, and after half a second. Of several processes
-    each step is one of its own, as they have to keep together, and so it is where a callback
-    averages the weights over the steps.
+    A training step of Lightning comprises many optimizer steps, since the hundreds of calls around
+    a training step take as long as an optimizer step of a small network. A training step ends if
+    Lightning may have something to do: before and after each ``log_every_n_steps`` steps, at a
+    validation, and after half a second. With several processes, or a callback that averages
+    weights, a training step is a single optimizer step.
 
     Args:
         model: the predictor.
         loss: loss of the model on a batch of windows.
-        optimizer: builds the optimizer from the parameters.
-        scheduler: builds the learning-rate schedule from the optimizer and ``total_steps``.
-        validator: figures of merit on validation trajectories.
-        config: the resolved configuration as plain values; saved in the checkpoint.
-        statistics: scales of the data; saved in the checkpoint.
-        compile: compile the dynamics for training.
-        gradient_clip_val: largest norm of the gradient, or its largest entry; None: any.
+        optimizer: builder of the optimizer from the parameters.
+        scheduler: builder of the learning-rate schedule from the optimizer and ``total_steps``.
+        validator: metrics on validation trajectories.
+        config: the resolved configuration as plain values, saved in the checkpoint.
+        statistics: scales of the data, saved in the checkpoint.
+        compile: true to compile the dynamics for training.
+        gradient_clip_val: largest norm, or largest entry, of the gradient. The default is no
+            clipping.
         gradient_clip_algorithm: ``"norm"`` or ``"value"``.
 
     Raises:
@@ -82,36 +83,38 @@ class DynamicsLearner(L.LightningModule):
     ):
         super().__init__()
         self.automatic_optimization = False
-        # For the checkpoint; what the loggers compare is chosen elsewhere.
+        # For the checkpoint. The hyperparameters of loggers are chosen elsewhere.
         hyperparameters = {"config": config, "statistics": statistics.to_dict()}
         self.save_hyperparameters(hyperparameters, logger=False)
-        set_output_limits(model, {})  # those of an earlier training
+        set_output_limits(model, {})  # remove the limits of an earlier training
         self.model = model
         self.loss = Penalized(loss) if model.penalized else loss
         self.validator = validator
         self._optimizer = optimizer
         self._scheduler = scheduler
         self._compile = compile
-        self._most, self._by_value = gradient_clip_val, gradient_clip_algorithm == "value"
-        self._losses: list[Tensor] = []  # of this epoch
+        self._clip_value, self._by_value = gradient_clip_val, gradient_clip_algorithm == "value"
+        self._losses: list[Tensor] = []  # losses of this epoch
 
     def gradients(self, vector: ParameterVector, steps: int) -> Engine:
-        """How loss and gradient in the parameters are taken, in a training of so many steps."""
+        """Return the engine that computes loss and gradient in a training of ``steps`` steps."""
         if self._compile and isinstance(self.model, ContinuousPredictor):
             return Compiled(self.loss, self.model, vector, steps)
         return Eager(self.loss, self.model, vector)
 
     def training_step(self, dataloader_iter: Iterator[tuple[Windows, int, int]]) -> None:
-        """Steps of the optimizer, one for each batch, until something may be due."""
+        """Take optimizer steps, one for each batch, until Lightning has something to do."""
         loop, trainer = self.trainer.fit_loop.epoch_loop, self.trainer
-        before = loop.batch_progress.current.ready - 1  # in this epoch; Lightning counted one
+        before = (
+            loop.batch_progress.current.ready - 1
+        )  # in this epoch; Lightning has counted this step
         if before == 0:
-            self._losses.clear()  # of an epoch that was cut short
-        # Not by way of Lightning, whose hooks around a step take as long as AdamW.
+            self._losses.clear()  # of an interrupted epoch
+        # Without the hooks of Lightning around a step, which take as long as AdamW.
         optimizer = self.optimizers(use_pl_optimizer=False)
         schedule = self.lr_schedulers()
-        step, until, done = self.global_step, time.monotonic() + MOST_SECONDS, 0
-        known = len(self._losses)
+        step, until, done = self.global_step, time.monotonic() + BLOCK_SECONDS, 0
+        count = len(self._losses)
         try:
             for batch, _, _ in islice(dataloader_iter, self._steps_until_due(before)):
                 optimizer.step(self._closure(batch, step + done))  # type: ignore[union-attr, arg-type]
@@ -121,65 +124,64 @@ class DynamicsLearner(L.LightningModule):
                     break
         finally:
             loop.manual_optimization.optim_step_progress.increment_by(done)
-            # Lightning itself counts one. The last of its counters is private, and no public call
-            # moves it: its loggers and monitors take the step from there.
+            # Lightning counts a single step. Loggers and monitors use the private counter, which no
+            # public function changes.
             loop.batch_progress.increment_by(done - 1)
             loop._batches_that_stepped += done - 1
-            if self.device.type == "cuda" and (new := self._losses[known:]):
+            if self.device.type == "cuda" and (new := self._losses[count:]):
                 self._refuse_non_finite(torch.stack(new), step)
         if before + done >= trainer.num_training_batches:
             self.log_losses(torch.stack(self._losses).mean(0))
             self._losses.clear()
 
     def _steps_until_due(self, before: int) -> int:
-        """Steps until Lightning may have something to do, after so many in this epoch."""
+        """Return the number of steps until Lightning may have something to do."""
         trainer = self.trainer
-        averaged = any(isinstance(one, WeightAveraging) for one in trainer.callbacks)  # type: ignore[attr-defined]
+        averaged = any(isinstance(item, WeightAveraging) for item in trainer.callbacks)  # type: ignore[attr-defined]
         if trainer.world_size > 1 or averaged:
             return 1
         steps = self.global_step
         due = [int(trainer.num_training_batches) - before]
-        if every := trainer.log_every_n_steps:  # type: ignore[attr-defined]
-            due += [every - steps % every, every - (steps + 1) % every]
-        if isinstance(every := trainer.val_check_batch, int):
-            due += [every - steps % every, every - before % every]
+        if period := trainer.log_every_n_steps:  # type: ignore[attr-defined]
+            due += [period - steps % period, period - (steps + 1) % period]
+        if isinstance(period := trainer.val_check_batch, int):
+            due += [period - steps % period, period - before % period]
         if trainer.max_steps > 0:
             due.append(trainer.max_steps - self.global_step)
         return max(1, min(due))
 
     def _closure(self, batch: Windows, step: int) -> Callable[[], Tensor]:
-        """What gives the parameters the gradient of a batch, and returns the loss."""
-        # The step comes back with a checkpoint: a resumed training is as far as it was.
+        """Return a function that sets the gradient of a batch and returns the loss."""
+        # The step is restored from a checkpoint, so a resumed training has the same progress.
         windows = self.loss.selected(batch, step / self._steps)
 
         def closure() -> Tensor:
             losses, gradient = self._gradients(windows)
-            if not losses.is_cuda:  # a GPU would have to be waited for: it is asked later
+            if not losses.is_cuda:  # on a GPU it would wait: see training_step
                 self._refuse_non_finite(losses[None], step)
             gradient = self.trainer.strategy.reduce(gradient)  # mean over processes
-            self._vector.gradient.copy_(clipped(gradient, self._most, self._by_value))
-            if self._vector.parameters[0].grad is None:  # the trainer clears them once
+            self._vector.gradient.copy_(clipped(gradient, self._clip_value, self._by_value))
+            if self._vector.parameters[0].grad is None:  # the trainer clears them at first
                 self._vector.show_gradients()
             self._losses.append(losses)
-            return losses.sum()  # a single number, but for the members of an ensemble
+            return losses.sum()  # over the members of an ensemble
 
         return closure
 
     def _refuse_non_finite(self, losses: Tensor, first: int) -> None:
-        """Raise where the losses of the steps from ``first`` on, a row each, are not finite."""
+        """Raise an error if a loss is not finite. Each row is a step, starting at ``first``."""
         for step, loss in enumerate(losses.reshape(len(losses), -1).sum(1).tolist(), first):
             if not math.isfinite(loss):
                 raise NonFiniteLossError(
                     f"the training loss became {loss} at step {step} (epoch "
-                    f"{self.current_epoch}); the checkpoints written before are kept. Lower "
-                    "optimizer.lr, shorten the window (data.steps, data.stride) or raise the "
-                    "heads' epsilon, then start again"
+                    f"{self.current_epoch}); earlier checkpoints are kept. Reduce optimizer.lr, or "
+                    "use shorter windows (data.steps, data.stride), and start again"
                 )
 
     def log_losses(self, losses: Tensor) -> None:
-        """Log the mean loss of an epoch.
+        """Log the mean loss once per epoch.
 
-        Once an epoch: a call of ``log`` at every step takes as long as a small network's step.
+        A call of ``log`` takes as long as a step of a small network.
         """
         self.log(
             "train/loss",
@@ -188,13 +190,13 @@ class DynamicsLearner(L.LightningModule):
             on_step=False,
             on_epoch=True,
             batch_size=1,
-            sync_dist=True,  # the mean over processes that share a batch
+            sync_dist=True,  # mean over processes that share a batch
         )
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
         """Roll out all validation trajectories."""
         figures = self.validator(self.model, batch)
-        # Processes that train together all roll out the same; sync_dist says that this is known.
+        # All processes compute the same metrics; sync_dist suppresses a warning.
         named = {f"val/{key}": value for key, value in figures.items()}
         named |= {f"model/{key}": value for key, value in self.model.learned_figures().items()}
         self.log_dict(named, batch_size=1, sync_dist=True)
@@ -205,8 +207,8 @@ class DynamicsLearner(L.LightningModule):
         """Keep the gradients, which are views of one vector."""
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add how far the heads may go beyond what these weights give on the training windows."""
-        weights = checkpoint["state_dict"]  # those of a callback that averages them, maybe
+        """Add the output limits of the heads for these weights and the training windows."""
+        weights = checkpoint["state_dict"]  # possibly averaged by a callback
         model = copy.deepcopy(self.model)
         model.load_state_dict({name.removeprefix("model."): x for name, x in weights.items()})
         q = self.trainer.datamodule.windows.q  # type: ignore[attr-defined]
@@ -214,31 +216,31 @@ class DynamicsLearner(L.LightningModule):
         weights.update({f"model.{name}": limit for name, limit in limits.items()})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on learning without limits."""
+        """Remove the output limits for further training."""
         checkpoint["state_dict"] = free_weights(checkpoint["state_dict"])
 
     def output_limits(self, model: Predictor, q: Tensor) -> dict[str, Tensor]:
-        """How far the heads of a model may go beyond what they give at q ``(K, N)``."""
+        """Return the output limits of the heads of a model at q ``(K, N)``."""
         return output_limits(model, q)
 
     def parameter_vector(self) -> ParameterVector:
-        """The parameters of the model as one vector."""
+        """Return the parameters of the model as one vector."""
         return ParameterVector(self.model.parameters())
 
     def built_optimizer(self, vector: ParameterVector) -> Optimizer:
-        """The optimizer, of all numbers at once where it takes each by itself."""
+        """Build the optimizer, on a single vector if it treats every number separately."""
         optimizer = self._optimizer(vector.parameters)
         return self._optimizer([vector.values]) if type(optimizer) in ELEMENTWISE else optimizer
 
     def configure_optimizers(self) -> Any:
-        """The optimizer, with its learning rate scheduled per step.
+        """Build the optimizer and the learning-rate schedule, which advances at every step.
 
-        The model is on its device now. What is compiled is compiled here, in the process that
-        trains: it does not reach another one.
+        Lightning calls this in the training process with the model on its device. Compiled programs
+        are created here, since they cannot be sent to another process.
         """
         if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
             raise ValueError(
-                f"trainer.precision is {self.trainer.precision}, which scales the loss: take "
+                f"trainer.precision is {self.trainer.precision}, which scales the loss: use "
                 "bf16-mixed or 32"
             )
         self._steps = int(self.trainer.estimated_stepping_batches)
@@ -251,25 +253,25 @@ class DynamicsLearner(L.LightningModule):
             "lr_scheduler": {
                 "scheduler": scheduler,
                 "interval": "step",
-                "name": "train/learning_rate",  # in the log
+                "name": "train/learning_rate",
             },
         }
 
 
 def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> Tensor:
-    """A gradient ``(*members, P)`` scaled down to a norm, each member's own, or cut off at a value.
+    """Clip a gradient ``(*members, P)`` by the norm of each member, or by value.
 
     Args:
-        gradient: of all parameters.
-        largest: norm, or value; None: as it is.
-        by_value: whether it is a value.
+        gradient: gradient of all parameters.
+        largest: largest norm or value. None returns the gradient unchanged.
+        by_value: true to clip by value.
     """
     if largest is None:
         return gradient
     if by_value:
         return gradient.clamp(-largest, largest)
     norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
-    # As in most steps: one operation, not five; a GPU would have to be waited for.
+    # The usual case by one operation instead of five. On a GPU this would wait.
     if norm.numel() == 1 and not norm.is_cuda and float(norm) < largest:
         return gradient
     return gradient * (largest / (norm + 1e-6)).clamp(max=1.0)

@@ -1,4 +1,4 @@
-"""Least squares for models of few parameters: from inverse dynamics, then on roll-outs."""
+"""Least-squares fits of models with few parameters, by inverse dynamics and by roll-outs."""
 
 from __future__ import annotations
 
@@ -33,50 +33,51 @@ log = logging.getLogger(__name__)
 AtLeastTwo = Annotated[int, Field(ge=2)]
 """Number of samples or evaluations: one sample has no spread."""
 
-_MOST_PARAMETERS = 500
+_MAX_PARAMETERS = 500
 _CHUNK = 500
-"""Windows whose derivatives are rolled out at once; bounds the memory."""
+"""Number of windows whose derivatives are rolled out at once, to limit the memory."""
 _FIRST_NOISE = 0.1
-"""Of the normalized residuals at most, before a fit has shown it."""
+"""Largest assumed noise of the normalized residuals before the first fit."""
 REST = 0.05
-"""Part of a joint's typical speed below which it counts as at rest."""
+"""Share of the typical speed of a joint below which it is considered at rest."""
 _CHANGED = 5.0
-"""Standard deviation of the parameters of a changed body: a payload may outweigh its link."""
-_BROKEN = 1e4
-"""Residual of a roll-out that breaks down."""
+"""Prior standard deviation of a changed body. A payload may be heavier than its link."""
+_DIVERGED = 1e4
+"""Residual of a diverged roll-out."""
 
 
 class LeastSquares:
-    """Maximum a posteriori fit by Gauss-Newton (a trust region, ``scipy.optimize``)::
+    """Maximum a posteriori fit by Gauss-Newton with a trust region (``scipy.optimize``)::
 
         min over z of  |r(z)|^2 / s^2 + (z - z_0)^T P (z - z_0)
 
-    z are the standardized parameters of the model, so z_0 = 0 and P = 1 is its prior. After an
-    earlier fit z_0 is what that found and P the inverse of its covariance, but for the bodies that
-    have ``changed`` since: a payload is learned from seconds, as all the rest is known. Two stages,
-    each started where the one before ended:
+    z are the standardized parameters of the model, with the prior z_0 = 0 and P = 1. After an
+    earlier fit, z_0 is its result and P the inverse of its covariance, except for bodies that have
+    ``changed`` since. For example, a payload can be learned from seconds of data. A fit has two
+    stages, each starting from the result of the previous one:
 
-    1. inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), each force in units of its
-       spread, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
-       same filter on q, v, a and u leaves a linear law as it is. A joint at rest is left out, as
-       dry friction may then have any value up to its level. This is the classical identification,
-       here with constants that stay physical;
-    2. roll-outs: r = predicted less measured increments of the windows, each in units of its
-       spread, as of the loss of increments. Derivatives by forward mode through the integrator.
-       First over a quarter of the windows' steps, then over all.
+    1. Inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), in units of the spread of the
+       forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
+       same filter for q, v, a and u does not change a linear law. Joints at rest are excluded,
+       since dry friction may then have any value up to its level. This is the classical
+       identification, with physical constants.
+    2. Roll-outs: r = predicted minus measured increments of the windows, in units of their spread,
+       as in the increment loss. Derivatives are computed in forward mode through the integrator.
+       The first roll-outs use a quarter of the steps of the windows.
 
-    s, by residual, is the root mean square of what remains, found by repeating each stage. What is
-    correlated counts as one: successive samples of the motion by :func:`correlation_length`, the
-    residuals within a window, and of windows that overlap, for each coordinate.
+    s is the root mean square of the residuals, estimated by repeating each stage. Correlated
+    residuals are counted once: successive samples of the motion by :func:`correlation_length`, and
+    the residuals of a coordinate within a window.
 
     Args:
-        cutoff: of the filter before the inverse dynamics, Hz: above the motion, below the noise.
-        rollouts: whether to take the second stage; without it the result is the identification.
-        samples: samples of the inverse dynamics.
-        evaluations: most evaluations of the residuals in a stage.
-        velocity_weight: weight of the velocity half in the roll-outs, as of the loss.
-        changed: bodies and other owners of constants, such as the ``tip`` in ``mass of tip``,
-            that are others than in the earlier fit, and free again.
+        cutoff: cutoff of the filter before the inverse dynamics, Hz. Choose it above the
+            frequencies of the motion and below those of the noise.
+        rollouts: true for both stages, false for the identification only.
+        samples: number of samples of the inverse dynamics.
+        evaluations: largest number of evaluations of the residuals in a stage.
+        velocity_weight: weight of the velocity half in the roll-outs, as in the loss.
+        changed: bodies, or other owners of constants such as ``tip`` in ``mass of tip``, that have
+            changed since the earlier fit and are fitted anew.
     """
 
     def __init__(
@@ -104,27 +105,26 @@ class LeastSquares:
         covariance: Tensor | None = None,
         stopped: Fit | None = None,
     ) -> Fit:
-        """Fit the model in place; it comes back in the precision it had.
+        """Fit the model in place. Its precision does not change.
 
         Args:
-            model: what is fitted.
-            trajectories: the training trajectories, for the inverse dynamics.
-            windows: the training windows, for the roll-outs.
-            covariance: of the z that the model has from an earlier fit, ``(P, P)``, if any.
-            stopped: this very fit, if it was stopped, to go on from the z that the model has.
+            model: the model to fit.
+            trajectories: training trajectories for the inverse dynamics.
+            windows: training windows for the roll-outs.
+            covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
+            stopped: interrupted result of this fit, to continue from the present z.
 
         Raises:
-            ValueError: on a model without parameters or with more than 500, trajectories that are
-                too short for the filter, fewer residuals than parameters without an earlier fit, a
-                covariance that is none or of another model, or changed bodies that the model does
-                not have, or without an earlier fit.
-            StoppedFit: on an interrupt; the model then has the best z so far.
+            ValueError: if the model has no parameters or more than 500, trajectories are too short
+                for the filter, there are fewer residuals than parameters, the covariance does not
+                fit the model, or changed bodies are unknown.
+            StoppedFit: on an interrupt. The model then has the best z so far.
         """
         count = sum(p.numel() for p in model.parameters())
-        if not 0 < count <= _MOST_PARAMETERS:
+        if not 0 < count <= _MAX_PARAMETERS:
             raise ValueError(
-                f"the model has {count} parameters, least squares takes 1 to {_MOST_PARAMETERS}: "
-                "take a gradient method (optimizer=adamw) or a smaller model"
+                f"least squares takes 1 to {_MAX_PARAMETERS} parameters, the model has {count}: "
+                "use a gradient method (optimizer=adamw) or a smaller model"
             )
         precision = next(model.parameters()).dtype
         model.double()
@@ -137,55 +137,54 @@ class LeastSquares:
             windows = windows.to(torch.device("cpu"), torch.float64)
             steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
             _require_enough(
-                size * _halves(steps) * steps,
+                size * _informative_blocks(steps) * steps,
                 count,
                 f"{len(windows)} windows of {steps} steps",
-                "take more windows (data.pairs) or longer ones (data.steps)",
+                "use more windows (data.pairs) or longer windows (data.steps)",
                 earlier,
             )
-            # Short ones first: long ones break down, or end in a poor minimum, from a poor start.
+            # Short windows first: from a poor start, long windows diverge or end in a poor minimum.
             short = -(-steps // 4)
-            enough = size * _halves(short) * short >= count
+            enough = size * _informative_blocks(short) * short >= count
             for length in [short, steps] if enough and short < steps else [steps]:
                 stages.append(partial(self._roll_out, model, prior, windows.first(length)))
-        found, number = stopped, (stopped.stopped_in or 0) if stopped else 0
+        result, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         try:
             while number < len(stages):
-                found = stages[number]()
+                result = stages[number]()
                 number += 1
         except KeyboardInterrupt as interrupt:
-            nothing = torch.zeros_like(prior.root)
-            known = found or Fit(
-                posterior_covariance(nothing, prior.root), nothing, prior, float("nan"), 0
-            )
-            raise StoppedFit(replace(known, stopped_in=number)) from interrupt
+            zero = torch.zeros_like(prior.root)
+            covariance = posterior_covariance(zero, prior.root)
+            partial_fit = result or Fit(covariance, zero, prior, float("nan"), 0)
+            raise StoppedFit(replace(partial_fit, stopped_in=number)) from interrupt
         finally:
             model.to(precision)
-        assert found is not None
+        assert result is not None
         z = parameters_to_vector(model.parameters()).detach().to(prior.mean)
         for line in far_from_start(model.parameter_names(), z, prior):
             log.warning("least squares: %s", line)
-        return found
+        return result
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
         z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()
         if covariance is None:
             if self.changed:
                 raise ValueError(
-                    f"changed is {self.changed}, but there is no earlier fit that "
-                    "they have changed since: name its run, start_from=<run>"
+                    f"changed is {self.changed}, but there is no earlier fit: give its run by "
+                    "start_from=<run>"
                 )
             return Prior(0 * z, torch.eye(len(z)).to(z))
         owners = [name.split(" of ", 1)[-1] for name in names]
-        if unknown := [one for one in self.changed if one not in owners]:
+        if unknown := [owner for owner in self.changed if owner not in owners]:
             raise ValueError(
                 f"changed names {', '.join(unknown)}, expected some of "
                 f"{', '.join(dict.fromkeys(owners))}"
             )
         if covariance.shape != (len(z), len(z)):
             raise ValueError(
-                f"the earlier fit has {len(covariance)} constants, this model {len(z)}: take the "
-                "friction and the drive gains of that run"
+                f"the earlier fit has {len(covariance)} constants, this model {len(z)}: use the "
+                "friction and the drive gains of the earlier run"
             )
         free = torch.tensor([owner in self.changed for owner in owners])
         held = ~free
@@ -195,10 +194,10 @@ class LeastSquares:
         factor, failed = torch.linalg.cholesky_ex(spread)
         if failed:
             raise ValueError(
-                "the covariance of the earlier fit is no positive definite matrix of finite "
-                "numbers: its checkpoint is damaged, fit it again"
+                "the covariance of the earlier fit is not positive definite: its checkpoint is "
+                "damaged, fit the model again"
             )
-        # Not by way of the inverse: rounding makes it indefinite where much is known for certain.
+        # The inverse would be indefinite by rounding if many constants are known precisely.
         root = torch.linalg.solve_triangular(factor, torch.eye(len(z)).to(z), upper=False)
         return Prior(z, root)
 
@@ -215,8 +214,7 @@ class LeastSquares:
         moves = v.abs() > REST * v.std(0)
         if not moves.any():
             raise ValueError(
-                "least squares: nothing moves in the training trajectories, expected motions that "
-                "show the constants: excite the robot"
+                "least squares: no joint moves in the training trajectories: excite the robot"
             )
         _require_enough(
             int(moves.sum()),
@@ -241,14 +239,14 @@ class LeastSquares:
         self._solve("inverse dynamics", model, prior, residuals, correlated=1.0)
         with torch.no_grad():
             correlated = correlation_length((errors() * moves).numpy())
-        stage = f"inverse dynamics, {correlated:.3g} samples as one"
+        stage = f"inverse dynamics, correlation over {correlated:.3g} samples"
         return self._solve(stage, model, prior, residuals, correlated=correlated)
 
     def _roll_out(self, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
         scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
         x0, measured = windows.start("qv"), windows.increments("qv")
-        first = (2 - _halves(measured.shape[1])) * model.num_coordinates
+        first = (2 - _informative_blocks(measured.shape[1])) * model.num_coordinates
 
         def residuals(derivative: bool) -> Tensor:
             if derivative:
@@ -270,17 +268,17 @@ class LeastSquares:
         *,
         correlated: float,
     ) -> Fit:
-        """Two fits, the second with the noise that the first left; the model is set in place.
+        """Fit twice, the second time with the noise level of the first fit; set the model in place.
 
-        ``residuals`` gives those of the model as it is, ``(..., R)``, or their derivatives
-        ``(..., R, P)``; ``correlated`` of them count as one.
+        ``residuals`` returns the residuals of the present model, ``(..., R)``, or their derivatives
+        ``(..., R, P)``. ``correlated`` residuals are worth one independent residual.
         """
         z = parameters_to_vector(model.parameters()).detach()
         mean, root = prior.mean.numpy(), prior.root.numpy()
 
         def spread(at: np.ndarray) -> float:
-            remains = np.mean(_evaluate(model, at, residuals, False) ** 2)
-            return max(float(np.sqrt(remains)), np.finfo(float).eps)
+            square = np.mean(_evaluate(model, at, residuals, False) ** 2)
+            return max(float(np.sqrt(square)), np.finfo(float).eps)
 
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
         best = np.inf, z.numpy()
@@ -291,10 +289,10 @@ class LeastSquares:
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 nonlocal best
                 data = weight * _evaluate(model, at, residuals, False)
-                every = np.concatenate([data, root @ (at - mean)])
-                if (cost := float(every @ every)) < best[0]:
+                errors = np.concatenate([data, root @ (at - mean)])
+                if (cost := float(errors @ errors)) < best[0]:
                     best = cost, at.copy()
-                return every
+                return errors
 
             def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
@@ -302,15 +300,15 @@ class LeastSquares:
 
             limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
             try:
-                found = least_squares(value, z.numpy(), slope, **limit)
+                solution = least_squares(value, z.numpy(), slope, **limit)
             except KeyboardInterrupt:
                 vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
                 raise
-            z = torch.from_numpy(found.x)
-            noise = spread(found.x)
-            steps += int(found.njev)
+            z = torch.from_numpy(solution.x)
+            noise = spread(solution.x)
+            steps += int(solution.njev)
             log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
-        slopes = torch.from_numpy(found.jac[: -len(z)])
+        slopes = torch.from_numpy(solution.jac[: -len(z)])
         information = slopes.T @ slopes
         covariance = posterior_covariance(information, prior.root)
         return Fit(covariance, information, prior, noise, steps)
@@ -319,34 +317,38 @@ class LeastSquares:
 def _evaluate(
     model: LearnedConstants, z: np.ndarray, residuals: Callable[[bool], Tensor], derivative: bool
 ) -> np.ndarray:
-    """Residuals at z, flattened; a roll-out that breaks down is a bad step, not an error."""
+    """Return the residuals at z, flattened. A diverged roll-out has large residuals."""
     with torch.no_grad():
         vector_to_parameters(torch.from_numpy(z), model.parameters())
-        found = residuals(derivative)
-    bad = 0.0 if derivative else _BROKEN
-    values = np.nan_to_num(found.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
-    return values if derivative else values.clip(-_BROKEN, _BROKEN)
+        result = residuals(derivative)
+    bad = 0.0 if derivative else _DIVERGED
+    values = np.nan_to_num(result.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
+    return values if derivative else values.clip(-_DIVERGED, _DIVERGED)
 
 
-def _halves(steps: int) -> int:
-    """Of q and v, how many say something of an increment: where dq/dt = v, q none of one step."""
+def _informative_blocks(steps: int) -> int:
+    """Return the number of informative residual blocks: 1 for one-step windows, otherwise 2.
+
+    In one step dq/dt = v makes the residual of q zero.
+    """
     return 1 if steps == 1 else 2
 
 
-def _require_enough(found: int, constants: int, where: str, remedy: str, earlier: bool) -> None:
-    """Refuse fewer residuals than constants, which are met exactly, as if there were no noise.
+def _require_enough(count: int, constants: int, source: str, remedy: str, earlier: bool) -> None:
+    """Check that there are at least as many residuals as constants.
 
-    After an earlier fit it is a warning: only what has changed is free.
+    Fewer residuals would be fitted exactly, so that the noise seems to be zero. After an earlier
+    fit this is only a warning, since few constants are free.
 
     Raises:
-        ValueError: with the counts.
+        ValueError: if there are fewer residuals than constants.
     """
-    if found >= constants:
+    if count >= constants:
         return
-    said = (
-        f"{where} give {found} residuals for {constants} constants, expected at least as many: "
-        f"fewer are met exactly, as if there were no noise; {remedy}"
+    message = (
+        f"{source} give {count} residuals for {constants} constants, expected at least as many, "
+        f"since fewer would be fitted exactly, without noise: {remedy}"
     )
     if not earlier:
-        raise ValueError(f"least squares: {said}")
-    log.warning("least squares: %s", said)
+        raise ValueError(f"least squares: {message}")
+    log.warning("least squares: %s", message)

@@ -23,28 +23,28 @@ from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.losses import WindowLoss
 
 COVARIANCE = "covariance"
-"""Under which a checkpoint has that of the constants."""
+"""Key of the covariance of the constants in a checkpoint."""
 _FIT = "fit"
 
 
 class LeastSquaresLearner(DynamicsLearner):
-    """Fits a model by least squares where others take many steps of an optimizer.
+    """LightningModule that fits a model by least squares in a single training step.
 
-    So a fit has the run folder, checkpoints, validation and logs of every training. The trainer has
-    ``steps: 1`` and ``validations: 1``; one batch holds all windows. SIGTERM and Ctrl-C end a fit
-    at once, wherever it is: it goes on from the checkpoint that is written then.
+    A fit has the same run folder, checkpoints, validation and logs as other trainings. The trainer
+    has ``steps: 1`` and ``validations: 1``, and one batch contains all windows. SIGTERM and Ctrl-C
+    interrupt a fit at any time. It continues from the checkpoint that is then written.
 
     Args:
-        model: what is fitted.
-        solver: the fit.
-        covariance: of the constants that the model starts from, if an earlier fit found them.
-        loss, validator, config, statistics: as of :class:`DynamicsLearner`.
+        model: the model to fit.
+        solver: the least-squares solver.
+        covariance: covariance of the initial constants from an earlier fit, if any.
+        loss, validator, config, statistics: see :class:`DynamicsLearner`.
 
     Attributes:
-        result: of the fit, once it is done or was stopped.
+        result: result of the fit, once it is finished or interrupted.
 
     Raises:
-        TypeError: unless the parameters of the model are physical constants.
+        TypeError: if the parameters of the model are not physical constants.
     """
 
     result: Fit | None = None
@@ -63,7 +63,7 @@ class LeastSquaresLearner(DynamicsLearner):
         if not isinstance(model, LearnedConstants):
             raise TypeError(
                 "least squares fits physical constants (model=known or known_system), not "
-                f"{type(model).__name__}: take optimizer=adamw"
+                f"{type(model).__name__}: use optimizer=adamw"
             )
         super().__init__(
             model,
@@ -79,7 +79,7 @@ class LeastSquaresLearner(DynamicsLearner):
         self.covariance = covariance
 
     def training_step(self, batch: Windows, batch_idx: int) -> None:  # type: ignore[override]
-        """The fit, on all training trajectories and windows, in double precision."""
+        """Fit the model on all training trajectories and windows, in double precision."""
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(self.model, LearnedConstants)
         if self.result is None or self.result.stopped_in is not None:
@@ -94,41 +94,43 @@ class LeastSquaresLearner(DynamicsLearner):
                     raise SIGTERMException from stopped
                 raise
         self.log_losses(torch.tensor(self.result.residual**2))
-        self.optimizers().step()  # type: ignore[union-attr]  # no gradients: it only counts
+        self.optimizers().step()  # type: ignore[union-attr]  # only counts the step
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the fit, and its covariance for one that starts from it."""
+        """Save the fit, and its covariance for later fits."""
         if self.result is not None:
             checkpoint[COVARIANCE] = self.result.covariance
             checkpoint[_FIT] = self.result.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on with the fit of the checkpoint, if it has one.
+        """Continue the fit of the checkpoint, if any.
 
         Raises:
-            ValueError: if what it has is none.
+            ValueError: if the fit in the checkpoint is damaged.
         """
         if _FIT in checkpoint:
             count = sum(p.numel() for p in self.model.parameters())
             self.result = Fit.from_state(checkpoint[_FIT], count)
 
     def configure_optimizers(self) -> Any:
-        """One that does nothing, as the trainer counts its steps."""
+        """Return an optimizer that does nothing; the trainer counts its steps."""
         return SGD(self.model.parameters(), lr=0.0)
 
 
 @contextlib.contextmanager
 def _sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt, as Ctrl-C does: who waits for a step waits for minutes."""
+    """Raise KeyboardInterrupt on SIGTERM within a context, since a step takes minutes."""
     before = signal.getsignal(signal.SIGTERM)
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, before)  # once: what was found is being kept by then
+        signal.signal(signal.SIGTERM, before)  # once, since the result is then being saved
         if callable(before):
-            before(number, frame)  # the trainer's, which makes a note of it
+            before(number, frame)  # the handler of the trainer
         raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():  # which alone gets signals
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # only the main thread receives signals
         yield
         return
     signal.signal(signal.SIGTERM, interrupt)

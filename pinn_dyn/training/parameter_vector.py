@@ -19,23 +19,24 @@ from torch.optim import (
 )
 
 ELEMENTWISE = (Adam, AdamW, NAdam, RAdam, Adamax, Adagrad, Adadelta, RMSprop, SGD)
-"""Optimizers that treat every number on its own: all parameters are one vector to them, and those
-of E stacked models are E trainings."""
+"""Optimizers that treat every number separately. All parameters can be one vector, and E stacked
+models are E independent trainings."""
 
 
 class ParameterVector:
-    """The parameters of a model as one vector, of which each becomes a view; the gradients too.
+    """The parameters of a model and their gradients as views of two vectors.
 
-    Clipping, and an optimizer that treats every number on its own, then take one operation where
-    they took one for each parameter, which is most of the time of a small network's step.
+    Clipping and elementwise optimizers then need one operation instead of one per parameter, which
+    would take most of the time of a step of a small network.
 
     Args:
-        parameters: of one model, or stacked over E members, ``(E, ...)``; on one device.
-        members: E; None for a single model.
+        parameters: parameters of one model, or stacked over E members, ``(E, ...)``.
+        members: E, or None for a single model.
 
     Attributes:
-        parameters: those of the model.
-        values: all their numbers, ``(P,)``, or ``(E, P)`` of members; its ``grad`` holds theirs.
+        parameters: the parameters.
+        values: all numbers of the parameters, ``(P,)`` or ``(E, P)``. Its ``grad`` holds all
+            gradients.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], members: int | None = None):
@@ -53,12 +54,12 @@ class ParameterVector:
         self.show_gradients()
 
     def show_gradients(self) -> None:
-        """Give the parameters their part of the gradient, which others may take from them."""
+        """Set the gradients of the parameters, which an optimizer or trainer may have removed."""
         for parameter, gradient in zip(self.parameters, self._gradients, strict=True):
             parameter.grad = gradient
 
     def split(self, vector: Tensor) -> list[Tensor]:
-        """A vector ``(..., P)`` as views of the shapes of the parameters, ``(..., *shape)``."""
+        """Split a vector ``(..., P)`` into views of the parameters' shapes, ``(..., *shape)``."""
         parts = vector.split(self._sizes, dim=-1)
         return [
             part.view((*part.shape[:-1], *shape))
@@ -66,17 +67,17 @@ class ParameterVector:
         ]
 
     def joined(self, gradients: Sequence[Tensor | None], leading: tuple[int, ...] = ()) -> Tensor:
-        """Gradients ``(*leading, *shape)`` of the parameters as a vector ``(*leading, P)``.
+        """Join gradients ``(*leading, *shape)`` of the parameters to a vector ``(*leading, P)``.
 
-        Those of None, which the loss does not depend on, are zero.
+        None stands for a parameter that the loss does not depend on, with a zero gradient.
         """
         rows = [
-            self.values.new_zeros(*leading, n) if one is None else one.reshape(*leading, n)
-            for one, n in zip(gradients, self._sizes, strict=True)
+            self.values.new_zeros(*leading, n) if value is None else value.reshape(*leading, n)
+            for value, n in zip(gradients, self._sizes, strict=True)
         ]
         return torch.cat(rows, dim=-1)
 
     def gradient_of(self, loss: Tensor) -> Tensor:
-        """That of a loss by autograd, in the shape of ``values``."""
+        """Return the gradient of a loss by autograd, in the shape of ``values``."""
         gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
         return self.joined(gradients, tuple(self.values.shape[:-1]))

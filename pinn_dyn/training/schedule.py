@@ -12,17 +12,17 @@ from torch.optim.lr_scheduler import OneCycleLR
 def one_cycle(
     optimizer: Optimizer, *, total_steps: int, warm_up: Annotated[float, Field(ge=0, le=1)] = 0.05
 ) -> OneCycleLR:
-    """Half a cosine up to the optimizer's learning rate, then one down to next to nothing.
+    """Build a schedule that rises to the optimizer's learning rate and then falls to nearly zero.
 
-    Smith and Topin 2019, "Super-convergence". The rate starts at a 25th of the peak and ends at a
-    25,000th of it; momentum stays as it is.
+    Both parts are half a cosine. The rate starts at 1/25 and ends at 1/25,000 of the peak. Momentum
+    is constant. Source: Smith and Topin (2019), "Super-convergence".
 
     Args:
-        optimizer: its learning rate is the peak.
-        total_steps: steps of the training.
-        warm_up: the part of them that the rate rises in, 0 to 1.
+        optimizer: the optimizer. Its learning rate is the peak.
+        total_steps: number of training steps.
+        warm_up: share of the steps in which the rate rises.
     """
-    if warm_up * total_steps == 1:  # the slope of a rise of exactly one step is not defined
+    if warm_up * total_steps == 1:  # the slope of a rise in exactly one step is undefined
         total_steps += 1
     return OneCycleLR(
         optimizer,

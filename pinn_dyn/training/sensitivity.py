@@ -1,4 +1,4 @@
-"""How predicted motion depends on the constants of a model."""
+"""Derivatives of predicted motion by the constants of a model."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from pinn_dyn.models.learned_constants import LearnedConstants
 
 
 def rollout_slopes(model: LearnedConstants, windows: Windows) -> Tensor:
-    """Derivatives of the increments of the windows by z, ``(B, H, 2N, P)``.
+    """Return the derivatives of predicted increments by z, ``(B, H, 2N, P)``.
 
-    The state x = (q, v) and its sensitivity S = dx/dz ``(2N, P)`` are rolled out together by
-    the integrator of every roll-out, under ::
+    The state x = (q, v) and its sensitivity S = dx/dz ``(2N, P)`` are rolled out together by RK4::
 
         dS/dt = (S_v, -M^-1 (de/dx S + de/dz))
 
-    with the missing force e of :class:`LearnedConstants`, as da/dz = -M^-1 de/dz at fixed q, v
-    and u. RK4 of this equation is the derivative of RK4.
+    e is the missing force of :class:`LearnedConstants`, with da/dz = -M^-1 de/dz at fixed q, v and
+    u. RK4 of this equation is the derivative of RK4.
 
     Args:
-        model: in float64, at the z of interest.
-        windows: B of H steps.
+        model: model in float64, at the z of interest.
+        windows: B windows of H steps.
     """
     size = model.num_coordinates
     count = sum(p.numel() for p in model.parameters())

@@ -1,4 +1,4 @@
-"""SOAP with the small matrices of a model taken as batches."""
+"""The optimizer SOAP, with the small matrices of a model processed in batches."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Beta = Annotated[float, Field(ge=0, lt=1)]
 """Decay of a moving average."""
 
 SMALLEST = 32
-"""Matrices are filled up with zeros to powers of two from this on: the fewer sizes, the fewer
-calls, and each takes longer than the arithmetic of the zeros."""
+"""Smallest padded size. Matrices are padded with zeros to powers of two, since fewer sizes need
+fewer calls, and a call takes longer than the arithmetic of the padding."""
 
 
 class SOAP(Optimizer):
@@ -25,13 +25,14 @@ class SOAP(Optimizer):
         L <- b L + (1 - b) G G^T        R <- b R + (1 - b) G^T G
         W <- (1 - lr d) (W - lr Q_L Adam(Q_L^T G Q_R) Q_R^T)
 
-    with the gradient G, the weight decay d and the eigenvectors Q_L of L and Q_R of R, brought up
-    to date by one power iteration every ``precondition_frequency`` steps. The first step only
-    starts them. Vectors take Adam; of a tensor of more dimensions the first is that of the rows.
+    with the gradient G, the weight decay d and the eigenvectors Q_L of L and Q_R of R, which are
+    updated by one power iteration every ``precondition_frequency`` steps. The first step only
+    initializes them. Vectors use Adam. In a tensor of more than two dimensions, the first is that
+    of the rows.
 
-    A network of ours has some ten matrices of up to 32 rows, and one by one they take a hundred
-    calls. Here all of a size go through each product and decomposition as one batch, filled up with
-    zeros, which stay zeros: no basis turns them into the rest.
+    A typical network has ten matrices of up to 32 rows. Processing them one by one takes a hundred
+    calls. Here all matrices of a size are padded with zeros and processed as one batch. No basis
+    mixes the padding with the entries.
 
     Source: Vyas et al. 2024, "SOAP: Improving and Stabilizing Shampoo using Adam".
 
@@ -45,7 +46,7 @@ class SOAP(Optimizer):
     """
 
     leading = 0
-    """Dimensions of a parameter before those of its matrix."""
+    """Number of dimensions of a parameter before those of its matrix."""
 
     def __init__(
         self,
@@ -68,7 +69,7 @@ class SOAP(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """One step; parameters without a gradient stay where they are."""
+        """Take a step. Parameters without a gradient do not change."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -85,7 +86,7 @@ class SOAP(Optimizer):
         layout = self._layouts[number]
         beta1, beta2 = group["betas"]
         gradient = layout.laid_out([p.grad for p in moved])  # type: ignore[misc]
-        # One state for all parameters, kept where the checkpoints find it.
+        # One state for all parameters, stored with the first parameter for checkpoints.
         state = self.state[group["params"][0]]
         if not state:
             state["step"] = 0
@@ -98,48 +99,46 @@ class SOAP(Optimizer):
             return
         state["step"] += 1
         step, mean, square = state["step"], state["exp_avg"], state["exp_avg_sq"]
-        turned = layout.turned(gradient, state["bases"])
+        turned = layout.transformed(gradient, state["bases"])
         mean.lerp_(gradient, 1 - beta1)
         square.mul_(beta2).addcmul_(turned, turned, value=1 - beta2)
-        update = layout.turned(mean, state["bases"]).div_(square.sqrt().add_(group["eps"]))
-        update = layout.turned(update, state["bases"], back=True)
+        update = layout.transformed(mean, state["bases"]).div_(square.sqrt().add_(group["eps"]))
+        update = layout.transformed(update, state["bases"], back=True)
         rate = group["lr"] * (1 - beta2**step) ** 0.5 / (1 - beta1**step)
         decay = group["lr"] * group["weight_decay"]
-        # All at once, and each parameter is moved by one call.
+        # One call updates all parameters.
         update.mul_(rate * (decay - 1)).sub_(layout.laid_out(moved), alpha=decay)
-        torch._foreach_add_(moved, layout.taken_apart(update))
+        torch._foreach_add_(moved, layout.unpacked(update))
         for k, batch in enumerate(layout.batches):
             state["averages"][k] = batch.averages(gradient, state["averages"][k], beta2)
             if step % group["precondition_frequency"] == 0:
-                state["bases"][k] = batch.brought_up_to_date(
-                    state["averages"][k], state["bases"][k], square
-                )
+                state["bases"][k] = batch.updated(state["averages"][k], state["bases"][k], square)
 
 
 @dataclass(frozen=True)
 class _Batch:
-    """Matrices ``(K, rows, columns)`` of one filled-up size, in a vector of numbers.
+    """Matrices ``(K, rows, columns)`` of one padded size, in a vector of numbers.
 
     Attributes:
-        start: where they begin.
+        start: position of the first number.
         shape: K, rows and columns.
-        sizes: true rows and columns of each, ``(K, 2)``.
+        sizes: rows and columns of each matrix without padding, ``(K, 2)``.
     """
 
     start: int
     shape: tuple[int, int, int]
     sizes: Tensor
 
-    def of(self, numbers: Tensor) -> Tensor:
-        """The matrices, as a view."""
+    def view(self, numbers: Tensor) -> Tensor:
+        """Return the matrices, as a view."""
         count, rows, columns = self.shape
         return numbers[self.start : self.start + count * rows * columns].view(self.shape)
 
     def averages(
         self, gradient: Tensor, before: tuple[Tensor, Tensor] | None, beta: float
     ) -> tuple[Tensor, Tensor]:
-        """L and R after one more gradient; they begin at zero."""
-        g = self.of(gradient)
+        """Return L and R after a gradient. They start at zero."""
+        g = self.view(gradient)
         if before is None:
             return (1 - beta) * (g @ g.mT), (1 - beta) * (g.mT @ g)
         left, right = before
@@ -149,40 +148,40 @@ class _Batch:
         )
 
     def eigenvectors(self, averages: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """Q_L and Q_R, the largest eigenvalue first; the identity where zeros were filled in."""
-        found = []
+        """Return Q_L and Q_R, the largest eigenvalue first, with the identity in the padding."""
+        results = []
         for average, sizes in zip(averages, self.sizes.T.tolist(), strict=True):
             basis = torch.eye(average.shape[-1]).to(average).repeat(len(average), 1, 1)
             for k, n in enumerate(sizes):
                 basis[k, :n, :n] = torch.linalg.eigh(average[k, :n, :n])[1].flip(-1)
-            found.append(basis)
-        return found[0], found[1]
+            results.append(basis)
+        return results[0], results[1]
 
-    def brought_up_to_date(
+    def updated(
         self, averages: tuple[Tensor, Tensor], bases: tuple[Tensor, Tensor], square: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """One power iteration of Q_L and Q_R; the second moments follow their new order."""
-        found = []
-        moments = self.of(square)
+        """Apply a power iteration to Q_L and Q_R, and reorder the second moments."""
+        results = []
+        moments = self.view(square)
         for k, (average, basis) in enumerate(zip(averages, bases, strict=True)):
             product = average @ basis
             size = product.shape[-1]
-            filled = torch.arange(size, device=product.device) >= self.sizes[:, k, None]
-            values = (basis * product).sum(-2).masked_fill_(filled, -torch.inf)
+            padding = torch.arange(size, device=product.device) >= self.sizes[:, k, None]
+            values = (basis * product).sum(-2).masked_fill_(padding, -torch.inf)
             order = values.argsort(dim=-1, descending=True)
             along = order.unsqueeze(-1) if k == 0 else order.unsqueeze(-2)
             moments.copy_(moments.take_along_dim(along, dim=k + 1))
-            # Columns of zeros, which are last, become those of the identity.
-            found.append(torch.linalg.qr(product.take_along_dim(order.unsqueeze(-2), dim=-1))[0])
-        return found[0], found[1]
+            # The zero columns of the padding are last, and become those of the identity.
+            results.append(torch.linalg.qr(product.take_along_dim(order.unsqueeze(-2), dim=-1))[0])
+        return results[0], results[1]
 
 
 class _Layout:
-    """Where the numbers of parameters are in one vector: batches of matrices, then the rest.
+    """Positions of the numbers of all parameters in a vector: batches of matrices, then vectors.
 
     Args:
         parameters: the parameters, with gradients.
-        leading: dimensions of a parameter before those of its matrix.
+        leading: number of dimensions of a parameter before those of its matrix.
     """
 
     def __init__(self, parameters: list[Tensor], leading: int):
@@ -190,32 +189,32 @@ class _Layout:
         sizes = [p.numel() for p in parameters]
         total = sum(sizes)
         by_size: dict[tuple[int, int], list[Tensor]] = {}
-        rest = []
+        vectors = []
         for p, numbers in zip(parameters, torch.arange(total).split(sizes), strict=True):
             if p.ndim < leading + 2:
-                rest.append(numbers)
+                vectors.append(numbers)
                 continue
             rows, columns = p.shape[leading], p.shape[leading + 1 :].numel()
             matrices = numbers.view(-1, rows, columns)
-            filled = _filled(rows), _filled(columns)
-            by_size.setdefault(filled, []).extend(matrices)
+            padded = _padded(rows), _padded(columns)
+            by_size.setdefault(padded, []).extend(matrices)
         self.batches: list[_Batch] = []
-        places: list[Tensor] = []  # of each number in the parameters; the last is a zero
+        positions: list[Tensor] = []  # in the parameters; the last one is a zero
         start = 0
-        for (rows, columns), several in by_size.items():
-            shape = (len(several), rows, columns)
+        for (rows, columns), matrices in by_size.items():
+            shape = (len(matrices), rows, columns)
             block = torch.full(shape, total)
-            for filled_up, matrix in zip(block, several, strict=True):
-                filled_up[: matrix.shape[0], : matrix.shape[1]] = matrix
-            true = torch.tensor([matrix.shape for matrix in several], device=device)
-            self.batches.append(_Batch(start, shape, true))
-            places.append(block.flatten())
+            for padded_matrix, matrix in zip(block, matrices, strict=True):
+                padded_matrix[: matrix.shape[0], : matrix.shape[1]] = matrix
+            true_sizes = torch.tensor([matrix.shape for matrix in matrices], device=device)
+            self.batches.append(_Batch(start, shape, true_sizes))
+            positions.append(block.flatten())
             start += block.numel()
-        places += rest
-        self._rest = slice(start, None)
-        self._places = torch.cat(places).to(device)
-        back = self._places.new_empty(total + 1)
-        back[self._places] = torch.arange(len(self._places), device=device)
+        positions += vectors
+        self._vectors = slice(start, None)
+        self._positions = torch.cat(positions).to(device)
+        back = self._positions.new_empty(total + 1)
+        back[self._positions] = torch.arange(len(self._positions), device=device)
         self._back = back[:-1]
         self._zero = parameters[0].new_zeros(1)
         self._apart = parameters[0].new_empty(total)
@@ -223,26 +222,26 @@ class _Layout:
         self._parts = [part.view(p.shape) for part, p in parts]
 
     def laid_out(self, values: list[Tensor]) -> Tensor:
-        """The numbers of tensors of the parameters' shapes, laid out, with the zeros."""
+        """Return the numbers of tensors in the shapes of the parameters, with padding."""
         numbers = torch.cat([*(value.flatten() for value in values), self._zero])
-        return numbers.index_select(0, self._places)
+        return numbers.index_select(0, self._positions)
 
-    def taken_apart(self, numbers: Tensor) -> list[Tensor]:
-        """The tensors of the parameters' shapes, in memory that the next call takes again."""
+    def unpacked(self, numbers: Tensor) -> list[Tensor]:
+        """Return tensors in the shapes of the parameters. The next call overwrites them."""
         torch.index_select(numbers, 0, self._back, out=self._apart)
         return self._parts
 
-    def turned(self, numbers: Tensor, bases: list[Any], back: bool = False) -> Tensor:
-        """The matrices in their bases, or back from there; the rest as it is."""
-        found = torch.empty_like(numbers)
-        found[self._rest] = numbers[self._rest]
+    def transformed(self, numbers: Tensor, bases: list[Any], back: bool = False) -> Tensor:
+        """Transform the matrices to their bases, or back. Vectors do not change."""
+        result = torch.empty_like(numbers)
+        result[self._vectors] = numbers[self._vectors]
         for batch, (left, right) in zip(self.batches, bases, strict=True):
             if back:
                 left, right = left.mT, right.mT
-            torch.bmm(left.mT @ batch.of(numbers), right, out=batch.of(found))
-        return found
+            torch.bmm(left.mT @ batch.view(numbers), right, out=batch.view(result))
+        return result
 
 
-def _filled(size: int) -> int:
-    """The next power of two, from the smallest on."""
+def _padded(size: int) -> int:
+    """Return the next power of two, at least ``SMALLEST``."""
     return max(SMALLEST, 1 << (size - 1).bit_length())

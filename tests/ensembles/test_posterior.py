@@ -38,9 +38,9 @@ def test_the_draws_are_the_same_every_time():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c[:3, :3], "covariance is of 3 constants, expected of the"),
-        (lambda c: -c, "no positive definite matrix"),
-        (lambda c: torch.nan * c, "no positive definite matrix"),
+        (lambda c: c[:3, :3], "covariance has 3 rows, but the model has"),
+        (lambda c: -c, "not positive definite"),
+        (lambda c: torch.nan * c, "not positive definite"),
     ],
 )
 def test_what_is_no_covariance_is_refused(change, message):

@@ -133,5 +133,5 @@ def test_one_step_windows_teach_it_by_their_configuration():
 
 def test_a_loss_without_a_roll_out_refuses_it():
     model = make_structured("lnn", 2, 2, initial_velocity=LEARNED)
-    with pytest.raises(ValueError, match=r"rolls nothing out.*~model/initial_velocity"):
+    with pytest.raises(ValueError, match=r"has no roll-out.*~model/initial_velocity"):
         MidpointLoss(make_statistics(2, 2), model)

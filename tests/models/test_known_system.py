@@ -145,8 +145,8 @@ class Owned(SoftArm):
     [
         (Unnamed(), r"structure Unnamed names no constants .* \{'mass': \['kg'\]\}"),
         (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain names no constants"),
-        (Misnamed(), "constants names weight, which is no buffer; expected one of mass, stiff"),
-        (Unmeasured(), "constants has 1 units of stiffness, which has 3 entries"),
+        (Misnamed(), "constants names weight, which is not a buffer; expected one of mass, stiff"),
+        (Unmeasured(), "constants has 1 units of stiffness, expected 3"),
         (Owned(), r"has the parameters sag, expected constants that are buffers"),
         (SoftArm(stiffness=0.0), r"stiffness 1: start is .* expected positive"),
         (SoftArm(2), "the data have 3 coordinates and 3 inputs, the structure SoftArm has 6 and 6"),

@@ -129,7 +129,7 @@ def test_what_no_motion_shows_is_named():
 def test_data_at_rest_are_refused(arm_runs):
     run = arm_runs[0][0]
     still = Trajectory(run.q[:1].expand_as(run.q), 0 * run.v, run.input)
-    with pytest.raises(ValueError, match="nothing moves in the training trajectories"):
+    with pytest.raises(ValueError, match="no joint moves in the training trajectories"):
         fitted(known_arm(), [still])
 
 

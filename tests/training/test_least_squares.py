@@ -302,9 +302,9 @@ def test_a_constant_far_from_its_start_is_named():
     mean = torch.tensor([0.0, 0.0, 1.0, 0.0]).double()
     z = torch.tensor([-3.5, 6.0, 2.0, 25.0]).double()
     assert far_from_start(names, z, Prior(mean, root)) == [
-        "drive gain of wrist is 6.0 prior deviations from its start: check units and sign of its "
+        "drive gain of wrist is 6.0 prior standard deviations from its start: check units and sign of its "
         "input",
-        "mass of tip is 3.5 prior deviations from its start: check the units of the columns",
+        "mass of tip is 3.5 prior standard deviations from its start: check the units of the columns",
     ]
     many = far_from_start(
         [f"mass of {k}" for k in range(8)], 5 * torch.ones(8), Prior(torch.zeros(8), torch.eye(8))
@@ -319,4 +319,4 @@ def test_gains_of_the_wrong_unit_are_warned_of(runs, caplog):
     model = known_model(PENDULUM, locked_joints=(), friction=CoulombFriction, gain_spread=0.1)
     with caplog.at_level(logging.WARNING):
         LeastSquares(cutoff=20.0, rollouts=False).fit(model, wrong, None)
-    assert "prior deviations from its start" in caplog.text
+    assert "prior standard deviations from its start" in caplog.text

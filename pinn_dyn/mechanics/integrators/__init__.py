@@ -1,4 +1,4 @@
-"""One-step methods: a file each, and the loop that takes their steps."""
+"""One-step methods, one per file, and the loop over their steps."""
 
 from pinn_dyn.mechanics.integrators.integrator import Dynamics, Integrator
 from pinn_dyn.mechanics.integrators.rk4 import RK4

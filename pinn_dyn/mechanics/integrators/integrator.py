@@ -12,42 +12,41 @@ from torch import Tensor
 
 from pinn_dyn.mechanics.signal import Signal
 
-# Steps whose inputs are laid out at once: bounds the memory of large batches.
+# Number of steps whose inputs are computed at once, to limit the memory of large batches.
 BLOCK = 64
 
 
 class Dynamics(Protocol):
-    """What is integrated: dx/dt = f(x, u), with x ``(*batch, S)`` and u ``(*batch, M)``."""
+    """Dynamics dx/dt = f(x, u), with x ``(*batch, S)`` and u ``(*batch, M)``."""
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """f(x, u), ``(*batch, S)``."""
+        """Return f(x, u), ``(*batch, S)``."""
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Maps r to the k with (1 - step J) k = r, where J holds what is stiff of df/dx at x."""
+        """Return a function from r to k with (1 - s J) k = r, with J the stiff part of df/dx."""
 
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """One step of the method that it is integrated by; arguments of :meth:`Integrator.step`."""
+        """Take a step of the integrator. The arguments are those of :meth:`Integrator.step`."""
 
 
 class Integrator(abc.ABC):
-    """A one-step method. It integrates the increment x(t) - x(t_0), not the state::
+    """A one-step method, which integrates the increment x(t) - x(t_0) instead of the state::
 
         d_{k+1} = step(d_k),    x(t_k) = x(t_0) + d_k
 
-    With a small step in float32 an increment is far below the resolution of the state that it is
-    added to.
+    In float32 the increment of a small step is far below the resolution of the state.
 
     Args:
-        substeps: steps in a step of the data. One is enough while the data resolve the fastest
-            motion; data of a low rate need more.
+        substeps: integrator steps in a step of the data. One is enough if the data resolve the
+            fastest motion. Data of a low sample rate need more.
 
     Attributes:
         nodes: times of the stages in a step, from 0 to 1.
-        order: of the error, O(h^order).
-        mean_input: shift the inputs at the nodes so that their mean is that of the input over the
-            step, for a method whose steps are longer than a sample.
+        order: exponent of the error O(h^order).
+        mean_input: true to shift the inputs at the nodes so that their mean equals the mean of the
+            input over the step, for methods whose steps are longer than a sample.
     """
 
     nodes: tuple[float, ...]
@@ -61,18 +60,18 @@ class Integrator(abc.ABC):
     def step(
         self, dynamics: Dynamics, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """The increment after a step, ``(*batch, S)``.
+        """Return the increment after a step, ``(*batch, S)``.
 
         Args:
-            dynamics: f, and what is stiff of it.
-            increment: the one before, ``(*batch, S)``.
+            dynamics: f and its stiff part.
+            increment: increment before the step, ``(*batch, S)``.
             start: x(t_0), ``(*batch, S)``.
             inputs: u at the nodes, ``(stages, *batch, M)``.
             h: length of the step, ``()``, s.
         """
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        """Increments ``(T, *batch, S)`` at the times of the grid ``(T,)``, a step between two."""
+        """Return increments ``(T, *batch, S)`` at the ends of the steps, the grid ``(T,)``."""
         blocks = [torch.zeros_like(start)[None]]
         for inputs, lengths in self.blocks(grid, signal):
             steps = []
@@ -84,12 +83,12 @@ class Integrator(abc.ABC):
         return torch.cat(blocks)
 
     def blocks(self, grid: Tensor, signal: Signal) -> Iterator[tuple[Tensor, Tensor]]:
-        """Inputs ``(n, stages, *batch, M)`` and lengths ``(n,)`` of n steps at a time."""
+        """Yield inputs ``(n, stages, *batch, M)`` and lengths ``(n,)`` of blocks of n steps."""
         lengths = grid.diff()
         means = signal.means(grid) if self.mean_input else None
         for begin in range(0, grid.shape[0] - 1, BLOCK):
-            taken = slice(begin, begin + BLOCK)
+            block = slice(begin, begin + BLOCK)
             inputs = signal.stages(grid[begin : begin + BLOCK + 1], self.nodes)
             if means is not None:
-                inputs = inputs + (means[taken] - inputs.mean(1)).unsqueeze(1)
-            yield inputs, lengths[taken]
+                inputs = inputs + (means[block] - inputs.mean(1)).unsqueeze(1)
+            yield inputs, lengths[block]

@@ -17,8 +17,8 @@ class RK4(Integrator):
         k3 = f(x + h (k2 - k1/3), u(t + 2h/3))   k4 = f(x + h (k1 - k2 + k3), u(t + h))
         x(t + h) = x + h (k1 + 3 k2 + 3 k3 + k4)/8
 
-    A path is torchdiffeq's, whose ``method="rk4"`` is this rule; :meth:`step` has the same numbers
-    up to rounding, by operations that can be traced.
+    Paths are computed by torchdiffeq, whose ``method="rk4"`` is this rule. :meth:`step` gives the
+    same numbers up to rounding, by operations that can be traced.
     """
 
     nodes = (0.0, 1 / 3, 2 / 3, 1.0)
@@ -35,15 +35,15 @@ class RK4(Integrator):
         return increment + h * (first + 3 * (second + third) + fourth) / 8
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        if signal.t.requires_grad:  # a delay is learned: torchdiffeq's stages know no gradient in t
+        if signal.t.requires_grad:  # torchdiffeq has no gradient by t, which a learned delay needs
             return super().path(dynamics, start, grid, signal)
         f = dynamics.state_derivative
 
         def rate(time: Tensor, increment: Tensor) -> Tensor:
             return f(start + increment, signal(time))
 
-        # Of a held input both ends of a step see the value within it: torchdiffeq then moves the
-        # times of these stages inwards.
+        # Both ends of a step need the value of a held input within the step: torchdiffeq then
+        # moves the times of these stages inwards.
         held = signal.interpolation == "hold"
         zero = torch.zeros_like(start)
         return odeint(rate, zero, grid, method="rk4", options={"perturb": held})

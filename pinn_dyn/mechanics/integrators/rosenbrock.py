@@ -18,15 +18,15 @@ class Rosenbrock(Integrator):
         (1 - g h J) k2 = f(x + h k1, u(t + h)) - 2 k1
         x(t + h) = x + h (3 k1 + k2)/2
 
-    It has its order for any J, and with J = df/dx it is L-stable: what decays far faster than a
-    step lasts is damped, where an explicit method would blow up. J only has to hold what is
-    stiff. Two evaluations of f and two linear solves a step. Verwer, Spee, Blom and Hundsdorfer
-    (1999), "A second-order Rosenbrock method applied to photochemical dispersion problems".
+    The order is 2 for any J. With J = df/dx the method is L-stable: motions that decay within a
+    fraction of a step are damped, while an explicit method would diverge. J only needs the stiff
+    part. A step takes two evaluations of f and two linear solves. Source: Verwer, Spee, Blom and
+    Hundsdorfer (1999), "A second-order Rosenbrock method applied to photochemical dispersion
+    problems".
 
-    A step may span many samples of u. With m the mean of u over the step, both stages take
-    ``u + m - (u(t) + u(t + h))/2``, so that no impulse of the input is lost between them: a motion
-    that follows the rates of motors adds up to where the motors went. The shift is of order h^2,
-    and zero where u is linear over the step.
+    A step may span many samples of u. With the mean m of u over the step, both stages use
+    ``u + m - (u(t) + u(t + h))/2``, so that no impulse of the input between the stages is lost. The
+    shift is of order h^2, and zero if u is linear over the step.
     """
 
     nodes = (0.0, 1.0)

@@ -21,17 +21,17 @@ from pinn_dyn.training.parameter_vector import ParameterVector
 
 
 class Compiled:
-    """Loss and gradient of a model with compiled dynamics, or with all of it compiled.
+    """Engine for loss and gradient by compiled dynamics, or by one compiled program.
 
-    One program for loss and gradient is fastest, and takes longest to compile: it is made where
-    the training is long and a window costs few evaluations of the dynamics. Elsewhere the dynamics
-    alone are compiled. On a CPU large batches are taken in parts that fit into the cache.
+    A program for loss and gradient is fastest and takes longest to compile. It is used if the
+    training is long and a window needs few evaluations of the dynamics. Otherwise only the dynamics
+    are compiled. On a CPU large batches are split into parts that fit into the cache.
 
     Args:
-        loss: of the model.
-        model: what is trained; anything but its training goes on uncompiled.
-        vector: its parameters.
-        steps: of the training, about.
+        loss: the loss.
+        model: the trained model. Only its training is compiled.
+        vector: parameters of the model.
+        steps: approximate number of training steps.
     """
 
     def __init__(
@@ -59,15 +59,15 @@ class Compiled:
         )
 
     def _worth_a_program(self, evaluations: int, on_cpu: bool) -> bool:
-        """Whether so many evaluations in a window pay for one program of all."""
-        # On a GPU it takes the place of thousands of launches.
+        """Return true if one program for loss and gradient is worth its compilation."""
+        # On a GPU a program replaces thousands of launches.
         long = not on_cpu or self.steps >= STEPS_FOR_PROGRAM
         return evaluations == 1 or (evaluations <= MOST_EVALUATIONS and long)
 
     def _loss(self, windows: Windows) -> Tensor:
         with integrated_by(self.model, self._integrator):
             laid_out = StateWindows.of(windows, self.model.state)
-            # One compiled function for all stages, though the first needs no gradient in x.
+            # All stages share a compiled function, even if the first needs no gradient in x.
             laid_out.x0.requires_grad_()
             return self.loss(self.model, laid_out)
 
@@ -77,20 +77,20 @@ class Compiled:
 
 
 class EvaluationCount:
-    """How often the loss of a model evaluates the state derivative in a window: counted, once."""
+    """Number of evaluations of the state derivative by the loss of a window, measured once."""
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
         self._loss = loss
         self._model = model
-        self._found: dict[int, int] = {}
+        self._counts: dict[int, int] = {}
 
     def __call__(self, windows: Windows) -> int:
-        """The number for windows of as many steps as these."""
+        """Return the number of evaluations for windows of this length."""
         steps = len(windows.t)
-        if steps not in self._found:
-            two = torch.arange(min(2, len(windows)), device=windows.q.device)
-            self._found[steps] = self._count(windows[two])
-        return self._found[steps]
+        if steps not in self._counts:
+            sample = torch.arange(min(2, len(windows)), device=windows.q.device)
+            self._counts[steps] = self._count(windows[sample])
+        return self._counts[steps]
 
     def _count(self, windows: Windows) -> int:
         derivative, count = self._model.state_derivative, 0

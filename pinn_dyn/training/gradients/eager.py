@@ -12,17 +12,17 @@ from pinn_dyn.training.losses import WindowLoss
 from pinn_dyn.training.parameter_vector import ParameterVector
 
 Engine = Callable[[Windows], tuple[Tensor, Tensor]]
-"""Maps windows to the loss and its gradient in the parameters, ``()`` and ``(P,)``, or to those of
-the members of an ensemble, ``(E,)`` and ``(E, P)``."""
+"""Function from windows to the loss ``()`` and its gradient ``(P,)``, or to the losses ``(E,)`` and
+gradients ``(E, P)`` of an ensemble."""
 
 
 class Eager:
-    """Loss and gradient of a model, operation by operation.
+    """Engine for loss and gradient by eager autograd.
 
     Args:
-        loss: of the model.
-        model: what is trained.
-        vector: its parameters.
+        loss: the loss.
+        model: the trained model.
+        vector: parameters of the model.
     """
 
     def __init__(self, loss: WindowLoss, model: Predictor, vector: ParameterVector):

@@ -21,22 +21,21 @@ from pinn_dyn.training.parameter_vector import ParameterVector
 
 Program = Callable[..., list[Tensor]]
 _ROWS = {"qv": ("q", "v", "dq", "dv"), "qp": ("q", "p", "dq", "dp")}
-"""What a model of each state sees of windows, beside the input."""
+"""Fields of windows that a model of each state uses, besides the input."""
 
 
 class LossProgram:
-    """The loss of windows and its gradient in the parameters, by one call of a compiled program.
+    """Compiled program for the loss of windows and its gradient.
 
-    A compiled derivative still leaves some hundred operations around it to Python and autograd,
-    which is half of the time of a small batch. Here the roll-out, the loss and the gradient are
-    traced as one graph and compiled for the batch sizes that come. Parts of a batch are taken side
-    by side on the threads of torch, on a GPU one after the other.
+    With compiled dynamics alone, some hundred operations remain in Python and autograd, which take
+    half of the time of a small batch. Here the roll-out, the loss and the gradient are traced as
+    one graph, and compiled for each batch size. Parts of a batch run in parallel threads, or one
+    after another on a GPU.
 
     Args:
-        loss: of the model, by operations that can be traced.
-        model: what is trained; of an ensemble all members as one, or one of them, whose parameters
-            are then stacked over all.
-        vector: its parameters.
+        loss: the loss, by operations that can be traced.
+        model: the trained model. For an ensemble, the stack of all members or a single member.
+        vector: parameters of the model, or of all members.
     """
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
@@ -46,23 +45,23 @@ class LossProgram:
         self._programs: dict[tuple[Any, ...], Program] = {}
 
     def __call__(self, windows: Windows, part: int) -> tuple[Tensor, Tensor]:
-        """Loss and gradient, from parts of at least ``part`` windows each."""
+        """Return loss and gradient, computed in parts of at least ``part`` windows."""
         parts = windows.split(part)
-        taken = self.side_by_side([self._vector.values.detach()] * len(parts), parts)
-        return weighted_sum([len(part) / len(windows) for part in parts], taken)
+        results = self.in_parallel([self._vector.values.detach()] * len(parts), parts)
+        return weighted_sum([len(part) / len(windows) for part in parts], results)
 
-    def side_by_side(
+    def in_parallel(
         self, values: Iterable[Tensor], batches: list[Windows]
     ) -> Iterable[list[Tensor]]:
-        """Loss and gradient of each batch at the values ``(P,)`` that go with it."""
+        """Return loss and gradient of each batch at its parameter values ``(P,)``."""
         names = _ROWS[self._loss.model.state]
         arguments = [
-            (some, *_contiguous([*(getattr(batch, name) for name in names), *_samples(batch)]))
-            for some, batch in zip(values, batches, strict=True)
+            (value, *_contiguous([*(getattr(batch, name) for name in names), *_samples(batch)]))
+            for value, batch in zip(values, batches, strict=True)
         ]
-        # A program is compiled here, before the threads call it.
+        # Compile before the threads call the program.
         programs = list(map(self._program, batches, arguments))
-        # Even a single batch goes to a thread of the pool: its small products gain by one thread.
+        # A single batch also runs in the pool, since small products are faster with one thread.
         threads = torch.get_num_threads()
         alone = threads == 1 or self._vector.values.is_cuda
         run = map if alone else _pool(threads).map
@@ -81,8 +80,9 @@ class LossProgram:
 
         def loss_and_gradient(vector: Tensor, *rows: Tensor) -> list[Tensor]:
             names = _ROWS[state]
-            given: dict[str, Any] = dict(zip(names, rows, strict=False))
-            batch = replace(windows, **given, input=windows.input.with_samples(*rows[len(names) :]))
+            values_by_name: dict[str, Any] = dict(zip(names, rows, strict=False))
+            input = windows.input.with_samples(*rows[len(names) :])
+            batch = replace(windows, **values_by_name, input=input)
             batch = StateWindows.of(batch, state)
             with torch.enable_grad():
                 values = [value.detach().requires_grad_() for value in self._vector.split(vector)]
@@ -95,18 +95,18 @@ class LossProgram:
 
 
 def weighted_sum(weights: list[float], parts: Iterable[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
-    """The sum over parts (loss, gradient), each times its weight."""
-    (loss, gradient), *others = parts
-    if others:
+    """Return the weighted sum of pairs (loss, gradient)."""
+    (loss, gradient), *terms = parts
+    if terms:
         loss, gradient = weights[0] * loss, weights[0] * gradient
-    for weight, (more, slope) in zip(weights[1:], others, strict=True):
-        loss.add_(more, alpha=weight)
-        gradient.add_(slope, alpha=weight)
+    for weight, (part_loss, part_gradient) in zip(weights[1:], terms, strict=True):
+        loss.add_(part_loss, alpha=weight)
+        gradient.add_(part_gradient, alpha=weight)
     return loss, gradient
 
 
 class _Loss(nn.Module):
-    """The loss of a batch as a function of the parameters and of the data."""
+    """Loss of a batch as a module, for functional calls."""
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
         super().__init__()
@@ -124,7 +124,7 @@ def _samples(windows: Windows) -> list[Tensor]:
 
 
 def _contiguous(values: Iterable[Tensor]) -> Iterable[Tensor]:
-    """In the layout that a program is compiled for, also where they are parts of longer windows."""
+    """Convert tensors to the layout that a program is compiled for."""
     return [value.contiguous() for value in values]
 
 
@@ -135,5 +135,5 @@ def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads of torch's own one thread each: the programs let go of Python's lock."""
+    """Return a pool of threads, each with one torch thread. Programs release the lock of Python."""
     return ThreadPoolExecutor(threads, "windows", torch.set_num_threads, (1,))

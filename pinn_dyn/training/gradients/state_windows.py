@@ -1,4 +1,4 @@
-"""Windows as a compiled program takes them."""
+"""Windows in the layout of compiled programs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pinn_dyn.mechanics import State
 
 @dataclass(frozen=True)
 class StateWindows(Windows):
-    """Windows with the states of one model at hand.
+    """Windows with precomputed states of a model.
 
     Attributes:
-        x0: state at the start, ``(B, 2N)``, with the batch along memory, as the models compute.
-        dx: increments to each step, ``(B, H, 2N)``.
+        x0: state at the start, ``(B, 2N)``, with the batch contiguous in memory.
+        dx: increments up to each step, ``(B, H, 2N)``.
     """
 
     x0: Tensor
@@ -24,7 +24,7 @@ class StateWindows(Windows):
 
     @classmethod
     def of(cls, windows: Windows, state: State) -> StateWindows:
-        """These windows, for a model of this state."""
+        """Build from windows, for a model of this state."""
         values = {item.name: getattr(windows, item.name) for item in fields(Windows)}
         x0 = windows.start(state).mT.contiguous().mT
         return cls(**values, x0=x0, dx=windows.increments(state))

@@ -1,4 +1,4 @@
-"""Losses: how far predicted windows are from measured ones."""
+"""Losses of predicted windows."""
 
 from pinn_dyn.training.losses.increment import IncrementLoss
 from pinn_dyn.training.losses.midpoint import MidpointLoss

@@ -1,4 +1,4 @@
-"""The error of rolled-out increments as a loss."""
+"""Loss on the increments of roll-outs."""
 
 from __future__ import annotations
 
@@ -15,43 +15,39 @@ from pinn_dyn.training.losses.window_loss import WindowLoss
 
 
 class IncrementLoss(WindowLoss):
-    """Mean squared error of predicted state increments, each in units of its own spread.
+    """Mean squared error of predicted state increments, in units of their standard deviation.
 
     ::
 
         loss = mean over windows, steps h and components i of w_i ((dx^_hi - dx_hi) / s_hi)^2
 
-    dx_h is the increment of the state from the window's start to its h-th step and s_h its
-    standard deviation over the training windows. With one step this is the paper's loss
-    ||x_{k+1} - x^_{k+1}||^2, normalized; with more it is the multi-step loss.
+    dx_h is the increment of the state from the start of the window to step h, and s_h its standard
+    deviation over the training windows. With one step this is the normalized loss of the paper,
+    ||x_{k+1} - x^_{k+1}||^2; with more steps it is the multi-step loss.
 
-    The weight w of the configuration half is 1, as in the paper's Hamiltonian loss; it is 0 for
-    windows of one step where dq/dt = v holds by construction, as in the paper's Lagrangian loss,
-    and a roll-out starts at the measured v.
-    Over several steps it is 1 again: a measured q is better than a velocity derived from it. The
-    weight of the other half is 1 too, or the ``velocity_weight``: below 1 where the log has no v,
-    and its derivative of q is smoother than the motion. A window costs four evaluations of the
-    dynamics per step.
+    The weight w of the configuration half is 1, as in the Hamiltonian loss of the paper. It is 0
+    for windows of one step if dq/dt = v holds by construction and the roll-out starts at the
+    measured v, as in the Lagrangian loss of the paper. The weight of the velocity or momentum half
+    is ``velocity_weight``. Choose it below 1 if v is derived from q and smoother than the motion. A
+    window costs four evaluations of the dynamics per step.
 
-    With ``huber`` = d the mean over components r^2 of each window and step counts as ::
+    With ``huber`` = d the mean r^2 over the components of each window and step is replaced by::
 
         2 d^2 (sqrt(1 + r^2 / d^2) - 1)
 
-    that is r^2 where it is small and 2 d r where it is large (pseudo-Huber; Charbonnier et al.
-    1997, "Deterministic edge-preserving regularization in computed imaging"). The squared error
-    follows the few fast motions of a log; this one follows the mean error, of which the slow
-    motions and the rest make up more.
+    It is r^2 for small r and 2 d r for large r (pseudo-Huber; Charbonnier et al. 1997,
+    "Deterministic edge-preserving regularization in computed imaging"). The squared error is
+    dominated by the few fast motions of a log. This loss gives the slow motions more weight.
 
-    A curriculum ``[k_1, ... k_S]`` divides the training into S equal stages; stage s rolls out and
-    compares the first k_s steps of a window alone. Short roll-outs first are cheap, and keep a
-    model that knows nothing yet from diverging over a long window.
+    A curriculum ``[k_1, ... k_S]`` divides the training into S equal stages. Stage s only uses the
+    first k_s steps of a window. Short roll-outs are cheap, and an untrained model does not diverge.
 
     Args:
         statistics: scales of the data.
         model: the model that will be trained.
-        curriculum: steps in each stage, increasing to the H of the windows; H throughout if None.
-        velocity_weight: w of the velocity half, or of the momentum half.
-        huber: d, in units of the spread of the increments; None: the squared error.
+        curriculum: steps in each stage, increasing to the H of the windows. The default is H.
+        velocity_weight: w of the velocity or momentum half.
+        huber: d in units of the spread of the increments. The default is the squared error.
 
     Raises:
         ValueError: if the curriculum does not increase to H.
@@ -74,7 +70,7 @@ class IncrementLoss(WindowLoss):
         self.register_buffer("scale", scale, persistent=False)
         steps = scale.shape[0]
         self.curriculum = [steps] if curriculum is None else list(curriculum)
-        # Strictly increasing from at least 1 to the steps of a window.
+        # Strictly increasing up to the number of steps of a window.
         if self.curriculum != sorted({k for k in self.curriculum if k >= 1} | {steps}):
             raise ValueError(
                 f"curriculum is {curriculum}, expected step counts that increase from at least 1 "
@@ -88,7 +84,7 @@ class IncrementLoss(WindowLoss):
         self.exact_coordinates = model.num_coordinates if exact_rate else 0
 
     def selected(self, windows: Windows, progress: float) -> Windows:
-        """The first steps of the windows, as many as the curriculum has reached."""
+        """Return the first steps of the windows, as the curriculum prescribes."""
         stages = len(self.curriculum)
         return windows.first(self.curriculum[min(int(progress * stages), stages - 1)])
 
@@ -98,9 +94,9 @@ class IncrementLoss(WindowLoss):
         return self.error(predicted[..., 1:, :], windows.increments(model.state))
 
     def error(self, predicted: Tensor, measured: Tensor) -> Tensor:
-        """The loss of increments over the first k steps, ``(B, k, 2N)``.
+        """Return the loss of increments over the first k steps, ``(B, k, 2N)``.
 
-        Increments of an ensemble, ``(E, B, k, 2N)``, give one loss for each member, ``(E,)``.
+        Increments ``(E, B, k, 2N)`` of an ensemble give the loss of each member, ``(E,)``.
         """
         steps = predicted.shape[-2]
         residual = (predicted - measured) / self.scale[:steps]
@@ -108,5 +104,5 @@ class IncrementLoss(WindowLoss):
         if self.huber is None:
             return torch.mean(residual**2, dim=(-3, -2, -1))
         square = torch.mean(residual**2, dim=-1)
-        # 2 d^2 (sqrt(1 + r^2/d^2) - 1) without the loss of digits where r is small.
+        # 2 d^2 (sqrt(1 + r^2/d^2) - 1), without cancellation for small r.
         return torch.mean(2 * square / (torch.sqrt(1 + square / self.huber**2) + 1), dim=(-2, -1))

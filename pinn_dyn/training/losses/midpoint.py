@@ -1,4 +1,4 @@
-"""The equation of motion in the middle of a short step as a loss."""
+"""Loss on the equation of motion at the midpoint of a short step."""
 
 from __future__ import annotations
 
@@ -12,44 +12,43 @@ from pinn_dyn.training.losses.window_loss import WindowLoss
 
 
 class MidpointLoss(WindowLoss):
-    """Mean squared error of the increment of the state in one step, by the midpoint rule.
+    """Mean squared error of the state increment over one step by the midpoint rule.
 
-    A step of length h leads from measured (q_0, v_0) to measured (q_1, v_1). The cubic through
-    both, with those slopes (Hermite interpolation), gives its middle::
+    A step of length h leads from the measured (q_0, v_0) to the measured (q_1, v_1). Hermite
+    interpolation gives the midpoint::
 
         q_m = (q_0 + q_1)/2 - h dv/8        dq = q_1 - q_0
         v_m = 3 dq/(2 h) - (v_0 + v_1)/4    dv = v_1 - v_0
 
-    and there the dynamics dv/dt = a(q, v, u) are evaluated once::
+    The dynamics dv/dt = a(q, v, u) are evaluated there::
 
         dv^ = h a(q_m, v_m, mean of u over the step)
         loss = mean over windows and components i of ((dv^_i - dv_i) / s_i)^2
 
-    s is the standard deviation of dv over the training windows. Where the state is (q, p) its
-    middle is the mean of both ends, and the increments of q and of p are compared. The mean of u
-    is exact for inputs that are linear between samples, or held.
+    s is the standard deviation of dv over the training windows. For a state (q, p) the midpoint is
+    the mean of both ends, and the increments of q and p are compared. The mean of u is exact for
+    held and linear inputs.
 
-    The error of the rule is h^2/24 of the second derivative of a along the motion (h^2/12 with
-    momenta): a hundredth of a for an oscillation of r rad/s with r h = 0.5, and 1/2400 with
-    r h = 0.1. The terms learn it with the motion: halve ``data.stride`` to see whether it matters.
+    The error of the rule is h^2/24 times the second derivative of a along the motion (h^2/12 with
+    momenta): 1 % of a for an oscillation of r rad/s with r h = 0.5, and 1/2400 with r h = 0.1. The
+    model learns this error with the motion. Halve ``data.stride`` to check its influence.
 
-    One evaluation of the dynamics per window, where the roll-out of one step by RK4 costs four; no
-    roll-out and no stiffness, so ``integrator`` is for validation and test alone.
+    A window costs one evaluation of the dynamics; the roll-out of one step by RK4 costs four. There
+    is no roll-out, so ``integrator`` only matters for validation and test.
 
-    Assumptions: q and v are measured or simulated with little noise. Noise in v is divided by a
-    short h, as in a loss on accelerations by finite differences; for noisy logs take longer
-    windows and the increment loss.
+    Assumptions: q and v have little noise. Noise in v is divided by a short h, as in a loss on
+    accelerations by finite differences. For noisy logs use longer windows and the increment loss.
 
-    Source: not in the paper, whose losses roll out. Midpoint quadrature of the equation of motion
-    along a Hermite interpolant, as in direct collocation (Betts 2010, "Practical Methods for
-    Optimal Control and Estimation Using Nonlinear Programming").
+    Source: midpoint quadrature of the equation of motion along a Hermite interpolant, as in direct
+    collocation (Betts 2010, "Practical Methods for Optimal Control and Estimation Using Nonlinear
+    Programming"). This loss is not in the paper.
 
     Args:
         statistics: scales of the data.
         model: the model that will be trained.
 
     Raises:
-        TypeError: if the model has no state derivative, as ``model=mlp``.
+        TypeError: if the model has no state derivative, for example ``model=mlp``.
         ValueError: if the windows have more than one step, or the model learns its initial state.
     """
 
@@ -60,19 +59,19 @@ class MidpointLoss(WindowLoss):
         if not isinstance(model, ContinuousPredictor):
             raise TypeError(
                 f"model is a {type(model).__name__}, expected one with a state derivative, such as "
-                "model=lnn or model=acceleration: take loss=increment"
+                "model=lnn or model=acceleration: use loss=increment"
             )
         if model.learns_initial_state:
             raise ValueError(
-                "the model learns the velocity at which roll-outs start, and this loss rolls "
-                "nothing out: take loss=increment, or ~model/initial_velocity"
+                "the model learns the initial velocity of roll-outs, but this loss has no "
+                "roll-out: use loss=increment, or ~model/initial_velocity"
             )
         scale = statistics.increment_std(model.state)
         if scale.shape[0] != 1:
             raise ValueError(
                 f"the windows have {scale.shape[0]} steps, expected one: set data.steps=1"
             )
-        # Of (q, v) the first half holds by construction.
+        # For (q, v) the first half holds by construction.
         self.compared = slice(model.num_coordinates if model.state == "qv" else 0, None)
         self.register_buffer("scale", scale[0, self.compared].float(), persistent=False)
 
@@ -87,12 +86,12 @@ class MidpointLoss(WindowLoss):
 
 
 def midpoint(h: Tensor, x0: Tensor, increment: Tensor) -> Tensor:
-    """The state in the middle of a cubic from x0 to x0 + increment, ``(*batch, 2N)``.
+    """Return the midpoint of a cubic from x0 to x0 + increment, ``(*batch, 2N)``.
 
     Args:
         h: length of the step, s.
-        x0: (q, v) at its start, ``(*batch, 2N)``.
-        increment: of (q, v) over the step, ``(*batch, 2N)``.
+        x0: (q, v) at the start of the step, ``(*batch, 2N)``.
+        increment: increment of (q, v) over the step, ``(*batch, 2N)``.
     """
     (q, v), (dq, dv) = x0.chunk(2, -1), increment.chunk(2, -1)
     return torch.cat([q + 0.5 * dq - h * dv / 8, 1.5 * dq / h - 0.5 * v - 0.25 * dv], dim=-1)

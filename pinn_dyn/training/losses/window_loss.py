@@ -1,4 +1,4 @@
-"""The contract of a loss, and a loss with what the model's own freedom costs."""
+"""The contract of a loss, and a loss with the penalty of the model."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from pinn_dyn.mechanics import Predictor
 
 
 class WindowLoss(nn.Module, abc.ABC):
-    """A loss of a model on a batch of windows, a number near one before anything is learned.
+    """Loss of a model on a batch of windows. The initial value is near one.
 
-    It is mathematics alone: how its gradient is taken, eagerly or compiled, is no matter of the
-    loss (:mod:`pinn_dyn.training.gradients`).
+    A loss is independent of the gradient engine, eager or compiled
+    (:mod:`pinn_dyn.training.gradients`).
     """
 
     @abc.abstractmethod
     def forward(self, model: Predictor, windows: Windows) -> Tensor:
-        """The loss, a scalar, by operations that can be traced.
+        """Return the loss, a scalar, by operations that can be traced.
 
-        Of the stacked members of an ensemble, on windows ``(E, B, ...)``, it has one entry for
-        each, ``(E,)``.
+        For the stacked members of an ensemble and windows ``(E, B, ...)``, return ``(E,)``.
         """
 
     def selected(self, windows: Windows, progress: float) -> Windows:
-        """What of the windows counts when the part ``progress``, 0 to 1, of the training is over.
+        """Return the part of the windows that the loss uses at ``progress`` from 0 to 1.
 
-        Here it is all of them.
+        The default uses all of the windows.
         """
         return windows
 
 
 class Penalized(WindowLoss):
-    """loss + penalty of the model at the starts of the windows (:meth:`Predictor.penalty`).
+    """Sum of a loss and the penalty of the model (:meth:`Predictor.penalty`).
 
-    The acceleration there is the mean over the first step, and so is the input.
+    The penalty is evaluated at the start of each window, with the mean acceleration and the mean
+    input of the first step.
 
     Args:
-        loss: of the prediction.
+        loss: loss of the prediction.
     """
 
     def __init__(self, loss: WindowLoss):
