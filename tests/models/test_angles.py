@@ -75,5 +75,7 @@ def test_the_quadratic_well_leaves_angles_out():
 
 
 def test_an_angle_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match=r"angles is \[3\], expected positions from 0 to 2"):
+    with pytest.raises(
+        ValueError, match=r"angles is \[3\], expected different positions from 0 to 2"
+    ):
         make_structured("lnn", mass=partial(NetworkCholesky, hidden=[4]), angles=[3])

@@ -159,5 +159,5 @@ def test_a_structure_that_cannot_be_learned_is_refused_by_name(structure, messag
 
 
 def test_known_mechanics_takes_rigid_bodies():
-    with pytest.raises(ValueError, match=r"structure is a SoftArm, .* by model=known_system"):
+    with pytest.raises(ValueError, match=r"structure is a SoftArm, .* model=known_system"):
         KnownMechanics(statistics(3), SoftArm())

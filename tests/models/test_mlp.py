@@ -130,13 +130,3 @@ def test_without_hidden_layers_it_is_linear():
     value, tape = network.linearize(x)
     assert len(tape) == 1  # the slopes of the features
     assert_near(network(x + dx), value + network.pushforward(tape, dx), 1e-12)
-
-
-def test_an_unknown_activation_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="'relu', expected one of softplus, tanh, silu"):
-        MLP(2, 1, [3], "relu")
-
-
-def test_a_width_below_one_is_refused():
-    with pytest.raises(ValueError, match=r"hidden is \[4, 0\]"):
-        MLP(2, 1, [4, 0])

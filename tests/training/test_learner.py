@@ -185,7 +185,7 @@ class Ends(Callback):
 
 
 def trained(tmp_path, data, monkeypatch, seconds, **options):
-    monkeypatch.setattr("pinn_dyn.training.learner.MOST_SECONDS", seconds)
+    monkeypatch.setattr("pinn_dyn.training.learner.BLOCK_SECONDS", seconds)
     torch.manual_seed(0)
     learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
     ends = Ends()
@@ -248,7 +248,7 @@ def test_a_precision_that_scales_the_loss_is_refused(tmp_path, data):
     learner = make_learner(AccelerationMLP(data.statistics, [8]), data)
     trainer = make_trainer(tmp_path, max_epochs=1, enable_checkpointing=False)
     trainer.precision_plugin.scaler = object()
-    with pytest.raises(ValueError, match="which scales the loss: take bf16-mixed"):
+    with pytest.raises(ValueError, match="which scales the loss: use bf16-mixed"):
         trainer.fit(learner, data)
 
 

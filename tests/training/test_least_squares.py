@@ -3,6 +3,7 @@
 import copy
 import itertools
 import logging
+import re
 
 import numpy as np
 import pytest
@@ -105,7 +106,7 @@ def test_what_has_changed_is_refused_by_name(runs):
     solver = LeastSquares(cutoff=20.0, changed=["hand"])
     model = robot_model("generic")
     count = sum(p.numel() for p in model.parameters())
-    with pytest.raises(ValueError, match=r"there is no earlier fit .* start_from="):
+    with pytest.raises(ValueError, match=r"there is no earlier fit: .* start_from="):
         solver.fit(model, runs, windows)
     with pytest.raises(ValueError, match=r"changed names hand, expected some .* rod, tip"):
         solver.fit(model, runs, windows, torch.eye(count))
@@ -301,11 +302,9 @@ def test_a_constant_far_from_its_start_is_named():
     root = torch.diag(torch.tensor([1.0, 1.0, 2.0, 0.1]).double())
     mean = torch.tensor([0.0, 0.0, 1.0, 0.0]).double()
     z = torch.tensor([-3.5, 6.0, 2.0, 25.0]).double()
-    assert far_from_start(names, z, Prior(mean, root)) == [
-        "drive gain of wrist is 6.0 prior standard deviations from its start: check units and sign of its "
-        "input",
-        "mass of tip is 3.5 prior standard deviations from its start: check the units of the columns",
-    ]
+    gain, mass = far_from_start(names, z, Prior(mean, root))
+    assert re.match("drive gain of wrist is 6.0 prior .*: check units and sign of its input", gain)
+    assert re.match("mass of tip is 3.5 prior .*: check the units of the columns", mass)
     many = far_from_start(
         [f"mass of {k}" for k in range(8)], 5 * torch.ones(8), Prior(torch.zeros(8), torch.eye(8))
     )

@@ -107,7 +107,7 @@ def test_members_of_an_ensemble_have_the_losses_they_have_alone():
 
 
 def test_it_refuses_a_model_without_a_derivative_and_windows_of_several_steps():
-    with pytest.raises(TypeError, match=r"NextStateMLP, expected .*take loss=increment"):
+    with pytest.raises(TypeError, match=r"NextStateMLP, expected .*use loss=increment"):
         MidpointLoss(one_step(size=2), make_model("next_state"))
     two = replace(one_step(size=2), qv_increment_std=torch.ones(2, 4))
     with pytest.raises(ValueError, match=r"have 2 steps, expected one: set data.steps=1"):
