@@ -28,7 +28,7 @@ demo: $(VENV)/.installed  ## simulate a soft arm, train three models on it, comp
 	$(BIN)/python train.py experiment=demo model=mlp loss=increment hydra.run.dir=runs/demo/2_mlp-seed0
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' step=0.01 hydra.run.dir=runs/demo-evaluation
 	$(BIN)/python evaluate.py 'runs=[runs/demo/*]' dataset=soft_arm_1_beyond step=0.01 hydra.run.dir=runs/demo-beyond
-	$(BIN)/python control.py experiment=soft_arm_1/demo run=runs/demo/0_hnn-seed0 hydra.run.dir=runs/demo-control
+	$(BIN)/python control.py experiment=soft_arm_1/regulation gains.position=5 gains.velocity=0.4 rate=500 runs=4 'actuator.low=[-2,-2,-4]' 'actuator.high=[2,2,2]' run=runs/demo/0_hnn-seed0 hydra.run.dir=runs/demo-control
 	$(BIN)/python examples/demo_summary.py runs
 
 reproduce: $(VENV)/.installed  ## remake the paper's tables: hours; goes on where it stopped

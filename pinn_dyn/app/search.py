@@ -35,13 +35,13 @@ class EqualSearch:
     """
 
     draw: NonNegativeInt
-    lr: tuple[PositiveFloat, PositiveFloat]
-    weight_decay: tuple[PositiveFloat, PositiveFloat]
-    width: Sequence[PositiveInt]
-    depth: Sequence[PositiveInt]
-    activation: Sequence[Activation]
-    length: Sequence[PositiveFloat]
-    substeps: Sequence[PositiveInt]
+    lr: tuple[PositiveFloat, PositiveFloat] = (5e-4, 1e-2)
+    weight_decay: tuple[PositiveFloat, PositiveFloat] = (1e-4, 0.3)
+    width: Sequence[PositiveInt] = (16, 32, 64, 128)
+    depth: Sequence[PositiveInt] = (1, 2, 3, 4)
+    activation: Sequence[Activation] = ("softplus", "silu", "tanh")
+    length: Sequence[PositiveFloat] = (0.5, 1.0, 2.0)
+    substeps: Sequence[PositiveInt] = (1, 2, 4)
 
     def applied(self, config: dict[str, Any]) -> dict[str, Any]:
         """Return the configuration with the settings of the draw; of the search it keeps the draw.

@@ -112,12 +112,13 @@ def test_ensemble_with_spread(capsys):
 
 
 def test_write_example_bag(home):
-    """The bag that conf/dataset/example_bag.yaml reads, its joints by their names."""
+    """The bag that examples/conf/dataset/example_bag.yaml reads, its joints by their names."""
     main = runpy.run_path("write_example_bag.py")["main"]
     main.__globals__["SECONDS"] = 12  # of a minute
     main(Path("example_bag"))
     short = [f"dataset.{split}.seconds=4" for split in ("validation", "test")]
-    config = compose("dataset=example_bag", f"dataset.root='{home}'", *short).dataset
+    place = f"hydra.searchpath=[file://{ROOT / 'examples' / 'conf'}]"
+    config = compose(place, "dataset=example_bag", f"dataset.root='{home}'", *short).dataset
     source = instantiate(OmegaConf.to_container(config, resolve=True), _convert_="all")
     (train,) = source.load().train
     assert len(train.t) == 298
