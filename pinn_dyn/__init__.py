@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pinn_dyn.data import LogSource as LogSource
     from pinn_dyn.data import Splits as Splits
     from pinn_dyn.evaluation.closed_loops import close_loop as close_loop
+    from pinn_dyn.evaluation.log_check import check as check
     from pinn_dyn.mechanics import MechanicalSystem as MechanicalSystem
     from pinn_dyn.mechanics import Signal as Signal
     from pinn_dyn.mechanics import Terms as Terms
@@ -38,6 +39,7 @@ _MODULES = {
     "Splits": "pinn_dyn.data",
     "Terms": "pinn_dyn.mechanics",
     "Trajectory": "pinn_dyn.mechanics",
+    "check": "pinn_dyn.evaluation.log_check",
     "close_loop": "pinn_dyn.evaluation.closed_loops",
     "dataset": "pinn_dyn.app.dataset",
     "evaluate": "pinn_dyn.app.evaluation",

@@ -13,7 +13,7 @@ from pinn_dyn.app.known_data import check_structure
 from pinn_dyn.app.run_folder import write_config
 from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data.logs import LogError, LogSource
-from pinn_dyn.evaluation.log_check import check_log
+from pinn_dyn.evaluation.log_check import check as check_log
 from pinn_dyn.models.known import Structure
 
 

@@ -143,7 +143,7 @@ class LogCheck:
         return folder / "check.html"
 
 
-def check_log(
+def check(
     source: LogSource,
     *,
     longest_delay: PositiveFloat = 0.3,

@@ -127,7 +127,7 @@ def test_a_horizon_takes_the_test_motions_that_are_long_enough(run, tmp_path, ca
     run_script("evaluate.py", *words, *evaluation_of(run, tmp_path / "out"))
     assert "2 unseen test trajectories, 1.5 s" in capsys.readouterr().out
     said = (tmp_path / "out" / "evaluate.log").read_text()
-    assert "1 of 3 unseen test trajectories of example_log are shorter than horizon=1.5" in said
+    assert "1 of 3 trajectories of example_log are shorter than horizon=1.5" in said
 
 
 def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
@@ -153,12 +153,12 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
         ("dataset.q.unit=degree", ["dataset: q: unit is 'degree'", "did you mean deg"]),
         ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
         ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
-        ("dataset.test.piece=7.0", ["test: ", "no stretch is as long as its piece, 7 s"]),
+        ("dataset.test.piece=7.0", ["test: ", "no stretch lasts 7 s"]),
         ("data.pairs=5000", ["5000 windows", "fewer pairs"]),
         ("data.history=0.1 dataset.interpolation=hold", ["held between its samples", "InputDelay"]),
         (
             "model/delay=learned data.history=0.05",
-            ["may look 0.1 s back", "leave data.history out"],
+            ["may look 0.1 s back", "set both to the same time"],
         ),
     ],
 )

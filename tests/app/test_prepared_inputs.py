@@ -77,27 +77,24 @@ def test_a_preparation_that_changes_nothing_changes_no_figure(runs, tmp_path):
     table = evaluate(runs, ["plain", "zero"], tmp_path / "both")
     alone = evaluate(runs, ["plain"], tmp_path / "alone")
     figures = [name for name in table if name.startswith(("error", "window", "valid"))]
-    assert table.index[1] == "mlp with delay"
-    for row in ("mlp", "mlp with delay"):
-        np.testing.assert_array_equal(table.loc[row, figures], alone.loc["mlp", figures])
+    for row in (0, 1):
+        np.testing.assert_array_equal(table[figures].iloc[row], alone[figures].iloc[0])
 
 
 def test_a_run_at_a_lower_rate_is_compared_at_the_times_of_the_higher_one(runs, tmp_path):
     table = evaluate(runs, ["slow", "plain"], tmp_path / "both")
     assert table.index.tolist()[:2] == ["mlp with slow", "mlp"]
     assert (table["step"].iloc[:2] == 0.02).all()
-    record = json.loads((tmp_path / "both" / "provenance.json").read_text())
-    assert not record["dataset"]["steps"]
     # On inputs that are straight between samples of 50 Hz it predicts as it does alone.
     alone = evaluate(runs, ["slow"], tmp_path / "alone", "horizon=1.0")
-    found, expected = table.loc["mlp with slow", "error_mean"], alone.loc["mlp", "error_mean"]
-    assert found == pytest.approx(expected, rel=0.02)
+    expected = alone.loc["mlp", "error_mean"]
+    assert table.loc["mlp with slow", "error_mean"] == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("plain", "one"), "dataset.q.columns is ['q1'], there ['q1', 'q2'], and 1 more"),
+        (("plain", "one"), "was trained on another data set than"),
         (("plain", "late", "dataset=example_log"), "inputs of the runs were prepared in different"),
     ],
 )

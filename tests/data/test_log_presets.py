@@ -1,6 +1,9 @@
 """The presets: four recorded data sets where they are at hand, and the templates."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -153,3 +156,23 @@ def test_the_sections_that_measurements_link_to_exist():
         headings = re.findall(r"^#+ (.*)$", (ROOT / "docs" / page).read_text(), re.MULTILINE)
         anchors = [re.sub(r"[^\w -]", "", x).lower().replace(" ", "-") for x in headings]
         assert anchor in anchors
+
+
+def test_run_folders_may_name_the_steps_of_this_checkout_only(tmp_path):
+    """A folder ``examples`` beside a foreign run is neither trusted nor executed."""
+    (tmp_path / "examples").mkdir()
+    (tmp_path / "examples" / "__init__.py").write_text("open('was_here', 'w')")
+    code = "from pinn_dyn.app.trust import may_build as may; name = 'examples.cleaning_steps.'; "
+    code += "print(may(name + 'SubtractStart', ()), may(name + 'replace', ()))"
+    for folder, answer in ((tmp_path, "False False"), (ROOT, "True False")):
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        result = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert result.stdout.strip() == answer
+    assert not (tmp_path / "was_here").exists()

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data.logs import Butterworth, LogSource, Recording
-from pinn_dyn.evaluation.log_check import check_log
+from pinn_dyn.evaluation.log_check import check
 from pinn_dyn.evaluation.log_numbers import bandwidth, white_noise
 
 RATE = 100.0
@@ -43,7 +43,7 @@ def checked(frame, **changes):
         validation=dict(seconds=4.0, piece=2.0),
         test=dict(seconds=8.0, piece=4.0),
     )
-    return check_log(LogSource(**{**arguments, **changes}))
+    return check(LogSource(**{**arguments, **changes}))
 
 
 @pytest.fixture(scope="module")
@@ -51,17 +51,17 @@ def good():
     return driven(noise=1e-5)
 
 
-def verdicts(check):
-    return {(x.name, x.place): x.verdict for x in check.measurements}
+def verdicts(result):
+    return {(x.name, x.place): x.verdict for x in result.measurements}
 
 
 def test_a_good_log_has_no_warning_and_no_step_to_add(good, tmp_path):
-    check = checked(good)
-    assert set(verdicts(check).values()) == {"ok"}
-    assert not check.problems
-    assert check.steps == []
-    assert "a training makes sense" in str(check)
-    page = check.save(tmp_path, "python check.py")
+    result = checked(good)
+    assert set(verdicts(result).values()) == {"ok"}
+    assert not result.problems
+    assert result.steps == []
+    assert "a training makes sense" in str(result)
+    page = result.save(tmp_path, "python check.py")
     assert page.stat().st_size > 20_000
     saved = (tmp_path / "measurements.csv").read_text()
     assert saved.startswith("verdict,measurement,of,value,expected,explanation,docs")
@@ -69,17 +69,17 @@ def test_a_good_log_has_no_warning_and_no_step_to_add(good, tmp_path):
 
 
 def test_a_delay_is_measured_warned_of_and_given_as_a_step():
-    check = checked(driven(delay=0.05, noise=1e-5))
-    assert [x.delay for x in check.delays] == pytest.approx([0.05, 0.05], abs=0.006)
-    assert verdicts(check)["delay [ms]", "u1"] == "warning"
-    (line,) = check.steps
+    result = checked(driven(delay=0.05, noise=1e-5))
+    assert [x.delay for x in result.delays] == pytest.approx([0.05, 0.05], abs=0.006)
+    assert verdicts(result)["delay [ms]", "u1"] == "warning"
+    (line,) = result.steps
     assert line.startswith("delay: {_target_: pinn_dyn.data.logs.InputDelay, delay: 0.05}")
 
 
 def test_noise_is_measured_and_gives_a_filter_above_the_motion():
-    check = checked(driven(noise=0.005))
-    assert check.coordinates["noise of q"].to_numpy() == pytest.approx([0.005] * 2, rel=0.1)
-    (line,) = [x for x in check.steps if x.startswith("filter")]
+    result = checked(driven(noise=0.005))
+    assert result.coordinates["noise of q"].to_numpy() == pytest.approx([0.005] * 2, rel=0.1)
+    (line,) = [x for x in result.steps if x.startswith("filter")]
     cutoff = float(line.split("cutoff: ")[1].split("}")[0])
     assert 2.0 < cutoff < 20.0
     again = checked(driven(noise=0.005), steps={"smooth": Butterworth(cutoff)})
@@ -88,29 +88,29 @@ def test_noise_is_measured_and_gives_a_filter_above_the_motion():
 
 def test_inputs_of_another_robot_stop_a_training(good):
     other = driven(noise=1e-5, seed=5)
-    check = checked(good.assign(u1=other["u1"], u2=other["u2"]))
-    assert "the inputs explain" in check.problems[0]
-    assert check.table()["verdict"].iloc[0] == "stop"
-    assert "a training makes no sense" in str(check)
+    result = checked(good.assign(u1=other["u1"], u2=other["u2"]))
+    assert "the inputs explain" in result.problems[0]
+    assert result.table()["verdict"].iloc[0] == "stop"
+    assert "a training makes no sense" in str(result)
 
 
 def test_too_few_samples_stop_a_training(good):
     part = dict(seconds=0.4, piece=0.2)
-    check = checked(good[:200], validation=part, test=part, guard=0.1)
-    assert any("samples, expected at least 200" in text for text in check.problems)
+    result = checked(good[:200], validation=part, test=part, guard=0.1)
+    assert any("samples, expected at least 200" in text for text in result.problems)
 
 
 def test_a_test_outside_the_training_is_warned_of(good):
     far = good.copy()
     far.loc[len(far) - 800 :, "q1"] += 3.0
-    check = checked(far)
-    assert verdicts(check)["share of the test outside the range", "q1 [m]"] == "warning"
-    assert verdicts(check)["share of the test far away", ""] == "warning"
+    result = checked(far)
+    assert verdicts(result)["share of the test outside the range", "q1 [m]"] == "warning"
+    assert verdicts(result)["share of the test far away", ""] == "warning"
 
 
 def test_coordinates_that_move_together_are_not_identified(good):
-    check = checked(good.assign(q2=good["q1"] * 0.5 + 1e-6 * np.sin(9 * good["t"])))
-    assert verdicts(check)["independent share of a", "q1 [m]"] == "warning"
+    result = checked(good.assign(q2=good["q1"] * 0.5 + 1e-6 * np.sin(9 * good["t"])))
+    assert verdicts(result)["independent share of a", "q1 [m]"] == "warning"
 
 
 @given(st.floats(1e-6, 1e2), st.floats(0.2, 2.0))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pinn_dyn.data.logs import LogSource
-from pinn_dyn.evaluation.log_check import check_log
+from pinn_dyn.evaluation.log_check import check
 from pinn_dyn.evaluation.rigid_excitation import base_parameters, rigid_excitation
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import RigidChain
@@ -138,16 +138,16 @@ def source(tmp_path):
 
 
 def test_the_check_of_a_log_says_which_joint_is_not_excited(source):
-    excitation = check_log(source(follows=True), structure=RigidChain(TWO_RODS))
+    excitation = check(source(follows=True), structure=RigidChain(TWO_RODS))
     assert "elbow" in excitation.rigid.open_joints
     assert "dry friction of elbow" in str(excitation)
     assert any("do not determine constants of" in text for text in excitation.warnings)
 
 
 def test_the_check_of_a_log_has_the_number_of_base_parameters(source):
-    excitation = check_log(source(follows=False), structure=RigidChain(TWO_RODS))
+    excitation = check(source(follows=False), structure=RigidChain(TWO_RODS))
     # Six of the bodies, the elbow's armature, three frictions and offsets for each joint.
     assert excitation.rigid.count == 13
     assert 1 < excitation.rigid.condition < 100
     assert "not determined: none" in str(excitation)
-    assert check_log(source(follows=False)).rigid is None
+    assert check(source(follows=False)).rigid is None
