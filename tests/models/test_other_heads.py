@@ -42,16 +42,6 @@ def q():
 # The potential.
 
 
-@pytest.mark.parametrize("quadratic", [True, False])
-@pytest.mark.parametrize("activation", ["softplus", "tanh", "silu"])
-def test_potential_force_is_the_gradient_of_the_potential(quadratic, activation, q):
-    head = perturb(make_potential(hidden=[5, 4], activation=activation, quadratic=quadratic))
-    assert head(q).shape == (40,)
-    expected = torch.func.vjp(lambda q: head(q).sum(), q)[1](torch.tensor(1.0).double())[0]
-    assert_near(head.gradient(q), expected, 1e-12)
-    assert_near(head.gradient(q[0]), expected[0], 1e-12)
-
-
 def test_the_quadratic_part_is_an_elastic_well(q):
     head = make_potential(hidden=[4])
     with torch.no_grad():
@@ -96,13 +86,6 @@ def test_the_scale_of_an_input_is_that_of_its_column(q):
     doubled = make_input(partial(NetworkInput, hidden=[4]))
     doubled.scale *= torch.tensor([2.0, 3.0])
     assert_near(doubled(q), network(q) * torch.tensor([2.0, 3.0]).double(), 1e-12)
-
-
-@pytest.mark.parametrize("builder", [ConstantInput, FixedInput], ids=["constant", "fixed"])
-def test_a_constant_input_matrix_does_not_depend_on_q(builder, q):
-    head = make_input(builder, inputs=3)
-    assert torch.equal(head(q), head(q[:1]).expand(40, SIZE, 3))
-    assert float(head(q).abs().max()) > 0.5
 
 
 def test_a_fixed_input_matrix_is_the_given_one(q):

@@ -158,12 +158,6 @@ def test_exact_predictions_have_no_loss(kind):
     assert float(IncrementLoss(STATISTICS, MODELS[kind]()).error(MEASURED, MEASURED)) == 0
 
 
-def test_the_loss_has_nothing_to_learn_or_to_save():
-    loss = IncrementLoss(STATISTICS, MODELS["lnn"]())
-    assert not list(loss.parameters())
-    assert not loss.state_dict()
-
-
 class Drift(ContinuousPredictor):
     """dq/dt = v, dv/dt = u, and a count of the evaluations."""
 
