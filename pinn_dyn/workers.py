@@ -1,6 +1,6 @@
-"""Processes that work for another one.
+"""Worker processes that end with their parent.
 
-Outside the rooms, whose imports take seconds: a worker watches before it imports PyTorch.
+This module imports no package of pinn_dyn, so that a worker watches before it imports PyTorch.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ _watching = False
 
 
 def end_with_parent() -> None:
-    """End this process soon after the one that started it, however and whenever that one ended.
+    """End this process soon after its parent, also if the parent was killed.
 
-    A worker whose parent was killed would do its task to the end, then wait for another for ever.
+    Otherwise a worker of a killed parent would finish its task and then wait forever.
     """
     global _watching
     if not _watching:
         _watching = True
-        # As the parent said itself: one killed before this line is no parent any more.
+        # A parent that was killed before this line is no longer the parent of this process.
         parent = multiprocessing.parent_process()
         pid = os.getppid() if parent is None else parent.pid
         threading.Thread(target=_watch, args=(pid,), daemon=True).start()
@@ -33,5 +33,5 @@ def end_with_parent() -> None:
 def _watch(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_POLL)
-    # An orderly end waits for the parent too; what is written is whole or absent at any moment.
+    # A normal exit would wait for the parent; files are whole or absent at any moment.
     os._exit(128 + signal.SIGTERM)

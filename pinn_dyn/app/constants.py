@@ -1,4 +1,4 @@
-"""The fitted constants of a run: written by train.py, read by evaluate.py."""
+"""Fitted constants of a run: written by train.py, read by evaluate.py."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _SHOWN = 2  # lines of each kind in the log
 
 
 def write_constants(model: Predictor, result: Fit, source: DataSource, folder: Path) -> None:
-    """Write the constants with their 95 % intervals, and what the data leave to the prior.
+    """Write the constants with their 95 % intervals, and the directions that the prior determines.
 
-    Those of a fit that was stopped are in a file of another name, alone.
+    A fit that was stopped writes its constants alone, to ``constants_unfinished.csv``.
     """
     assert isinstance(model, LearnedConstants)
     inputs = [units([label]) for label in source.input_labels]
@@ -48,35 +48,37 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
     table = pd.concat([table, together])
     write_whole(folder / _CONSTANTS, table.to_csv(index=False))
     log.info("constants and their intervals are in %s", folder / _CONSTANTS)
-    left = undetermined(model, result)
-    known = [
+    prior = undetermined(model, result)
+    combined = [
         f"{row.name}: only this is determined, {row.value:.4g} ({row.low:.4g} to {row.high:.4g}) "
         f"{row.unit}"
         for row in together.itertuples(index=False)
     ]
-    head = f"{len(left)} of {len(model.parameter_names())} directions of the constants are held by "
+    head = (
+        f"{len(prior)} of {len(model.parameter_names())} directions of the constants are held by "
+    )
     head += "the prior, not by the data"
     path = folder / _UNDETERMINED
-    write_whole(path, f"{head}.\n\n" + "".join(f"- {line}\n" for line in [*known, *left]))
-    if known or left:
-        shown = [*known[:_SHOWN], *left[:_SHOWN]]
-        more = len(known) + len(left) - len(shown)
+    write_whole(path, f"{head}.\n\n" + "".join(f"- {line}\n" for line in [*combined, *prior]))
+    if combined or prior:
+        shown = [*combined[:_SHOWN], *prior[:_SHOWN]]
+        more = len(combined) + len(prior) - len(shown)
         shown += [f"and {more} more lines in {path}" if more else f"see {path}"]
         log.warning("%s: %s", head, "; ".join(shown))
 
 
 def read_constants(folders: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
-    """The constants of those runs that have some, by their names; a damaged file is passed over."""
-    found = {}
+    """Read the constants of runs by their names; a damaged file is left out with a warning."""
+    tables = {}
     for name, folder in folders.items():
         path = folder / _CONSTANTS
         if not path.is_file():
             continue
         try:
-            table = pd.read_csv(path).reindex(columns=COLUMNS)  # of older runs it has fewer
+            table = pd.read_csv(path).reindex(columns=COLUMNS)  # earlier versions wrote fewer
         except ValueError as error:
-            log.warning("passed over: %s cannot be read, it may be cut short: %s", path, error)
+            log.warning("left out: %s cannot be read, it may be cut short: %s", path, error)
             continue
         table["known"] = pd.to_numeric(table["known"], errors="coerce")
-        found[name] = table
-    return found
+        tables[name] = table
+    return tables

@@ -27,19 +27,19 @@ def check_known(model: Predictor, source: DataSource) -> None:
         ConfigError: if names or units of the columns show another order than that of the joints,
             or inputs such as currents have no drive gains.
     """
-    known = model.known if isinstance(model, KnownAndNetwork) else model
-    if isinstance(known, KnownMechanics):
-        check_structure("model.structure", known.structure, source)
-        _check_gains(known, source)
+    mechanics = model.known if isinstance(model, KnownAndNetwork) else model
+    if isinstance(mechanics, KnownMechanics):
+        check_structure("model.structure", mechanics.structure, source)
+        _check_gains(mechanics, source)
 
 
-def check_structure(place: str, structure: Structure, source: DataSource) -> None:
+def check_structure(path: str, structure: Structure, source: DataSource) -> None:
     """Refuse rigid bodies whose joints are not the data's.
 
     If the columns do not name the joints, their order counts, and is logged.
 
     Args:
-        place: key of the structure in the configuration.
+        path: key of the structure in the configuration.
         structure: rigid bodies.
         source: the data.
 
@@ -52,15 +52,15 @@ def check_structure(place: str, structure: Structure, source: DataSource) -> Non
     for key, columns in _signals(source):
         if len(columns) != len(joints):
             raise ConfigError(
-                f"{key} has {len(columns)} columns, {', '.join(columns)}, and {place} has the "
+                f"{key} has {len(columns)} columns, {', '.join(columns)}, and {path} has the "
                 f"joints {', '.join(joints)}: expected one column for each joint. Lock joints by "
-                f"{place}.locked_joints=[...], or leave out columns"
+                f"{path}.locked_joints=[...], or leave out columns"
             )
         matches = _joints_of(columns, joints)
         if any(joint not in (None, k) for k, joint in enumerate(matches)):
             order = [columns[matches.index(k)] if k in matches else "?" for k in range(len(joints))]
             raise ConfigError(
-                f"{key} has the order {', '.join(columns)}, and {place} has the joints "
+                f"{key} has the order {', '.join(columns)}, and {path} has the joints "
                 f"{', '.join(joints)}: expected the order of the joints in q, v and u, "
                 f"{key}=[{','.join(order)}]"
             )
@@ -75,7 +75,7 @@ def check_structure(place: str, structure: Structure, source: DataSource) -> Non
         expected = "rad" if turns else "m"
         if unit not in (None, expected):
             raise ConfigError(
-                f"{name} is in {unit}, and joint {joint} of {place} "
+                f"{name} is in {unit}, and joint {joint} of {path} "
                 f"{'turns' if turns else 'slides'}: expected {expected}; check the order of the "
                 "columns, and dataset.q.unit"
             )
@@ -118,14 +118,14 @@ def _check_gains(model: KnownMechanics, source: DataSource) -> None:
     if model.gain is not None:
         return
     gains = model.fixed_gain.tolist()
-    others = [
+    inputs = [
         f"{name} in {unit}"
         for (name, unit), gain in zip(_units(source, "u"), gains, strict=False)
         if unit not in (None, *_FORCES) and gain == 1
     ]
-    if others:
+    if inputs:
         raise ConfigError(
-            f"the inputs are {', '.join(others)}, and model.drive_gain is 1 with "
+            f"the inputs are {', '.join(inputs)}, and model.drive_gain is 1 with "
             "model.gain_spread=0, which means Nm: expected drive gains, as model.drive_gain=10 "
             "model.gain_spread=0.5 (Nm or N per unit, known within 50 %), or the unit of a force "
             "(dataset.u.unit) if the columns hold forces"

@@ -1,4 +1,4 @@
-"""The prediction of a data frame, in the columns, units and rows of a log."""
+"""Prediction along a data frame, in the columns, units and rows of a log."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pinn_dyn.mechanics import Predictor, Signal
 
 
 def predict_frame(model: Predictor, source: LogSource, frame: pd.DataFrame) -> pd.DataFrame:
-    """q and v along each run of a frame, from the first row of the run and under its inputs.
+    """Predict q and v along each run of a frame, from its first row and under its inputs.
 
     Args:
-        model: what predicts, in float64.
+        model: the predictor, in float64.
         source: columns, units and cleaning of the log.
-        frame: rows of such a log.
+        frame: rows of the log.
 
     Raises:
-        LogError: on a frame that is no such log; names the place.
+        LogError: if the frame lacks columns of the log or fails its checks.
         ValueError: if a model that predicts in fixed steps does not fit the sample time.
     """
     rates = [f"d{name}/dt" for name in source.q.columns] if source.v is None else []
@@ -45,7 +45,7 @@ def predict_frame(model: Predictor, source: LogSource, frame: pd.DataFrame) -> p
 def _along(
     model: Predictor, source: LogSource, runs: list[Recording], step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Predictions along K cleaned runs of S samples, ``step`` s apart.
+    """Predict along K cleaned runs of S samples, ``step`` s apart.
 
     Returns:
         The clock of their samples, ``(S,)``, the times of the prediction, ``(T,)``, both in s

@@ -1,4 +1,4 @@
-"""The progress of a training where there is no terminal to draw a bar on: a line per epoch."""
+"""Progress of a training without a terminal: one line per epoch."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ log = logging.getLogger(__name__)
 
 
 class EpochLines(L.Callback):
-    """Logs the training loss of every epoch, and the error where the epoch was validated.
+    """Logs the training loss of every epoch, and the error of validated epochs.
 
     Args:
-        error: the name under which the validation logs its error.
+        error: name of the logged validation error.
     """
 
     def __init__(self, error: str):
         self.error = error
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the line of this epoch."""
+        """Log the line of the epoch."""
         names = {"train/loss": "training loss"}
         if (trainer.current_epoch + 1) % (trainer.check_val_every_n_epoch or 1) == 0:
             names[self.error] = "validation error"
-        found = [
+        texts = [
             f"{text} {float(trainer.callback_metrics[name]):.4g}"
             for name, text in names.items()
             if name in trainer.callback_metrics
@@ -32,5 +32,5 @@ class EpochLines(L.Callback):
         if trainer.is_global_zero:
             epoch, epochs = trainer.current_epoch + 1, trainer.max_epochs
             log.info(
-                "epoch %d of %s, step %d: %s", epoch, epochs, trainer.global_step, ", ".join(found)
+                "epoch %d of %s, step %d: %s", epoch, epochs, trainer.global_step, ", ".join(texts)
             )

@@ -51,18 +51,19 @@ def shared_data(
             coordinates or inputs.
         ValueError: on data that cannot be used.
     """
-    own: list[Run] = []  # a run of each data set
+    distinct: list[Run] = []  # a run of each data set
     indices = []
     for run in runs:
-        k = next((k for k, other in enumerate(own) if _same_data(run, other)), len(own))
-        if k == len(own):
-            if own:
-                _require_same_motions(run, own[0])
-            own.append(run)
+        matches = [k for k, earlier in enumerate(distinct) if _same_data(run, earlier)]
+        k = matches[0] if matches else len(distinct)
+        if not matches:
+            if distinct:
+                _require_same_motions(run, distinct[0])
+            distinct.append(run)
         indices.append(k)
-    sources = [run.source for run in own]
+    sources = [run.source for run in distinct]
     splits = [source.load() for source in sources]
-    first = min(range(len(own)), key=lambda k: float(splits[k].train[0].t.diff()[0]))
+    first = min(range(len(distinct)), key=lambda k: float(splits[k].train[0].t.diff()[0]))
     source = sources[first]
     if test_source is not None:
         source = test_source
@@ -76,20 +77,20 @@ def shared_data(
         common = dict(zip(order, common_motions(logs, split), strict=True))
         motions = [common[k] for k in range(len(sources))]
     names: list[str] = []
-    for run in own:
-        name = _differences(run.config["dataset"], own[first].config["dataset"])
+    for run in distinct:
+        name = _differences(run.config["dataset"], distinct[first].config["dataset"])
         count = sum(earlier.split(" (")[0] == name for earlier in names)
         names.append(f"{name} ({count + 1})" if name and count else name)
     return [RunData(sources[k], splits[k], source, motions[k], names[k]) for k in indices]
 
 
-def _same_data(run: Run, other: Run) -> bool:
-    ours, theirs = run.config["dataset"], other.config["dataset"]
-    if not (run.data and other.data):  # runs of earlier versions
-        return ours == theirs
-    same_name = ours["name"] == theirs["name"]
-    same_input = ours.get("interpolation") == theirs.get("interpolation")
-    return same_name and same_input and not data_changes(run.data, other.data)
+def _same_data(run: Run, second: Run) -> bool:
+    ours, theirs = (
+        {key: x for key, x in item.config["dataset"].items() if key != "path"}
+        for item in (run, second)
+    )
+    stored = str(ours.get("_target_")).endswith(".StoredSource")
+    return ours == theirs and not (stored and data_changes(run.data, second.data))
 
 
 def _require_same_motions(run: Run, first: Run) -> None:
@@ -103,11 +104,11 @@ def _require_same_motions(run: Run, first: Run) -> None:
         and not (prepared and (key.split(".")[0] in _PREPARATION or key in _PIECES))
     ]
     if differences:
-        key = differences[0]
+        key, more = differences[0], len(differences) - 1
         raise ConfigError(
             f"runs: {run.folder} was trained on another data set than {first.folder} "
-            f"(dataset.{key} is {ours.get(key, 'absent')}, there {theirs.get(key, 'absent')}): "
-            "evaluate them separately"
+            f"(dataset.{key} is {ours.get(key, 'absent')}, there {theirs.get(key, 'absent')}"
+            f"{f', and {more} more' if more else ''}): evaluate them separately"
         )
 
 

@@ -82,9 +82,9 @@ def build_learner(
         return learner(model, **common, **clipping)  # type: ignore[arg-type]
 
 
-def even_validations(steps: int, most: int) -> int:
-    """Return the largest number of validations, up to ``most``, that divides the steps."""
-    return max(count for count in range(1, most + 1) if steps % count == 0)
+def even_validations(steps: int, limit: int) -> int:
+    """Return the largest number of validations, up to ``limit``, that divides the steps."""
+    return max(count for count in range(1, limit + 1) if steps % count == 0)
 
 
 def epochs(steps: int, validations: int) -> tuple[int, int, int]:
@@ -103,8 +103,8 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
             f"as trainer.steps={max(between, 1) * validations}"
         )
     fewest = -(-between // LONGEST_EPOCH)
-    every = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)
-    return validations * every, between // every, every
+    parts = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)
+    return validations * parts, between // parts, parts
 
 
 def require_device(trainer: Mapping[str, Any]) -> None:
@@ -172,12 +172,12 @@ def build_trainer(
         TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR),
         *([LearningRateMonitor()] if loggers else []),
     ]
-    count, batches, every = length
+    count, batches, interval = length
     arguments = {
         **{key: value for key, value in settings.items() if key not in CLIPPING},
         "enable_progress_bar": bar,
         "max_epochs": count,
-        "check_val_every_n_epoch": every,
+        "check_val_every_n_epoch": interval,
         "callbacks": [*callbacks, *added, *recorders],
         "logger": list(loggers),
         "plugins": [WholeCheckpoints()],

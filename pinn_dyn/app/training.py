@@ -169,7 +169,7 @@ def train(
     if folder is None:
         temporary = TemporaryDirectory(prefix="pinn_dyn-")
         folder, callbacks = temporary.name, callbacks or ()
-    place = Path(folder).expanduser()
+    run_folder = Path(folder).expanduser()
     if isinstance(optimizer, LeastSquares):
         steps = validations = 1
         trainer = {key: value for key, value in trainer.items() if key not in CLIPPING}
@@ -202,24 +202,24 @@ def train(
         stack.enter_context(isolate_rng())
         stack.enter_context(warnings.catch_warnings())
         hush()
-        stack.enter_context(claimed(place, config))
-        if is_finished(place):
-            log.info("already trained, to train again delete %s", place)
+        stack.enter_context(claimed(run_folder, config))
+        if is_finished(run_folder):
+            log.info("already trained, to train again delete %s", run_folder)
         else:
             if made_in_python and temporary is None:
-                store(source, place / TRAJECTORIES)
-            checkpoint = resumable(place, resume_from)
+                store(source, run_folder / TRAJECTORIES)
+            checkpoint = resumable(run_folder, resume_from)
             L.seed_everything(seed, verbose=False)
             require_device(trainer)
-            count, batches, every = epochs(steps, validations)
-            windows = build_data(data, source, seed, batches)
+            length = epochs(steps, validations)
+            windows = build_data(data, source, seed, length[1])
             statistics = _statistics(windows)
             identity = data_identity(source)
             if checkpoint is not None:
                 saved = read_checkpoint(checkpoint).get(DATA, {})
-                require_same_data(place, saved, source.name, identity)
+                require_same_data(run_folder, saved, source.name, identity)
             if isinstance(source, LogSource):
-                _write_report(source, place)
+                _write_report(source, run_folder)
             with naming("validator"):
                 rollouts = validator(training_step=statistics.step)
                 rollouts.check(stack_until(windows.splits.validation))
@@ -255,20 +255,20 @@ def train(
             recorder = Recorder(config, len(windows.windows), identity, description)
             _fit(
                 build_trainer(
-                    place,
+                    run_folder,
                     trainer,
                     [RolloutFigures(every_n_validations=4)] if callbacks is None else callbacks,
-                    [tensorboard(place)] if loggers is None else loggers,
+                    [tensorboard(run_folder)] if loggers is None else loggers,
                     [description, recorder],
-                    (count, batches, every),
+                    length,
                 ),
                 learner,
                 EnsembleData(windows, ensemble) if ensemble > 1 else windows,
                 checkpoint,
-                place,
+                run_folder,
                 source,
             )
-    run = load_run(place, "best", trust=None, model=_reloadable(model))
+    run = load_run(run_folder, "best", trust=None, model=_reloadable(model))
     return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
 
 

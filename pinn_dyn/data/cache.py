@@ -1,4 +1,4 @@
-"""A disk cache for arrays that took long to make."""
+"""Disk cache for arrays that take long to make."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def cache_key(description: object) -> str:
-    """SHA-256 of a JSON-serializable description, the first 16 hexadecimal digits."""
+    """Return the first 16 hexadecimal digits of the SHA-256 of a JSON-serializable description."""
     text = json.dumps(description, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -31,17 +31,17 @@ def load_or_make(
 ) -> Arrays:
     """Load the arrays of a description from the cache, or make and store them.
 
-    A file is ``<name>-<key>.npz``: plain arrays without pickle, with the description beside them.
-    It is written under another name and moved into place, so a reader never sees half a file; a
-    lock lets one process make it while others wait. On reading, the archive's checksums and the
-    description are compared; a file that is damaged or of other data is reported, kept aside as
-    ``.damaged`` and made again. A folder that may only be read serves what is there.
+    A file is ``<name>-<key>.npz``: plain arrays without pickle, with their description. It is
+    written under another name and moved into place, so that a reader never sees half a file. A lock
+    lets one process make the file while others wait. Reading compares the archive's checksums and
+    the description. A damaged file, or one of other data, is reported, kept as ``.damaged`` and
+    made again. A read-only folder is only read.
 
     Args:
         folder: the cache folder, made if missing.
-        name: readable first part of the file name.
-        description: everything the arrays depend on, JSON-serializable.
-        make: computes the arrays.
+        name: first part of the file name.
+        description: everything that the arrays depend on, JSON-serializable.
+        make: function that makes the arrays.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{cache_key(description)}.npz"
@@ -60,9 +60,9 @@ def load_or_make(
                     error,
                     aside.name,
                 )
-        # Who holds the lock is the only one to write: the others ended early.
-        for left in folder.glob(f"{glob.escape(path.name)}.*.partial"):
-            left.unlink(missing_ok=True)
+        # The holder of the lock is the only writer; other files are of killed processes.
+        for partial in folder.glob(f"{glob.escape(path.name)}.*.partial"):
+            partial.unlink(missing_ok=True)
         arrays = make()
         _write(path, arrays, description)
     return arrays
@@ -71,10 +71,10 @@ def load_or_make(
 def _read(path: Path, description: object) -> Arrays:
     # numpy reads each member to its end, where zipfile compares the checksum.
     with np.load(path, allow_pickle=False) as archive:
-        found = json.loads(str(archive["description"]))
-        if cache_key(found) != cache_key(description):
+        written = json.loads(str(archive["description"]))
+        if cache_key(written) != cache_key(description):
             raise ValueError(
-                f"it holds the data of another description, {json.dumps(found)[:200]}, expected "
+                f"it holds the data of another description, {json.dumps(written)[:200]}, expected "
                 f"{json.dumps(description)[:200]}"
             )
         return {str(name): archive[str(name)] for name in archive["names"]}

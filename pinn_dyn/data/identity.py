@@ -30,13 +30,12 @@ def data_identity(source: DataSource) -> dict[str, dict[str, Any]]:
 
 
 def _identity(names: list[str], trajectories: list[Trajectory]) -> dict[str, Any]:
-    known = [item.momentum for item in trajectories if item.momentum is not None]
     return {
         "names": list(names),
         "lengths": [len(item.t) for item in trajectories],
         "hashes": [_hash(item) for item in trajectories],
         "moments": _stacked([_moments(_signals(item)) for item in trajectories]),
-        "momenta": _stacked([_moments(_momenta(item)) for item in trajectories] if known else []),
+        "momenta": _stacked([_moments(_momenta(item)) for item in trajectories if item.momentum]),
     }
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 
 Length = int | str
-"""A number of samples; or a time with its unit, which keeps its meaning at another rate."""
+"""Number of samples, or a time with its unit, which does not depend on the sample rate."""
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 
 
 def seconds_of(name: str, length: str) -> float:
-    """A length such as ``"20 ms"`` in s.
+    """Convert a length such as ``"20 ms"`` to s.
 
     Raises:
         ValueError: on any other text, or a time that is not positive.

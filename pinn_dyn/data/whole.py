@@ -10,23 +10,23 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A file that is replaced only by a whole one, whenever its writer is killed or fails.
+    """Replace a file only by a complete one, even if the writer is killed or fails.
 
     Args:
         path: the file; its folder exists.
 
     Yields:
-        ``<name>.<process>.partial`` beside it, to be written; it is then moved into place.
+        Path of ``<name>.<process>.partial`` to write to; it is moved into place afterwards.
 
     Raises:
-        OSError: where it cannot be written, as on a full disk; names the file.
+        OSError: if it cannot be written, as on a full disk; names the file.
     """
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         yield partial
         os.replace(partial, path)
     except OSError as error:
-        if error.errno is not None:  # what the system says of a write names no file
+        if error.errno is not None:  # the system does not name the file
             error.filename = str(path)
         raise
     finally:
@@ -34,6 +34,6 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text, in UTF-8, by ``whole``."""
+    """Write a text in UTF-8 with :func:`whole`."""
     with whole(path) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -85,7 +85,7 @@ def test_constants_of_runs_are_read_where_there_are_any(tmp_path, fitted, caplog
     assert list(found) == ["fit", "older"]
     assert found["older"].value.equals(found["fit"].value)
     assert found["older"].start.isna().all()
-    assert f"passed over: {damaged / 'constants.csv'} cannot be read" in caplog.text
+    assert f"left out: {damaged / 'constants.csv'} cannot be read" in caplog.text
 
 
 def constants(folder):
