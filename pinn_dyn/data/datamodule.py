@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import lightning as L
 import torch
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor
 from torch.utils.data import DataLoader, Sampler
 
-from pinn_dyn.data.lengths import Length, seconds_of
+from pinn_dyn.data.lengths import seconds_of
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.data.windows import (
     BatchSampler,
@@ -26,40 +27,34 @@ class DynamicsData(L.LightningDataModule):
 
     Args:
         source: where the trajectories come from.
-        pairs: number of training windows, or ``"all"`` that the trajectories have.
+        pairs: number of training windows, or ``"all"`` windows of the trajectories.
         steps: steps H of a window; 1 gives the paper's transition pairs.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
         batch_size: windows in a batch.
         batches_per_epoch: batches in what the trainer counts as an epoch.
         seed: seed of the windows and their order.
-        coverage: how evenly the windows cover the configurations, 0 to 1; see
+        coverage: evenness of the windows over the configurations, 0 to 1; see
             :func:`~pinn_dyn.data.windows.draw_windows`.
         history: time before a window over which the input is kept, for models of a delay, s.
 
     Raises:
-        ValueError: on counts below 1, or a batch larger than the number of pairs.
+        ValueError: on a batch larger than the number of pairs.
     """
 
     def __init__(
         self,
         source: DataSource,
         *,
-        pairs: int | Literal["all"] = 8000,
-        steps: int = 1,
-        stride: Length = 10,
-        batch_size: int = 256,
-        batches_per_epoch: int,
-        seed: int,
-        coverage: float = 0.0,
-        history: float = 0.0,
+        pairs: PositiveInt | Literal["all"] = 8000,
+        steps: PositiveInt = 1,
+        stride: PositiveInt | str = 10,
+        batch_size: PositiveInt = 256,
+        batches_per_epoch: PositiveInt,
+        seed: NonNegativeInt,
+        coverage: Annotated[float, Field(ge=0, le=1)] = 0.0,
+        history: NonNegativeFloat = 0.0,
     ):
         super().__init__()
-        for name, value in (
-            ("batch_size", batch_size),
-            ("batches_per_epoch", batches_per_epoch),
-        ):
-            if value < 1:
-                raise ValueError(f"{name} is {value}, expected at least 1")
         if pairs != "all" and batch_size > pairs:
             raise ValueError(
                 f"batch_size is {batch_size}, expected at most the number of pairs, {pairs}"
@@ -82,7 +77,7 @@ class DynamicsData(L.LightningDataModule):
 
     @property
     def splits(self) -> Splits:
-        """The trajectories."""
+        """Trajectories of all splits."""
         if self._splits is None:
             self._splits = self.source.load()
         return self._splits
@@ -94,7 +89,7 @@ class DynamicsData(L.LightningDataModule):
         return self._samples() * float(t[1] - t[0])
 
     def _samples(self) -> int:
-        """Samples in a step."""
+        """Return the number of samples in a step."""
         if isinstance(self.stride, str):
             length = seconds_of("stride", self.stride)
             return samples_of("stride", length, self.splits.train[0].t)
@@ -102,7 +97,7 @@ class DynamicsData(L.LightningDataModule):
 
     @property
     def windows(self) -> Windows:
-        """The training windows."""
+        """Training windows."""
         if self._windows is None:
             self._windows = draw_windows(
                 self.splits.train,
@@ -126,11 +121,11 @@ class DynamicsData(L.LightningDataModule):
         return self.windows.statistics()
 
     def train_dataloader(self) -> WindowLoader:
-        """Batches of windows, in single precision; of several processes each gets its share."""
+        """Return batches of windows in single precision, a share for each of several processes."""
         return self.loader(self.sampler(self.seed))
 
     def sampler(self, seed: int) -> BatchSampler:
-        """The order of the windows by a seed."""
+        """Return the order of the windows by a seed."""
         trainer = self.trainer
         return BatchSampler(
             len(self.windows),
@@ -142,10 +137,10 @@ class DynamicsData(L.LightningDataModule):
         )
 
     def loader(self, sampler: Sampler[Tensor]) -> WindowLoader:
-        """The windows, moved once to the device that trains, where batches are picked."""
+        """Move the windows to the device that trains, where batches are picked."""
         device = torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
         return WindowLoader(self.windows.to(device, torch.float32), sampler)
 
     def val_dataloader(self) -> DataLoader[Trajectory]:
-        """One batch: all validation trajectories, up to the end of the shortest."""
+        """Return one batch: all validation trajectories, up to the end of the shortest."""
         return DataLoader([stack_until(self.splits.validation)], batch_size=None)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Whether a step is short enough for the fastest motion in the data."""
+"""Check of a step against the fastest motion in the data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MOST = 30  # trajectories that are looked at
 
 
 def periods(trajectories: Sequence[Trajectory]) -> Tensor:
-    """The typical period of each coordinate, ``(N,)``, s: the median of its spectrum.
+    """Return the typical period of each coordinate, ``(N,)``, s: the median of its spectrum.
 
     The spectrum is that of q v, the power of the velocity over the frequency. That of v itself is
     mostly noise where v is derived from a measured q, and that of q mostly drift. The mean
@@ -36,18 +36,18 @@ def periods(trajectories: Sequence[Trajectory]) -> Tensor:
 def too_long_for(
     trajectories: Sequence[Trajectory], step: float, labels: Sequence[str]
 ) -> str | None:
-    """What is wrong with a step, in a sentence; None where nothing is.
+    """Return a message if a step is too long, else None.
 
     Args:
         trajectories: of the data, each with samples of one distance.
         step: of a roll-out or a training window, s.
         labels: names of the coordinates.
     """
-    found = periods(trajectories)
-    k = int(found.argmin())
-    if not found[k] < _SAMPLES * step:
+    shortest = periods(trajectories)
+    k = int(shortest.argmin())
+    if not shortest[k] < _SAMPLES * step:
         return None
-    period = float(found[k])
+    period = float(shortest[k])
     return (
         f"a step of {step:g} s is too long for the fastest motion in the data, that of "
         f"{labels[k]}, which has a period of about {period:.2g} s: expected at least {_SAMPLES} "

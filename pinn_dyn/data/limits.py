@@ -11,12 +11,12 @@ class Limits:
     """A box of configurations, q_low <= q <= q_high.
 
     Args:
-        name: what is limited, for messages.
+        name: name of the limits, for messages.
         bounds: q_low and q_high, ``(2, N)``.
-        around: another such box that it has to hold.
+        around: a second box that must lie inside.
 
     Raises:
-        ValueError: on other sizes or bounds that are not finite, or if the other box is not inside.
+        ValueError: if the second box does not lie inside.
     """
 
     def __init__(
@@ -26,29 +26,23 @@ class Limits:
         *,
         around: tuple[Sequence[float], Sequence[float]],
     ):
-        shown = [list(row) for row in bounds]
-        size = len(around[0])
-        if [len(row) for row in shown] != [size, size] or not np.isfinite(shown).all():
-            raise ValueError(
-                f"{name} is {shown}, expected [low, high] with {size} finite numbers each"
-            )
-        self.bounds = np.asarray(shown, dtype=float)
+        self.bounds = np.asarray(bounds, dtype=float)
         low, high = self.bounds
         if not ((low <= around[0]) & (around[1] <= high)).all():
             raise ValueError(
-                f"{name} is {shown}, expected to hold the initial states, from {list(around[0])} "
-                f"to {list(around[1])}"
+                f"{name} is {self.bounds.tolist()}, expected to hold the initial states, from "
+                f"{list(around[0])} to {list(around[1])}"
             )
 
     def left_by(self, q: np.ndarray) -> np.ndarray:
-        """Which of K motions ``(K, T, N)`` leave the limits; samples after that may be NaN."""
+        """Return a mask of the K motions ``(K, T, N)`` that leave the limits, ``(K,)``."""
         low, high = self.bounds
         return ~((q >= low) & (q <= high)).all((1, 2))
 
     def passed(self, q: np.ndarray, labels: Sequence[str]) -> str:
-        """Which limits are passed by how many of K motions ``(K, T, N)``."""
+        """Describe the limits that K motions ``(K, T, N)`` pass, with the number of motions."""
         lowest, highest = np.nanmin(q, axis=1), np.nanmax(q, axis=1)
-        found = []
+        parts = []
         for k, label in enumerate(labels):
             low, high = self.bounds[:, k]
             for side, bound, beyond in (
@@ -56,5 +50,5 @@ class Limits:
                 ("above", high, highest[:, k] > high),
             ):
                 if beyond.any():
-                    found.append(f"{label} {side} {bound:g} ({beyond.sum()} motions)")
-        return ", ".join(found)
+                    parts.append(f"{label} {side} {bound:g} ({beyond.sum()} motions)")
+        return ", ".join(parts)

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
@@ -18,14 +19,14 @@ from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.limits import Limits
-from pinn_dyn.data.simulation import SimulationError, check_amount, simulate
+from pinn_dyn.data.simulation import SimulationError, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.systems import HasDomain
 
-# Part of the cache key: raise it when the same description would give other numbers.
+# Part of the cache key: raise it when the same settings give different numbers.
 _VERSION = 3
-# Within limits: how often a motion is drawn anew, and how many draws are simulated at once.
+# Within limits: largest number of draws of a motion, and draws that are simulated at once.
 _DRAWS = 40
 _AT_ONCE = 3
 
@@ -64,9 +65,8 @@ class SimulatedSource(DataSource):
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
 
     Raises:
-        ValueError: on a step longer than the duration, a count below 1, an unknown pairing or one
-            of unequal counts, sizes that do not match the system, or ranges of q that are empty or
-            go beyond where the system's equation holds.
+        ValueError: on durations, counts or sizes that do not match, or ranges of q beyond the
+            domain of the system's equation.
     """
 
     def __init__(
@@ -76,57 +76,37 @@ class SimulatedSource(DataSource):
         system: MechanicalSystem,
         excitation: Excitation,
         initial_states: InitialStates,
-        duration: float,
-        test_duration: float | None = None,
-        step: float,
-        keep_every: int = 1,
-        train_initial_states: int,
-        train_inputs: int,
+        duration: PositiveFloat,
+        test_duration: PositiveFloat | None = None,
+        step: PositiveFloat,
+        keep_every: PositiveInt = 1,
+        train_initial_states: PositiveInt,
+        train_inputs: PositiveInt,
         pairing: Literal["product", "matched"] = "product",
         q_limits: Sequence[Sequence[float]] | None = None,
-        validation: int,
-        test: int,
-        seed: int = 0,
-        rtol: float = 1e-8,
-        atol: float = 1e-9,
+        validation: PositiveInt,
+        test: PositiveInt,
+        seed: NonNegativeInt = 0,
+        rtol: PositiveFloat = 1e-8,
+        atol: PositiveFloat = 1e-9,
         compile: bool = False,
         cache: str = "~/.cache/pinn_dyn",
         labels: Sequence[str],
         input_labels: Sequence[str],
         configurations: Mapping[str, Sequence[float]] = MappingProxyType({}),
     ):
-        if not 0 < step <= duration:
-            raise ValueError(
-                f"{name}: step is {step} s and duration {duration} s, expected 0 < step <= duration"
-            )
         self.test_duration = duration if test_duration is None else test_duration
-        if not step <= self.test_duration <= duration:
+        if not keep_every * step <= self.test_duration <= duration:
             raise ValueError(
-                f"{name}: test_duration is {test_duration} s, expected from step = {step} to "
-                f"duration = {duration} s"
+                f"{name}: test_duration is {self.test_duration} s, expected from keep_every * step "
+                f"= {keep_every * step:g} to duration = {duration} s"
             )
-        for key, value in (
-            ("keep_every", keep_every),
-            ("train_initial_states", train_initial_states),
-            ("train_inputs", train_inputs),
-            ("validation", validation),
-            ("test", test),
-        ):
-            if value < 1:
-                raise ValueError(f"{name}: {key} is {value}, expected at least 1")
-        if keep_every * step > self.test_duration:
-            raise ValueError(
-                f"{name}: keep_every is {keep_every}, one in {keep_every * step:g} s, expected "
-                f"at least two in {self.test_duration} s"
-            )
-        if pairing not in ("product", "matched"):
-            raise ValueError(f"{name}: pairing is {pairing!r}, expected 'product' or 'matched'")
         if pairing == "matched" and train_initial_states != train_inputs:
             raise ValueError(
                 f"{name}: pairing is 'matched' with {train_initial_states} initial states and "
                 f"{train_inputs} inputs for training, expected as many of each"
             )
-        for key, found, expected in (
+        for key, size, expected in (
             ("initial_states", len(initial_states.q_low), system.num_coordinates),
             ("labels", len(labels), system.num_coordinates),
             ("input_labels", len(input_labels), system.num_inputs),
@@ -135,11 +115,8 @@ class SimulatedSource(DataSource):
                 for key, q in configurations.items()
             ),
         ):
-            if found != expected:
-                raise ValueError(f"{name}: {key} has {found} entries, the system needs {expected}")
-        trained = train_inputs * (train_initial_states if pairing == "product" else 1)
-        width = 2 * system.num_coordinates + system.num_inputs
-        check_amount(name, trained + validation + test, duration, step, width)
+            if size != expected:
+                raise ValueError(f"{name}: {key} has {size} entries, the system needs {expected}")
         ranges = {"initial_states": (initial_states.q_low, initial_states.q_high)}
         self.limits = None
         if q_limits is not None:
@@ -226,7 +203,7 @@ class SimulatedSource(DataSource):
         }
 
     def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
-        """Trajectories of some splits in one batch, filled up with copies to ``size``."""
+        """Simulate the trajectories of some splits in one batch, padded with copies to ``size``."""
         t = np.arange(round(duration / self.step) + 1) * self.step
         # One generator per split: more test trajectories do not change the training set.
         rngs = [np.random.default_rng([self.seed, SPLITS.index(split)]) for split in splits]
@@ -258,7 +235,7 @@ class SimulatedSource(DataSource):
         return states * inputs if product else states
 
     def _draw(self, splits: Sequence[str], rngs: Sequence[np.random.Generator]) -> _Draw:
-        """An initial state and an input for each motion of some splits."""
+        """Draw an initial state and an input for each motion of some splits."""
         starts, signals, pick = [], [], []
         for split, rng in zip(splits, rngs, strict=True):
             states, inputs = self.counts[split]
@@ -279,7 +256,7 @@ class SimulatedSource(DataSource):
     def _move(
         self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """q, v and u of some motions: ``rows`` of the draws one after another."""
+        """Simulate q, v and u of some motions: ``rows`` of the concatenated draws."""
         size = len(draws[0].q0)
         signal = Joined([draw.signal for draw in draws], rows // size, rows % size)
         q, v = simulate(
@@ -304,7 +281,7 @@ class SimulatedSource(DataSource):
         rngs: Sequence[np.random.Generator],
         t: np.ndarray,
     ) -> None:
-        """Put motions that stay within the limits in the place of those that leave them.
+        """Replace the motions that leave the limits by new draws that stay within them.
 
         Raises:
             SimulationError: if some leave them in every draw.
@@ -322,13 +299,13 @@ class SimulatedSource(DataSource):
             rows = np.concatenate([left + k * len(q) for k in range(_AT_ONCE)])
             new = self._move(draws, rows, t, left.size)
             stays = ~limits.left_by(new[0]).reshape(_AT_ONCE, left.size)
-            found = stays.any(0)
-            taken = (stays.argmax(0) * left.size + np.arange(left.size))[found]
+            replaced = stays.any(0)
+            first = (stays.argmax(0) * left.size + np.arange(left.size))[replaced]
             for old, values in zip(motions, new, strict=True):
-                old[left[found]] = values[taken]
+                old[left[replaced]] = values[first]
 
     def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
-        """p = M(q) v, in pieces that fit the processor's cache."""
+        """Return p = M(q) v, computed in pieces that fit the processor's cache."""
         size = q.shape[-1]
         pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
         with torch.no_grad():

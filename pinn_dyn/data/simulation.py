@@ -18,38 +18,14 @@ log = logging.getLogger(__name__)
 # In units of the whole duration: far below any step that a smooth motion needs.
 _SMALLEST_STEP = 1e-7
 
-MOST_VALUES = 2e9
-"""Of a data set: 16 GB."""
-
 
 def has_cpp_compiler() -> bool:
-    """Whether torch.compile finds a compiler for the CPU."""
+    """Return true if torch.compile finds a compiler for the CPU."""
     return any(map(shutil.which, ("g++", "clang++", "c++")))
 
 
 class SimulationError(RuntimeError):
     """The solver could not finish a simulation."""
-
-
-def check_amount(name: str, motions: int, duration: float, step: float, width: int) -> None:
-    """Refuse motions that no memory holds, before they are simulated.
-
-    Args:
-        name: of the data set.
-        motions: how many.
-        duration, step: of each, s.
-        width: numbers in a sample.
-
-    Raises:
-        ValueError: with the numbers that they have.
-    """
-    values = motions * (duration / step) * width
-    if not values <= MOST_VALUES:
-        raise ValueError(
-            f"{name}: {motions} motions of {duration:g} s in steps of {step:g} s have {values:.2g} "
-            f"numbers, expected at most {MOST_VALUES:.2g}: fewer or shorter motions, or longer "
-            "steps"
-        )
 
 
 def simulate(
@@ -72,7 +48,7 @@ def simulate(
     root mean square over the batch, and the samples come from its dense output.
 
     Args:
-        system: the truth.
+        system: the system that moves.
         q0: initial configurations, ``(K, N)``.
         v0: initial velocities, ``(K, N)``.
         signal: inputs as a function of time, ``(T,) -> (K, T, M)``; must be smooth.

@@ -1,4 +1,4 @@
-"""Windows: short pieces of training trajectories, the samples that a network sees."""
+"""Windows: short pieces of training trajectories, the samples of a network."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class Windows:
         return self.q.shape[0]
 
     def __getitem__(self, index: Tensor) -> Windows:
-        """The windows at the positions ``index``."""
+        """Return the windows at the positions ``index``."""
         return self._map(lambda value: value[index])
 
     def unbind(self) -> Iterator[Windows]:
-        """Those at each place of the first of several leading dimensions, as views."""
+        """Iterate over the first of several leading dimensions, by views."""
         rows = zip(*(getattr(self, name).unbind() for name in _ROWS), strict=True)
         rate = self.input.rate
         rates = repeat(None) if rate is None else rate.unbind()
@@ -63,14 +63,14 @@ class Windows:
             yield replace(self, **picked, input=self.input.with_samples(u, slope))
 
     def split(self, size: int) -> list[Windows]:
-        """The windows in parts of at least ``size`` that differ by at most one window."""
+        """Split the windows into parts of at least ``size`` that differ by at most one window."""
         number = len(self) // size
         if number < 2:
             return [self]
         return [self[index] for index in torch.arange(len(self)).tensor_split(number)]
 
     def to(self, device: torch.device, dtype: torch.dtype | None = None) -> Windows:
-        """All tensors on a device and, where given, in a dtype."""
+        """Move all tensors to a device and, optionally, a dtype."""
         moved = self._map(lambda value: value.to(device, dtype))
         return replace(moved, t=self.t.to(device, dtype), input=self.input.to(device, dtype))
 
@@ -85,15 +85,15 @@ class Windows:
         return self.input.u[..., self.past :, :]
 
     def start(self, state: State) -> Tensor:
-        """State at the start, ``(B, 2N)``: (q, v) or (q, p)."""
+        """Return the state at the start, ``(B, 2N)``: (q, v) or (q, p)."""
         return torch.cat([self.q, self.v if state == "qv" else self.p], dim=-1)
 
     def increments(self, state: State) -> Tensor:
-        """Increments to each step, ``(B, H, 2N)``, of (q, v) or (q, p)."""
+        """Return the increments of (q, v) or (q, p) to each step, ``(B, H, 2N)``."""
         return torch.cat([self.dq, self.dv if state == "qv" else self.dp], dim=-1)
 
     def first(self, steps: int) -> Windows:
-        """The windows cut after their first ``steps`` steps."""
+        """Cut the windows after their first ``steps`` steps."""
         if steps == len(self.t) - 1:
             return self
         stride = (len(self.input.t) - 1 - self.past) // (len(self.t) - 1)
@@ -106,8 +106,8 @@ class Windows:
         )
 
     def statistics(self) -> Statistics:
-        """Means, standard deviations and ranges over the windows."""
-        one = torch.ones_like(self.q[0])
+        """Return means, standard deviations and ranges over the windows."""
+        ones = torch.ones_like(self.q[0])
 
         def spread(values: Tensor) -> Tensor:
             std = values.std(0, correction=0)
@@ -121,7 +121,7 @@ class Windows:
             q_low=self.q.amin(0),
             q_high=self.q.amax(0),
             v_std=spread(self.v),
-            p_std=spread(self.p) if has_momentum else one,
+            p_std=spread(self.p) if has_momentum else ones,
             u_mean=self.u.mean((0, 1)),
             u_std=spread(self.u.flatten(0, 1)),
             qv_increment_std=qv_std,
@@ -144,34 +144,26 @@ def draw_windows(
 ) -> Windows:
     """Draw windows at random starts, over all starts of all trajectories.
 
-    With ``coverage`` c = 0 every start is as likely as any other, and most windows lie where the
-    robot was most of the time. With c > 0 the starts are drawn from candidates (400,000 or ten
-    times as many as asked for) with probabilities ~ (d_k)^(c N), where d_k is the distance from a
-    candidate's q, ``(N,)`` in units of its spread, to its tenth nearest: as 1/d_k^N estimates the
-    density (Loftsgaarden and Quesenberry 1965), c = 1 spreads them evenly over all configurations
-    that were visited.
+    With ``coverage`` c = 0 all starts are equally likely, so most windows lie where the robot was
+    most of the time. With c > 0 the starts are drawn from candidates (the larger of 400,000 and ten
+    times ``count``) with probabilities ~ (d_k)^(c N), where d_k is the distance from a candidate's
+    q, ``(N,)`` in units of its spread, to its tenth nearest neighbor: as 1/d_k^N estimates the
+    density (Loftsgaarden and Quesenberry 1965), c = 1 spreads the windows evenly over all
+    configurations that were visited.
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
-        count: number of windows B; None: every start has one.
+        count: number of windows B; None for a window at each start.
         steps: steps H of a window.
         stride: samples in a step.
         seed: seed of the starts.
         coverage: c, from 0 to 1.
-        history: time before each start over which the input is kept, s; windows start so late.
+        history: time before each start over which the input is kept, s.
 
     Raises:
-        ValueError: on counts below 1, a coverage outside 0 to 1, a negative history or one of a
-            held input, differing sample times, trajectories shorter than a window, or more windows
-            than there are starts.
+        ValueError: on a history of a held input, differing sample times, or more windows than
+            starts.
     """
-    for name, value in (("count", count), ("steps", steps), ("stride", stride)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} is {value}, expected at least 1")
-    if not 0 <= coverage <= 1:
-        raise ValueError(f"coverage is {coverage}, expected a number from 0 to 1")
-    if not 0 <= history < math.inf:
-        raise ValueError(f"history is {history} s, expected 0 or more")
     span = steps * stride
     sample = float(trajectories[0].t[1] - trajectories[0].t[0])
     for k, item in enumerate(trajectories):
@@ -208,15 +200,15 @@ def draw_windows(
     else:
         flat = _distinct(total, count, generator)
     ends = starts.cumsum(0)
-    which = torch.searchsorted(ends, flat, right=True)
-    offset = past + flat - (ends - starts)[which]
+    number = torch.searchsorted(ends, flat, right=True)
+    offset = past + flat - (ends - starts)[number]
 
     knots = torch.arange(steps + 1) * stride
-    q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(which, offset, strict=True)])
-    v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(which, offset, strict=True)])
+    q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(number, offset, strict=True)])
+    v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(number, offset, strict=True)])
     inputs = [item.input for item in trajectories]
     inputs = [
-        inputs[i].part(slice(k - past, k + span + 1)) for i, k in zip(which, offset, strict=True)
+        inputs[i].part(slice(k - past, k + span + 1)) for i, k in zip(number, offset, strict=True)
     ]
     t = torch.arange(-past, span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
@@ -235,8 +227,8 @@ def draw_windows(
 
 
 def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
-    """``count`` different numbers below ``total``, in random order."""
-    # Also where there are too many of them for a permutation.
+    """Draw ``count`` different numbers below ``total``, in random order."""
+    # Works also for a total that is too large for a permutation.
     numbers = torch.unique(torch.randint(total, (count,), generator=generator))
     while numbers.shape[0] < count:
         more = torch.randint(total, (count,), generator=generator)
@@ -245,7 +237,7 @@ def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
 
 
 def _spread_out(q: Tensor, count: int, power: float, generator: torch.Generator) -> Tensor:
-    """Positions of ``count`` rows, drawn without repetition with weights (d_k)^power."""
+    """Draw positions of ``count`` rows without repetition, with weights (d_k)^power."""
     z = (q / q.std(0).clamp(min=1e-12)).numpy()
     neighbours = min(11, z.shape[0])  # the nearest is the row itself
     distance = torch.from_numpy(cKDTree(z).query(z, k=neighbours)[0][:, -1])
@@ -255,7 +247,7 @@ def _spread_out(q: Tensor, count: int, power: float, generator: torch.Generator)
 
 
 PICKED = 16_384
-"""Windows that are picked at once, about."""
+"""Approximate number of windows that are picked at once."""
 
 
 class WindowLoader:
@@ -279,8 +271,8 @@ class WindowLoader:
         device = self.windows.q.device
         indices = iter(self.sampler)
         for first in indices:
-            others = islice(indices, max(PICKED // first.numel(), 1) - 1)
-            index = torch.stack([first, *others]).to(device, non_blocking=True)
+            following = islice(indices, max(PICKED // first.numel(), 1) - 1)
+            index = torch.stack([first, *following]).to(device, non_blocking=True)
             yield from self.windows[index].unbind()
 
 
