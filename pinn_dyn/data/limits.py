@@ -16,7 +16,7 @@ class Limits:
         around: a second box that must lie inside.
 
     Raises:
-        ValueError: if the second box does not lie inside.
+        ValueError: on another size, or if the second box does not lie inside.
     """
 
     def __init__(
@@ -27,6 +27,11 @@ class Limits:
         around: tuple[Sequence[float], Sequence[float]],
     ):
         self.bounds = np.asarray(bounds, dtype=float)
+        if self.bounds.shape != (2, len(around[0])):
+            raise ValueError(
+                f"{name} is {self.bounds.tolist()}, expected [low, high] of "
+                f"{len(around[0])} numbers"
+            )
         low, high = self.bounds
         if not ((low <= around[0]) & (around[1] <= high)).all():
             raise ValueError(

@@ -28,7 +28,7 @@ def wide():
 def beyond():
     entry = read_entries()["beyond/soft_arm_1_wide"]
     words = shlex.split(entry["evaluate"])
-    return build("soft_arm_1_wide", *(word for word in words if "dataset." in word))
+    return build("soft_arm_1_wide", *(f"++{word}" for word in words if "dataset." in word))
 
 
 def drawn(source, split, count):
