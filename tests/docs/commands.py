@@ -79,6 +79,7 @@ def check_overrides(program, words, folder):
     for word in words:
         if word.startswith("--config-dir="):
             assert (folder / word.split("=")[1]).is_dir()
+            overrides.append(f"hydra.searchpath=[file://{folder / word.split('=')[1]}]")
         elif word not in FLAGS:
             assert "=" in word or word.startswith("~"), f"{word} is neither a flag nor an override"
             overrides.append(word)
@@ -114,7 +115,9 @@ def compose(program, overrides, folder):
     """
     candidates = [folder, *sorted(path for path in folder.glob("*conf") if path.is_dir())]
     paths = [f"file://{path}" for path in candidates if any(path.glob("*/*.yaml"))]
-    words = [f"hydra.searchpath=[{','.join(paths)}]", *overrides] if paths else overrides
+    words = [word for word in overrides if not word.startswith("hydra.searchpath")]
+    paths += [word.split("=")[1].strip("[]") for word in overrides if word not in words]
+    words = [f"hydra.searchpath=[{','.join(paths)}]", *words] if paths else words
     try:
         cfg = _composed(program, words)
     except MissingConfigException as error:

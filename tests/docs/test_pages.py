@@ -10,21 +10,7 @@ import yaml
 from pinn_dyn.app.config import CONF
 from tests.docs.blocks import ROOT, blocks
 
-DIARY = (
-    r"(?i)\b(asked|missed|met|allowed|private (script|loop|code)|(an)?other job|busy machine|"
-    r"\w+ other processes|beside \w+ trainings|not measured yet|so far)\b"
-)
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
-
-
-@pytest.mark.parametrize(
-    "page",
-    [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *(ROOT / "docs").rglob("*.md")],
-    ids=lambda page: page.relative_to(ROOT).as_posix(),
-)
-def test_a_page_speaks_to_its_reader_not_of_its_making(page):
-    found = [line for line in page.read_text().splitlines() if re.search(DIARY, line)]
-    assert not found, "what was tried goes into studies/"
 
 
 def test_the_readme_is_a_front_door():
@@ -57,14 +43,6 @@ def test_every_equation_has_its_code_or_its_tests():
             assert re.search(r"- Tests: `(tests|pinn_dyn/testing)/", section), section.splitlines()[
                 0
             ]
-
-
-def test_no_test_file_imports_another():
-    for path in (ROOT / "tests").rglob("test_*.py"):
-        imported = re.findall(r"^from (tests\.\S+) import (.+)$", path.read_text(), re.MULTILINE)
-        for module, names in imported:
-            assert ".test_" not in module, f"{path} imports {module}"
-            assert not names.startswith("test_"), f"{path} imports {names}"
 
 
 def test_the_recipes_of_contributing_are_diffs_of_the_files():
