@@ -99,7 +99,7 @@ def load_run(
         made_by = record.get("pinn_dyn", __version__)
         version = "" if made_by == __version__ else f" (made by pinn_dyn {made_by})"
         raise ConfigError(f"{path}{version}: {error}") from error
-    dataset = config["dataset"]
+    dataset, covariance = config["dataset"], saved.get(COVARIANCE)
     if str(dataset.get("_target_")).endswith(".StoredSource"):
         dataset = {**dataset, "path": str(folder / dataset["path"])}
     return Run(
@@ -110,7 +110,7 @@ def load_run(
         record,
         saved.get(DATA, {}),
         bool(saved.get(FINISHED)),
-        saved.get(COVARIANCE),
+        covariance if isinstance(covariance, torch.Tensor) else None,
     )
 
 

@@ -244,7 +244,8 @@ def train(
                 if start_from.covariance is None:
                     raise ConfigError(
                         f"start_from: {start_from.folder} has no covariance of its constants, "
-                        "which a fit by optimizer=least_squares leaves: fit it again"
+                        "which a fit by optimizer=least_squares leaves: fit it again, or leave "
+                        "start_from out"
                     )
                 learner.covariance = start_from.covariance
             description = RunDescription(

@@ -246,11 +246,18 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch, stop, sta
     assert (folder / "undetermined.md").exists()
 
 
+def unfinish(folder, **values):
+    """Take back the end of a training, as if it was killed before its record."""
+    path = folder / "checkpoints" / "last.ckpt"
+    torch.save({**torch.load(path, weights_only=True), "finished": False, **values}, path)
+
+
 def test_a_fit_that_is_finished_is_not_done_again(tmp_path, fitted, monkeypatch):
     """As where a training was killed after its checkpoint, and before it wrote its record."""
     folder = shutil.copytree(fitted, tmp_path / "run")
     for name in ("metrics.json", "constants.csv", "undetermined.md"):
         (folder / name).unlink()
+    unfinish(folder)
     monkeypatch.setattr("pinn_dyn.training.LeastSquares.fit", lambda *_: pytest.fail("fitted"))
     run_script("train.py", f"resume={folder}")
     first, again = (pd.read_csv(place / "constants.csv") for place in (fitted, folder))
@@ -272,8 +279,6 @@ def test_currents_without_gains_end_in_a_sentence(tmp_path, capsys):
 
 def test_a_damaged_fit_ends_in_a_sentence(tmp_path, fitted, capsys):
     folder = shutil.copytree(fitted, tmp_path / "run")
-    (folder / "metrics.json").unlink()
-    path = folder / "checkpoints" / "last.ckpt"
-    torch.save({**torch.load(path, weights_only=True), "fit": {}}, path)
+    unfinish(folder, fit={})
     text = refused_text(capsys, "train.py", f"resume={folder}")
     assert "the checkpoint has no fit of the model's 36 constants" in text
