@@ -1,23 +1,25 @@
-"""The configuration reference, made of conf/ and of the docstrings that its classes have.
+"""Configuration reference, made of conf/, the signatures of its classes and their docstrings.
 
     python docs/config_reference.py     writes the page to the terminal
 
-Of each option: the comment at the top of its YAML, and a row for each key with its default and
-what the constructor's docstring and the comment beside the key say about it.
+An option has the comment at the top of its YAML, and a table with a row for each key: default, type
+and limits as the program checks them, and the meaning according to the docstring of the constructor
+and the comment beside the key.
 """
 
 from __future__ import annotations
 
 import inspect
 import logging
+import pkgutil
 import re
 from pathlib import Path
 
 import griffe
 import yaml
 
-from pinn_dyn.app.keys import KEYS
-from pinn_dyn.app.schema import ConfigError, arguments, find, words
+from pinn_dyn.app.settings import SETTINGS
+from pinn_dyn.app.validation import arguments_model
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
@@ -56,7 +58,9 @@ def config_reference() -> str:
     for name in PROGRAMS:
         own = CONF / name / f"{name}.yaml"
         path = own if own.is_file() else CONF / f"{name}.yaml"
-        parts.append(_option(package, path, f"{name}.py", "", level=3, types=KEYS[name]))
+        parts.append(
+            _option(package, path, f"{name}.py", "", level=3, types=_types(SETTINGS[name]))
+        )
     for folder in sorted(path for path in CONF.rglob("*") if path.is_dir()):
         group = folder.relative_to(CONF).as_posix().removeprefix("control/")
         files = sorted(folder.glob("*.yaml"))
@@ -94,7 +98,7 @@ def _rows(package, lines: list[str], node: yaml.Node, prefix: str, types) -> lis
     """A row for each key of a mapping, and of the mappings inside."""
     target = next((v.value for k, v in node.value if k.value == "_target_"), None)
     described = _arguments(package, target) if target else {}
-    types = _types(target, prefix) if target else types
+    types = _types(_imported(target)) if target else types
     rows = []
     if target:
         rows.append(f"| `{prefix}_target_` | {_linked(package, target)} | | |")
@@ -107,8 +111,7 @@ def _rows(package, lines: list[str], node: yaml.Node, prefix: str, types) -> lis
             continue
         meaning = [described.get(name, ""), _beside(lines, key, value)]
         text = _cell(" ".join(part.rstrip(".") + "." for part in meaning if part))
-        kind = _cell(words(types[name])) if name in types else ""
-        kind = "" if kind == "any value" else f"{kind} "
+        kind = f"{_cell(types[name])} " if types.get(name) else ""
         if isinstance(value, yaml.MappingNode) and value.value and not value.flow_style:
             rows.append(f"| **`{prefix}{name}`** | | | {text} |")
             rows.extend(_rows(package, lines, value, f"{prefix}{name}.", {}))
@@ -121,7 +124,7 @@ def _rows(package, lines: list[str], node: yaml.Node, prefix: str, types) -> lis
         rows.extend(_unlisted(target, prefix, types, described, there))
     elif not prefix:
         rows.extend(
-            f"| `{name}` | | {_cell(words(types[name]))} | {text} |"
+            f"| `{name}` | | {_cell(types[name])} | {text} |"
             for name, text in OPTIONAL.items()
             if name in types and name not in there
         )
@@ -132,8 +135,8 @@ def _unlisted(target: str, prefix: str, types, described, there) -> list[str]:
     """Rows for what a class takes besides the keys of its YAML."""
     return [
         f"| `{prefix}{name}` | `{'null' if one.default is None else one.default}` "
-        f"| {_cell(words(types[name]))} | {_cell(described[name])} |"
-        for name, one in inspect.signature(find(target)).parameters.items()
+        f"| {_cell(types[name])} | {_cell(described[name])} |"
+        for name, one in inspect.signature(pkgutil.resolve_name(target)).parameters.items()
         if name in described and name not in there and isinstance(one.default, PLAIN)
     ]
 
@@ -150,12 +153,42 @@ def _defaults(value: yaml.SequenceNode) -> list[str]:
     return rows
 
 
-def _types(target: str, prefix: str):
-    """Types of the arguments of a class, as the program checks them."""
+def _imported(target: str):
+    """Return the class of a name; None of a package that need not be installed."""
     try:
-        return arguments(target, prefix.rstrip("."))
-    except ConfigError:  # of a package that need not be installed
+        return pkgutil.resolve_name(target)
+    except ImportError:
+        return None
+
+
+def _types(target) -> dict[str, str]:
+    """Return the types and limits of the arguments of a class, as the program checks them."""
+    if target is None:
         return {}
+    properties = arguments_model(target).model_json_schema().get("properties", {})
+    return {key: _type(schema) for key, schema in properties.items()}
+
+
+_NAMES = {"integer": "whole number", "boolean": "true or false", "string": "text"}
+_LIMITS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+
+
+def _type(schema: dict) -> str:
+    """Return a JSON schema in words; nothing where any value is accepted."""
+    if options := schema.get("anyOf"):
+        return " or ".join(dict.fromkeys(map(_type, options)))
+    if choices := schema.get("enum", [schema["const"]] if "const" in schema else []):
+        return " or ".join(f"`{choice}`" for choice in choices)
+    kind = schema.get("type", "")
+    limits = [f"{sign} {schema[key]}" for key, sign in _LIMITS.items() if key in schema]
+    if kind == "array":
+        items = schema.get("items", {})
+        kind = f"list ({_type(items)})" if items else "list"
+    elif kind == "object":
+        # A field without an annotation of its own has its key for a title.
+        is_class = "additionalProperties" not in schema and "title" in schema
+        kind = schema["title"] if is_class else "mapping"
+    return " ".join([_NAMES.get(kind, kind), *limits])
 
 
 def _arguments(package, target: str) -> dict[str, str]:

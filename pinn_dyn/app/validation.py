@@ -23,6 +23,8 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    NonNegativeFloat,
+    PositiveFloat,
     Strict,
     TypeAdapter,
     ValidationError,
@@ -164,14 +166,19 @@ def arguments_model(target: Any, required: bool = False) -> type[BaseModel]:
     return create_model(model_name, __config__=config, **fields)
 
 
-_OPTIMIZER_LIMITS = {"lr": {"gt": 0}, "weight_decay": {"ge": 0}, "eps": {"gt": 0}}
+_Share = Annotated[float, Field(ge=0, lt=1)]
+_OPTIMIZER_ARGUMENTS = {
+    "lr": PositiveFloat,
+    "weight_decay": NonNegativeFloat,
+    "eps": PositiveFloat,
+    "betas": tuple[_Share, _Share],
+}
 
 
 def _limited(target: Any, name: str, hint: Any) -> Any:
     """Add limits to the annotations of the optimizers of PyTorch, which have none."""
-    if name in _OPTIMIZER_LIMITS and str(target.__module__).startswith("torch.optim"):
-        return Annotated[float, Field(**_OPTIMIZER_LIMITS[name])]
-    return hint
+    is_optimizer = str(getattr(target, "__module__", "")).startswith("torch.optim")
+    return _OPTIMIZER_ARGUMENTS.get(name, hint) if is_optimizer else hint
 
 
 def argument_names(target: str) -> set[str]:

@@ -1,7 +1,7 @@
 """Configurations that are accepted: our own ones, keys that stand in no YAML, lengths."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import pytest
 from pydantic import Field, PositiveInt
@@ -166,7 +166,6 @@ UNFITTING = [
     ({**RK4, "substeps": "x"}, Integrator | None),
     ({"columns": "a", "units": "rad"}, Columns | Mapping[str, Any]),
     (1, Annotated[float, Field(lt=1)]),
-    (True, Literal[1]),
 ]
 
 
