@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
@@ -60,8 +61,8 @@ class SoftArm(MechanicalSystem):
         nodes: Gauss-Legendre nodes per segment; 10 are exact to 1e-12 for theta <= 3.
 
     Raises:
-        ValueError: on segments < 1, nodes < 1, length not positive, masses that are all zero,
-            negative gravity, or constants that are negative or neither one nor as many as expected.
+        ValueError: on masses that are all zero, or constants that are negative or neither one nor
+            as many as expected.
     """
 
     z_is_down = True
@@ -73,22 +74,15 @@ class SoftArm(MechanicalSystem):
 
     def __init__(
         self,
-        segments: int = 1,
+        segments: PositiveInt = 1,
         *,
-        mass: float | Sequence[float] = 0.3,
-        length: float = 0.2,
-        gravity: float = 9.81,
-        stiffness: float | Sequence[float] = 1.0,
-        damping: float | Sequence[float] = 0.1,
-        nodes: int = 10,
+        mass: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.3,
+        length: PositiveFloat = 0.2,
+        gravity: NonNegativeFloat = 9.81,
+        stiffness: NonNegativeFloat | Sequence[NonNegativeFloat] = 1.0,
+        damping: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.1,
+        nodes: PositiveInt = 10,
     ):
-        for name, count in (("segments", segments), ("nodes", nodes)):
-            if count < 1:
-                raise ValueError(f"SoftArm: {name} is {count}, expected at least 1")
-        if not length > 0:
-            raise ValueError(f"SoftArm: length is {length}, expected a positive number")
-        if not gravity >= 0:
-            raise ValueError(f"SoftArm: gravity is {gravity}, expected zero or a positive number")
         super().__init__(num_coordinates=3 * segments, num_inputs=3 * segments)
         self.segments = segments
         self.length = length

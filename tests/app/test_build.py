@@ -2,7 +2,7 @@
 
 import pytest
 
-from pinn_dyn.app import build
+from pinn_dyn.app import trainer
 from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 
@@ -12,49 +12,46 @@ def compiler(monkeypatch):
     """Says whether this machine has a C++ compiler."""
 
     def set_compiler(there):
-        monkeypatch.setattr(build, "has_cpp_compiler", lambda: there)
+        monkeypatch.setattr(trainer, "has_cpp_compiler", lambda: there)
 
     set_compiler(True)
     return set_compiler
 
 
 def config(choice, steps=STEPS_FOR_DERIVATIVE, accelerator="cpu"):
-    return {
-        "compile": choice,
-        "trainer": {"steps": steps, "accelerator": accelerator},
-    }
+    return choice, steps, {"accelerator": accelerator}
 
 
 @pytest.mark.parametrize("choice", [True, False])
 @pytest.mark.parametrize("steps", [2, STEPS_FOR_DERIVATIVE])
 def test_a_choice_holds_for_any_length(compiler, choice, steps):
-    assert build.compiles(config(choice, steps)) is choice
+    assert trainer.compiles(*config(choice, steps)) is choice
 
 
 def test_auto_compiles_long_trainings_alone(compiler):
-    assert build.compiles(config("auto", STEPS_FOR_DERIVATIVE))
-    assert not build.compiles(config("auto", STEPS_FOR_DERIVATIVE - 2))
+    assert trainer.compiles(*config("auto", STEPS_FOR_DERIVATIVE))
+    assert not trainer.compiles(*config("auto", STEPS_FOR_DERIVATIVE - 2))
 
 
 def test_auto_compiles_where_there_is_a_compiler_alone(compiler):
     compiler(False)
-    assert not build.compiles(config("auto"))
+    assert not trainer.compiles(*config("auto"))
 
 
 def test_a_gpu_needs_triton_too(compiler, monkeypatch):
-    monkeypatch.setattr(build, "find_spec", lambda name: None if name == "triton" else name)
-    assert not build.compiles(config("auto", accelerator="gpu"))
-    assert build.compiles(config("auto"))
-    with pytest.raises(ConfigError, match=r"no Triton.*install one, or set compile=false"):
-        build.compiles(config(True, accelerator="gpu"))
-    monkeypatch.setattr(build, "find_spec", lambda name: name)
-    assert build.compiles(config("auto", accelerator="gpu"))
+    monkeypatch.setattr(trainer, "find_spec", lambda name: None if name == "triton" else name)
+    assert not trainer.compiles(*config("auto", accelerator="gpu"))
+    assert trainer.compiles(*config("auto"))
+    with pytest.raises(ConfigError, match=r"no Triton.*install it, or set compile=false"):
+        trainer.compiles(*config(True, accelerator="gpu"))
+    monkeypatch.setattr(trainer, "find_spec", lambda name: name)
+    assert trainer.compiles(*config("auto", accelerator="gpu"))
 
 
 def test_true_without_a_compiler_says_what_to_install(compiler):
     compiler(False)
-    with pytest.raises(ConfigError, match=r"no C\+\+ compiler.*install one, or set compile=false"):
-        build.compiles(config(True))
+    with pytest.raises(ConfigError, match=r"no C\+\+ compiler.*install it, or set compile=false"):
+        trainer.compiles(*config(True))
 
 
 def test_arguments_of_a_part_and_of_the_parts_in_it_are_checked():

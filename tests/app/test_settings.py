@@ -81,7 +81,7 @@ def test_steps_that_are_no_multiple_of_the_validations_say_which_are(steps, vali
         ("control", "robot.mass=0.36", "robot.mass"),
         ("evaluate", "thresholds.tiny=0.001", "thresholds.tiny"),
         ("gather", "filter.model=lnn", "filter.model"),
-        ("check", "dataset.test.blocks=2", "dataset.test.blocks"),
+        ("check", "dataset.max_age=0.2", "dataset.max_age"),
     ],
 )
 def test_an_argument_in_no_yaml_needs_no_plus(command, word, path):

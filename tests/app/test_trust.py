@@ -56,7 +56,6 @@ def test_trust_is_given_on_the_command_line(tmp_path, monkeypatch, lnn_run):
     run = foreign(lnn_run, tmp_path / "run", change)
     with pytest.raises(ConfigError, match="trust=my_arms"):
         load_run(run, "best")
-    (run / "data.json").unlink()  # of the arm that it was trained on
     given = ["trust=my_arms", "horizon=0.1", "windows=[]", "hydra.run.dir=out"]
     run_script("evaluate.py", f"runs=[{run}]", *given)
     assert (tmp_path / "out" / "summary.csv").is_file()

@@ -13,9 +13,9 @@ pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (th
 import pybullet_data  # noqa: E402
 
 from pinn_dyn.systems import BulletArm, RigidChain  # noqa: E402
+from pinn_dyn.testing.finite_differences import assert_near  # noqa: E402
 from pinn_dyn.testing.mechanical_system import Configurations, MechanicalSystemContract  # noqa: E402
 from tests.support.bullet_arms import FINGERS, PANDA, states  # noqa: E402
-from tests.support.finite_differences import assert_near  # noqa: E402
 from tests.support.rigid_chains import TREE  # noqa: E402
 from tests.support.urdf_by_hand import (  # noqa: E402
     SPATIAL,

@@ -266,15 +266,10 @@ def test_default_quadrature_is_exact_to_twelve_digits_up_to_three_radians():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("segments", 0),
-        ("nodes", 0),
         ("mass", 0.0),
         ("mass", -0.3),
         ("mass", math.nan),
         ("mass", [-0.3]),
-        ("length", -1.0),
-        ("length", 0.0),
-        ("gravity", -9.81),
         ("stiffness", -1.0),
         ("damping", -1.0),
     ],
