@@ -77,8 +77,10 @@ class TrainerArguments:
 
 STAND_INS[L.Trainer] = TrainerArguments
 _LENGTH = "trainer.steps and trainer.validations"
-_LENGTHS = ("max_epochs", "max_steps", "max_time", "min_epochs", "min_steps")
-_LENGTHS += ("limit_train_batches", "overfit_batches", "val_check_interval")
+_LENGTHS = (
+    *("max_epochs", "max_steps", "max_time", "min_epochs", "min_steps"),
+    *("limit_train_batches", "overfit_batches", "val_check_interval"),
+)
 SET_BY_PROGRAM.update(
     {
         **{f"trainer.{name}": _LENGTH for name in _LENGTHS},

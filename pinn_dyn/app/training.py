@@ -211,6 +211,7 @@ def train(
             checkpoint = resumable(run_folder, resume_from)
             L.seed_everything(seed, verbose=False)
             require_device(trainer)
+            is_compiled = compiles(compile, steps, trainer)  # refused before data are simulated
             length = epochs(steps, validations)
             windows = build_data(data, source, seed, length[1])
             statistics = _statistics(windows)
@@ -237,7 +238,7 @@ def train(
                 optimizer=optimizer,
                 scheduler=scheduler,
                 config=config,
-                compile=compiles(compile, steps, trainer),
+                compile=is_compiled,
                 clipping={key: trainer[key] for key in CLIPPING if key in trainer},
             )
             if isinstance(learner, LeastSquaresLearner) and start_from is not None:

@@ -31,8 +31,7 @@ def said(error, capsys):
         ("train.py", "optimiser.lr=0.1", "optimizer"),
         ("train.py", "sed=1", "seed"),
         ("train.py", "weight_decay=1", "optimizer.weight_decay"),
-        ("evaluate.py", "run=[runs/here]", "runs"),
-        ("evaluate.py", "horizn=1", "horizon"),
+        ("check.py", "longest_dely=1", "longest_delay"),
     ],
 )
 def test_a_misspelt_key_is_answered_with_the_right_one(elsewhere, script, mistake, meant):
@@ -95,10 +94,10 @@ def test_missing_runs_are_asked_for_by_name(capsys):
     ("overrides", "words"),
     [
         (["dataset.train_inputs=0"], ["dataset", "train_inputs is 0"]),
-        (["dataset.system.mass=-1"], ["dataset.system.mass is -1", "from 0 to"]),
+        (["dataset.system.mass=-1"], ["dataset.system.mass is -1", "greater than or equal to 0"]),
         (["data.batch_size=65"], ["data", "batch_size is 65", "64"]),
         (["model=mlp", "model.activation=gelu"], ["model", "gelu", "softplus"]),
-        (["validator.step=0.2"], ["validator: step is 0.2 s and horizon 0.1 s"]),
+        (["validator.step=0.2"], ["validator: ", "step 0.2 s", "horizon 0.1 s"]),
         (["validator.window=0.2"], ["validator: window is 0.2 s", "horizon 0.1 s"]),
         (["+data.nonsense=1"], ["data", "nonsense"]),
         (["dataset.system._target_=pinn_dyn.systems.Nothing"], ["dataset", "Nothing"]),
@@ -160,7 +159,7 @@ def test_a_folder_without_a_run_cannot_be_resumed(elsewhere, capsys, exists):
     if exists:
         (elsewhere / "empty").mkdir()
     text = said(fails("train.py", "resume=empty"), capsys)
-    assert "empty is not a run folder" in text
+    assert "empty/checkpoints/last.ckpt does not exist: this is no run folder" in text
     assert "Traceback" not in text
 
 
