@@ -82,7 +82,7 @@ def test_the_configuration_reference_has_every_option_and_every_key(reference):
 
 def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments(reference):
     # From the docstring of NetworkCholesky.
-    kind, text = "a list, each a whole number Gt(gt=0)", "widths of the hidden layers."
+    kind, text = "list (whole number > 0)", "widths of the hidden layers."
     assert f"| `model.mass.hidden` | `[32, 32, 32]` | {kind} | {text} |" in reference
     # From the comment beside the key.
     assert "| `gains.position` | `100.0` |  | K\\_P. |" in reference
