@@ -96,7 +96,7 @@ def _logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
     """Build a logger that writes to the run folder."""
     if name == "tensorboard":
         return tensorboard(folder)
-    extra = {"tags": {"folder": str(folder.resolve())}} if name == "mlflow" else {}
+    extra: dict[str, Any] = {"tags": {"folder": str(folder.resolve())}} if name == "mlflow" else {}
     try:
         return build_part(f"logger.{name}", config, save_dir=str(folder), **extra)
     except ConfigError as error:

@@ -51,6 +51,6 @@ def _path(item: Any) -> str:
     parts = item.__module__.split(".")
     for count in range(min(2, len(parts)), len(parts) + 1):
         module = ".".join(parts[:count])
-        if getattr(sys.modules.get(module), item.__qualname__, None) is item:
+        if getattr(sys.modules.get(module), str(item.__qualname__), None) is item:
             return f"{module}.{item.__qualname__}"
     raise TypeError(f"{item} cannot be imported by its name")

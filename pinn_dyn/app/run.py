@@ -332,9 +332,10 @@ class Run:
             ValueError: on an argument of the wrong size.
         """
         system = self.system
-        x, rate = self._coordinates("q", q), self._coordinates("v", v)
+        position, velocity = self._coordinates("q", q), self._coordinates("v", v)
+        position, velocity = torch.broadcast_tensors(position, velocity)
         force = self._array("u", u, self.model.num_inputs, "M")
-        return system.forward_dynamics(*torch.broadcast_tensors(x, rate), force).numpy()
+        return system.forward_dynamics(position, velocity, force).numpy()
 
     def _coordinates(self, name: str, value: Values) -> Tensor:
         return self._array(name, value, self.model.num_coordinates, "N")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -48,7 +49,8 @@ def build_baselines(
         "hold position": HoldPosition(size, inputs),
         "constant velocity": ConstantVelocity(size, inputs),
     }
-    for name, degree in (("ARX", 1), ("EDMDc degree 2", 2)):
+    degrees: dict[str, Literal[1, 2]] = {"ARX": 1, "EDMDc degree 2": 2}
+    for name, degree in degrees.items():
         try:
             model = fit_linear_rival(train, validation, step=step, degree=degree)
         except ValueError as error:

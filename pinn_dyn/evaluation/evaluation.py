@@ -270,7 +270,9 @@ def evaluate_models(
         windows: times between two resets to the measured state, s, one windowed error each.
         thresholds: names and values of the valid prediction times, in the units of q.
     """
-    rows, torque, parts = [], [], []
+    rows: list[dict[str, Any]] = []
+    torque: list[pd.DataFrame] = []
+    parts: list[pd.DataFrame] = []
     predictions: dict[str, Prediction] = {}
     intervals: dict[str, dict[float, Calibration]] = {}
     for index, entry in enumerate(tqdm([*entries, *baselines], desc="evaluating", disable=None)):

@@ -135,5 +135,8 @@ def _relative(difference: Tensor, reference: Tensor) -> Tensor:
 def _array(values: Tensor) -> str:
     """Return an array as text with three significant digits; rounding errors print as 0."""
     clean = torch.where(values.abs() < 1e-9 * values.abs().max(), 0.0, values)
-    formatter = {"float_kind": lambda value: f"{value:10.3g}"}
-    return np.array2string(clean.numpy(), formatter=formatter, max_line_width=100)
+    return np.array2string(
+        clean.numpy(),
+        formatter={"float_kind": lambda value: f"{value:10.3g}"},
+        max_line_width=100,
+    )

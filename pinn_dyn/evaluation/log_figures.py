@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import Cleaned
@@ -35,8 +37,8 @@ def cleaning_figure(
     speeds = [f"d/dt {label.replace(']', '/s]')}" for label in labels]
     title = f"{title}: {raw.run}, {cleaned.split}"
     figure, axes = panels([labels, speeds, input_labels], raw.t, title=title)
-    dots = {"color": TRUTH, "linestyle": "none", "marker": ".", "markersize": 3}
-    styles = [(raw, dots | {"label": "log"})]
+    dots: dict[str, Any] = {"color": TRUTH, "linestyle": "none", "marker": ".", "markersize": 3}
+    styles: list[tuple[Any, dict[str, Any]]] = [(raw, dots | {"label": "log"})]
     styles += [
         (x, {"color": COLORS[0], "linewidth": 1.0, "label": "cleaned"}) for x in cleaned.clean
     ]

@@ -75,7 +75,7 @@ def with_unit(text: str, labels: Sequence[str]) -> str:
 
 
 def panels(
-    columns: Sequence[Sequence[str]], t: Tensor, *, title: str
+    columns: Sequence[Sequence[str]], t: Tensor | np.ndarray, *, title: str
 ) -> tuple[Figure, list[list[Axes]]]:
     """Create columns of panels over time.
 
