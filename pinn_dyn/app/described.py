@@ -48,9 +48,9 @@ def described(value: Any) -> Any:
 
 def _path(item: Any) -> str:
     """Return the shortest dotted name by which a class or function can be imported."""
-    parts = item.__module__.split(".")
+    name, parts = str(item.__qualname__), item.__module__.split(".")
     for count in range(min(2, len(parts)), len(parts) + 1):
         module = ".".join(parts[:count])
-        if getattr(sys.modules.get(module), str(item.__qualname__), None) is item:
-            return f"{module}.{item.__qualname__}"
+        if getattr(sys.modules.get(module), name, None) is item:
+            return f"{module}.{name}"
     raise TypeError(f"{item} cannot be imported by its name")

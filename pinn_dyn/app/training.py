@@ -409,19 +409,19 @@ def _fit(
     source: DataSource,
 ) -> None:
     """Run the trainer, and write the record of the training."""
-    fitted = isinstance(learner, LeastSquaresLearner)
+    least_squares = learner if isinstance(learner, LeastSquaresLearner) else None
     try:
-        with naming("optimizer") if fitted else contextlib.nullcontext():
+        with naming("optimizer") if least_squares else contextlib.nullcontext():
             trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit as stop:  # Lightning's end of an interrupted training
-        if fitted and learner.result is not None:
+        if least_squares and least_squares.result is not None:
             trainer.save_checkpoint(folder / CHECKPOINTS / "last.ckpt")
-            write_constants(learner.model, learner.result, source, folder)
+            write_constants(learner.model, least_squares.result, source, folder)
         raise KeyboardInterrupt from stop
     if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, data, verbose=False)
-    if fitted and learner.result is not None:
-        write_constants(learner.model, learner.result, source, folder)
+    if least_squares and least_squares.result is not None:
+        write_constants(learner.model, least_squares.result, source, folder)
     (recorder,) = (x for x in trainer.callbacks if isinstance(x, Recorder))  # type: ignore[attr-defined]
     # Other processes have counted the steps of theirs.
     last = read_checkpoint(folder / CHECKPOINTS / "last.ckpt")

@@ -20,7 +20,10 @@ from pinn_dyn.app.validation import ConfigError, places
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml takes a tenth of the time
 
-_PACKAGES = "control data data.logs evaluation mechanics models systems training".split()
+_PACKAGES = (
+    *("control", "data", "data.logs", "evaluation", "mechanics", "models", "systems"),
+    "training",
+)
 """Packages of pinn_dyn whose public classes may be built: none writes files or loads code."""
 
 _CALLBACKS = "EarlyStopping EMAWeightAveraging GradientAccumulationScheduler LearningRateMonitor "

@@ -46,7 +46,7 @@ def animate_lines(record: ClosedLoopRecord, run: int, robot: Drawable, path: Pat
     canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
     _set_space(ax, _scene(record, run, shape, goal), robot.z_is_down)
-    images: list[np.ndarray] = []
+    images: list[Image.Image] = []
     for sample in samples:
         for line in list(ax.lines):
             line.remove()
@@ -67,7 +67,7 @@ def animate_images(record: ClosedLoopRecord, run: int, robot: Rendered, path: Pa
     points = torch.cat([robot.tip_position(q), robot.tip_position(q_ref)]).numpy()
     pictures, pixels = robot.render(q.numpy(), points, _SIZE)
     tip, goal = (list(map(tuple, part.tolist())) for part in np.split(pixels, 2))
-    images: list[np.ndarray] = []
+    images: list[Image.Image] = []
     for frame, (sample, picture) in enumerate(zip(samples, pictures, strict=True)):
         image = Image.fromarray(picture)
         draw = ImageDraw.Draw(image)
