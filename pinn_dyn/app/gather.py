@@ -148,5 +148,5 @@ def gather(cfg: DictConfig) -> None:
             save(figure, folder / "sweep.png")
         print(f"\ntables are in {folder}")
     if problems:
-        print(f"\n{len(problems)} jobs have no result:")
+        print(f"\njobs without a result: {len(problems)}")
         print("\n".join(f"  {path}\n    {text}" for path, text in problems.items()))

@@ -180,6 +180,12 @@ def finish(folder: Path, record: dict[str, Any]) -> None:
     write_json(folder / METRICS, record)
 
 
+def restore_record(folder: Path) -> None:
+    """Write the copy of the record anew if it is missing, after a kill at the end of a training."""
+    if not (folder / METRICS).is_file():
+        write_json(folder / METRICS, read_checkpoint(folder / CHECKPOINTS / "last.ckpt")[RECORD])
+
+
 def check_data(run: Run, source: DataSource) -> None:
     """Refuse data that are not those that a run was trained on.
 

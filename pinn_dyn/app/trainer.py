@@ -148,6 +148,7 @@ def build_trainer(
     loggers: Sequence[Logger],
     recorders: Sequence[L.Callback],
     length: tuple[int, int, int],
+    batch_size: int,
 ) -> L.Trainer:
     """Build the trainer with its callbacks and loggers, all writing to ``folder``.
 
@@ -158,9 +159,11 @@ def build_trainer(
         loggers: loggers.
         recorders: callbacks after those of the program.
         length: as returned by :func:`epochs`.
+        batch_size: windows in a batch, which the devices share.
 
     Raises:
-        ConfigError: if the strategy starts the program again on each device.
+        ConfigError: if the strategy starts the program again on each device, or the devices cannot
+            share a batch equally.
     """
     # A resumed training finds its checkpoints by these names.
     files: dict[str, Any] = {"dirpath": str(folder / CHECKPOINTS), "enable_version_counter": False}
@@ -194,6 +197,11 @@ def build_trainer(
         raise ConfigError(
             "trainer: on several devices this strategy starts the whole program again, a sweep "
             "included: use trainer.strategy=ddp_spawn_find_unused_parameters_true"
+        )
+    if batch_size % trainer.world_size:
+        raise ConfigError(
+            f"data.batch_size is {batch_size}, expected a multiple of the {trainer.world_size} "
+            "devices that share a batch"
         )
     return trainer
 

@@ -35,6 +35,7 @@ from pinn_dyn.app.run_folder import (
     claimed,
     finish,
     is_finished,
+    restore_record,
     load_run,
     read_checkpoint,
     require_same_data,
@@ -205,6 +206,7 @@ def train(
         stack.enter_context(claimed(run_folder, config))
         if is_finished(run_folder):
             log.info("already trained, to train again delete %s", run_folder)
+            restore_record(run_folder)
         else:
             if made_in_python and temporary is None:
                 store(source, run_folder / TRAJECTORIES)
@@ -263,6 +265,7 @@ def train(
                     [tensorboard(run_folder)] if loggers is None else loggers,
                     [description, recorder],
                     length,
+                    windows.batch_size,
                 ),
                 learner,
                 EnsembleData(windows, ensemble) if ensemble > 1 else windows,

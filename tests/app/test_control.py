@@ -170,7 +170,7 @@ def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["gains.position=-1"], ["gains.position is -1", "above 0 to 1"]),
+        (["gains.position=-1"], ["gains.position is -1", "greater than 0"]),
         (["gains.position=[1,2]"], ["controllers.learned", "position_gain"]),
         (["reference.q_low=[0,0]", "reference.q_high=[0,0]"], ["reference"]),
         (["controllers.learned.terms=guess"], ["controllers.learned.terms", "guess", "truth"]),
@@ -182,7 +182,7 @@ def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
         (["plant=simulator", "rate=200"], ["plant"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
         (["stability={region: x, q_low: [0], q_high: [1], samples: 5}"], ["stability.q_low", "3"]),
-        (["checkpoint=first"], ["first", "best or last"]),
+        (["checkpoint=first"], ["first", "'best' or 'last'"]),
     ],
     ids=lambda value: value[0] if isinstance(value[0], str) else None,
 )

@@ -144,7 +144,7 @@ def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
 
     table, text = gather(f"runs=[{sweep}]")
     assert len(table) == 4
-    assert "5 jobs have no result" in text
+    assert "jobs without a result: 5" in text
     lines = text.splitlines()
     messages = {
         name: lines[next(i for i, line in enumerate(lines) if line.endswith(f"/{name}")) + 1]
@@ -161,7 +161,7 @@ def test_a_sweep_of_failures_only_is_listed(tmp_path, gather):
     write_run(tmp_path / "sweep" / "0_lnn")
     table, text = gather(f"runs=[{tmp_path / 'sweep'}]")
     assert table is None
-    assert "1 jobs have no result" in text
+    assert "jobs without a result: 1" in text
 
 
 def test_a_repeated_run_counts_once(sweep, gather):
