@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from functools import partial
 from pathlib import Path
@@ -74,12 +75,26 @@ def check(command: str, config: dict[str, Any]) -> None:
     check_arguments(SETTINGS[command], config)
 
 
+def _check_names(command: str, cfg: DictConfig) -> None:
+    """Check the keys of a command alone: a value may be missing because its key is misspelled."""
+    from pinn_dyn.app.settings import SETTINGS
+
+    names = list(inspect.signature(SETTINGS[command]).parameters)
+    for key in cfg:
+        if key not in names:
+            raise ConfigError(
+                f"the configuration has no key '{key}'{did_you_mean(str(key), names)}"
+            )
+
+
 def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
     """Convert the configuration of a command to plain values, and check them.
 
     Raises:
         ConfigError: as :func:`plain` and :func:`check`.
     """
+    if OmegaConf.missing_keys(cfg):
+        _check_names(command, cfg)
     config = plain(cfg)
     check(command, config)
     return config
