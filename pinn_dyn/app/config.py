@@ -80,11 +80,9 @@ def _check_names(command: str, cfg: DictConfig) -> None:
     from pinn_dyn.app.settings import SETTINGS
 
     names = list(inspect.signature(SETTINGS[command]).parameters)
-    for key in cfg:
+    for key in map(str, cfg):
         if key not in names:
-            raise ConfigError(
-                f"the configuration has no key '{key}'{did_you_mean(str(key), names)}"
-            )
+            raise ConfigError(f"the configuration has no key '{key}'{did_you_mean(key, names)}")
 
 
 def checked(command: str, cfg: DictConfig) -> dict[str, Any]:

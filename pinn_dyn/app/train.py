@@ -6,7 +6,7 @@ import logging
 import math
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -39,7 +39,7 @@ def train(cfg: DictConfig) -> float:
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     trust = packages(cfg.get("trust"))
-    resume_from = cfg.get("resume_from") or "last"
+    resume_from: Literal["last", "best"] = cfg.get("resume_from") or "last"
     resumed = cfg.get("resume") is not None
     if resumed:
         folder = Path(cfg.resume)

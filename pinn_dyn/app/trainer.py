@@ -79,7 +79,7 @@ def build_learner(
             return LeastSquaresLearner(model, solver=optimizer, **common)  # type: ignore[arg-type]
         learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
         common |= {"optimizer": optimizer, "scheduler": scheduler, "compile": compile}
-        return learner(model, **common, **clipping)  # type: ignore[arg-type]
+        return learner(model, **common, **clipping)
 
 
 def even_validations(steps: int, limit: int) -> int:

@@ -201,7 +201,7 @@ def _configurable(hint: Any) -> Any:
     if origin in (Union, types.UnionType):
         return _union(inner)
     if origin is tuple and inner and inner[-1] is not Ellipsis:
-        return Annotated[tuple[tuple(map(_configurable, inner))], Strict(False)]
+        return Annotated[tuple[tuple(map(_configurable, inner))], Strict(False)]  # type: ignore[misc]
     if (origin or hint) in (*_LISTS, tuple):
         return list[_configurable(inner[0] if inner else Any)]  # type: ignore[misc]
     if (origin or hint) in _MAPPINGS:
@@ -239,7 +239,7 @@ def _union(options: Sequence[Any]) -> Any:
     ]
     if objects:
         values.append(Annotated[Any, _Object(objects, short)])
-    union = Union[tuple(values)]  # noqa: UP007
+    union: Any = Union[tuple(values)]  # noqa: UP007
     if len(values) > 1:
         union = Annotated[union, WrapValidator(_merge_alternatives)]
     return union | None if type(None) in options or None in options else union
@@ -258,7 +258,7 @@ def _merge_alternatives(value: Any, validate: Callable[[Any], Any]) -> Any:
     messages = [mistake["msg"].removeprefix("Input should be ") for mistake in mistakes]
     expected = " or ".join(dict.fromkeys(" or ".join(messages).split(" or ")))
     kind = "object" if any(mistake["type"] == "object" for mistake in mistakes) else "union"
-    raise PydanticCustomError(kind, "Input should be {expected}", {"expected": expected})  # type: ignore[arg-type]
+    raise PydanticCustomError(kind, "Input should be {expected}", {"expected": expected})
 
 
 def _located(mistakes: Sequence[Mapping[str, Any]]) -> ValidationError:

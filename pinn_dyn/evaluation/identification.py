@@ -46,12 +46,12 @@ class Direction(NamedTuple):
     """A direction of P parameters.
 
     Attributes:
-        index: the parameter that only this direction of a basis contains.
+        parameter: index of the parameter that only this direction of a basis contains.
         direction: unit vector, ``(P,)``.
         text: the largest entries with their names.
     """
 
-    index: int
+    parameter: int
     direction: np.ndarray
     text: str
 

@@ -129,7 +129,7 @@ def rigid_excitation(
     return RigidExcitation(
         condition=float(sizes[0] / sizes[-1]) if sizes[-1] > least else float("inf"),
         count=len(base),
-        joints=_joints(structure, owners[base], shares, names, [one.index for one in found]),
+        joints=_joints(structure, owners[base], shares, names, [one.parameter for one in found]),
         undetermined=[one.text for one in found],
     )
 
