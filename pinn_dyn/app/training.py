@@ -35,10 +35,10 @@ from pinn_dyn.app.run_folder import (
     claimed,
     finish,
     is_finished,
-    restore_record,
     load_run,
     read_checkpoint,
     require_same_data,
+    restore_record,
 )
 from pinn_dyn.app.trainer import (
     CLIPPING,
