@@ -85,7 +85,7 @@ def test_the_configuration_reference_takes_the_words_of_docstrings_and_comments(
     kind, text = "list (whole number > 0)", "widths of the hidden layers."
     assert f"| `model.mass.hidden` | `[32, 32, 32]` | {kind} | {text} |" in reference
     # From the comment beside the key.
-    assert "| `gains.position` | `100.0` |  | K\\_P. |" in reference
+    assert "| `gains.position` | `100.0` | | K\\_P. |" in reference
     # From the comment above the key.
     above = "Control instants per second, with the input held in between;"
-    assert f"| `rate` | `1000.0` | a number above 0 or null | {above}" in reference
+    assert f"| `rate` | `1000.0` | number > 0 or null | {above}" in reference
