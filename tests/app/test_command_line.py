@@ -32,6 +32,7 @@ def said(error, capsys):
         ("train.py", "sed=1", "seed"),
         ("train.py", "weight_decay=1", "optimizer.weight_decay"),
         ("check.py", "longest_dely=1", "longest_delay"),
+        ("evaluate.py", "run=[runs/here]", "runs"),
     ],
 )
 def test_a_misspelt_key_is_answered_with_the_right_one(elsewhere, script, mistake, meant):
