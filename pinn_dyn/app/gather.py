@@ -138,7 +138,7 @@ def gather(cfg: DictConfig) -> None:
         write_table(table, folder, "sweep")
         figures = [k for k in _SHOWN if k in table and (k[-8:] != "diverged" or table[k].any())]
         shown = [*settings, "seeds", *figures]
-        print(f"\n{len(runs)} runs: mean ± standard deviation over seeds")
+        print(f"\nruns: {len(runs)}, mean ± standard deviation over seeds")
         print(to_text(table, {name: name for name in shown}))
         if repeated.any():
             print(f"\nleft out: {repeated.sum()} runs that were repeated with the same seed")

@@ -118,7 +118,7 @@ def test_every_command_teaches(installed, tmp_path):
     for name, text in zip(names, helps, strict=True):
         assert f"python {name}.py" in text
     assert "model_name: ${hydra:runtime.choices.model}" in composed
-    assert "steps: 60000" in composed
+    assert "steps: 30000" in composed
     assert "complete -o nospace" in completion
     assert not list(tmp_path.iterdir())
 
