@@ -67,11 +67,12 @@ def model_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> l
 
     The name of the model is followed by the settings in which runs of this model differ.
     """
-    settings = varied_settings(configs).map(str)
+    settings = varied_settings(configs)
     labels = []
     for name, (_, row) in zip(names, settings.iterrows(), strict=True):
-        same = settings[[label == name for label in names]]
-        differing = [f"{key}={row[key]}" for key in same if same[key].nunique() > 1]
+        same = settings[[label == name for label in names]].map(str)
+        varied = [key for key in same if same[key].nunique() > 1]
+        differing = [f"{key}={row[key]}" for key, is_set in row[varied].notna().items() if is_set]
         labels.append(" ".join([name, *differing]))
     return labels
 

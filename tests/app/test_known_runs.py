@@ -162,7 +162,7 @@ def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path, fitted,
         rows[name] = pd.read_csv(tmp_path / name / "summary.csv").set_index("run")
     found, trained = (
         rows["rolled"].loc["identification of known"],
-        rows["both"].loc["known seed 0 known"],
+        rows["both"].loc["known optimizer.rollouts=False"],
     )
     figures = ["error_mean", "error_worst", "window_0.1s_error_mean", "torque_share"]
     np.testing.assert_allclose(
