@@ -8,8 +8,11 @@ from collections.abc import Mapping, Sequence
 from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.identification import identified
 from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import check_data
-from pinn_dyn.app.shared_data import shared_data
+from pinn_dyn.app.shared_data import (
+    require_fitting_test,
+    require_same_test,
+    training_sources,
+)
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import (
@@ -64,14 +67,17 @@ def evaluate(
             if the settings do not fit the data.
     """
     runs = [runs] if isinstance(runs, Run) else list(runs)
-    data = shared_data(runs, split, source)
-    for run, item in zip(runs, data, strict=True):
-        check_data(run, item.trained_on)
-    plain = next(k for k, item in enumerate(data) if not item.preparation)
-    source, motions = data[plain].source, data[plain].trajectories
+    sources = training_sources(runs)
+    for run, trained_on in zip(runs, sources, strict=True):
+        if source is None:
+            require_same_test(run, runs[0], split)
+        else:
+            require_fitting_test(run, trained_on, source)
+    source = source or sources[0]
+    splits = {item: item.load() for item in {*sources, source}}
+    motions = getattr(splits[source], split)
     horizon = horizon or default_horizon(stack_until(motions).duration)
-    truths = [stack_until(item.trajectories, horizon) for item in data]
-    truth = truths[plain]
+    truth = stack_until(motions, horizon)
     if len(truth.q) < len(motions):
         log.warning(
             "%d of %d trajectories of %s are shorter than horizon=%g and left out",
@@ -83,11 +89,7 @@ def evaluate(
     stride = common_stride(steps, truth.t)
     grid = stride * truth.duration / (len(truth.t) - 1)
 
-    prepared = [
-        f"{run.config['model_name']} {item.preparation}".rstrip()
-        for run, item in zip(runs, data, strict=True)
-    ]
-    models = model_names(prepared, [run.config for run in runs])
+    models = model_names([run.config["model_name"] for run in runs], [run.config for run in runs])
     names = _run_names(runs, models)
     entries = []
     for k, run in enumerate(runs):
@@ -97,8 +99,8 @@ def evaluate(
             Entry(
                 names[k],
                 run.model,
-                truths[k],
-                data[k].training,
+                truth,
+                splits[sources[k]],
                 steps[k],
                 models[k],
                 seed=run.config["seed"],
@@ -106,12 +108,12 @@ def evaluate(
                 members=run.ensemble,
             )
         )
-    training = data[plain].training
+    training = splits[sources[0]]
     predictors = build_baselines(training.train, training.validation, step=grid)
     baselines = [Entry(name, x, truth, training, grid, name) for name, x in predictors.items()]
-    for k, model in identified(runs, data).items():
+    for k, model in identified(runs, sources).items():
         name = f"identification of {names[k]}"
-        baselines.append(Entry(name, model, truths[k], data[k].training, steps[k], name))
+        baselines.append(Entry(name, model, truth, splits[sources[k]], steps[k], name))
     evaluation = evaluate_models(
         entries,
         baselines,
@@ -123,11 +125,6 @@ def evaluate(
     )
     folders = {name: run.folder for name, run in zip(names, runs, strict=True)}
     evaluation.constants = read_constants(folders)
-    evaluation.notes = [
-        f"{text}: trained and tested on inputs as prepared in its own data set; motions and times "
-        f"are of {source.name}."
-        for text in dict.fromkeys(item.preparation for item in data if item.preparation)
-    ]
     return evaluation
 
 

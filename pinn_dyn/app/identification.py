@@ -10,13 +10,13 @@ from typing import Any
 from pinn_dyn.app.build import build_data, build_model
 from pinn_dyn.app.config import build_part
 from pinn_dyn.app.run import Run
-from pinn_dyn.app.shared_data import RunData
+from pinn_dyn.data import DataSource
 from pinn_dyn.mechanics import Predictor
 
 log = logging.getLogger(__name__)
 
 
-def identified(runs: Sequence[Run], data: Sequence[RunData]) -> dict[int, Predictor]:
+def identified(runs: Sequence[Run], sources: Sequence[DataSource]) -> dict[int, Predictor]:
     """Repeat the first stage of least squares for the runs that also took the second one.
 
     Runs of equal settings, such as several seeds, share one model. Runs that are trained by
@@ -31,7 +31,7 @@ def identified(runs: Sequence[Run], data: Sequence[RunData]) -> dict[int, Predic
         for k, run in enumerate(runs)
         if run.covariance is not None and run.config.get("start_from") is None
     ]
-    settings = {k: _settings(runs[k], data[k]) for k in fits}
+    settings = {k: _settings(runs[k]) for k in fits}
     seen = [settings[k] for k in fits if not runs[k].config["optimizer"].get("rollouts", True)]
     models = {}
     for k in fits:
@@ -39,23 +39,23 @@ def identified(runs: Sequence[Run], data: Sequence[RunData]) -> dict[int, Predic
             continue
         seen.append(settings[k])
         try:
-            models[k] = _fitted(runs[k], data[k])
+            models[k] = _fitted(runs[k], sources[k])
         except ValueError as error:
             log.warning("no row 'identification' of %s: %s", runs[k].folder, error)
     return models
 
 
-def _settings(run: Run, data: RunData) -> tuple[Any, ...]:
+def _settings(run: Run) -> tuple[Any, ...]:
     optimizer = {key: value for key, value in run.config["optimizer"].items() if key != "rollouts"}
-    return run.config["model"], optimizer, data.preparation
+    return run.config["model"], optimizer, run.data and run.data["train"]["hashes"]
 
 
-def _fitted(run: Run, data: RunData) -> Predictor:
+def _fitted(run: Run, source: DataSource) -> Predictor:
     model = build_model(run.config, run.statistics)
     solver = build_part("optimizer", {**run.config["optimizer"], "rollouts": False})
     start = time.process_time()
-    windows = build_data(run.config, data.trained_on).windows
-    solver.fit(model, data.training.train, windows)
+    windows = build_data(run.config, source).windows
+    solver.fit(model, source.load().train, windows)
     log.info(
         "identification: inverse dynamics on the training motions, %.1f s of processor time",
         time.process_time() - start,

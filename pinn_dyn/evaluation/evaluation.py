@@ -78,7 +78,7 @@ class Entry:
     Attributes:
         run: name of the row.
         model: the predictor.
-        truth: test trajectories stacked, with the inputs as prepared for this model.
+        truth: test trajectories stacked.
         training: the data that the model was trained on.
         step: step of the rollouts, s.
         name: name of the model and of its settings; rows of one name differ in the seed.
@@ -114,7 +114,6 @@ class Evaluation:
         intervals: calibration by run and window in s; runs without members have none.
         terms: learned terms beside the true ones, by run; empty where the truth is unknown.
         constants: tables of fitted constants, by run.
-        notes: remarks on some of the rows.
         origin: command, commit, data and configurations, for the page.
     """
 
@@ -129,7 +128,6 @@ class Evaluation:
     intervals: dict[str, dict[float, Calibration]]
     terms: dict[str, TermComparison]
     constants: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
     origin: Any = None
 
     @property
@@ -164,7 +162,7 @@ class Evaluation:
             for row in rows.itertuples()
         ]
         intervals = interval_lines(self.intervals)
-        return [*self.notes, *unbeaten_baselines(self.summary), *leaving, *intervals]
+        return [*unbeaten_baselines(self.summary), *leaving, *intervals]
 
     def __str__(self) -> str:
         terms = [f"{k}: learned and true terms\n{x.to_text()}" for k, x in self.terms.items()]

@@ -111,9 +111,20 @@ def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
     assert "input delay [s]" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_evaluate_refuses_a_horizon_beyond_the_pieces(run, tmp_path, capsys):
-    error = fails("evaluate.py", *evaluation_of(run, tmp_path / "out"), "horizon=6")
-    assert "horizon is 6" in said(error, capsys)
+@pytest.mark.usefixtures("undrawn")
+def test_runs_whose_inputs_were_prepared_differently_are_refused(run, tmp_path, capsys):
+    words = [f"dataset.root='{run.parent}'", f"hydra.run.dir={tmp_path / 'late'}"]
+    words += ["+dataset.steps.delay={_target_: pinn_dyn.data.logs.InputDelay, delay: 0.04}"]
+    words += ["dataset.validation.piece=4.9", "dataset.test.piece=4.9"]
+    run_script("train.py", *TINY, *words)
+    runs = [f"runs=[{run},{tmp_path / 'late'}]", f"hydra.run.dir={tmp_path / 'out'}"]
+    text = said(fails("evaluate.py", *runs), capsys)
+    assert "late has another data set in test than" in text
+    assert "steps.delay.delay=0.04 (None)" in text
+    data = ["dataset=example_log", f"dataset.root='{run.parent}'", "horizon=1", "windows=[]"]
+    run_script("evaluate.py", *runs, *data)
+    log = (tmp_path / "out" / "evaluate.log").read_text()
+    assert log.count("was trained with other steps than those of example_log") == 1
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -2,7 +2,6 @@
 
 from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.common import common_motions
 from pinn_dyn.data.logs.delay import DelayCurve, agreed_delays, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
@@ -47,7 +46,6 @@ __all__ = [
     "Step",
     "Table",
     "agreed_delays",
-    "common_motions",
     "default_split",
     "input_delays",
     "window_samples",
