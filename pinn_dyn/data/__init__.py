@@ -7,7 +7,6 @@ from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.logs import Cleaned, LogError, LogSource
 from pinn_dyn.data.robot import RobotSource
 from pinn_dyn.data.robot_excitation import (
-    Robot,
     RobotExcitation,
     TorqueMultiSine,
     TrackedMultiSine,
@@ -29,7 +28,6 @@ __all__ = [
     "LogSource",
     "Mixture",
     "MultiSine",
-    "Robot",
     "RobotExcitation",
     "RobotSource",
     "SimulatedSource",

@@ -5,33 +5,23 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, NamedTuple
 
 import numpy as np
+import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from pinn_dyn.data.excitation import Bounds, MultiSine
-from pinn_dyn.systems import HasLimits, Stepped
+from pinn_dyn.systems import SimulatedArm
 
-# Fine enough for references of a few Hz.
-_CHECK_STEP = 0.02
+_CHECK_STEP = 0.02  # s, fine enough for references of a few Hz
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
-
-
-@runtime_checkable
-class Robot(HasLimits, Stepped, Protocol):
-    """A robot that a recording can move, beyond being a mechanical system with A = I."""
-
-    def describe(self) -> dict[str, object]:
-        """Return everything the motion depends on, JSON-serializable."""
-
-    def dynamics(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return M ``(N, N)`` and C v + G + D v ``(N,)`` at one state."""
+Generators = Sequence[np.random.Generator]
 
 
 class Plan(NamedTuple):
-    """One motion to record: initial state ``(N,)`` and torque law u_k = torque(k, q_k, v_k)."""
+    """K motions to record: initial states ``(K, N)`` and laws u_k = torque(k, q_k, v_k)."""
 
     q0: np.ndarray
     v0: np.ndarray
@@ -43,8 +33,8 @@ class RobotExcitation(abc.ABC):
     """A family of random motions of a robot; a dataclass, as its fields are part of a cache key."""
 
     @abc.abstractmethod
-    def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
-        """Draw one motion for the sample times ``t`` ``(T,)``, s."""
+    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
+        """Draw a motion from each generator for the sample times ``t`` ``(T,)``, s."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +44,16 @@ class TrackedMultiSine(RobotExcitation):
         r_i(t) = centre_i + amplitude_i sum_h w_ih sin(2 pi f_ih t + phi_ih),   sum_h w_ih = 1
         u = M(q) (d2r/dt2 + 2 w (dr/dt - v) + w^2 (r - q)) + C v + G + D v,   w = bandwidth
 
-    The robot starts on the reference. References lie within ``reach`` of the joint ranges; small
-    amplitudes make fast motions, from which inertia is learned, large ones see more of gravity. A
-    joint's frequencies are lowered until
-    its peak speed is within ``speed``, all of them together until the torque along the reference
-    is within ``torque``.
+    The robot starts on the reference. Small amplitudes make fast motions, from which inertia is
+    learned, large ones see more of gravity. A joint's frequencies are lowered until its peak speed
+    is within ``speed``, and all frequencies until the torque along the reference is within
+    ``torque``.
 
     Source: Swevers et al. 1997 (IEEE Trans. Robotics and Automation 13(5)), excitation by sums of
     sines; computed torque: Murray, Li, Sastry 1994, eq. (4.51).
 
     Args:
-        frequency: [low, high] in Hz; each f_ih is drawn from it, uniform in its logarithm.
+        frequency: [low, high] in Hz; f_ih is uniform in its logarithm.
         harmonics: number of sines.
         reach: fraction of the joint ranges.
         amplitude: [low, high] of each joint's amplitude, as a fraction of the reach.
@@ -84,9 +73,24 @@ class TrackedMultiSine(RobotExcitation):
     torque: Fraction
     bandwidth: PositiveFloat
 
-    def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
-        """Draw a reference and its tracking law."""
-        size = len(robot.q_low)
+    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
+        """Draw references and their tracking law."""
+        draws = [self._draw_sines(robot, float(t[-1]), rng) for rng in rngs]
+        centre, *sines = (np.stack(values) for values in zip(*draws, strict=True))
+        w = self.bandwidth
+
+        def law(k: int, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            q_ref, v_ref, a_ref = _reference(t[k], centre, *sines)
+            return robot.motor_torque(q, v, a_ref + 2 * w * (v_ref - v) + w**2 * (q_ref - q))
+
+        q0, v0, _ = _reference(t[0], centre, *sines)
+        return Plan(q0, v0, law)
+
+    def _draw_sines(
+        self, robot: SimulatedArm, duration: float, rng: np.random.Generator
+    ) -> tuple[np.ndarray, ...]:
+        """Draw the arguments of :func:`_reference` for a motion within the limits."""
+        size = robot.num_coordinates
         half = self.reach * (robot.q_high - robot.q_low) / 2
         smallest, largest = self.amplitude
         amplitude = half * rng.uniform(smallest, largest, size)
@@ -94,47 +98,34 @@ class TrackedMultiSine(RobotExcitation):
         centre = middle + (half - amplitude) * rng.uniform(-1, 1, size)
         shape = (size, self.harmonics)
         low, high = np.log(self.frequency)
-        frequency = np.exp(rng.uniform(low, high, shape))
+        rate = 2 * np.pi * np.exp(rng.uniform(low, high, shape))
         phase = rng.uniform(0, 2 * np.pi, shape)
         weight = amplitude[:, None] * rng.dirichlet(np.ones(self.harmonics), size)
-
-        def reference(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            rate = 2 * np.pi * frequency
-            angle = rate * t[:, None, None] + phase
-            q = centre + (weight * np.sin(angle)).sum(-1)
-            v = (weight * rate * np.cos(angle)).sum(-1)
-            return q, v, -(weight * rate**2 * np.sin(angle)).sum(-1)
-
-        grid = np.arange(0.0, t[-1], _CHECK_STEP)
-        peak = np.abs(reference(grid)[1]).max(0)
+        grid = np.arange(0.0, duration, _CHECK_STEP)[:, None, None]
+        peak = np.abs(_reference(grid, centre, weight, rate, phase)[1]).max(0)
         # Slower sines run through a part of the same shape, so the peak falls with the frequency.
-        frequency *= np.minimum(1.0, self.speed * robot.v_max / peak)[:, None]
+        rate *= np.minimum(1.0, self.speed * robot.v_max / peak)[:, None]
         for _ in range(20):
-            use = self._torque_use(robot, *reference(grid))
+            u = robot.motor_torque(*_reference(grid, centre, weight, rate, phase))
+            use = np.abs(u).max(0) / (self.torque * robot.u_max)
             if use.max() <= 1:
-                break
-            frequency *= 0.9
-        else:
-            joint = int(use.argmax())
-            raise ValueError(
-                f"TrackedMultiSine: even a slow reference takes {use[joint]:.2f} of the torque "
-                f"allowed at joint {robot.joint_names[joint]!r} ({self.torque:g} of its limit "
-                f"{robot.u_max[joint]:g} Nm): raise torque, lower reach, or check the URDF's effort"
-            )
-        q_ref, v_ref, a_ref = reference(t)
-        w = self.bandwidth
+                return centre, weight, rate, phase
+            rate *= 0.9
+        joint = int(use.argmax())
+        raise ValueError(
+            f"TrackedMultiSine: even a slow reference takes {use[joint]:.2f} of the torque allowed "
+            f"at joint {robot.joint_names[joint]!r}: raise torque, lower reach, or check the URDF"
+        )
 
-        def law(k: int, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            mass, bias = robot.dynamics(q, v)
-            return mass @ (a_ref[k] + 2 * w * (v_ref[k] - v) + w**2 * (q_ref[k] - q)) + bias
 
-        return Plan(q_ref[0], v_ref[0], law)
-
-    def _torque_use(self, robot: Robot, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Largest torque along a reference over the torque allowed, ``(N,)``."""
-        terms = (robot.dynamics(*state) for state in zip(q, v, strict=True))
-        u = np.array([mass @ a_k + bias for (mass, bias), a_k in zip(terms, a, strict=True)])
-        return np.abs(u).max(0) / (self.torque * robot.u_max)
+def _reference(
+    t: np.ndarray, centre: np.ndarray, weight: np.ndarray, rate: np.ndarray, phase: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return q, v and a of multi-sines ``(..., N, harmonics)``."""
+    angle = rate * t + phase
+    q = centre + (weight * np.sin(angle)).sum(-1)
+    v = (weight * rate * np.cos(angle)).sum(-1)
+    return q, v, -(weight * rate**2 * np.sin(angle)).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -143,14 +134,14 @@ class TorqueMultiSine(RobotExcitation):
 
         u_i = G_i(q) + k_i (centre_i - q_i) - c_i v_i + s_i(t)
 
-    s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit. The spring k_i is so
-    stiff that a constant s_i at its peak would move the joint by ``reach`` of the way from the
-    centre to the nearer limit; c_i damps it critically for the inertia M_ii(centre). The centre is
-    drawn from the middle half of the range. The robot starts at rest where spring and torque
-    balance: a jump in the acceleration would weigh heavily in a squared loss.
+    s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit. A constant s_i at
+    its peak would move the spring k_i by ``reach`` of the way from the centre to the nearer limit;
+    c_i damps it critically for the inertia M_ii(centre). The centre is drawn from the middle half
+    of the range. The robot starts at rest where spring and torque balance, without a jump in the
+    acceleration.
 
     Args:
-        frequency: [low, high] in Hz; each sine's is drawn from it, uniform in its logarithm.
+        frequency: [low, high] of the sines in Hz, uniform in the logarithm.
         harmonics: number of sines.
         amplitude: peak of the multi-sines, as a fraction of the torque limits.
         reach: static displacement, as a fraction of the way to the nearer limit.
@@ -161,21 +152,25 @@ class TorqueMultiSine(RobotExcitation):
     amplitude: Fraction
     reach: Fraction
 
-    def draw(self, robot: Robot, t: np.ndarray, rng: np.random.Generator) -> Plan:
-        """Draw a torque signal and a centre."""
-        size = len(robot.q_low)
+    def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
+        """Draw torque signals and centres."""
         half = (robot.q_high - robot.q_low) / 2
-        centre = (robot.q_low + robot.q_high) / 2 + half * rng.uniform(-0.5, 0.5, size)
-        way = self.reach * np.minimum(centre - robot.q_low, robot.q_high - centre)
         peak = self.amplitude * robot.u_max
-        sines = MultiSine([0.0] * size, peak.tolist(), self.frequency, self.harmonics)
-        signal = sines.draw(1, float(t[-1]), rng)(t)[0]
-        rest = np.zeros(size)
+        sines = MultiSine([0.0] * len(peak), peak.tolist(), self.frequency, self.harmonics)
+        draws = [
+            (half * rng.uniform(-0.5, 0.5, len(half)), sines.draw(1, float(t[-1]), rng)(t)[0])
+            for rng in rngs
+        ]
+        offset, signal = (np.stack(values) for values in zip(*draws, strict=True))
+        centre = (robot.q_low + robot.q_high) / 2 + offset
+        way = self.reach * np.minimum(centre - robot.q_low, robot.q_high - centre)
         stiffness = peak / way
-        friction = 2 * np.sqrt(stiffness * np.diag(robot.dynamics(centre, rest)[0]))
+        inertia = robot.mass_matrix(torch.from_numpy(centre)).diagonal(dim1=-2, dim2=-1).numpy()
+        friction = 2 * np.sqrt(stiffness * inertia)
+        zero = np.zeros_like(centre)
 
         def law(k: int, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            gravity = robot.dynamics(q, rest)[1]
-            return gravity + stiffness * (centre - q) - friction * v + signal[k]
+            gravity = robot.motor_torque(q, zero, zero)
+            return gravity + stiffness * (centre - q) - friction * v + signal[:, k]
 
-        return Plan(centre + signal[0] / stiffness, rest, law)
+        return Plan(centre + signal[:, 0] / stiffness, zero, law)

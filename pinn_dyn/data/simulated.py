@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -11,7 +12,6 @@ from typing import Literal
 import numpy as np
 import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
-from torch import Tensor
 
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation, Joined
@@ -19,7 +19,7 @@ from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.limits import Limits
-from pinn_dyn.data.simulation import SimulationError, simulate
+from pinn_dyn.data.simulation import SimulationError, momentum, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.systems import HasDomain
@@ -165,7 +165,12 @@ class SimulatedSource(DataSource):
                 torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
             )
             splits[split] = [
-                Trajectory(q[k], v[k], Signal(t[: q.shape[1]], u[k]), momentum=self._momentum)
+                Trajectory(
+                    q[k],
+                    v[k],
+                    Signal(t[: q.shape[1]], u[k]),
+                    momentum=partial(momentum, self.system),
+                )
                 for k in range(q.shape[0])
             ]
         return Splits(**splits)
@@ -303,13 +308,6 @@ class SimulatedSource(DataSource):
             first = (stays.argmax(0) * left.size + np.arange(left.size))[replaced]
             for old, values in zip(motions, new, strict=True):
                 old[left[replaced]] = values[first]
-
-    def _momentum(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return p = M(q) v, computed in pieces that fit the processor's cache."""
-        size = q.shape[-1]
-        pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
-        with torch.no_grad():
-            return torch.cat([self.system.momentum(a, b) for a, b in pieces]).reshape(q.shape)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import torch
 from scipy.integrate import DOP853
+from torch import Tensor
 from tqdm import tqdm
 
 from pinn_dyn.data.excitation import Signal
@@ -26,6 +27,14 @@ def has_cpp_compiler() -> bool:
 
 class SimulationError(RuntimeError):
     """The solver could not finish a simulation."""
+
+
+def momentum(system: MechanicalSystem, q: Tensor, v: Tensor) -> Tensor:
+    """Return p = M(q) v, computed in pieces that fit the processor's cache."""
+    size = q.shape[-1]
+    pieces = zip(q.reshape(-1, size).split(2048), v.reshape(-1, size).split(2048), strict=True)
+    with torch.no_grad():
+        return torch.cat([system.momentum(*piece) for piece in pieces]).reshape(q.shape)
 
 
 def simulate(

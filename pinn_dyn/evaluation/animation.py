@@ -10,36 +10,31 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
-from PIL import Image, ImageDraw
+from PIL import Image
 from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.plots import COLORS, TRUTH
-from pinn_dyn.systems import Drawable, Rendered
+from pinn_dyn.systems import Drawable
 
-_TIP, _GOAL = "#CC0000", "#707070"
+_TIP = "#CC0000"
 _FRAME, _LAST_FRAME = 50, 1000  # ms
-_SIZE = (480, 360)  # of a rendered image, px
 
 
 def animate(record: ClosedLoopRecord, run: int, robot: object, path: Path) -> None:
-    """Write a GIF of one run in real time, up to its end or stop; nothing for other robots.
+    """Write a GIF of one run in real time, up to its end or stop, if the robot gives its lines.
+
+    The reference is grey, the path of the tip red.
 
     Args:
         record: K runs.
         run: index of the run.
-        robot: a system that gives its lines (:class:`Drawable`) or images (:class:`Rendered`).
+        robot: nothing is written for a robot that is not :class:`Drawable`.
         path: the GIF; its folder is created.
     """
-    if isinstance(robot, Rendered):
-        animate_images(record, run, robot, path)
-    elif isinstance(robot, Drawable):
-        animate_lines(record, run, robot, path)
-
-
-def animate_lines(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> None:
-    """Write a GIF of the lines of a robot. The reference is grey, the path of the tip red."""
+    if not isinstance(robot, Drawable):
+        return
     samples = _frames(record, run)
     shape, goal = _shapes(record, run, robot)
     figure = Figure(figsize=(4.8, 4.8), dpi=90)
@@ -57,29 +52,6 @@ def animate_lines(record: ClosedLoopRecord, run: int, robot: Drawable, path: Pat
             _legend(figure, ax)
         canvas.draw()
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
-    _save_gif(images, path)
-
-
-def animate_images(record: ClosedLoopRecord, run: int, robot: Rendered, path: Path) -> None:
-    """Write a GIF of images from a robot's simulator, with the paths of tip and reference."""
-    samples = _frames(record, run)
-    q, q_ref = (x[run, samples].double() for x in (record.q, record.reference.q))
-    points = torch.cat([robot.tip_position(q), robot.tip_position(q_ref)]).numpy()
-    pictures, pixels = robot.render(q.numpy(), points, _SIZE)
-    tip, goal = (list(map(tuple, part.tolist())) for part in np.split(pixels, 2))
-    images: list[Image.Image] = []
-    for frame, (sample, picture) in enumerate(zip(samples, pictures, strict=True)):
-        image = Image.fromarray(picture)
-        draw = ImageDraw.Draw(image)
-        draw.line(goal, fill=_GOAL, width=1)
-        draw.line(tip[: frame + 1], fill=_TIP, width=2)
-        draw.circle(goal[frame], 3, outline="black")
-        draw.circle(tip[frame], 3, fill=_TIP)
-        legend = "path of the tip: red, reference: grey"
-        draw.text((8, _SIZE[1] - 20), legend, fill="black", font_size=12)
-        text = _caption(record, run, sample, last=frame == len(samples) - 1)
-        draw.text((8, 6), text, fill="black", font_size=14)
-        images.append(image)
     _save_gif(images, path)
 
 

@@ -1,7 +1,7 @@
 """Analytic and simulated robots, the truth that models are compared with."""
 
 from pinn_dyn.systems.bullet_arm import BulletArm
-from pinn_dyn.systems.protocols import Drawable, HasDomain, HasLimits, HasTip, Rendered, Stepped
+from pinn_dyn.systems.protocols import Drawable, HasDomain, HasLimits, HasTip, Stepped
 from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.simulated_arm import SimulatedArm
 from pinn_dyn.systems.soft_arm import SoftArm
@@ -12,7 +12,6 @@ __all__ = [
     "HasDomain",
     "HasLimits",
     "HasTip",
-    "Rendered",
     "RigidChain",
     "SimulatedArm",
     "SoftArm",

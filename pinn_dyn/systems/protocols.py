@@ -1,11 +1,10 @@
 """What a robot may offer beyond its equation of motion; a class of your own just has the methods.
 
-References, plants, limits and pictures ask for these and for no class.
+References, plants, limits and animations ask for these and for no class.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -74,22 +73,3 @@ class Drawable(Protocol):
 
     def lines(self, q: Tensor) -> Tensor:
         """S lines of P points each, ``(*batch, S, P, 3)``, m; the last point is the tip."""
-
-
-@runtime_checkable
-class Rendered(HasTip, Protocol):
-    """A robot whose simulator takes pictures of it."""
-
-    def render(
-        self, q: np.ndarray, points: np.ndarray, size: tuple[int, int]
-    ) -> tuple[Iterable[np.ndarray], np.ndarray]:
-        """Pictures of configurations, and where points are in them.
-
-        Args:
-            q: configurations, ``(T, N)``.
-            points: points that must be in view, ``(P, 3)``, m.
-            size: width W and height H, pixels.
-
-        Returns:
-            T pictures ``(H, W, 3)`` of bytes, and columns and rows of the points, ``(P, 2)``.
-        """

@@ -74,6 +74,7 @@ class RigidChain(MechanicalSystem):
             a damping of another length.
     """
 
+    z_is_down = False
     inertia: Tensor
     _gravity: Tensor
     _placements: Tensor
@@ -273,6 +274,14 @@ class RigidChain(MechanicalSystem):
         if self._tip_body < 0:
             return origin[:3].expand(*q.shape[:-1], 3)
         return self.kinematics(q).poses[..., self._tip_body, :3, :] @ origin
+
+    def lines(self, q: Tensor) -> Tensor:
+        """Return a line from each joint to the next, and to the tip, ``(*batch, N + 1, 2, 3)``."""
+        origins = self.kinematics(q).poses[..., :3, 3]
+        base = torch.zeros_like(origins[..., :1, :])
+        points = torch.cat([base, origins, self.tip_position(q).unsqueeze(-2)], dim=-2)
+        starts = [parent + 1 for parent in (*self.parents, self._tip_body)]
+        return torch.stack([points[..., starts, :], points[..., 1:, :]], dim=-2)
 
     # The contract of a mechanical system.
 

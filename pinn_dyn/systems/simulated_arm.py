@@ -98,11 +98,11 @@ class SimulatedArm(RigidChain, abc.ABC):
             step: time step, s.
         """
 
-    def dynamics(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return M ``(N, N)`` and C v + G + D v ``(N,)`` at one state, for a law in NumPy."""
-        with torch.no_grad():
-            mass, bias = self.mass_and_bias(torch.from_numpy(q), torch.from_numpy(v))
-        return mass.numpy(), bias.numpy() + self.friction * v
+    def motor_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return M a + C v + G + D v, ``(*batch, N)``, Nm."""
+        with torch.inference_mode():
+            force = self.rigid_force(*map(torch.from_numpy, (q, v, a)))
+        return force.numpy() + self.friction * v
 
     @property
     def friction(self) -> np.ndarray:

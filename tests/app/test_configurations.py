@@ -61,7 +61,7 @@ def of_arm_2(folder):
 
 def of_panda(folder):
     pytest.importorskip("pybullet", reason="the Panda is simulated by PyBullet: pinn_dyn[panda]")
-    counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1", "dataset.workers=1"]
+    counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1"]
     return ["dataset.duration=0.2", *counts, STRIDE]
 
 

@@ -255,7 +255,7 @@ def test_the_panda_is_controlled_in_bullet(request, tmp_path, experiment, panda_
 def panda_run(tmp_path_factory):
     pytest.importorskip("pybullet", reason="the Panda is simulated by PyBullet: pinn_dyn[panda]")
     folder = tmp_path_factory.mktemp("runs") / "panda"
-    counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1", "dataset.workers=1"]
+    counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1"]
     run_script(
         "train.py",
         "experiment=panda",

@@ -10,7 +10,7 @@ from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import animate, pose_strip
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.systems import Drawable, HasLimits, HasTip, Rendered, SoftArm, Stepped
+from pinn_dyn.systems import Drawable, HasLimits, HasTip, SoftArm, Stepped
 
 
 class Crane(MechanicalSystem):
@@ -126,7 +126,7 @@ def test_a_robot_that_steps_by_itself_is_a_plant():
 def test_what_a_robot_offers_is_seen():
     assert isinstance(Crane(), HasTip)
     assert isinstance(Crane(), Drawable)
-    assert not isinstance(Crane(), (HasLimits, Rendered, Stepped))
+    assert not isinstance(Crane(), (HasLimits, Stepped))
     assert isinstance(Limited(), HasLimits)
     assert isinstance(SoftArm(), HasTip)
     assert isinstance(SoftArm(), Drawable)

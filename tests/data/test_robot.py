@@ -4,6 +4,7 @@ import importlib
 import re
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import hydra
 import numpy as np
@@ -38,7 +39,7 @@ TRACKED = {
 }
 TORQUE = {"frequency": [0.1, 1.0], "harmonics": 4, "amplitude": 0.25, "reach": 0.7}
 FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
-SHORT = {"duration": 0.5, "train": 4, "validation": 2, "test": 2, "workers": 1}
+SHORT = {"duration": 0.3, "train": 4, "validation": 2, "test": 2}
 
 
 def build(cache, dataset="panda", **changes):
@@ -80,25 +81,20 @@ def test_counts_names_and_samples_are_those_asked_for(source, splits):
     assert source.labels[0] == "q1 [rad]"
     assert source.input_labels[-1] == "τ7 [Nm]"
     for item in everything(splits):
-        assert item.q.shape == item.v.shape == item.u.shape == (501, 7)
+        assert item.q.shape == item.v.shape == item.u.shape == (301, 7)
         assert float(item.t[1]) == pytest.approx(1e-3)
 
 
-def moved(robot, plan, steps):
-    """q, v and u of a plan that the robot follows, ``(steps, N)`` each."""
-    q, v = plan.q0, plan.v0
-    robot.set_state(q, v)
-    rows = []
-    for k in range(steps):
-        u = plan.torque(k, q, v)
-        rows.append((q, v, u))
-        q, v = robot.step(u, 1e-3)
-    return (np.array(x) for x in zip(*rows, strict=True))
+def moved(source, excitation, steps, *seeds):
+    """q, v and u of motions of 10 s that the robot follows, ``(K, T, N)`` each."""
+    t = np.arange(10001) * 1e-3
+    plan = excitation.draw(source.system, t, [np.random.default_rng(seed) for seed in seeds])
+    return source._record(plan, t[:steps])
 
 
 def recorded(source, split):
     """q, v and u as the simulator gave them, from the cache."""
-    arrays = load_or_make(source.cache, source.name, source.describe(), source.simulate)
+    arrays = load_or_make(Path(source.cache), source.name, source.describe(), source.simulate)
     return (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
 
 
@@ -114,7 +110,7 @@ def test_records_satisfy_the_equation_of_motion_with_the_recorded_torque(source,
 
 def test_velocities_are_those_at_the_time_of_the_configuration(source, splits):
     """The true equations, rolled out, stay closer to the samples than to the record."""
-    centred = stack(splits.test).until(0.4)
+    centred = stack(splits.test).until(0.25)
     q, v, u = (x[:, : len(centred.t)] for x in recorded(source, "test"))
     torch.testing.assert_close(centred.q, q, rtol=0, atol=0)
     raw = Trajectory(q, v, Signal(centred.t, u, "hold"))
@@ -126,7 +122,7 @@ def test_velocities_are_those_at_the_time_of_the_configuration(source, splits):
 
 
 def test_position_velocity_and_torque_limits_hold(source, splits):
-    robot = source.robot
+    robot = source.system
     for item in everything(splits):
         q, v, u = (x.numpy() for x in (item.q, item.v, item.u))
         assert ((q > robot.q_low) & (q < robot.q_high)).all()
@@ -136,44 +132,34 @@ def test_position_velocity_and_torque_limits_hold(source, splits):
 
 def test_references_use_the_speed_and_range_allowed(source):
     """The fraction of the limits is reached by some joint and passed by none."""
-    t = np.arange(10001) * 1e-3
-    peaks, low, high = [], [], []
-    for seed in range(3):
-        plan = TrackedMultiSine(**TRACKED).draw(source.robot, t, np.random.default_rng(seed))
-        q, v, _ = moved(source.robot, plan, 10000)
-        peaks.append(np.abs(v).max(0) / source.robot.v_max)
-        low.append(q.min(0))
-        high.append(q.max(0))
-    assert np.max(peaks) <= 0.505  # tracked, so not exactly the reference
-    assert np.max(peaks) > 0.49
-    margin = 0.04 * (source.robot.q_high - source.robot.q_low)
-    assert (np.min(low, 0) > source.robot.q_low + margin).all()
-    assert (np.max(high, 0) < source.robot.q_high - margin).all()
-    used = (np.max(high, 0) - np.min(low, 0)) / (source.robot.q_high - source.robot.q_low)
-    assert (used > 0.3).all()
+    robot = source.system
+    q, v, _ = moved(source, TrackedMultiSine(**TRACKED), 5000, 0, 1, 2)
+    peak = (np.abs(v) / robot.v_max).max()
+    assert 0.49 < peak <= 0.505  # tracked, so not exactly the reference
+    extent, low, high = robot.q_high - robot.q_low, q.min((0, 1)), q.max((0, 1))
+    assert (low > robot.q_low + 0.04 * extent).all()
+    assert (high < robot.q_high - 0.04 * extent).all()
+    assert (high - low > 0.3 * extent).all()
 
 
 def test_a_tight_torque_limit_slows_the_reference_down(source):
-    t = np.arange(2001) * 1e-3
-    fast, slow = (
-        TrackedMultiSine(**{**TRACKED, "frequency": [1, 2], "speed": 1.0, "torque": torque}).draw(
-            source.robot, t, np.random.default_rng(5)
-        )
+    settings = {**TRACKED, "frequency": [1, 2], "speed": 1.0}
+    (q, v, _), (q_slow, v_slow, u_slow) = (
+        moved(source, TrackedMultiSine(**{**settings, "torque": torque}), 1000, 5)
         for torque in (1.0, 0.5)
     )
-    np.testing.assert_array_equal(fast.q0, slow.q0)
-    assert (np.abs(slow.v0) < 0.95 * np.abs(fast.v0)).all()
-    _, _, u = moved(source.robot, slow, 2000)
-    assert (np.abs(u) <= 0.505 * source.robot.u_max).all()
+    np.testing.assert_array_equal(q[:, 0], q_slow[:, 0])
+    assert (np.abs(v_slow[:, 0]) < 0.95 * np.abs(v[:, 0])).all()
+    assert (np.abs(u_slow) <= 0.505 * source.system.u_max).all()
 
 
-@pytest.mark.slow
-def test_more_test_motions_and_more_processes_change_no_other(source, splits, tmp_path):
-    other = build(tmp_path, test=3, workers=2).load()
-    assert len(other.test) == 3
-    for mine, theirs in zip(everything(splits), everything(other), strict=False):
-        assert torch.equal(mine.q, theirs.q)
-        assert torch.equal(mine.u, theirs.u)
+def test_more_test_motions_change_no_other(source, splits, tmp_path):
+    """To rounding, as the laws of all motions are computed together."""
+    more = build(tmp_path, test=3).load()
+    assert len(more.test) == 3
+    for first, second in zip(everything(splits), everything(more), strict=False):
+        torch.testing.assert_close(first.q, second.q, rtol=0, atol=1e-9)
+        torch.testing.assert_close(first.u, second.u, rtol=0, atol=1e-6)
 
 
 def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
@@ -203,10 +189,6 @@ def test_what_changes_the_motion_changes_the_key(source, cache, change):
     assert build(cache, configurations=None, **change).describe() != source.describe()
 
 
-def test_workers_and_names_of_configurations_do_not_change_the_key(source, cache):
-    assert build(cache, workers=3, configurations=None).describe() == source.describe()
-
-
 def test_momenta_are_those_of_the_mass_matrix(source, splits):
     windows = draw_windows(splits.train, count=50, steps=2, stride=5, seed=0)
     expected = torch.einsum("bij,bj->bi", source.system.mass_matrix(windows.q), windows.v)
@@ -233,11 +215,10 @@ def test_any_urdf_by_path(cache):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"step": 2.0}, r"panda: step is 2.0 s, expected at most duration, 0.5 s"),
-        ({"configurations": {"short": [0.0]}}, r"configurations.short has 1 entries.* needs 7"),
+        ({"configurations": {"short": [0.0]}}, r"configurations.short is \[0.0\]"),
         (
             {"configurations": {"bent": [0, 0, 0, 1.0, 0, 0, 0]}},
-            r"configurations.bent: q of joint 'panda_joint4' is 1 rad at sample 0, expected -3.142",
+            r"configurations.bent is .* within",
         ),
     ],
 )
@@ -258,7 +239,7 @@ def test_a_urdf_without_torque_limits_is_refused(cache, tmp_path):
           <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="2"/></joint></robot>"""
     )
     with pytest.raises(
-        hydra.errors.InstantiationException, match=r"joint 'hinge' has velocity limit 2 .*limit 0 N"
+        hydra.errors.InstantiationException, match=r"the joints hinge have no velocity or torque"
     ):
         build(cache, "urdf_arm", system={"urdf": str(path)})
 
@@ -267,8 +248,8 @@ def test_a_urdf_without_torque_limits_is_refused(cache, tmp_path):
 class Push(RobotExcitation):
     """Full torque all the time, which no arm survives."""
 
-    def draw(self, robot, t, rng):
-        middle = (robot.q_low + robot.q_high) / 2
+    def draw(self, robot, t, rngs):
+        middle = np.tile((robot.q_low + robot.q_high) / 2, (len(rngs), 1))
         return Plan(middle, 0 * middle, lambda k, q, v: 1000 * robot.u_max)
 
 
@@ -286,13 +267,13 @@ def test_torques_are_clipped_to_the_limits(cache):
     source = build(cache, duration=0.005)
     source.excitations = [Push()]
     arrays = source.simulate()
-    np.testing.assert_array_equal(arrays["test_u"][0], np.tile(source.robot.u_max, (7, 1)))
+    np.testing.assert_array_equal(arrays["test_u"][0], np.tile(source.system.u_max, (7, 1)))
 
 
 def test_a_robot_too_weak_to_hold_itself_is_reported(source):
     weak = TrackedMultiSine(**{**TRACKED, "torque": 0.1})
-    with pytest.raises(ValueError, match=r"of the torque allowed at joint 'panda_joint5' \(0.1 of"):
-        weak.draw(source.robot, np.arange(101) * 1e-3, np.random.default_rng(0))
+    with pytest.raises(ValueError, match=r"of the torque allowed at joint 'panda_joint5'"):
+        weak.draw(source.system, np.arange(101) * 1e-3, [np.random.default_rng(0)])
 
 
 def test_everything_else_imports_without_pybullet(tmp_path):

@@ -83,9 +83,7 @@ class TestRobotSource(DataSourceContract):
             validation=1,
             test=1,
             seed=seed,
-            workers=1,
             cache=str(cache),
-            configurations=None,
         )
 
     @pytest.fixture

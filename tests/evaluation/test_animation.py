@@ -7,12 +7,9 @@ from PIL import Image
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.evaluation import save
-from pinn_dyn.evaluation.animation import animate_images, animate_lines, pose_strip
+from pinn_dyn.evaluation.animation import animate, pose_strip
 from pinn_dyn.systems import SoftArm
-from pinn_dyn.systems.bullet_camera import camera, pixels
 
-PANDA = "franka_panda/panda.urdf"
-FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 RED = np.array([0xCC, 0, 0])
 
 
@@ -52,7 +49,7 @@ def count_red(pixels):
 
 def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(bending, tmp_path):
     path = tmp_path / "new" / "arm.gif"
-    animate_lines(bending, 0, SoftArm(2), path)
+    animate(bending, 0, SoftArm(2), path)
     found, times = frames(path)
     # From 0 s up to 0.45 s, and the last sample at 0.5 s.
     assert times == [50] * 10 + [1000]
@@ -66,7 +63,7 @@ def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(bending, tmp_path
 
 def test_a_stopped_run_is_drawn_up_to_its_stop(bending, tmp_path):
     stop(bending, 21)
-    animate_lines(bending, 0, SoftArm(2), tmp_path / "arm.gif")
+    animate(bending, 0, SoftArm(2), tmp_path / "arm.gif")
     assert frames(tmp_path / "arm.gif")[1] == [50] * 4 + [1000]  # 0 to 0.15 s, 0.2 s
 
 
@@ -96,55 +93,3 @@ def test_a_run_that_ran_away_does_not_set_the_scale(bending):
     stop(bending, 41)
     figure = pose_strip(bending, 0, SoftArm(2), [0.1], title="fake")
     assert abs(np.subtract(*figure.axes[0].get_zlim())) < 1.0
-
-
-@pytest.mark.panda
-def test_panda_moves_in_view_of_the_camera(tmp_path):
-    pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
-    from pinn_dyn.systems import BulletArm
-
-    t = 0.01 * torch.arange(51, dtype=torch.float64)
-    home = torch.tensor([0, -0.785, 0, -2.356, 0, 1.571, 0.785], dtype=torch.float64)
-    q_ref = (home + t[:, None] * torch.tensor([3.0, 1, 0, 2, 0, 0, 0]))[None]
-    record = make_record(q_ref - 0.05, q_ref, t)
-    arm = BulletArm(PANDA, locked_joints=FINGERS)
-    path = tmp_path / "panda.gif"
-    animate_images(record, 0, arm, path)
-    found, times = frames(path)
-    assert times == [50] * 10 + [1000]
-    assert count_red(found[-1]) > count_red(found[0]) + 30
-    q = record.q[0, ::10]
-    plain, _ = arm.render(q.numpy(), arm.tip_position(q).numpy(), (240, 180))
-    plain = np.asarray(plain).astype(int)
-    for picture in plain:
-        arm_pixels = (picture < 220).all(-1)
-        assert arm_pixels.mean() > 0.05
-        border = np.ones_like(arm_pixels)
-        border[3:-3, 3:-3] = False
-        assert not arm_pixels[border].any()
-    assert (np.abs(plain[-1] - plain[0]).max(-1) > 40).mean() > 0.03
-    assert not any(count_red(picture) for picture in plain)
-
-
-@pytest.mark.panda
-@pytest.mark.parametrize("size", [(160, 120), (120, 160)])
-def test_points_are_where_bullet_draws_them(size):
-    bullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
-    points = np.array([[0.5, 0.2, 0.1], [-0.3, 0.4, 0.9], [0.1, -0.6, 0.4]])
-    view, projection = camera(bullet, points, size)
-    expected = pixels(points, view, projection, size)
-    client = bullet.connect(bullet.DIRECT)
-    try:
-        ball = bullet.createVisualShape(bullet.GEOM_SPHERE, radius=0.03, physicsClientId=client)
-        body = bullet.createMultiBody(baseVisualShapeIndex=ball, physicsClientId=client)
-        for point, (column, row) in zip(points, expected, strict=True):
-            bullet.resetBasePositionAndOrientation(
-                body, point, [0, 0, 0, 1], physicsClientId=client
-            )
-            mask = bullet.getCameraImage(
-                *size, view, projection, renderer=bullet.ER_TINY_RENDERER, physicsClientId=client
-            )[4]
-            rows, columns = np.nonzero(np.reshape(mask, size[::-1]) >= 0)
-            assert (columns.mean() + 0.5, rows.mean() + 0.5) == pytest.approx((column, row), abs=1)
-    finally:
-        bullet.disconnect(client)

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
 import pybullet_data  # noqa: E402
 
-from pinn_dyn.systems import BulletArm, RigidChain  # noqa: E402
+from pinn_dyn.systems import BulletArm  # noqa: E402
 from pinn_dyn.testing.finite_differences import assert_near  # noqa: E402
 from pinn_dyn.testing.mechanical_system import Configurations, MechanicalSystemContract  # noqa: E402
 from tests.support.bullet_arms import FINGERS, PANDA, states  # noqa: E402
@@ -46,20 +45,6 @@ class TestPanda(MechanicalSystemContract):
 
 
 # Against independent answers.
-
-
-@pytest.mark.parametrize(("urdf", "settings"), ARMS)
-def test_the_chain_and_pybullet_have_the_same_terms(urdf, settings):
-    """Agrees to rounding: 4e-15 in M, 4e-14 in the bias force."""
-    arm = BulletArm(urdf, **settings)
-    rng = np.random.default_rng(0)
-    for q, v in rng.uniform(-2, 2, (20, 2, arm.num_coordinates)):
-        mass, bias = arm.dynamics(q, v)
-        chain_mass, chain_bias = RigidChain(urdf, **{"damping": 0.5, **settings}).mass_and_bias(
-            torch.from_numpy(q), torch.from_numpy(v)
-        )
-        np.testing.assert_allclose(mass, chain_mass, rtol=0, atol=2e-14)
-        np.testing.assert_allclose(bias, chain_bias + arm.friction * v, rtol=0, atol=2e-13)
 
 
 def pendulum_terms(q, v, g=9.81):
@@ -214,9 +199,3 @@ def test_copies_and_pickles_give_the_same_numbers(panda):
 def test_a_robot_that_is_no_arm_is_refused_with_what_to_do(pendulum, changes, arguments, message):
     with pytest.raises(ValueError, match=message):
         BulletArm(pendulum(*changes), **arguments)
-
-
-def test_without_pybullet_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(ImportError, match=r"pip install 'pinn_dyn\[panda\]'.*3\.10 and 3\.11"):
-        BulletArm(PANDA)
