@@ -27,7 +27,7 @@ from pinn_dyn.data import DataSource, data_changes, data_identity
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
-from pinn_dyn.models.output_limits import expect_output_limits
+from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.training import COVARIANCE, WholeCheckpoints
 
 CONFIG = "config.yaml"
@@ -121,7 +121,7 @@ def _take_weights(model: Predictor, path: Path, state: Mapping[str, torch.Tensor
         ConfigError: if they are those of another model, or not finite.
     """
     weights = {k.removeprefix("model."): x for k, x in state.items() if k.startswith("model.")}
-    expect_output_limits(model, weights)
+    set_output_limits(model, weights)
     if broken := [key for key, value in weights.items() if not value.isfinite().all()]:
         raise ConfigError(
             f"the weights {broken[0]} are NaN or infinite, the training diverged: take another "

@@ -15,17 +15,11 @@ from pinn_dyn.mechanics import Trajectory
 
 
 class EnsembleData(L.LightningDataModule):
-    """Data module that gives each member the training windows in a different order.
-
-    Args:
-        data: data module of the windows. Member k has the order of the seed ``data.seed + k``.
-        members: E.
-    """
+    """Data module in which member k has the training windows in the order of ``data.seed + k``."""
 
     def __init__(self, data: DynamicsData, members: int):
         super().__init__()
-        self.data = data
-        self.members = members
+        self.data, self.members = data, members
 
     @property
     def source(self) -> DataSource:
@@ -53,11 +47,7 @@ class EnsembleData(L.LightningDataModule):
 
 
 class MemberSampler(Sampler[Tensor]):
-    """Sampler of batches ``(E, batch_size)``, in a different order for each member.
-
-    Args:
-        samplers: the order of each member.
-    """
+    """Sampler of batches ``(E, batch_size)`` from a sampler for each member."""
 
     def __init__(self, samplers: list[BatchSampler]):
         self.samplers = samplers

@@ -20,17 +20,10 @@ class CompiledMembers:
     If a window needs few evaluations of the dynamics, a compiled program for the loss and gradient
     of a single model runs for all members in parallel threads. On a GPU one program computes all
     members. Otherwise the dynamics of all members are compiled together.
-
-    Args:
-        loss: loss of a model, or of stacked members.
-        stack: the members.
-        vector: parameters of the members.
     """
 
     def __init__(self, loss: WindowLoss, stack: ContinuousStack, vector: ParameterVector):
-        self.loss = loss
-        self.stack = stack
-        self.vector = vector
+        self.loss, self.stack, self.vector = loss, stack, vector
         self._integrator = CompiledDynamics(stack.integrator, stack)
         model = stack if vector.values.is_cuda else stack.template.model
         self._program = LossProgram(loss, model, vector)

@@ -17,16 +17,12 @@ from pinn_dyn.training.gradients import Eager, Engine
 class EnsembleLearner(DynamicsLearner):
     """LightningModule that trains the members of an :class:`Ensemble` together and independently.
 
-    A batch of windows has a leading dimension E, with a batch for each member. The loss is the sum
-    of the losses of the members, so the gradients are independent. Gradients are clipped by the
-    norm of each member. The optimizer treats every weight, or every member, separately
-    (:class:`MemberSOAP`). Validation rolls out the ensemble.
-
-    Args and errors: as :class:`DynamicsLearner`.
+    Windows ``(E, B, ...)`` have a batch for each member. The loss is the sum of the losses of the
+    members, so their gradients are independent, and clipped by the norm of each member. Validation
+    rolls out the ensemble. Arguments and errors are those of :class:`DynamicsLearner`.
 
     Raises:
-        ValueError: at the start of the training, if the optimizer mixes the entries of a tensor,
-            and therefore the members.
+        ValueError: in training, if the optimizer mixes the entries of a tensor, and so the members.
     """
 
     model: Ensemble
@@ -59,8 +55,7 @@ class EnsembleLearner(DynamicsLearner):
         if type(optimizer) not in ELEMENTWISE:
             raise ValueError(
                 f"optimizer is {type(optimizer).__name__}, which mixes the weights of different "
-                "members: use optimizer=adamw or soap, or train the seeds one by one "
-                "(train.py -m seed=0,1,2)"
+                "members: use optimizer=adamw or soap, or train.py -m seed=0,1,2"
             )
         return optimizer
 
@@ -68,9 +63,8 @@ class EnsembleLearner(DynamicsLearner):
 class MemberSOAP(SOAP):
     """SOAP on parameters ``(E, ...)`` with preconditioners for each of the E members.
 
-    The gradient of a matrix that is not square does not determine the whole basis. Rounding then
-    chooses the basis, so a member may be trained differently, but equally well, than a single model
-    of the same seed.
+    Rounding chooses a part of the bases of matrices that are not square, so a member may be trained
+    differently, but equally well, than a single model of the same seed.
     """
 
     leading = 1

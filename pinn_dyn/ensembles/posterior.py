@@ -24,22 +24,9 @@ def posterior_draws(model: Predictor, covariance: Tensor, size: int = DRAWS) -> 
         model: model with the fitted z.
         covariance: C, ``(P, P)``.
         size: E.
-
-    Raises:
-        ValueError: if C is not a covariance of the P parameters.
     """
     z = parameters_to_vector(model.parameters()).detach().double()
-    if covariance.shape != (len(z), len(z)):
-        raise ValueError(
-            f"the covariance has {len(covariance)} rows, but the model has {len(z)} constants: "
-            "the checkpoint is damaged, fit the model again"
-        )
-    root, failed = torch.linalg.cholesky_ex(covariance.double())
-    if failed or not root.isfinite().all():
-        raise ValueError(
-            "the covariance of the constants is not positive definite: the checkpoint is damaged, "
-            "fit the model again"
-        )
+    root = torch.linalg.cholesky(covariance.double())
     noise = torch.randn(size, len(z), generator=torch.Generator().manual_seed(0)).double()
     members = [copy.deepcopy(model) for _ in range(size)]
     for member, shift in zip(members, noise @ root.T, strict=True):

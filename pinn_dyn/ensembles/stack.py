@@ -57,9 +57,8 @@ class ContinuousStack(ContinuousPredictor):
         first = members[0]
         if first.input_history:
             raise ValueError(
-                "the members learn an input delay (model/delay=learned), and all members take one "
-                "input: train the seeds one by one (train.py -m seed=0,1,2), or with "
-                "~model/delay on an input that is shifted before (the step InputDelay)"
+                "the members learn an input delay (model/delay=learned), but take one input: train "
+                "the seeds one by one (train.py -m seed=0,1,2), or use the step InputDelay"
             )
         super().__init__(first.num_coordinates, first.num_inputs, first.state)
         self.integrator = first.integrator

@@ -22,32 +22,27 @@ from pinn_dyn.mechanics.integrators.integrator import BLOCK
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 
-# Thresholds for compiling. Each number is from benchmarks/training_step.py or, for roll-outs,
-# benchmarks/long_rollout.py, on two cores; benchmarks/README.md has the tables.
+# Thresholds measured by benchmarks/training_step.py and benchmarks/long_rollout.py on two cores.
 
 STEPS_FOR_DERIVATIVE = 5_000
-"""Training steps from which compiling the state derivative pays off. At batch 256 and N = 3 it
-saves 11 ms per step and takes 19 to 33 s."""
+"""Training steps from which compiling the state derivative pays off: 11 ms per step for 19 to
+33 s at batch 256 and N = 3."""
 STEPS_FOR_PROGRAM = 20_000
-"""Training steps from which compiling loss and gradient as one program pays off. It saves another
-4 ms per step, and takes 54 s longer at N = 3 (14,000 steps) and 124 s at N = 7 (28,000 steps). For
-ensembles it always pays off."""
+"""Training steps from which compiling loss and gradient as one program pays off: another 4 ms per
+step for 54 s at N = 3 and 124 s at N = 7. For ensembles it always pays off."""
 MOST_EVALUATIONS = 4
-"""Largest number of evaluations of the dynamics in a window that is compiled as one program. The
-time to compile grows with this number."""
+"""Largest number of evaluations of the dynamics in a window that is compiled as one program."""
 CHUNK = 256
 """Number of windows with MOST_EVALUATIONS that are computed at once, so that the values for the
-gradient stay in the cache. With one evaluation the number is four times larger (8,192 windows of
-the midpoint loss at N = 3: 76 ms in parts of 256, 55 ms in parts of 1,024). Batches of less than
-twice this number are not split."""
+gradient stay in the cache. Batches of less than twice this number are not split."""
 WORK_FOR_LOOP = 4_500_000
-"""Steps times (batch + 300) from which a compiled loop pays off in a roll-out. It saves 2 ms per
-step and 7 us per trajectory, and takes 20 s to compile."""
+"""Steps times (batch + 300) from which a compiled loop pays off in a roll-out: 2 ms per step and
+7 us per trajectory for 20 s."""
 
-# Products over at most this many numbers become sums that the compiler can fuse.
 _SHORT = 8
-# A loop over fewer numbers runs in one thread, since starting threads takes longer than its work.
+"""Largest number of terms for which the compiler can fuse a product as a sum."""
 _WORTH_THREADS = 1024
+"""Smallest number of values for which a loop runs in several threads."""
 
 
 @contextmanager
@@ -75,19 +70,11 @@ class _Wrapped(Integrator):
 
 
 class Unrolled(_Wrapped):
-    """Integrator whose paths are the traceable loop of the base class."""
+    """Integrator whose paths are the traceable loop over single steps."""
 
 
 class CompiledDynamics(_Wrapped):
-    """Integrator of compiled dynamics, with gradients.
-
-    Only the state derivative or a step is compiled, not the whole path. This keeps the time to
-    compile short.
-
-    Args:
-        inner: the integration method.
-        dynamics: the dynamics to compile, for a fixed batch shape.
-    """
+    """Integrator of dynamics whose derivative or step is compiled, with gradients."""
 
     def __init__(self, inner: Integrator, dynamics: Dynamics):
         super().__init__(inner)
@@ -103,11 +90,7 @@ class CompiledDynamics(_Wrapped):
 
 
 class CompiledLoop(_Wrapped):
-    """Integrator that runs a path as one compiled loop, without gradients, for long roll-outs.
-
-    Compiling takes 30 to 60 s for a new model, and about 15 s for a model of the same shape by the
-    compiler's cache on disk.
-    """
+    """Integrator that runs a path as one compiled loop, without gradients, for long roll-outs."""
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         u = signal.u[..., 0, :].expand(BLOCK, len(self.nodes), *signal.batch, signal.num_inputs)
@@ -115,7 +98,7 @@ class CompiledLoop(_Wrapped):
         loop = compile_loop(dynamics.integration_step, torch.zeros_like(start), start, arguments)
         blocks = [torch.zeros_like(start)[None]]
         for inputs, lengths in self.blocks(grid, signal):
-            # The loop has BLOCK steps. The last block is padded with steps of length zero.
+            # The last block is padded with steps of length zero.
             missing = BLOCK - lengths.shape[0]
             padded = torch.cat([inputs, inputs[-1:].expand(missing, *inputs.shape[1:])])
             path = loop(blocks[-1][-1], start, padded, F.pad(lengths, (0, missing)))
@@ -126,8 +109,8 @@ class CompiledLoop(_Wrapped):
 class RecordedSteps(_Wrapped):
     """Integrator that replays steps from a CUDA graph on a GPU, without gradients.
 
-    A step consists of some hundred small kernels, and launching a kernel takes longer than its
-    work. Dynamics that wait for the GPU cannot be recorded; they use the inner integrator.
+    Launching a kernel takes longer than its work. Dynamics that wait for the GPU cannot be
+    recorded; they use the inner integrator.
     """
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
@@ -182,16 +165,15 @@ def compile_graph(
 ) -> Callable[..., Any]:
     """Compile a function for arguments of fixed shapes and types.
 
-    The function is traced once. Numbers and tensors that are not arguments become constants of the
-    program. The program has no checks. On a CPU it runs in one thread. On a GPU it is recorded as a
-    CUDA graph, so that a call launches all kernels.
+    The function is traced once. Numbers and tensors that are not arguments become constants. The
+    program has no checks. On a CPU it runs in one thread; on a GPU it is recorded as a CUDA graph.
     """
     _keep_rows()
     graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
     for node in graph.graph.nodes:  # the recorded shapes do not fit; use those of the arguments
         node.meta.clear()
     if arguments[0].is_cuda:
-        # Combine kernels of independent heads, since a launch takes as long as the work.
+        # Combined kernels of independent heads need fewer launches.
         program = compile_fx_graph(graph, list(arguments), {"combo_kernels": True})
         return _Recorded(program, arguments)
     # Without the wrappers of torch.compile, which take 0.15 ms per call.
@@ -219,16 +201,8 @@ def compile_loop(
 ) -> Callable[..., Tensor]:
     """Compile the loop x_{k+1} = step(x_k, c, *inputs_k) into one program without gradients.
 
-    The program is for arguments of fixed shapes and types, as by :func:`compile_graph`.
-
-    Args:
-        step: the repeated function.
-        state: x, ``(...)``.
-        constant: c, the same in all steps.
-        inputs: the inputs of all steps, each ``(T, ...)``.
-
-    Returns:
-        A function of x, c and the unpacked inputs that returns x_1 to x_T, ``(T, ...)``.
+    The program is for arguments of fixed shapes and types. Each of the ``inputs`` is ``(T, ...)``,
+    and the program returns x_1 to x_T, ``(T, ...)``.
     """
     # make_fx does not support bound methods.
     graph = make_fx(lambda *arguments: step(*arguments), _DECOMPOSITIONS)(
@@ -252,11 +226,7 @@ def compile_loop(
 
 
 def _keep_rows() -> None:
-    """Make the compiler pass matrices to triangular solves in row-major order.
-
-    Otherwise it chooses column-major order, and each solve makes a copy: a sixth of a step at
-    N = 48.
-    """
+    """Make the compiler pass matrices to triangular solves in row-major order, without copies."""
     from torch._inductor import lowering  # the import takes a second
 
     solve = torch.ops.aten.linalg_solve_triangular.default

@@ -22,8 +22,7 @@ class Predictor(nn.Module, abc.ABC):
     """Model that predicts the motion of a state under an input.
 
     Attributes:
-        num_coordinates: N, the dimension of q.
-        num_inputs: M, the dimension of u.
+        num_coordinates, num_inputs: N and M, the dimensions of q and u.
         state: the predicted state x ``(*batch, 2N)``: ``"qv"`` for (q, v), ``"qp"`` for (q, p).
         fixed_step: step of a discrete-time model in s, or None if any step is possible.
         penalized: true if training adds :meth:`penalty` to the loss.
@@ -76,13 +75,21 @@ class Predictor(nn.Module, abc.ABC):
         """Return states x(t_k), ``(*batch, T, 2N)``. The arguments are those of :meth:`increments`.
 
         Raises:
-            ValueError: if the initial state or the input has a wrong size, the times do not
-                increase, or the initial state is not finite.
+            ValueError: if a size is wrong, times do not increase, or the state is not finite.
         """
         require_last_dim("x0", x0, 2 * self.num_coordinates, "2N")
         require_last_dim("u", input.u, self.num_inputs, "M")
         require_start(x0, t, input)
         return x0.unsqueeze(-2) + self.increments(x0, t, input)
+
+    def _require_step(self, t: Tensor) -> None:
+        """Raise an error if times advance by other steps than the fixed step of the model."""
+        step, spacing = self.fixed_step or 0.0, t.double().diff()
+        if float((spacing - step).abs().max()) > 1e-3 * step:
+            raise ValueError(
+                f"{type(self).__name__} predicts in steps of {step:g} s, but t advances by "
+                f"{float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
+            )
 
 
 class ContinuousPredictor(Predictor):

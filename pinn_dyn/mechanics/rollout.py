@@ -29,9 +29,6 @@ def rollout(
         t: times of the solution, ``(T,)``, s.
         input: u.
         substeps: steps of the integrator between two times of ``t``.
-
-    Raises:
-        ValueError: see :func:`require_start`.
     """
     require_start(x0, t, input)
     path = path_between(_Flow(derivative), RK4(substeps), x0, t, input)
@@ -39,20 +36,14 @@ def rollout(
 
 
 def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
-    """Check the arguments of a roll-out.
-
-    Raises:
-        ValueError: if there are fewer than 2 times, the times do not increase, the batches of
-            input and initial state differ, or the initial state is not finite.
-    """
+    """Raise an error if times do not increase, batches differ, or the state is not finite."""
     if t.ndim != 1 or t.shape[0] < 2:
         raise ValueError(f"t has shape {tuple(t.shape)}, expected (T,) with at least 2 times")
     if not bool((t.diff() > 0).all()):
         raise ValueError("t must increase strictly; sort it and drop repeated times")
     if input.batch != x0.shape[:-1]:
         raise ValueError(
-            f"u has batch shape {tuple(input.batch)}, x0 has {tuple(x0.shape[:-1])}: "
-            "expected the same batch"
+            f"u has batch shape {tuple(input.batch)}, expected that of x0, {tuple(x0.shape[:-1])}"
         )
     require_finite("the initial state x0", x0)
 
@@ -60,15 +51,7 @@ def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
 def path_between(
     dynamics: Dynamics, integrator: Integrator, x0: Tensor, t: Tensor, input: Signal
 ) -> Tensor:
-    """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks, as in training.
-
-    Args:
-        dynamics: the state derivative.
-        integrator: the method, with its substeps between two times of ``t``.
-        x0: initial state, ``(*batch, S)``.
-        t: times of the solution, ``(T,)``, s.
-        input: u, of the same batch.
-    """
+    """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks of a roll-out."""
     # Times are made relative to the start before they are cast, so that the times of the solver and
     # of the input have the same dtype and compare exactly.
     input = input.since(t[0])

@@ -13,7 +13,6 @@ from torch import Tensor
 
 Interpolation = Literal["hold", "linear", "cubic"]
 """Interpolation between two samples: the earlier sample, a line, or a cubic."""
-Side = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
@@ -28,15 +27,13 @@ class Signal:
                      + h (s - 2s^2 + s^3) r_k - h (s^2 - s^3) r_{k+1}
 
     r_k is the rate at a sample, by second-order differences of its two neighbours (a cubic Hermite
-    spline). The error for smooth inputs is of order h^3, and a sample influences the curve up to
-    two samples away.
+    spline). The error for smooth inputs is of order h^3.
 
     Args:
         t: sample times, ``(K,)``, s, strictly increasing.
         u: samples, ``(*batch, K, M)``.
         interpolation: ``"hold"``, ``"linear"`` or ``"cubic"``.
-        rate: r, ``(*batch, K, M)``, for a cubic that is part of a longer one. The default is
-            computed from u.
+        rate: r, ``(*batch, K, M)``, for a part of a longer cubic. The default is computed from u.
 
     Raises:
         ValueError: if shapes do not match, times do not increase, or the interpolation is unknown.
@@ -50,8 +47,8 @@ class Signal:
     def __post_init__(self) -> None:
         if self.t.ndim != 1 or self.u.ndim < 2 or self.u.shape[-2] != self.t.shape[0]:
             raise ValueError(
-                f"u has shape {tuple(self.u.shape)}, expected (*batch, {self.t.shape[0]}, M): "
-                f"one row for each of the {self.t.shape[0]} sample times"
+                f"u has shape {tuple(self.u.shape)}, expected (*batch, {self.t.shape[0]}, M) for "
+                f"{self.t.shape[0]} sample times"
             )
         if self.interpolation not in get_args(Interpolation):
             raise ValueError(
@@ -61,9 +58,8 @@ class Signal:
         if backward.any():
             k = int(backward.nonzero()[0])
             raise ValueError(
-                f"t must increase strictly, but t[{k}] = {float(self.t[k])} "
-                f"is followed by t[{k + 1}] = {float(self.t[k + 1])}: sort it and drop repeated "
-                "times"
+                f"t must increase strictly, but t[{k}] = {float(self.t[k])} is followed by "
+                f"t[{k + 1}] = {float(self.t[k + 1])}: sort it and drop repeated times"
             )
         if self.interpolation == "cubic" and self.rate is None:
             object.__setattr__(self, "rate", _rates(self.t, self.u))
@@ -77,8 +73,6 @@ class Signal:
     def batch(self) -> torch.Size:
         """Batch shape of u."""
         return self.u.shape[:-2]
-
-    # Derived signals.
 
     def part(self, samples: slice) -> Signal:
         """Return the signal restricted to a slice of its samples."""
@@ -97,8 +91,8 @@ class Signal:
         if self.interpolation == "hold":
             raise ValueError(
                 "interpolation is 'hold', expected 'linear' or 'cubic': the delay of a held input "
-                "cannot be learned, since its slope is zero; set dataset.interpolation=linear, or "
-                "measure the delay by check.py and shift the input by the step InputDelay"
+                "cannot be learned; set dataset.interpolation=linear, or measure the delay by "
+                "check.py and shift the input by the step InputDelay"
             )
         return self._changed(self.t + delay.to(self.t), lambda value: value)
 
@@ -120,18 +114,14 @@ class Signal:
     def _made(self, t: Tensor, u: Tensor, rate: Tensor | None) -> Signal:
         """Build a signal without checks, by operations that can be traced."""
         made = object.__new__(Signal)
-        values = {"t": t, "u": u, "interpolation": self.interpolation, "rate": rate}
-        made.__dict__.update(values)
+        made.__dict__.update(t=t, u=u, interpolation=self.interpolation, rate=rate)
         return made
 
-    # Values.
-
-    def __call__(self, time: Tensor | float, side: Side = "right") -> Tensor:
-        """Return u at a time, ``(*batch, M)``. The side matters at the jumps of a held input."""
+    def __call__(self, time: Tensor | float) -> Tensor:
+        """Return u at a time, ``(*batch, M)``. At a jump the right value counts."""
         now, times = float(time), self._times
         last = len(times) - 1
-        find = bisect.bisect_right if side == "right" else bisect.bisect_left
-        index = min(max(find(times, now) - 1, 0), last)
+        index = min(max(bisect.bisect_right(times, now) - 1, 0), last)
         if self.interpolation == "hold" or index == last:
             return self._samples[index]
         span = times[index + 1] - times[index]
@@ -140,8 +130,8 @@ class Signal:
             return torch.lerp(self._samples[index], self._samples[index + 1], share)
         # Outside the samples the share is 0, and the rates have no weight.
         weights = torch.tensor(share, dtype=self.u.dtype, device=self.u.device)
-        values = self._samples[index : index + 2], span * self._rates[index : index + 2]
-        return _combined(_cubic(weights), values[0][0], values[0][1], values[1][0], values[1][1])
+        low, high = self._samples[index : index + 2]
+        return _combined(_cubic(weights), low, high, *(span * self._rates[index : index + 2]))
 
     def at(self, times: Tensor) -> Tensor:
         """Return u at times ``(T,)``, ``(T, *batch, M)``. At a jump the right value counts."""

@@ -14,11 +14,7 @@ from pinn_dyn.mechanics.predictor import ContinuousPredictor
 
 
 class Terms(NamedTuple):
-    """Terms of the equation of motion at a configuration.
-
-    ``M`` mass matrix ``(*batch, N, N)``, ``D`` damping matrix ``(*batch, N, N)``,
-    ``G`` potential force ``(*batch, N)``, ``A`` input matrix ``(*batch, N, M)``.
-    """
+    """Mass matrix M, damping matrix D, potential force G and input matrix A at a q."""
 
     M: Tensor
     D: Tensor
@@ -44,11 +40,11 @@ class MechanicalSystem(ContinuousPredictor):
     ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
     force ``(*batch, N)``; SI units and radians.
 
-    If the force is not linear in the input, as for a robot driven by motor positions, A depends on
-    u, ``input_affine`` is false, and :meth:`input_matrix` is A at a typical input.
+    If the force is not linear in the input, ``input_affine`` is false, and :meth:`input_matrix` is
+    A at a typical input.
 
-    A subclass implements the four abstract terms. The ``_``-methods below derive all other
-    quantities by automatic differentiation. A subclass with closed formulas may override them.
+    A subclass implements the four abstract terms. The ``_``-methods derive all other quantities by
+    automatic differentiation. A subclass with closed formulas may override them.
     """
 
     input_affine: bool = True
@@ -123,21 +119,15 @@ class MechanicalSystem(ContinuousPredictor):
         return spd_solve(self.mass_matrix(q), p)
 
     def _kinetic_gradient(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return d(v^T M(q) v / 2)/dq at fixed v, by one reverse pass through the mass matrix."""
+        """Return d(v^T M(q) v / 2)/dq at fixed v."""
         return torch.func.grad(lambda x: 0.5 * (v * matvec(self.mass_matrix(x), v)).sum())(q)
-
-    # What every mechanical system can then do.
 
     @final
     def terms(self, q: Tensor) -> Terms:
         """Return M(q), D(q), G(q) and A(q) together."""
         self._check(q=q)
-        return Terms(
-            self.mass_matrix(q),
-            self.damping_matrix(q),
-            self._potential_force(q),
-            self.input_matrix(q),
-        )
+        mass, damping = self.mass_matrix(q), self.damping_matrix(q)
+        return Terms(mass, damping, self._potential_force(q), self.input_matrix(q))
 
     @final
     def potential_force(self, q: Tensor) -> Tensor:
@@ -155,25 +145,20 @@ class MechanicalSystem(ContinuousPredictor):
     def coriolis_matrix(self, q: Tensor, v: Tensor) -> Tensor:
         """Return C(q, v), ``(*batch, N, N)``, from the Christoffel symbols of the first kind::
 
-            C_ij = sum_k (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k / 2
+        C_ij = sum_k (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k / 2
 
-        With this choice dM/dt - 2 C is skew-symmetric (Murray, Li, Sastry 1994, Lemma 4.2).
         """
         self._check(q=q, v=v)
         basis = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
-        slopes = torch.stack(
-            [
-                torch.func.jvp(self.mass_matrix, (q,), (direction.expand_as(q),))[1]
-                for direction in basis
-            ],
-            dim=-1,
-        )  # (*batch, i, j, k) = dM_ij / dq_k
+        directions = [row.expand_as(q) for row in basis]
+        rates = [torch.func.jvp(self.mass_matrix, (q,), (e,))[1] for e in directions]
+        slopes = torch.stack(rates, dim=-1)  # (*batch, i, j, k) = dM_ij / dq_k
         symbols = slopes + slopes.transpose(-1, -2) - slopes.movedim(-1, -3)
         return 0.5 * matvec(symbols, v.unsqueeze(-2))
 
     @final
     def residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return r(q, v, u), ``(*batch, N)``; it may have any power."""
+        """Return r(q, v, u), ``(*batch, N)``."""
         self._check(q=q, v=v, u=u)
         return self._residual_force(q, v, u)
 
@@ -248,9 +233,8 @@ class MechanicalSystem(ContinuousPredictor):
 
             (q, v):  J = [[0, 1], [0, -M^-1 D']]       (q, p):  J = [[0, M^-1], [0, -D' M^-1]]
 
-        D' = D + diag(dF_i/dv_i) has the slope of the dry friction too. With r = (r_q, r_v) or
-        (r_q, r_p) and E = (M + s D')^-1 that is k_v = E M r_v and k_q = r_q + s k_v, or
-        k_p = M E r_p and k_q = r_q + s E r_p.
+        D' = D + diag(dF_i/dv_i). With r = (r_q, r_v) or (r_q, r_p) and E = (M + s D')^-1 that is
+        k_v = E M r_v and k_q = r_q + s k_v, or k_p = M E r_p and k_q = r_q + s E r_p.
         """
         q, v = x.chunk(2, dim=-1)
         if self.state == "qp":
@@ -272,7 +256,5 @@ class MechanicalSystem(ContinuousPredictor):
 
     def _check(self, **values: Tensor) -> None:
         for name, value in values.items():
-            if name == "u":
-                require_last_dim(name, value, self.num_inputs, "M")
-            else:
-                require_last_dim(name, value, self.num_coordinates, "N")
+            size, symbol = (self.num_inputs, "M") if name == "u" else (self.num_coordinates, "N")
+            require_last_dim(name, value, size, symbol)

@@ -21,8 +21,7 @@ class Trajectory:
     """A sampled motion under a sampled input.
 
     Attributes:
-        q: configuration, ``(*batch, T, N)``.
-        v: velocity dq/dt, ``(*batch, T, N)``.
+        q, v: configuration and velocity, ``(*batch, T, N)``.
         input: u at T times, ``(*batch, T, M)``, and its interpolation.
         momentum: function from (q, v) to p = M(q) v on the CPU, ``(*batch, N)``, for simulated
             data; None for measured data.
@@ -42,13 +41,13 @@ class Trajectory:
         samples = self.t.shape[0]
         if samples < 2:
             raise ValueError(f"t has shape ({samples},), expected (T,) with at least 2 samples")
-        batch, size = self.q.shape[:-2], self.q.shape[-1] if self.q.ndim else 0
+        batch = self.q.shape[:-2]
         for name, value, width in (
-            ("q", self.q, size),
-            ("v", self.v, size),
+            ("q", self.q, self.q.shape[-1]),
+            ("v", self.v, self.q.shape[-1]),
             ("u", self.u, self.input.num_inputs),
         ):
-            if value.ndim < 2 or value.shape != (*batch, samples, width):
+            if value.shape != (*batch, samples, width):
                 raise ValueError(
                     f"{name} has shape {tuple(value.shape)}, expected (*batch, {samples}, {width}) "
                     f"with the batch {tuple(batch)} of q"
@@ -70,9 +69,10 @@ class Trajectory:
         return float(self.t[-1] - self.t[0])
 
     def input_since(self, history: float) -> Signal:
-        """Return u from ``history`` seconds before the start on. Unknown input has the first value.
+        """Return u from ``history`` seconds before the start on, a sample time apart.
 
-        The samples before the start are a sample time apart.
+        Unknown input has the value of the earliest known sample.
+
         """
         step = self.t[1] - self.t[0]
         count = math.ceil(history / float(step) - 1e-6)
@@ -80,11 +80,8 @@ class Trajectory:
             return self.input
         past = _extended(self.u[..., :0, :] if self.past is None else self.past, self.u, count)
         before = self.t[0] - step * torch.arange(count, 0, -1).to(self.t)
-        return Signal(
-            torch.cat([before, self.t]),
-            torch.cat([past, self.u], dim=-2),
-            self.input.interpolation,
-        )
+        t, u = torch.cat([before, self.t]), torch.cat([past, self.u], dim=-2)
+        return Signal(t, u, self.input.interpolation)
 
     def states(self, state: State, samples: slice = slice(None)) -> Tensor:
         """Return states (q, v) or (q, p) at the chosen samples, ``(*batch, T, 2N)``.
@@ -97,8 +94,7 @@ class Trajectory:
             return torch.cat([q, v], dim=-1)
         if self.momentum is None:
             raise ValueError(
-                "this trajectory has no momentum p, which a Hamiltonian model needs: use "
-                "simulated data or a Lagrangian model"
+                "this trajectory has no momentum p: use simulated data or a Lagrangian model"
             )
         return torch.cat([q, self.momentum(q.cpu(), v.cpu()).to(q)], dim=-1)
 
@@ -115,21 +111,14 @@ class Trajectory:
             ValueError: if the horizon is longer than the trajectory, or shorter than a step.
         """
         step = float(self.t[1] - self.t[0])
-        if self.duration < horizon - 0.5 * step:
-            raise ValueError(
-                f"horizon is {horizon} s, but the trajectory lasts only {self.duration:g} s"
-            )
         count = int(torch.searchsorted(self.t, self.t[0] + horizon + 0.5 * step))
-        if count < 2:
+        if self.duration < horizon - 0.5 * step or count < 2:
             raise ValueError(
-                f"horizon is {horizon} s, expected at least one step of the trajectory, {step:g} s"
+                f"horizon is {horizon} s, but the trajectory lasts only {self.duration:g} s, with "
+                f"steps of {step:g} s"
             )
-        return replace(
-            self,
-            q=self.q[..., :count, :],
-            v=self.v[..., :count, :],
-            input=self.input.part(slice(count)),
-        )
+        q, v = (x[..., :count, :] for x in (self.q, self.v))
+        return replace(self, q=q, v=v, input=self.input.part(slice(count)))
 
 
 def stack(trajectories: list[Trajectory]) -> Trajectory:
@@ -145,8 +134,7 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         kind, expected = item.input.interpolation, first.input.interpolation
         if kind != expected:
             raise ValueError(
-                f"trajectory {index} has interpolation {kind!r}, trajectory 0 {expected!r}: "
-                "expected the same"
+                f"trajectory {index} has interpolation {kind!r}, trajectory 0 {expected!r}"
             )
         # Sample times are compared relative to the start of each trajectory.
         resolution = 4 * torch.finfo(item.t.dtype).eps * float(item.t.abs().max())
@@ -168,11 +156,9 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
 
 
 def stack_until(trajectories: Sequence[Trajectory], duration: float | None = None) -> Trajectory:
-    """Stack the trajectories that are long enough, cut to a duration.
+    """Stack the trajectories that are long enough, cut to a duration in s.
 
-    Args:
-        trajectories: trajectories of any length with the same sample time.
-        duration: duration in s. The default is that of the shortest trajectory.
+    All have the same sample time. The default duration is that of the shortest trajectory.
 
     Raises:
         ValueError: if no trajectory is long enough, or they cannot be stacked, see :func:`stack`.
@@ -214,7 +200,7 @@ def samples_of(name: str, duration: float, t: Tensor) -> int:
     if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:
         raise ValueError(
             f"{name} is {duration} s, but the sample time varies between {float(steps.min()):g} "
-            f"and {float(steps.max()):g} s: {name} needs a constant one, resample the data first"
+            f"and {float(steps.max()):g} s: resample the data first"
         )
     count = round(duration / sample_time)
     if count < 1 or abs(duration / sample_time - count) > 1e-3:

@@ -25,8 +25,7 @@ class NextStateMLP(Predictor):
 
     Args:
         statistics: scales of the data.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
         angles: coordinates that are angles. The network uses their sine and cosine.
     """
 
@@ -58,16 +57,10 @@ class NextStateMLP(Predictor):
         Raises:
             ValueError: if the step of ``t`` is not that of the training windows.
         """
-        step = self.fixed_step
-        spacing = (t[1:] - t[:-1]).double()
-        if (spacing - step).abs().max() > 1e-3 * step:
-            raise ValueError(
-                f"NextStateMLP predicts in steps of {step:g} s, as it was trained, but t advances "
-                f"by {float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
-            )
+        self._require_step(t)
         x = torch.zeros_like(x0)
         path = [x]
-        # The input at both ends of each step. A held input has the same value at both.
+        # A held input has the same value at both ends of a step.
         for before, after in input.stages(t, (0.0, 1.0)).to(x0):
             x = x + self.scale * self.network(torch.cat([x0 + x, before, after], dim=-1))
             path.append(x)
@@ -77,14 +70,12 @@ class NextStateMLP(Predictor):
 class AccelerationMLP(DelayedPredictor):
     """dv/dt = s * network(q, v, u), integrated by the same RK4 as the structured models.
 
-    This is a stronger baseline than :class:`NextStateMLP`: dq/dt = v holds by construction, and any
-    step is possible. s is the standard deviation of the velocity increment over a step, divided by
-    the step.
+    dq/dt = v holds by construction, and any step is possible. s is the standard deviation of the
+    velocity increment over a step, divided by the step.
 
     Args:
         statistics: scales of the data.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
         angles: coordinates that are angles. The network uses their sine and cosine.
         integrator: the integration method.
         initial_velocity: builder of the head for the initial velocity.
@@ -109,9 +100,8 @@ class AccelerationMLP(DelayedPredictor):
         mean, std = statistics.network_input(repeat_input=1)
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         self.register_buffer("scale", statistics.acceleration.float())
-        self.initial_velocity = initial_velocity(
-            Scales(statistics, statistics.v_std, tuple(angles))
-        )
+        scales = Scales(statistics, statistics.v_std, tuple(angles))
+        self.initial_velocity = initial_velocity(scales)
         self.learns_initial_state = self.initial_velocity.learned
         self.delay = delay or NoDelay()
 

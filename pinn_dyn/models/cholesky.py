@@ -15,10 +15,10 @@ from pinn_dyn.models.positivity import Positive, Positivity
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.triangular import UNROLLED, square
 
-# Margins of the outputs beyond their values on the data. A softplus far below zero is an
-# exponential, so the margin changes a diagonal entry by at most a factor exp(-0.2) = 0.82.
 _DIAGONAL_MARGIN = 0.2
-_MARGIN = 0.1  # in units of the range on the data
+"""Margin of the outputs beyond the data: a factor of at least exp(-0.2) = 0.82 for a softplus."""
+_MARGIN = 0.1
+"""Margin of all other outputs, in units of their range on the data."""
 
 
 class CholeskyFactor(nn.Module, abc.ABC):
@@ -36,20 +36,15 @@ class CholeskyFactor(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def linearize(self, q: Tensor) -> tuple[Tensor, Tape]:
-        """Return L(q), ``(*batch, N, N)``, and the tape for the passes below."""
+        """Return L(q), ``(*batch, N, N)``, and the tape for :meth:`pullback`."""
 
     @abc.abstractmethod
-    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        """Return dL, ``(*batch, N, N)``, for dq ``(*batch, N)``."""
+    def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
+        """Return L(q), dL for dq, and the tape."""
 
     @abc.abstractmethod
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
         """Return the gradient of <cotangent, L(q)> in q, ``(*batch, N)``."""
-
-    def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """Return L(q), dL for dq, and the tape."""
-        factor, tape = self.linearize(q)
-        return factor, self.pushforward(tape, dq), tape
 
     def forward(self, q: Tensor) -> Tensor:
         """Return L(q), ``(*batch, N, N)``."""
@@ -69,30 +64,25 @@ class NetworkCholesky(CholeskyFactor):
     """L(q) = diag(scale) * tril(network(q)), with a positive diagonal.
 
     The network has N (N + 1)/2 outputs y, the first N for the diagonal (paper, section Sub-Network
-    Structures). ``positivity`` maps them to the entries of L. The input of the network saturates
-    outside the data. After training, its outputs saturate, too, since no motion may have visited
-    the corners of a box around the data: with c = y clipped to its range on the data and a margin m
-    (0.2 on the diagonal, a tenth of the range elsewhere), y is replaced by c + m tanh((y - c)/m).
-    So every entry of L is nearly within its range on the data, and the eigenvalues of the matrix
-    are bounded from both sides.
+    Structures), which ``positivity`` maps to the entries of L. Its input saturates outside the
+    data. After training y is replaced by c + m tanh((y - c)/m), with c = y clipped to its range on
+    the data and a margin m (0.2 on the diagonal, a tenth of the range elsewhere), which bounds the
+    eigenvalues of the matrix from both sides.
 
-    In a chain of bodies, row i of L in M = L^T L (``transposed``) describes the bodies from joint i
-    to the tip. Most entries are then simpler functions of q than in M = L L^T (Featherstone 2005,
-    "Efficient factorization of the joint-space inertia matrix for branched kinematic trees"). The
-    scale is then that of the columns of L.
+    In M = L^T L of a chain of bodies (``transposed``), row i of L describes the bodies from joint i
+    to the tip, and most entries are simpler functions of q than in M = L L^T (Featherstone 2005,
+    "Efficient factorization of the joint-space inertia matrix for branched kinematic trees").
 
-    In a serial chain of rigid bodies with the joints ordered from base to tip, M_ij with i >= j
-    depends only on the joints after j, since the joints up to j move all bodies beyond as one.
-    Column j of L in M = L^T L, and in M^-1 = L L^T, has the same property. ``chain`` enforces this
+    In a serial chain of rigid bodies with the joints ordered from base to tip, column j of L in
+    M = L^T L, and in M^-1 = L L^T, depends only on the joints after j. ``chain`` enforces this
     property by masked weights.
 
     Args:
-        scales: scales of the data. The value is the typical size of the rows of L, ``(N,)``.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        scales: scales of the data. The value is the typical size of the rows of L, or of its
+            columns if transposed, ``(N,)``.
+        hidden, activation: widths and activation of the hidden layers.
         positivity: map from outputs to entries with a positive diagonal.
-        transposed: true for the matrix L^T L.
-        chain: true if column j of L depends only on the coordinates after q_j.
+        transposed, chain: see :class:`CholeskyFactor`.
 
     Raises:
         ValueError: if ``chain`` needs wider hidden layers.
@@ -113,16 +103,12 @@ class NetworkCholesky(CholeskyFactor):
         chain: bool = False,
     ):
         super().__init__()
-        size = scales.size
-        self.size = size
-        self.positivity = positivity
-        self.transposed = transposed
-        self.chain = chain
+        self.size = size = scales.size
+        self.positivity, self.transposed, self.chain = positivity, transposed, chain
         row, column = torch.tril_indices(size, size, offset=-1)
         after = [*range(size), *column.tolist()] if chain else None
         self.network = scales.network(size * (size + 1) // 2, hidden, activation, after)
-        with torch.no_grad():
-            # Start near a diagonal matrix, so that no random off-diagonal part has to be unlearned.
+        with torch.no_grad():  # start near a diagonal matrix
             last = self.network.linears[-1]
             last.weight.mul_(0.1)
             last.bias[:size] = positivity.start
@@ -142,15 +128,10 @@ class NetworkCholesky(CholeskyFactor):
         return _matrices(self._assemble(values), q), (*tape, slopes)
 
     def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """Return L(q), dL for dq, and the tape, by one pass through the network."""
         y, dy, tape = self.network.linearize_along(q, dq)
         values, slopes = self._entries(columns(y))
         rate = self._assemble(slopes * columns(dy))
         return _matrices(self._assemble(values), q), _matrices(rate, q), (*tape, slopes)
-
-    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        dy = columns(self.network.pushforward(tape[:-1], dq))
-        return _matrices(self._assemble(tape[-1] * dy), dq)
 
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
         dy = self._take(columns(cotangent.flatten(-2))) * tape[-1]
@@ -181,7 +162,7 @@ class NetworkCholesky(CholeskyFactor):
         return torch.cat([diagonal, lower]), torch.cat([diagonal_slope, lower_slope])
 
     def _scales(self, y: Tensor) -> Tensor:
-        """Scale of each entry, shaped to be multiplied with y ``(K, ...)``."""
+        """Return the scale of each entry, shaped to be multiplied with y ``(K, ...)``."""
         return self.placement.gather(1, self.order).reshape(-1, *[1] * (y.ndim - 1))
 
     def _assemble(self, values: Tensor) -> Tensor:
@@ -213,18 +194,16 @@ def _matrices(square: Tensor, like: Tensor) -> Tensor:
     """Reshape ``(N, N, B)`` to ``(*batch, N, N)``, with the batch of ``like`` ``(*batch, k)``."""
     size = square.shape[0]
     matrices = rows(square.flatten(0, 1), like).unflatten(-1, (size, size))
-    # The library would copy a matrix that is not contiguous at every solve.
+    # Otherwise the library copies the matrix at every solve.
     return matrices.contiguous() if size > UNROLLED else matrices
 
 
 class _ConstantFactor(CholeskyFactor):
-    """Factor that is the same at every q."""
-
     constant = True
 
-    def pushforward(self, tape: Tape, dq: Tensor) -> Tensor:
-        size = dq.shape[-1]
-        return dq.new_zeros((*dq.shape[:-1], size, size))
+    def linearize_along(self, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor, Tape]:
+        factor, tape = self.linearize(q)
+        return factor, torch.zeros_like(factor), tape
 
     def pullback(self, tape: Tape, cotangent: Tensor) -> Tensor:
         return torch.zeros_like(cotangent[..., 0])
@@ -255,11 +234,11 @@ class ConstantCholesky(_ConstantFactor):
 
 
 class FixedCholesky(_ConstantFactor):
-    """L = the Cholesky factor of a fixed constant matrix.
+    """L = the Cholesky factor of a fixed symmetric positive semi-definite matrix.
 
     Args:
         scales: scales of the data.
-        value: symmetric positive semi-definite matrix, ``(N, N)``.
+        value: the matrix, ``(N, N)``.
 
     Raises:
         ValueError: if the matrix is not N x N, symmetric and positive semi-definite.
@@ -271,20 +250,15 @@ class FixedCholesky(_ConstantFactor):
         super().__init__()
         size = scales.size
         matrix = torch.tensor(value, dtype=torch.float64)
-        if matrix.shape != (size, size) or not torch.equal(matrix, matrix.T):
+        eigenvalues, vectors = torch.linalg.eigh(matrix)
+        symmetric = matrix.shape == (size, size) and torch.equal(matrix, matrix.T)
+        if not symmetric or eigenvalues[0] < -1e-12 * eigenvalues[-1].abs():
             raise ValueError(
-                f"FixedCholesky: value has shape {tuple(matrix.shape)}, expected a symmetric "
+                f"FixedCholesky: value is {value}, expected a symmetric positive semi-definite "
                 f"({size}, {size}) matrix"
             )
-        eigenvalues, vectors = torch.linalg.eigh(matrix)
-        if eigenvalues[0] < -1e-12 * eigenvalues[-1].abs():
-            raise ValueError(
-                f"FixedCholesky: value has the eigenvalue {float(eigenvalues[0]):.4g}, expected "
-                "a positive semi-definite matrix"
-            )
         # A QR factor of the square root is a Cholesky factor, also of a singular matrix.
-        root = (vectors * eigenvalues.clamp(min=0).sqrt()).T
-        upper = torch.linalg.qr(root).R
+        upper = torch.linalg.qr((vectors * eigenvalues.clamp(min=0).sqrt()).T).R
         sign = torch.where(upper.diagonal() < 0, -1.0, 1.0).to(upper)
         self.register_buffer("factor", (sign[:, None] * upper).T.float().contiguous())
 

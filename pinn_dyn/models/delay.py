@@ -12,11 +12,7 @@ from pinn_dyn.mechanics import ContinuousPredictor, Signal
 
 
 class Delay(nn.Module, abc.ABC):
-    """Delay d >= 0 of all inputs: u(t - d) acts at t.
-
-    Attributes:
-        longest: largest possible d, s. Roll-outs need the input this long before the start.
-    """
+    """Delay d >= 0 of all inputs, u(t - d), at most ``longest`` s."""
 
     longest: float
 
@@ -43,10 +39,9 @@ class LearnedDelay(Delay):
 
         d = longest * clamp(z, 0, 1),      dL/dd = -sum over stages of dL/du . du/dt
 
-    The clamp passes gradients, so that a d at 0 can grow again. The slope du/dt is that of the
-    interpolation. Adam needs about 1/lr steps to change d by ``longest``. Inputs with different
-    delays must be shifted before (the cleaning step InputDelay). The data determine d only if the
-    input changes faster than the motion that it causes; ``check.py`` shows the curve.
+    The clamp passes gradients, so that a d at 0 can grow again. Adam needs about 1/lr steps to
+    change d by ``longest``. Inputs with different delays must be shifted before (the cleaning step
+    InputDelay). The data determine d only if the input changes faster than the motion.
 
     Args:
         longest: the longest delay that can be learned, s.
@@ -59,9 +54,7 @@ class LearnedDelay(Delay):
     def __init__(self, longest: PositiveFloat = 0.1, initial: NonNegativeFloat = 0.0):
         super().__init__()
         if initial > longest:
-            raise ValueError(
-                f"the initial delay is {initial} s, expected at most the longest, {longest} s"
-            )
+            raise ValueError(f"initial delay is {initial} s, expected at most {longest} s")
         self.longest = longest
         self.share = nn.Parameter(torch.tensor(initial / longest))
 
@@ -78,11 +71,7 @@ class LearnedDelay(Delay):
 
 
 class DelayedPredictor(ContinuousPredictor):
-    """Predictor with a head for the delay of its input.
-
-    Attributes:
-        delay: the head.
-    """
+    """Predictor with a head for the delay of its input."""
 
     delay: Delay
 

@@ -33,10 +33,7 @@ class Friction(nn.Module, abc.ABC):
         """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends on v_i alone."""
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """Return the joint force after transmission losses, ``(*batch, N)``.
-
-        The default transmits the full drive force.
-        """
+        """Return the joint force after transmission losses, ``(*batch, N)``. By default none."""
         return force
 
     def physical_constants(self) -> list[Named]:
@@ -45,11 +42,7 @@ class Friction(nn.Module, abc.ABC):
 
 
 class NoFriction(Friction):
-    """F = 0: all dissipation is viscous, as in the paper.
-
-    Args:
-        scales: scales of the data.
-    """
+    """F = 0: all dissipation is viscous, as in the paper."""
 
     def __init__(self, scales: Scales):
         super().__init__()
@@ -64,16 +57,16 @@ class NoFriction(Friction):
 class CoulombFriction(Friction):
     """Smooth Coulomb law F_i(v) = c_i tanh(v_i / w_i) with learned c_i > 0 and w_i > 0.
 
-    c_i is the friction level of coordinate i (N or Nm). At the speed w_i (m/s or rad/s) the force
-    has reached 76 % of the level. The law is passive: v_i F_i(v) >= 0 for every v. It has no
-    stiction. Source: Armstrong-Helouvry, Dupont and Canudas de Wit (1994), "A survey of models,
-    analysis tools and compensation methods for the control of machines with friction".
+    c_i is the friction level of coordinate i (N or Nm), of which the force has reached 76 % at the
+    speed w_i (m/s or rad/s). The law has no stiction. Source: Armstrong-Helouvry, Dupont and
+    Canudas de Wit (1994), "A survey of models, analysis tools and compensation methods for the
+    control of machines with friction".
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
         level: initial c in units of the typical forces.
-        width: initial w in units of the typical speeds. A hundredth of the typical speed is added
-            to it. The default is 0.1 for a network, and 0.03 for known mechanics.
+        width: initial w in units of the typical speeds, without the added minimum of 0.01. The
+            default is 0.1 for a network, and 0.03 for known mechanics.
         spread: prior standard deviation of log c and log w, for known mechanics only.
     """
 
@@ -90,18 +83,16 @@ class CoulombFriction(Friction):
             width = 0.03 if scales.prior else 0.1
         forces = [joint.force for joint in scales.joints]
         speeds = [joint.speed for joint in scales.joints]
-        v_std = scales.statistics.v_std
+        v_std, floor = scales.statistics.v_std, _SMALLEST_WIDTH
         self.level = scales.positive("Coulomb friction", level, scales.value, spread, forces)
-        self.width = scales.positive(
-            "friction width", width, v_std, spread, speeds, floor=_SMALLEST_WIDTH
-        )
+        self.width = scales.positive("friction width", width, v_std, spread, speeds, floor)
         self._add_constants(scales)
 
     def _add_constants(self, scales: Scales) -> None:
         """Add the constants that a subclass has in addition to level and width."""
 
     def physical_constants(self) -> list[Named]:
-        """Return level and width."""
+        """Return the constants of the law."""
         return [*self._levels(), self.width.named()]
 
     def forward(self, v: Tensor) -> Tensor:
@@ -126,9 +117,7 @@ class CoulombFriction(Friction):
 class AsymmetricCoulomb(CoulombFriction):
     """Coulomb law with a level for each direction, as worn and preloaded gears have::
 
-        F_i(v) = c+_i tanh(v_i / w_i) for v_i > 0,    c-_i tanh(v_i / w_i) for v_i < 0
-
-    The arguments are those of :class:`CoulombFriction`.
+    F_i(v) = c+_i tanh(v_i / w_i) for v_i > 0,    c-_i tanh(v_i / w_i) for v_i < 0
     """
 
     def _add_constants(self, scales: Scales) -> None:
@@ -153,7 +142,6 @@ class Stribeck(AsymmetricCoulomb):
 
     Friction is larger by s_i > 0 near rest, where lubrication is not yet established, and decreases
     at the Stribeck speed b_i. Source: Armstrong-Helouvry, Dupont and Canudas de Wit (1994), sec. 2.
-    The arguments are those of :class:`CoulombFriction`.
     """
 
     def _add_constants(self, scales: Scales) -> None:
@@ -163,7 +151,6 @@ class Stribeck(AsymmetricCoulomb):
         self.speed = scales.positive("Stribeck speed", 0.3, v_std, 1.0, self.width.units)
 
     def physical_constants(self) -> list[Named]:
-        """Return the levels, the width, the rise and the Stribeck speed."""
         return [*super().physical_constants(), self.rise.named(), self.speed.named()]
 
     def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -180,10 +167,9 @@ class LoadDependent(Stribeck):
 
     Gear teeth that transmit a larger force have more friction. l_i is the share of the drive force
     that is lost while the drive moves the joint; if the joint moves the drive, the same share is
-    added. The loss is passive: v_i l_i |f_i| tanh(v_i / w_i) >= 0. Source: model M3 of Duclusaud et
-    al. (2025), "Extended friction models for the physics simulation of servo actuators" (BAM), with
-    the rise of M2. Their load is the difference of the drive force and the force of the arm; here
-    it is the drive force. The arguments are those of :class:`CoulombFriction`.
+    added. Source: model M3 of Duclusaud et al. (2025), "Extended friction models for the physics
+    simulation of servo actuators" (BAM), with the rise of M2. Their load is the difference of the
+    drive force and the force of the arm; here it is the drive force.
     """
 
     by_load = True
@@ -193,12 +179,10 @@ class LoadDependent(Stribeck):
         self.odds = _dimensionless(scales, "loss by load", 0.05)
 
     def physical_constants(self) -> list[Named]:
-        """Return the constants of the Stribeck law and the loss l."""
         loss = self.odds.named()._replace(values=_share(self.odds()))
         return [*super().physical_constants(), loss]
 
     def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """Return f - l |f| tanh(v / w)."""
         return force - self._loss(v) * force.abs() * torch.tanh(v / self.width())
 
     def _loss(self, v: Tensor) -> Tensor:
@@ -211,8 +195,7 @@ class LoadDependentStribeck(LoadDependent):
 
         l_i(v) = o_i / (1 + o_i),     o_i = odds_i + rise_i exp(-(v_i / b_i)^2)
 
-    b_i is the Stribeck speed. The law is passive, since 0 < l_i < 1 at every v. Source: model M4 of
-    the source of :class:`LoadDependent`. The arguments are those of :class:`CoulombFriction`.
+    b_i is the Stribeck speed. Source: model M4 of the source of :class:`LoadDependent`.
     """
 
     def _add_constants(self, scales: Scales) -> None:
@@ -220,7 +203,6 @@ class LoadDependentStribeck(LoadDependent):
         self.odds_rise = _dimensionless(scales, "loss by load near rest", 0.02)
 
     def physical_constants(self) -> list[Named]:
-        """Return the constants of the Stribeck law, the loss l, and l at rest."""
         at_rest = _share(self.odds() + self.odds_rise())
         return [*super().physical_constants(), self.odds_rise.named()._replace(values=at_rest)]
 

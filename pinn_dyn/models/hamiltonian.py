@@ -10,25 +10,15 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models import structured
 from pinn_dyn.models.delay import Delay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.residual import NoResidual
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.models.structured import (
-    DAMPING,
-    INPUT,
-    MASS,
-    POTENTIAL,
-    CholeskyHead,
-    FrictionHead,
-    InputHead,
-    PotentialHead,
-    StructuredNetwork,
-)
 from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
-class HamiltonianNetwork(StructuredNetwork):
+class HamiltonianNetwork(structured.StructuredNetwork):
     """Hamiltonian network with dissipation and a learned input matrix.
 
     The mass head gives W(q) = L L^T = M(q)^-1, as in the tables of the paper. With
@@ -36,22 +26,19 @@ class HamiltonianNetwork(StructuredNetwork):
 
         dq/dt = W p,    dp/dt = -G - d(p^T W p / 2)/dq - D W p + A u
 
-    One reverse pass through the mass head gives the gradient. No system of equations is solved.
-
-    Momenta cannot be measured. With ``state="qv"`` the same equations are written in the state
-    (q, v), with p = W^-1 v, and need no momenta::
+    With ``state="qv"`` the same equations are written in the state (q, v), with p = W^-1 v, and
+    need no momenta, which cannot be measured::
 
         dq/dt = v,    dv/dt = (dW/dt) p + W dp/dt
 
-    This takes two more triangular solves and a tangent pass. If A is learned, the scale of the
-    energies is then arbitrary: W / c with c V, c D and c A gives the same motion.
+    If A is learned, the scale of the energies is then arbitrary: W / c with c V, c D and c A gives
+    the same motion.
 
     Args:
         statistics: scales of the data.
         inverse_mass, potential, damping, input, friction: builders of the heads.
         angles: coordinates that are angles. The heads use their sine and cosine.
-        integrator: the integration method; :class:`~pinn_dyn.mechanics.Rosenbrock` if damping
-            dominates inertia.
+        integrator: the integration method; Rosenbrock if damping dominates inertia.
         state: "qp" for (q, p), which needs data with momenta, or "qv" for (q, v).
         delay: delay of the input. The default has no delay.
 
@@ -62,39 +49,28 @@ class HamiltonianNetwork(StructuredNetwork):
     def __init__(
         self,
         statistics: Statistics,
-        inverse_mass: CholeskyHead = MASS,
-        potential: PotentialHead = POTENTIAL,
-        damping: CholeskyHead = DAMPING,
-        input: InputHead = INPUT,
-        friction: FrictionHead = NoFriction,
+        inverse_mass: structured.CholeskyHead = structured.MASS,
+        potential: structured.PotentialHead = structured.POTENTIAL,
+        damping: structured.CholeskyHead = structured.DAMPING,
+        input: structured.InputHead = structured.INPUT,
+        friction: structured.FrictionHead = NoFriction,
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         state: State = "qp",
         delay: Delay | None = None,
     ):
-        super().__init__(
-            statistics,
-            state,
-            potential,
-            damping,
-            friction,
-            input,
-            NoResidual,
-            angles,
-            integrator,
-            delay,
-        )
+        heads = potential, damping, friction, input, NoResidual
+        super().__init__(statistics, state, *heads, angles, integrator, delay)
         if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std
         else:
-            # The force for a typical acceleration, as in the Lagrangian network.
             force = self.input.typical_force(statistics.u_rms)
             inverse_mass_scale = statistics.acceleration / force
         self.inverse_mass = inverse_mass(self._scales(statistics, inverse_mass_scale.sqrt()))
         if self.inverse_mass.transposed:
             raise ValueError(
-                "inverse_mass.transposed is true, expected false: M^-1 = L L^T already means "
-                "M = R^T R with the lower triangular R = L^-1, the form for a chain of bodies"
+                "inverse_mass.transposed is true, expected false: M^-1 = L L^T already is the form "
+                "for a chain of bodies"
             )
 
     def inverse_mass_matrix(self, q: Tensor) -> Tensor:
@@ -135,7 +111,6 @@ class HamiltonianNetwork(StructuredNetwork):
         return upper_solve(factor, lower_solve(factor, a - mass_rate_p)) + bias
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        """Return the acceleration (dW/dt) p + W dp/dt."""
         factor, bias, rate_p = self._factor_and_rates(q, v)
         net_force = force - bias - self._potential_force(q)
         return rate_p + matvec(factor, matvec(factor.transpose(-1, -2), net_force))

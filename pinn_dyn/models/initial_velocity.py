@@ -37,11 +37,7 @@ InitialVelocityHead = Callable[[Scales], InitialVelocity]
 
 
 class MeasuredVelocity(InitialVelocity):
-    """v_0 = v, the measured velocity.
-
-    Args:
-        scales: scales of the data.
-    """
+    """v_0 = v, the measured velocity."""
 
     learned = False
 
@@ -55,17 +51,14 @@ class MeasuredVelocity(InitialVelocity):
 class LearnedVelocity(InitialVelocity):
     """v_0 = v + s_v * network(q, v, u), for velocities that are estimated instead of measured.
 
-    A velocity derived from a few samples of q is noisy, and a strongly damped motion forgets the
-    initial velocity within a step or two, so the dynamics cannot average over the noise. The
-    network learns where noise is likely, for example while the motors rest. The motion after the
-    start obeys the equation of motion. The head starts at v_0 = v and is trained together with the
-    dynamics. Source: an encoder of the initial state as in Beintema, Schoukens and Toth (2023),
-    "Deep subspace encoders for nonlinear system identification".
+    Velocities derived from a few samples of q are noisy, and strongly damped dynamics cannot
+    average over the noise. The head starts at v_0 = v and is trained together with the dynamics.
+    Source: an encoder of the initial state as in Beintema, Schoukens and Toth (2023), "Deep
+    subspace encoders for nonlinear system identification".
 
     Args:
         scales: scales of the data. The value is s_v, ``(N,)``.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
     """
 
     learned = True

@@ -53,8 +53,7 @@ class NetworkInput(InputMatrix):
 
     Args:
         scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
     """
 
     scale: Tensor
@@ -73,19 +72,15 @@ class NetworkInput(InputMatrix):
 class NonlinearInput(InputMatrix):
     """tau = A(q, u) u with A(q, u) = scale_j * network(q, u), reshaped to N x M.
 
-    This head is for inputs that are positions instead of forces. For example, a tendon that is
-    tightened becomes stiffer and pulls in a different direction. With the rates of the motors among
-    the inputs (the cleaning step :class:`pinn_dyn.data.logs.InputRates`), the force is that of
-    nonlinear springs and dampers between motors and body. Controllers need an A(q) and refuse this
-    head.
+    This head is for inputs that are positions instead of forces, such as motors of tendons: a
+    tightened tendon becomes stiffer and pulls in a different direction. Controllers refuse it.
 
     The columns of the ``linear`` inputs are constants, and the network does not depend on these
     inputs. This prevents overfitting to inputs with little information, such as motor rates.
 
     Args:
         scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
         linear: inputs with a constant column.
 
     Raises:
@@ -108,16 +103,12 @@ class NonlinearInput(InputMatrix):
         size, inputs = self.shape
         self.curved = [k for k in range(inputs) if k not in linear]
         if len(self.curved) + len(linear) != inputs or not self.curved:
-            raise ValueError(
-                f"linear is {list(linear)}, expected some but not all of the {inputs} inputs, 0 to "
-                f"{inputs - 1}, without repetition"
-            )
+            raise ValueError(f"linear is {list(linear)}, expected some of the {inputs} inputs")
         data, curved = scales.statistics, len(self.curved)
         mean = torch.cat([data.q_mean, data.u_mean[self.curved]])
         std = torch.cat([data.q_std, data.u_std[self.curved]])
-        self.network = MLP(
-            size + curved, size * curved, hidden, activation, mean, std, scales.angles
-        )
+        sizes = size + curved, size * curved
+        self.network = MLP(*sizes, hidden, activation, mean, std, scales.angles)
         self.constant = nn.Parameter(torch.zeros(size, len(linear))) if linear else None
         # Position of each input in [curved, linear].
         self.order = sorted(range(inputs), key=[*self.curved, *linear].__getitem__)
@@ -132,21 +123,16 @@ class NonlinearInput(InputMatrix):
         return matvec(self._matrix(q, u), u)
 
     def _matrix(self, q: Tensor, u: Tensor) -> Tensor:
-        if self.constant is None:
-            y = self.network.linearize(torch.cat([q, u], dim=-1))[0]
-            return self.scale * y.unflatten(-1, self.shape)
         y = self.network.linearize(torch.cat([q, u[..., self.curved]], dim=-1))[0]
-        curved = y.unflatten(-1, (self.shape[0], len(self.curved)))
-        constant = self.constant.expand(*curved.shape[:-1], -1)
-        return self.scale * torch.cat([curved, constant], dim=-1)[..., self.order]
+        matrix = y.unflatten(-1, (self.shape[0], -1))
+        if self.constant is not None:
+            constant = self.constant.expand(*matrix.shape[:-1], -1)
+            matrix = torch.cat([matrix, constant], dim=-1)[..., self.order]
+        return self.scale * matrix
 
 
 class ConstantInput(InputMatrix):
-    """A = scale * parameters, the same at every q.
-
-    Args:
-        scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
-    """
+    """A = scale * parameters, the same at every q, with a scale ``(M,)`` of the columns."""
 
     scale: Tensor
 
@@ -161,11 +147,7 @@ class ConstantInput(InputMatrix):
 
 
 class NoInput(InputMatrix):
-    """A = 0, for a part of a sum that has no drives.
-
-    Args:
-        scales: scales of the data.
-    """
+    """A = 0, for a part of a sum that has no drives."""
 
     def forward(self, q: Tensor) -> Tensor:
         return q.new_zeros(*q.shape[:-1], *self.shape)
@@ -174,7 +156,6 @@ class NoInput(InputMatrix):
         return torch.zeros_like(q)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Return the inputs themselves if there is an input for each coordinate."""
         return u_rms if self.shape[0] == self.shape[1] else super().typical_force(u_rms)
 
 
@@ -183,7 +164,7 @@ class FixedInput(InputMatrix):
 
     Args:
         scales: scales of the data.
-        value: the matrix, ``(N, M)``. The default is the identity, which needs N = M.
+        value: the matrix, ``(N, M)``. The default is the identity.
 
     Raises:
         ValueError: if the matrix is not N x M.

@@ -27,10 +27,9 @@ Start = Literal["generic", "prior"]
 
 @runtime_checkable
 class Structure(Protocol):
-    """Interface of rigid bodies with known kinematics for :class:`KnownMechanics`.
+    """Rigid bodies with known kinematics. All terms are linear in their pseudo-inertias.
 
-    ``turning`` is true for each revolute joint and false for each prismatic joint. ``inertia`` are
-    the pseudo-inertias ``(n, 4, 4)`` of the n bodies. All terms are linear in them.
+    ``turning`` is true for each revolute joint. ``inertia`` are the pseudo-inertias ``(n, 4, 4)``.
     """
 
     num_coordinates: int
@@ -40,21 +39,14 @@ class Structure(Protocol):
     inertia: Tensor
 
     def generic_inertia(self) -> Tensor: ...
-
     def parameters_of(self, inertia: Tensor) -> Tensor: ...
-
     def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor: ...
-
     def potential_energy(self, q: Tensor, inertia: Tensor) -> Tensor: ...
-
     def mass_and_bias(self, q: Tensor, v: Tensor, inertia: Tensor) -> tuple[Tensor, Tensor]: ...
-
     def rigid_force(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor, gravity: bool
     ) -> Tensor: ...
-
     def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor: ...
-
     def force_slopes(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor
     ) -> tuple[Tensor, Tensor]: ...
@@ -67,31 +59,26 @@ class KnownMechanics(LearnedConstants):
 
     T is the drive force k u after transmission losses. M, C and G are those of the ``structure``
     with learned pseudo-inertias. r is the armature (inertia of the rotors at the joint), o a
-    constant torque (a potential -o^T q), D = diag(d) viscous friction and F dry friction. k are the
-    drive gains from the input to the torque, for example in Nm/A. All values of the parameters are
-    physical: bodies have a positive density, and r, d, k > 0.
-
-    Each parameter is a standard normal variate a priori (:mod:`.known_constants`). The scales of
-    the drives come from the data: with the typical torque f = k u, d ~ f/v, F ~ f, o ~ f and
-    r ~ f/a.
+    constant torque, D = diag(d) viscous friction and F dry friction. k are the drive gains from the
+    input to the torque, for example in Nm/A. Bodies have a positive density, and r, d, k > 0 for
+    all values of the parameters, which are standard normal a priori (:mod:`.known_constants`).
+    Scales come from the data: with the typical torque f = k u, d ~ f/v, F ~ f, o ~ f, r ~ f/a.
 
     Args:
         statistics: scales of the data.
         structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
         start: ``"generic"`` starts from rods along the links, ``"prior"`` from the bodies of the
-            description. For a simulated robot these bodies are the ground truth.
+            description, which are the ground truth for a simulated robot.
         spread: prior standard deviation of the bodies, see :class:`PhysicalBodies`: 0.3 for a data
-            sheet, 3 for generic bodies. With 1 the intervals of generic bodies are too narrow
-            (``benchmarks/random_chains.py``).
+            sheet, 3 for generic bodies (with 1 their intervals are too narrow).
         friction: builder of the dry friction.
         drive_gain: initial k, one number or N. It is learned if ``gain_spread`` is positive.
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
-        integrator: the integration method; :class:`~pinn_dyn.mechanics.Rosenbrock` if friction
-            dominates inertia.
+        integrator: the integration method; Rosenbrock if friction dominates inertia.
 
     Raises:
-        ValueError: if the structure has no rigid bodies, its coordinates are not those of the data,
-            a body is not physical, or the number of gains is wrong.
+        ValueError: if the structure has no rigid bodies or other joints than the data, or a body is
+            not physical.
     """
 
     def __init__(
@@ -121,10 +108,7 @@ class KnownMechanics(LearnedConstants):
         super().__init__(size, size)
         self.structure = structure
         self.integrator = integrator or RK4()
-        gain = torch.as_tensor(drive_gain, dtype=torch.float64)
-        if gain.shape not in ((), (size,)):
-            raise ValueError(f"drive_gain has {len(gain)} numbers, expected 1 or {size}")
-        gain = gain.expand(size)
+        gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(size)
         force = gain * statistics.u_rms.double()
         acceleration = statistics.acceleration.double()
         joints = tuple(map(Joint, structure.joint_names, structure.turning))
@@ -132,12 +116,10 @@ class KnownMechanics(LearnedConstants):
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
         scales = Scales(statistics, force, named=joints, prior=True)
         inertia, damping = force / acceleration, force / statistics.v_std.double()
-        self.armature = scales.positive(
-            "armature", 0.03, inertia, 1.5, [joint.inertia for joint in joints]
-        )
-        self.viscous = scales.positive(
-            "viscous friction", 0.1, damping, 1.5, [joint.damping for joint in joints]
-        )
+        units = [joint.inertia for joint in joints]
+        self.armature = scales.positive("armature", 0.03, inertia, 1.5, units)
+        units = [joint.damping for joint in joints]
+        self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
         self.offset = RealConstants(
             0.3 * force,
             [f"{'torque' if joint.turns else 'force'} offset of {joint.name}" for joint in joints],
@@ -153,14 +135,12 @@ class KnownMechanics(LearnedConstants):
         self.fixed_gain: Tensor
         self.float()
 
-    # Learned constants.
-
     def drive_gain(self) -> Tensor:
         """Return k, ``(N,)``."""
         return self.fixed_gain if self.gain is None else self.gain()
 
     def physical_constants(self) -> list[Named]:
-        """Return bodies (mass, m c, moments of inertia), drives, friction and gains in SI units."""
+        """Return bodies, drives, friction and gains in SI units."""
         table = self.body_parameters()
         constants = []
         for column, label in enumerate(INERTIAL):
@@ -179,21 +159,18 @@ class KnownMechanics(LearnedConstants):
     def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``, all terms except the bodies.
 
-        The equation of motion is Y pi + drive force = 0. The drive force of a joint depends only on
-        the constants of that joint.
+        The equation of motion is Y pi + drive force = 0.
         """
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
         return resistance - self.offset() - self.friction.transmitted(v, self.drive_gain() * u)
 
     def slopes(self) -> KnownSlopes:
-        """Return the derivatives of the missing force by closed formulas."""
+        """Return the derivatives by closed formulas."""
         return KnownSlopes(self)
 
     def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> KnownSamples:
-        """Return the missing force at fixed samples, by their regressor."""
+        """Return the samples by their regressor."""
         return KnownSamples(self, q, v, a, u)
-
-    # The contract of a mechanical system.
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """Return M(q) + diag(r), ``(*batch, N, N)``."""

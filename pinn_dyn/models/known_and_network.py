@@ -23,24 +23,21 @@ class KnownAndNetwork(Sum):
 
     Known terms have the index k, terms of the network n. The network has no input matrix
     (``input: none``) and small initial terms. Its force is penalized, so that the network only
-    learns forces that the known mechanics cannot represent::
+    learns forces that the known mechanics cannot represent. With the typical torques f of the
+    drives::
 
         penalty = w mean over the batch and i of (tau_i / f_i)^2
         tau = M_n a + C_n v + G_n + D_n v + F_n
 
-    f are the typical torques of the drives.
-
     Args:
         statistics: scales of the data.
-        known: builder of the known part.
-        network: builder of the learned part.
+        known, network: builders of the parts.
         residual: builder of the residual force.
         weight: w.
         integrator: the integration method.
 
     Raises:
-        ValueError: if the network has an input matrix, a residual force or a learned initial
-            velocity.
+        ValueError: if the network has a head that a sum does not use.
     """
 
     def __init__(
@@ -58,15 +55,13 @@ class KnownAndNetwork(Sum):
         forces = replace(statistics, u_mean=gain * statistics.u_mean, u_std=gain * statistics.u_std)
         second = network(statistics=forces)
         drives = second.input(statistics.q_mean[None].float()).any()
-        for head, present, reason in (
-            ("input", drives, "the known part drives the robot"),
-            ("residual", second.has_residual, "the sum has it (model/residual=network)"),
-            ("initial_velocity", second.learns_initial_state, "a sum learns no initial velocity"),
+        for head, present in (
+            ("input", drives),
+            ("residual", second.has_residual),
+            ("initial_velocity", second.learns_initial_state),
         ):
             if present:
-                raise ValueError(
-                    f"network.{head} is a head that a sum does not use, since {reason}: remove it"
-                )
+                raise ValueError(f"network.{head} is a head that a sum does not use: remove it")
         super().__init__({"known": first, "network": second}, integrator)
         self.weight = weight
         force = forces.u_rms

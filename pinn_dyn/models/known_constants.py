@@ -1,8 +1,4 @@
-"""Learned physical constants, as functions of unconstrained parameters z.
-
-For a least-squares fit every z is a standard normal variate a priori. The prior is then
-``|z|^2 / 2`` for all of them, and a parameter that no data determine stays at its initial value.
-"""
+"""Learned physical constants, as functions of parameters z that are standard normal a priori."""
 
 from __future__ import annotations
 
@@ -18,11 +14,7 @@ _NO_LIMIT = -float("inf")
 
 
 class Named(NamedTuple):
-    """Constants in physical units: n names, n units, values ``(n,)``, and their lower limit.
-
-    A drive gain has the unit of its force by u, such as ``Nm/u``, since no model knows the unit of
-    its input.
-    """
+    """Constants in physical units. A drive gain has the unit of its force by u, such as Nm/u."""
 
     names: list[str]
     units: list[str]
@@ -34,9 +26,7 @@ class Constants(nn.Module, abc.ABC):
     """Constants of one kind, made from the parameters ``z``.
 
     Attributes:
-        z: the parameters.
-        names: meaning of each entry of z, flattened.
-        units: unit of the constant with each name.
+        names, units: meaning and unit of each entry of z, flattened.
         lower: lower limit of the constants.
     """
 
@@ -63,8 +53,7 @@ class PositiveConstants(Constants):
     Args:
         start: prior median, ``(n,)``.
         spread: prior standard deviation of the logarithm; 0.7 is a factor of two.
-        names: n names.
-        units: n units.
+        names, units: n names and units.
         floor: lower limit of the constants.
 
     Raises:
@@ -96,14 +85,10 @@ class PositiveConstants(Constants):
 class SoftplusConstants(Constants):
     """Positive constants scale (softplus(z) + floor), for training by gradients.
 
-    Far from zero a step of z changes the constant by a similar amount, where an exponential would
-    multiply it.
-
     Args:
         scale: typical size, ``(n,)``.
         ratio: initial softplus(z).
-        names: n names.
-        units: n units.
+        names, units: n names and units.
         floor: lower limit of the constants, in units of the scale.
     """
 
@@ -132,8 +117,7 @@ class RealConstants(Constants):
 
     Args:
         spread: prior standard deviation, ``(n,)``.
-        names: n names.
-        units: n units.
+        names, units: n names and units.
     """
 
     spread: Tensor
@@ -167,7 +151,7 @@ class PhysicalBodies(Constants):
         bodies: n names.
 
     Raises:
-        ValueError: if a start is not a body of positive density. The message names the body.
+        ValueError: if a start is not a body of positive density.
     """
 
     root: Tensor
@@ -178,9 +162,9 @@ class PhysicalBodies(Constants):
             smallest = float(torch.linalg.eigvalsh(body)[0])
             if not smallest > 0:
                 raise ValueError(
-                    f"body {name!r} has a pseudo-inertia with the eigenvalue {smallest:.3g}, "
-                    "expected positive ones: no body of positive density has these mass and "
-                    "moments; correct its <inertial>, or use start='generic'"
+                    f"body {name!r} has a pseudo-inertia with the eigenvalue {smallest:.3g}: no "
+                    "body has this mass and these moments; correct its <inertial>, or use "
+                    "start='generic'"
                 )
         parts = ["mass", "x extent", "y extent", "z extent", "xy shear", "xz shear", "yz shear"]
         parts += ["x centre", "y centre", "z centre"]

@@ -20,12 +20,8 @@ class KnownSlopes(Slopes):
         e = Y(q, v, a) pi(z) + drive force(v, a, u; z)
         de/dz = Y dpi/dz + d(drive force)/dz
 
-    The first term only needs Y. The drive of a joint depends only on the constants of that joint,
-    so one reverse pass through all drives, with a copy of the constants for each sample, gives the
-    second term.
-
-    Args:
-        model: model at the z of interest.
+    The drive of a joint depends only on the v and the constants of that joint, so one reverse pass
+    through all drives, with a copy of the constants for each sample, gives the second term.
     """
 
     def __init__(self, model: LearnedConstants):
@@ -36,12 +32,10 @@ class KnownSlopes(Slopes):
         return self.by_regressor(self.model.structure.regressor(q, v, a), v, a, u)
 
     def by_regressor(self, regressor: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return de/dz from the regressor Y ``(*batch, N, 10 n)``."""
         drives = self._drive_slopes(lambda m: m.drive_force(v, a, u), v)
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        # The drive of a joint depends only on the v of that joint.
         by_q, by_v = self.model.structure.force_slopes(q, v, a, self.model.bodies())
         speed = v.clone().requires_grad_()
         with torch.enable_grad():

@@ -18,11 +18,7 @@ from pinn_dyn.models.statistics import Statistics
 
 @runtime_checkable
 class HasConstants(Protocol):
-    """Interface of a mechanical system that names its physical constants.
-
-    Attributes:
-        constants: units of the entries of each buffer that is a constant: {"mass": ["kg"]}.
-    """
+    """Mechanical system with the units of each buffer that is a constant: {"mass": ["kg"]}."""
 
     constants: dict[str, list[str]]
 
@@ -71,7 +67,7 @@ class KnownSystem(LearnedConstants):
             raise ValueError(
                 f"the data have {statistics.num_coordinates} coordinates and "
                 f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
-                f"{size} and {inputs}: use the structure of this robot"
+                f"{size} and {inputs}"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()
@@ -79,7 +75,9 @@ class KnownSystem(LearnedConstants):
         self.has_residual = structure.has_residual
         self.learned = nn.ModuleDict()
         self.shapes: dict[str, torch.Size] = {}
-        for name, start, units in _constants_of(structure):
+        buffers = dict(structure.named_buffers())
+        for name, units in _units_of(structure).items():
+            start = buffers[name]
             names = [name] if len(units) == 1 else [f"{name} {k + 1}" for k in range(len(units))]
             self.learned[name] = PositiveConstants(start.flatten(), spread, names, units)
             self.shapes[name] = start.shape
@@ -109,32 +107,19 @@ class KnownSystem(LearnedConstants):
     _kinetic_gradient = _of_structure("_kinetic_gradient")
 
 
-def _constants_of(structure: MechanicalSystem) -> list[tuple[str, Tensor, list[str]]]:
-    """Return name, initial value and units of each constant."""
+def _units_of(structure: MechanicalSystem) -> dict[str, list[str]]:
+    """Return the units of each constant, a buffer of the structure."""
     kind = type(structure).__name__
     if not isinstance(structure, HasConstants) or not structure.constants:
         raise ValueError(
             f"structure {kind} names no constants to learn: add an attribute constants with the "
             "units of each buffer, such as {'mass': ['kg']}; for rigid chains use model=known"
         )
-    if parameters := [name for name, _ in structure.named_parameters()]:
-        raise ValueError(
-            f"structure {kind} has the parameters {', '.join(parameters)}, expected constants that "
-            "are buffers (register_buffer), named in the attribute constants"
-        )
-    buffers = dict(structure.named_buffers())
-    constants = []
+    sizes = {name: buffer.numel() for name, buffer in structure.named_buffers()}
     for name, units in structure.constants.items():
-        if name not in buffers:
+        if sizes.get(name) != len(units):
             raise ValueError(
-                f"structure {kind}: constants names {name}, which is not a buffer; expected one of "
-                f"{', '.join(buffers) or 'none'} (register_buffer)"
+                f"structure {kind}: constants has {len(units)} units of {name}, expected one for "
+                f"each entry of a buffer (register_buffer); the buffers have the sizes {sizes}"
             )
-        start = buffers[name]
-        if len(units) != start.numel():
-            raise ValueError(
-                f"structure {kind}: constants has {len(units)} units of {name}, expected "
-                f"{start.numel()}, one for each entry"
-            )
-        constants.append((name, start, units))
-    return constants
+    return structure.constants

@@ -10,44 +10,32 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.models import structured
 from pinn_dyn.models.delay import Delay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
 from pinn_dyn.models.mlp import Tape
 from pinn_dyn.models.residual import NoResidual, ResidualHead
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.models.structured import (
-    DAMPING,
-    INPUT,
-    MASS,
-    POTENTIAL,
-    CholeskyHead,
-    FrictionHead,
-    InputHead,
-    PotentialHead,
-    StructuredNetwork,
-)
 from pinn_dyn.models.triangular import lower_solve, upper_solve
 
 
-class LagrangianNetwork(StructuredNetwork):
+class LagrangianNetwork(structured.StructuredNetwork):
     """Lagrangian network with dissipation and a learned input matrix.
 
-    Heads give M = L L^T, V, D = L_D L_D^T, A, a friction F and a residual force r; the acceleration
-    follows from paper eq. (armdynamics), which for L(q, v) = v^T M v / 2 - V reads::
+    The acceleration follows from paper eq. (armdynamics), which for L(q, v) = v^T M v / 2 - V
+    reads, with a friction F and a residual force r::
 
         M a = A u + r - D v - F(v) - G - (dM/dt) v + d(v^T M v / 2)/dq
 
-    One tangent pass (dL/dt) and one reverse pass (the last term, through |L^T v|^2 / 2) through the
-    mass head replace the Hessian of the Lagrangian. Two triangular solves with the factor L replace
-    the inverse of M.
+    One tangent pass and one reverse pass through the mass head M = L L^T replace the Hessian of the
+    Lagrangian. Two triangular solves with the factor L replace the inverse of M.
 
     Args:
         statistics: scales of the data.
         mass, potential, damping, input, friction, residual, initial_velocity: builders of heads.
         angles: coordinates that are angles. The heads use their sine and cosine.
-        integrator: the integration method; :class:`~pinn_dyn.mechanics.Rosenbrock` if damping
-            dominates inertia.
+        integrator: the integration method; Rosenbrock if damping dominates inertia.
         delay: delay of the input. The default has no delay.
 
     Raises:
@@ -57,35 +45,25 @@ class LagrangianNetwork(StructuredNetwork):
     def __init__(
         self,
         statistics: Statistics,
-        mass: CholeskyHead = MASS,
-        potential: PotentialHead = POTENTIAL,
-        damping: CholeskyHead = DAMPING,
-        input: InputHead = INPUT,
-        friction: FrictionHead = NoFriction,
+        mass: structured.CholeskyHead = structured.MASS,
+        potential: structured.PotentialHead = structured.POTENTIAL,
+        damping: structured.CholeskyHead = structured.DAMPING,
+        input: structured.InputHead = structured.INPUT,
+        friction: structured.FrictionHead = NoFriction,
         residual: ResidualHead = NoResidual,
         initial_velocity: InitialVelocityHead = MeasuredVelocity,
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         delay: Delay | None = None,
     ):
-        super().__init__(
-            statistics,
-            "qv",
-            potential,
-            damping,
-            friction,
-            input,
-            residual,
-            angles,
-            integrator,
-            delay,
-        )
+        heads = potential, damping, friction, input, residual
+        super().__init__(statistics, "qv", *heads, angles, integrator, delay)
         inertia = self.input.typical_force(statistics.u_rms) / statistics.acceleration
         self.mass = mass(self._scales(statistics, inertia.sqrt()))
         if self.mass.chain and not self.mass.transposed:
             raise ValueError(
-                "mass.chain is true and mass.transposed is false, expected both true: only in "
-                "M = L^T L does a column of L depend on later joints alone"
+                "mass.chain is true and mass.transposed is false, expected both true: columns of L "
+                "depend on later joints alone in M = L^T L only"
             )
 
         self.initial_velocity = initial_velocity(self._scales(statistics, statistics.v_std))

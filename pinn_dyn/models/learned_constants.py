@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -16,21 +16,16 @@ from pinn_dyn.models.known_constants import Constants, Named
 
 
 class LearnedConstants(MechanicalSystem):
-    """Mechanical system whose parameters are :class:`~.known_constants.Constants`.
-
-    The equation of motion is written as a missing force::
+    """Mechanical system whose parameters are :class:`~.known_constants.Constants`::
 
         e(q, v, a, u; z) = M a + C v + G + D v + F - A u - r = 0
 
-    z ``(P,)`` are the standardized parameters, in the order of ``parameters()``. All methods below
-    follow from the terms. A subclass with closed formulas may override them.
+    e is the missing force. z ``(P,)`` are the parameters in the order of ``parameters()``. All
+    methods below follow from the terms. A subclass with closed formulas may override them.
     """
 
     def parameter_names(self) -> list[str]:
-        """Return the meaning of each parameter, in the order of ``parameters()``.
-
-        A parameter outside :class:`~.known_constants.Constants` has the name of its attribute.
-        """
+        """Return the meaning of each parameter, or the name of its attribute."""
         names: list[str] = []
         for path, module in self.named_modules():
             if isinstance(module, Constants):
@@ -42,14 +37,11 @@ class LearnedConstants(MechanicalSystem):
 
     def physical_constants(self) -> list[Named]:
         """Return all constants in physical units."""
-        return [part.named() for part in self._constants()]
+        parts = [part for part in self.modules() if isinstance(part, Constants)]
+        return [part.named() for part in parts]
 
     def drive_gain(self) -> Tensor:
-        """Return the gain k ``(N,)`` of each input: 1, unless gains are learned.
-
-        An identification divides the missing force by k. Otherwise it could reduce the error by
-        shrinking all constants and gains.
-        """
+        """Return the gain k ``(N,)`` of each input: 1, unless gains are learned."""
         return torch.ones(self.num_coordinates, dtype=next(self.parameters()).dtype)
 
     def missing_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
@@ -71,17 +63,9 @@ class LearnedConstants(MechanicalSystem):
         """Return e as a function of z at fixed samples of motion, ``(K, N)`` and ``(K, M)``."""
         return Samples(self, q, v, a, u)
 
-    def _constants(self) -> Iterator[Constants]:
-        parts: Iterator[nn.Module] = self.modules()
-        return (part for part in parts if isinstance(part, Constants))
-
 
 class Slopes:
-    """Derivatives of the missing force e, by a reverse pass for each of its N entries.
-
-    Args:
-        model: model at the z of interest.
-    """
+    """Derivatives of the missing force e of a model, by a reverse pass for each entry of e."""
 
     def __init__(self, model: LearnedConstants):
         self.model: Any = model
@@ -116,10 +100,7 @@ class Slopes:
 
 
 class Samples:
-    """Missing force e at K fixed samples of motion, for the present z of the model.
-
-    A subclass may compute quantities that do not depend on z once.
-    """
+    """Missing force e at K fixed samples of motion, for the present z of the model."""
 
     def __init__(self, model: LearnedConstants, *at: Tensor):
         self.model: Any = model

@@ -29,14 +29,12 @@ class LinearRival(Predictor):
     degree 2. u_{k+1} is the left value of the input at the end of the step. W and b come from ridge
     regression on standardized features.
 
-    A roll-out uses the initial state (q, v) and the input from the start on, as for all models. The
-    state history before the start is not observed. It is estimated from (x_0, u_0) by a linear map
-    fitted on the training windows. So the baseline uses the same measurements as a network.
+    The state history before the start of a roll-out is estimated from (x_0, u_0) by a linear map
+    fitted on the training windows, so the baseline uses the same measurements as a network.
 
     Sources: Ljung (1999), "System Identification", section 4.2 (ARX); Korda and Mezic (2018),
-    "Linear predictors for nonlinear dynamical systems" (EDMDc), here projected onto the state
-    after every step as in van Goor et al. (2023), "Reprojection methods for Koopman-based
-    modelling and prediction".
+    "Linear predictors for nonlinear dynamical systems" (EDMDc), projected onto the state after
+    every step as in van Goor et al. (2023), "Reprojection methods for Koopman-based modelling".
 
     Args:
         train: training trajectories, each q ``(T, N)`` at a constant sample time.
@@ -46,8 +44,8 @@ class LinearRival(Predictor):
         ridge: weight of the squared coefficients, relative to the variance of the features.
 
     Raises:
-        ValueError: if no training trajectory is ``lags`` steps long, the step is not a multiple of
-            the sample time, or there are too many features.
+        ValueError: if the training trajectories are shorter than ``lags`` steps, the step is not a
+            multiple of the sample time, or there are too many features.
     """
 
     mean: Tensor
@@ -71,10 +69,7 @@ class LinearRival(Predictor):
         self.lags, self.degree = lags, degree
         state, ends, target = _windows(train, step, lags)
         if degree == 2 and state.shape[1] ** 2 > 2 * _FEATURES:
-            raise ValueError(
-                f"{state.shape[1]} entries of the past give more than {_FEATURES} products: "
-                "expected fewer lags"
-            )
+            raise ValueError(f"more than {_FEATURES} products of past states: expected fewer lags")
         self.register_buffer("mean", state.mean(0))
         self.register_buffer("scale", _spread(state))
         features = torch.cat([self._lift(state), ends], dim=1)
@@ -93,15 +88,8 @@ class LinearRival(Predictor):
         Raises:
             ValueError: if the step of ``t`` is not that of the model.
         """
-        spacing = t.double().diff()
-        step = self.fixed_step
-        assert step is not None
-        if float((spacing - step).abs().max()) > 1e-3 * step:
-            raise ValueError(
-                f"this linear model predicts in steps of {step:g} s, but t advances by "
-                f"{float(spacing.min()):g} to {float(spacing.max()):g} s: predict with that step"
-            )
-        # The input at both ends of each step. A held input has the same value at both.
+        self._require_step(t)
+        # A held input has the same value at both ends of a step.
         ends = input.stages(t, (0.0, 1.0)).to(x0)
         size, inputs = x0.shape[-1], self.num_inputs
         start = torch.cat([x0, ends[0, 0]], dim=-1)
@@ -123,10 +111,10 @@ class LinearRival(Predictor):
     def _lift(self, state: Tensor) -> Tensor:
         """Return phi(s), standardized, ``(*batch, F)``."""
         z = (state - self.mean) / self.scale
-        if self.degree == 1:
-            return z
-        first, second = torch.triu_indices(z.shape[-1], z.shape[-1], device=z.device)
-        return torch.cat([z, z[..., first] * z[..., second]], dim=-1)
+        if self.degree == 2:
+            first, second = torch.triu_indices(z.shape[-1], z.shape[-1], device=z.device)
+            z = torch.cat([z, z[..., first] * z[..., second]], dim=-1)
+        return z
 
 
 def fit_linear_rival(
@@ -146,7 +134,7 @@ def fit_linear_rival(
     truth = stack_until(validation)
     stride = samples_of("step", step, truth.t)
     truth = truth.until(min(truth.duration, step * _STEPS))
-    best: tuple[float, LinearRival] | None = None
+    rivals: list[tuple[float, LinearRival]] = []
     reason = "the training data are empty"
     for lags, ridge in itertools.product(_LAGS[degree], _RIDGES):
         try:
@@ -160,12 +148,10 @@ def fit_linear_rival(
             truth.input.to(truth.q.device, torch.float64),
         )
         off = x[..., : rival.num_coordinates] - truth.q[:, ::stride]
-        error = float(off.norm(dim=-1).mean().nan_to_num(torch.inf, torch.inf))
-        if best is None or error < best[0]:
-            best = error, rival
-    if best is None:
+        rivals.append((float(off.norm(dim=-1).mean().nan_to_num(torch.inf, torch.inf)), rival))
+    if not rivals:
         raise ValueError(f"no linear model can be fitted: {reason}")
-    return best[1]
+    return min(rivals, key=lambda item: item[0])[1]
 
 
 def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -174,10 +160,7 @@ def _windows(train: Sequence[Trajectory], step: float, lags: int) -> tuple[Tenso
     counts = [len(item.t) - lags * k for item, k in zip(train, strides, strict=True)]
     total = sum(max(count, 0) for count in counts)
     if total < 2:
-        raise ValueError(
-            f"no training trajectory is as long as {lags} steps of {step:g} s and one more: "
-            "expected a shorter step or fewer lags"
-        )
+        raise ValueError(f"no training trajectory is as long as {lags} steps of {step:g} s")
     thin = -(-total // _ROWS)
     parts = []
     for item, stride, count in zip(train, strides, counts, strict=True):
@@ -196,7 +179,7 @@ def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tens
     """Return W and b that minimize mean |y - z W - b|^2 + ridge |W s|^2, s the spread of z."""
     centre, scale = features.mean(0), _spread(features)
     z, mean = (features - centre) / scale, target.mean(0)
-    # z = Q R: a fit only needs R and Q^T y, and a Gram matrix would lose precision.
+    # A Gram matrix would lose precision.
     rows = torch.linalg.qr(torch.cat([z, target - mean], dim=1), mode="r").R[: z.shape[1]]
     left, size, right = torch.linalg.svd(rows[:, : z.shape[1]], full_matrices=False)
     shrunk = size / (size.square() + ridge * len(z))

@@ -12,7 +12,7 @@ from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 Tape = tuple[Tensor, ...]
-"""Slopes of the features and hidden activations, for the passes below."""
+"""Slopes of the features and hidden activations."""
 
 
 def _softplus(z: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,34 +43,26 @@ ACTIVATIONS: dict[Activation, Callable[[Tensor], tuple[Tensor, Tensor]]] = {
 class MLP(nn.Module):
     """y = W_n s(... s(W_1 z + b_1) ...) + b_n, with z = (x - mean)/std.
 
-    The features of an angle x_i are sin(x_i) and cos(x_i), so that y has a period of 2 pi. With
-    ``limits`` the features of all other entries are z = (c - mean)/std + tanh((x - c)/std), with
-    c = x clipped to its limits. They are unchanged within the limits, at most one standard
-    deviation beyond them, and twice continuously differentiable. So y far outside the data only has
-    values that it also has near the data.
+    The features of an angle x_i are sin(x_i) and cos(x_i). With ``limits`` the features of all
+    other entries are z = (c - mean)/std + tanh((x - c)/std), with c = x clipped to its limits. They
+    are at most one standard deviation beyond the limits, and twice continuously differentiable.
 
-    With ``after`` the output y_o depends only on the entries x_i with i > after_o. The weights W_k
-    are masked (Germain et al. 2015, "MADE"). A hidden unit reads all entries from some x_i on.
-    More units read many entries than few.
+    With ``after`` the output y_o depends only on the entries x_i with i > after_o, by masked
+    weights W_k (Germain et al. 2015, "MADE").
 
-    :meth:`linearize` evaluates the network and returns the slopes of its activations. With these,
-    :meth:`pushforward` computes J dx (tangent pass) and :meth:`pullback` J^T dy (reverse pass) by
-    ordinary tensor operations, which can be differentiated again and compiled.
+    :meth:`linearize_along` returns y and J dx, and :meth:`pullback` J^T dy, by operations that can
+    be differentiated again and compiled.
 
     Args:
-        inputs: size of x.
-        outputs: size of y.
-        hidden: widths of the hidden layers.
-        activation: one of softplus, tanh, silu.
+        inputs, outputs: sizes of x and y.
+        hidden, activation: widths and activation of the hidden layers.
         mean, std: normalization of x, ``(inputs,)``. The default is no normalization.
         angles: positions of the angles in x.
-        after: for each output, the position in x after which the output depends on x. The default
-            is all of x.
+        after: position for each output. The default lets all outputs depend on all of x.
         limits: smallest and largest x in the data, ``(inputs,)`` each. The default is no limits.
 
     Raises:
-        ValueError: if ``angles`` contains a position that x does not have or a position twice, or
-            if ``after`` needs wider hidden layers.
+        ValueError: if ``after`` needs wider hidden layers.
     """
 
     mean: Tensor
@@ -91,10 +83,6 @@ class MLP(nn.Module):
         limits: tuple[Tensor, Tensor] | None = None,
     ):
         super().__init__()
-        if any(not 0 <= index < inputs for index in angles) or len({*angles}) < len(angles):
-            raise ValueError(
-                f"angles is {list(angles)}, expected different positions from 0 to {inputs - 1}"
-            )
         self._activation = ACTIVATIONS[activation]
         self._has_angles = len(angles) > 0
         is_angle = torch.zeros(inputs, dtype=torch.bool)
@@ -110,10 +98,9 @@ class MLP(nn.Module):
             self._mask(inputs, after)
         self.register_buffer("mean", torch.zeros(inputs) if mean is None else mean.float())
         self.register_buffer("std", torch.ones(inputs) if std is None else std.float())
-        if limits is not None and len(set(angles)) < inputs:
-            self.register_buffer("limits", torch.stack(limits).float())
-        else:
-            self.register_buffer("limits", None)
+        if len(set(angles)) == inputs:
+            limits = None
+        self.register_buffer("limits", None if limits is None else torch.stack(limits).float())
 
     @property
     def linears(self) -> list[nn.Linear]:
@@ -122,20 +109,19 @@ class MLP(nn.Module):
 
     def _mask(self, inputs: int, after: Sequence[int]) -> None:
         """Register masks for the weights, and scale the initial weights to compensate."""
-        # The first entry that each unit reads.
-        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)
+        first = torch.arange(inputs).repeat(2 if self._has_angles else 1)  # entry read by each unit
+        # The number of units that read from x_i on is proportional to the number of these entries.
+        share = torch.arange(inputs - 1, 0, -1).cumsum(0).double()
         masks = []
         for layer in self.linears[:-1]:
             width = layer.out_features
-            # The number of units that read from x_i on is proportional to the number of entries.
-            share = torch.arange(inputs - 1, 0, -1).cumsum(0).double()
             position = (torch.arange(width) + 0.5) / width * inputs * (inputs - 1) / 2
             below, first = first, 1 + torch.searchsorted(share, position.double())
             masks.append(below >= first[:, None])
             if set(first.tolist()) < set(range(1, inputs)):
                 raise ValueError(
                     f"hidden has a layer of {width} units, expected at least "
-                    f"{inputs * (inputs - 1) // 2}, so that some units read from each entry on"
+                    f"{inputs * (inputs - 1) // 2} for a chain"
                 )
         masks.append(first > torch.tensor(after)[:, None])
         for k, (layer, mask) in enumerate(zip(self.linears, masks, strict=True)):
@@ -144,17 +130,12 @@ class MLP(nn.Module):
                 read = mask.sum(1, keepdim=True).clamp(min=1)
                 layer.weight.mul_((mask.shape[1] / read).sqrt())
 
-    def _weights(self) -> list[Tensor]:
-        """Return the weight matrices, masked if ``after`` is used."""
-        weights = [layer.weight for layer in self.linears]
-        if not self._masked:
-            return weights
-        return [weight * self.get_buffer(f"mask_{k}") for k, weight in enumerate(weights)]
-
     def _layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Return weights ``(a, b)`` and biases ``(a, 1)``, from input to output."""
-        biases = [layer.bias[:, None] for layer in self.linears]
-        return list(zip(self._weights(), biases, strict=True))
+        """Return weights ``(a, b)``, masked by ``after``, and biases ``(a,)``."""
+        layers: list[tuple[Tensor, Tensor]] = [(layer.weight, layer.bias) for layer in self.linears]
+        if not self._masked:
+            return layers
+        return [(w * self.get_buffer(f"mask_{k}"), b) for k, (w, b) in enumerate(layers)]
 
     def forward(self, x: Tensor) -> Tensor:
         """Return y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
@@ -162,53 +143,41 @@ class MLP(nn.Module):
         if self._has_angles:
             cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
             h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
-        *hidden, last = zip(self._weights(), self.linears, strict=True)
-        for weight, layer in hidden:
-            h, _ = self._activation(F.linear(h, weight, layer.bias))
-        return F.linear(h, last[0], last[1].bias)
+        *hidden, last = self._layers()
+        for weight, bias in hidden:
+            h, _ = self._activation(F.linear(h, weight, bias))
+        return F.linear(h, *last)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tape]:
-        """Return y and the tape that :meth:`pushforward` and :meth:`pullback` need."""
+        """Return y and the tape that :meth:`pullback` needs."""
         h, slopes = self._features(columns(x))
         tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
-            h, slope = self._activation(torch.addmm(bias, weight, h))
+            h, slope = self._activation(torch.addmm(bias[:, None], weight, h))
             tape.append(slope)
-        return rows(torch.addmm(last_bias, last, h), x), tuple(tape)
+        return rows(torch.addmm(last_bias[:, None], last, h), x), tuple(tape)
 
     def linearize_along(self, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tape]:
-        """Return y, J dx and the tape: :meth:`linearize` and :meth:`pushforward` in one pass.
-
-        Each layer is a single product of twice as many columns.
-        """
+        """Return y, J dx and the tape in one pass."""
         features, slopes = self._features(columns(x))
         tangent = self._tangent(columns(dx), slopes)
         tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
             z, dz = _side_by_side(weight, features, tangent)
-            features, slope = self._activation(z + bias)
+            features, slope = self._activation(z + bias[:, None])
             tangent = slope * dz
             tape.append(slope)
         y, dy = _side_by_side(last, features, tangent)
-        return rows(y + last_bias, x), rows(dy, x), tuple(tape)
-
-    def pushforward(self, tape: Tape, dx: Tensor) -> Tensor:
-        """Return J dx, ``(*batch, outputs)``, for a tangent dx ``(*batch, inputs)``."""
-        *hidden, last = self._weights()
-        h = self._tangent(columns(dx), tape[0])
-        for weight, slope in zip(hidden, tape[1:], strict=True):
-            h = (weight @ h) * slope
-        return rows(last @ h, dx)
+        return rows(y + last_bias[:, None], x), rows(dy, x), tuple(tape)
 
     def pullback(self, tape: Tape, dy: Tensor) -> Tensor:
         """Return J^T dy, ``(*batch, inputs)``, for a cotangent dy ``(*batch, outputs)``."""
-        *hidden, last = self._weights()
+        *hidden, last = (weight for weight, _ in self._layers())
         first, *slopes = tape
         h = columns(dy)
-        # For one output use elementwise products: Inductor (torch 2.13) compiles ones(B, 1) @ W to
-        # a wrong gradient at some small sizes.
+        # Inductor (torch 2.13) compiles ones(B, 1) @ W to a wrong gradient at some small sizes.
         h = last.T * h if last.shape[0] == 1 else last.T @ h
         for weight, slope in zip(reversed(hidden), reversed(slopes), strict=True):
             h = weight.T @ (h * slope)
@@ -219,7 +188,7 @@ class MLP(nn.Module):
         return rows(h, dy)
 
     def _normalized(self, x: Tensor, in_columns: bool = False) -> tuple[Tensor, Tensor]:
-        """Return z and its slope in x, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
+        """Return z and its slope, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
         mean, std, limits = self.mean, self.std, self.limits
         if in_columns:
             mean, std = mean[:, None], std[:, None]
@@ -255,11 +224,7 @@ def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor
 
 
 def columns(x: Tensor) -> Tensor:
-    """Return ``(*batch, n)`` as a view ``(n, B)``, the layout of all passes.
-
-    With the batch contiguous in memory, products of small matrices and triangular solves become a
-    few operations on long vectors.
-    """
+    """Return ``(*batch, n)`` as a view ``(n, B)``, so that operations run along the batch."""
     return x.reshape(-1, x.shape[-1]).T
 
 

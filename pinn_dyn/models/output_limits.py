@@ -21,7 +21,7 @@ def output_limits(model: nn.Module, q: Tensor) -> dict[str, Tensor]:
 
 def given_limits(model: nn.Module) -> dict[str, Tensor]:
     """Return the limits that the heads of a model have, by name."""
-    return {name: x for name, x in model.named_buffers() if is_limit(name)}
+    return {name: x for name, x in model.named_buffers() if name.endswith(f".{_NAME}")}
 
 
 def joint_limits(members: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
@@ -35,26 +35,14 @@ def joint_limits(members: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def set_output_limits(model: nn.Module, limits: Mapping[str, Tensor]) -> None:
-    """Set the limits of the heads of a model by name. Heads without a name have no limits."""
+    """Set the limits of the heads of a model by name, and remove all other limits."""
     for name, head in _heads(model):
         head.output_limits = limits.get(f"{name}.{_NAME}")
 
 
-def expect_output_limits(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Register buffers for the limits in the weights of a checkpoint."""
-    for name, head in _heads(model):
-        limited = f"{name}.{_NAME}" in weights
-        head.output_limits = torch.zeros(3, len(head.order)) if limited else None
-
-
 def free_weights(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the weights of a checkpoint without limits."""
-    return {name: value for name, value in weights.items() if not is_limit(name)}
-
-
-def is_limit(name: str) -> bool:
-    """Return true if a buffer of this name holds the limits of a head."""
-    return name.endswith(f".{_NAME}")
+    return {name: value for name, value in weights.items() if not name.endswith(f".{_NAME}")}
 
 
 def _heads(model: nn.Module) -> list[tuple[str, NetworkCholesky]]:

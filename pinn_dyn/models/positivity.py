@@ -16,11 +16,9 @@ class Positivity(abc.ABC):
     """Map from free numbers y to the entries of a triangular factor, in units of their scale.
 
     Attributes:
-        floor: lower limit of the diagonal entries.
         start: initial y of the diagonal entries.
     """
 
-    floor: float
     start: float
 
     @abc.abstractmethod
@@ -38,8 +36,7 @@ class Positive(Positivity):
 
     Args:
         floor: smallest diagonal entry, in units of the scale; 0 allows a semi-definite matrix.
-        initial: initial diagonal entry without the floor. Choose a value below 1 for the mass
-            matrix of a robot with little inertia.
+        initial: initial diagonal entry without the floor; below 1 for a robot of little inertia.
     """
 
     floor: NonNegativeFloat = 1e-3
@@ -61,12 +58,11 @@ class Positive(Positivity):
 class Bounded(Positivity):
     """L_ii = b sigmoid(y_ii) + floor,   L_ij = b (2 sigmoid(y_ij) - 1),   b the limit.
 
-    This is the scaled sigmoid of the paper for a real arm, with b = 3.5. The initial diagonal is
-    0.63 b.
+    This is the scaled sigmoid of the paper for a real arm. The initial diagonal is 0.63 b.
 
     Args:
         limit: b, in units of the scale.
-        floor: smallest diagonal entry, in units of the scale; 0 allows a semi-definite matrix.
+        floor: smallest diagonal entry, in units of the scale.
     """
 
     limit: PositiveFloat = 3.5

@@ -28,17 +28,15 @@ class Potential(nn.Module, abc.ABC):
 class NetworkPotential(Potential):
     """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
 
-    K = S S^T is a learned constant. An elastic or gravity well is mostly quadratic, so the network
-    only learns the difference. z has zeros for angles, since V is periodic in them. The input of
-    the network saturates outside the data, so that V is bounded from below.
+    K = S S^T is a learned constant, since an elastic or gravity well is mostly quadratic. z has
+    zeros for angles. The input of the network saturates outside the data, so that V is bounded from
+    below.
 
     Args:
         scales: scales of the data. The value is a typical energy, J.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
         quadratic: true for the term with K; false is the plain network of the paper.
-        initial: factor of the initial weights of the last layer; 0 starts from V = 0, for a part
-            of a sum.
+        initial: factor of the initial weights of the last layer; 0 for a part of a sum.
     """
 
     scale: Tensor
@@ -84,22 +82,16 @@ class NetworkPotential(Potential):
 
 
 class ChainPotential(Potential):
-    """Potential of a serial chain of revolute joints, linear in each sine and cosine.
-
-    ::
+    """Potential of a serial chain of revolute joints, linear in each sine and cosine::
 
         V = scale * e^T w_1,    w_k = (T_k + S_k sin q_k + C_k cos q_k) w_k+1 + h_k
 
-    with w_N+1 = h_N+1, and learned T, S, C, h and e. Joints are ordered from base to tip.
-
-    In a chain of rigid bodies w_k is the first moment of mass of the bodies from joint k to the
-    tip, in the frame before joint k: the moment of the bodies beyond, rotated by the joint, plus
-    the moment of the body. Three rows represent this potential exactly. More rows are easier to
-    train.
+    with w_N+1 = h_N+1, and learned T, S, C, h and e. Joints are ordered from base to tip. In a
+    chain of rigid bodies w_k is the first moment of mass of the bodies from joint k to the tip, in
+    the frame before joint k. Three rows represent it exactly; more rows are easier to train.
 
     Args:
-        scales: scales of the data. The value is a typical energy, J, and all coordinates are
-            angles.
+        scales: scales of the data. The value is a typical energy, J.
         rank: number of rows of the vectors w, h and e.
 
     Raises:
@@ -113,8 +105,8 @@ class ChainPotential(Potential):
         size, angles = scales.size, scales.angles
         if set(angles) != set(range(size)):
             raise ValueError(
-                f"angles is {list(angles)}, expected all {size} coordinates: ChainPotential is "
-                "for revolute joints; use NetworkPotential"
+                f"angles is {list(angles)}, expected all {size} coordinates: a ChainPotential is "
+                "for revolute joints"
             )
         self.rank = rank
 
@@ -134,7 +126,7 @@ class ChainPotential(Potential):
         return self.scale * (self.base * w).sum(0).reshape(q.shape[:-1])
 
     def gradient(self, q: Tensor) -> Tensor:
-        """Return G(q) = dV/dq, ``(*batch, N)``, by one pass from the tip and one from the base."""
+        """Return G(q) = dV/dq, ``(*batch, N)``."""
         x = columns(q)
         sine, cosine = torch.sin(x), torch.cos(x)
         _, turned = self._moments(x)

@@ -39,11 +39,7 @@ ResidualHead = Callable[[Scales], Residual]
 
 
 class NoResidual(Residual):
-    """r = 0, as in the paper.
-
-    Args:
-        scales: scales of the data.
-    """
+    """r = 0, as in the paper."""
 
     learned = False
 
@@ -62,14 +58,13 @@ class NetworkResidual(Residual):
 
         penalty = w mean over the batch and i of (r_i / f_i)^2
 
-    f is a typical generalized force. Due to the penalty, r only represents effects that M, V, D, F
-    and A cannot represent, such as hysteresis and drive losses. The force is not passive. The input
-    of the network saturates outside the data, so that r is bounded.
+    f is a typical generalized force. Due to the penalty, r only represents effects that the other
+    heads cannot represent, such as hysteresis. The force is not passive, but bounded: the input of
+    the network saturates outside the data.
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
-        hidden: widths of the hidden layers.
-        activation: activation of the hidden layers.
+        hidden, activation: widths and activation of the hidden layers.
         weight: w. The initial loss of the prediction is near one.
     """
 
@@ -90,9 +85,9 @@ class NetworkResidual(Residual):
         mean, std = data.network_input(repeat_input=1)
         low, high = mean - _REACH * std, mean + _REACH * std
         low[:size], high[:size] = data.q_low, data.q_high
-        self.network = MLP(
-            len(mean), size, hidden, activation, mean, std, scales.angles, limits=(low, high)
-        )
+        sizes = len(mean), size
+        limits = low, high
+        self.network = MLP(*sizes, hidden, activation, mean, std, scales.angles, limits=limits)
         nn.init.zeros_(self.network.linears[-1].weight)
         self.register_buffer("scale", scales.value.float())
 

@@ -14,12 +14,7 @@ from pinn_dyn.models.statistics import Statistics
 
 @dataclass(frozen=True)
 class Joint:
-    """Name of a joint, and the units of forces and motions along it.
-
-    Attributes:
-        name: name of the joint.
-        turns: true for a revolute joint, false for a prismatic one.
-    """
+    """Name of a joint, and units along it, depending on whether it turns or slides."""
 
     name: str
     turns: bool = True
@@ -113,6 +108,7 @@ class Scales:
     ) -> MLP:
         """Build a network of q. Its input saturates outside the data, see :class:`MLP`."""
         data = self.statistics
-        limits = (data.q_low, data.q_high)
-        mean, std = data.q_mean, data.q_std
-        return MLP(self.size, outputs, hidden, activation, mean, std, self.angles, after, limits)
+        sizes = self.size, outputs
+        limits = data.q_low, data.q_high
+        normal = data.q_mean, data.q_std
+        return MLP(*sizes, hidden, activation, *normal, self.angles, after, limits)

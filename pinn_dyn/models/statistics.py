@@ -10,8 +10,6 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import State
 
-_MOST_NUMBERS = 10_000
-
 
 @dataclass(frozen=True)
 class Statistics:
@@ -81,34 +79,23 @@ class Statistics:
         """Build from the result of :meth:`to_dict`.
 
         Raises:
-            ValueError: if a field is missing, has a wrong size, is not finite, or must be positive
-                and is not. The message names the field.
+            ValueError: if a field is missing, has a wrong size, or is not finite or positive.
         """
         names = [item.name for item in fields(cls)]
-        if sorted(values) != sorted(names):
-            raise ValueError(f"statistics has {', '.join(values)}, expected {', '.join(names)}")
-        read = {name: _numbers(name, values[name]) for name in names}
+        if missing := [name for name in names if name not in values]:
+            raise ValueError(f"statistics has no {', '.join(missing)}")
+        read = {name: torch.tensor(values[name], dtype=torch.float64) for name in names}
         size, inputs = read["q_mean"].shape, read["u_mean"].shape
         for name, value in read.items():
             shape = () if name == "step" else inputs if name.startswith("u_") else size
-            if name.endswith("increment_std") and value.ndim == 2:
-                shape = torch.Size((len(value), 2 * size.numel()))
+            if name.endswith("increment_std"):
+                shape = torch.Size((*value.shape[:-1], 2 * size.numel()))
             positive = name.endswith("_std") or name == "step"
-            if value.shape != shape or not value.numel() or (positive and not (value > 0).all()):
+            valid = value.isfinite() & (value > 0 if positive else True)
+            if value.shape != shape or not valid.all():
                 raise ValueError(
-                    f"statistics.{name} has shape {tuple(value.shape)} and starts with "
-                    f"{value.flatten()[:3].tolist()}, expected {tuple(shape)}"
-                    f"{' positive numbers' if positive else ''}"
+                    f"statistics.{name} has shape {tuple(value.shape)}, expected "
+                    f"{'positive' if positive else 'finite'} numbers of shape {tuple(shape)}"
                 )
         step = float(read.pop("step"))
         return cls(**read, step=step)
-
-
-def _numbers(name: str, value: Any) -> Tensor:
-    try:
-        numbers = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(f"statistics.{name} holds no numbers: {error}") from error
-    if numbers.numel() > _MOST_NUMBERS or not numbers.isfinite().all():
-        raise ValueError(f"statistics.{name} has {numbers.numel()} numbers, expected finite ones")
-    return numbers

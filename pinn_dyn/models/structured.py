@@ -19,14 +19,10 @@ from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[[Scales], CholeskyFactor]
-"""Builder of a Cholesky head. The value of its scales is that of the rows of L."""
 PotentialHead = Callable[[Scales], Potential]
-"""Builder of a potential head. The value of its scales is an energy."""
 InputHead = Callable[[Scales], InputMatrix]
-"""Builder of an input head. The value of its scales is that of the columns of A."""
 FrictionHead = Callable[[Scales], Friction]
-"""Builder of a friction head. The value of its scales is a force."""
-
+"""Builders of heads. The values of their scales are those of rows of L, V, columns of A and F."""
 
 MASS = partial(NetworkCholesky, hidden=(32, 32, 32))
 POTENTIAL = partial(NetworkPotential, hidden=(32, 32))
@@ -38,9 +34,8 @@ INPUT = partial(NetworkInput, hidden=(16, 16))
 class StructuredNetwork(DelayedPredictor, MechanicalSystem):
     """Mechanical system with learned V, D, F, A and residual force. Subclasses add the mass.
 
-    The scales of the heads come from the data, so that every network works on numbers near one.
-    With the root mean square f of the input, A ~ f/u. With the resulting typical force f_i of
-    coordinate i, D ~ f_i/v_i, F ~ f_i, r ~ f_i and V ~ f q.
+    The scales of the heads come from the data: with the root mean square f of the input, A ~ f/u;
+    with the resulting typical force f_i of coordinate i, D ~ f_i/v_i, F ~ f_i, r ~ f_i and V ~ f q.
     """
 
     def __init__(
@@ -105,7 +100,6 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return self.residual(q, v, u)
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return the penalty of the residual force."""
         return self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:

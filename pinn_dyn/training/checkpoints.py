@@ -14,11 +14,7 @@ from pinn_dyn.data.whole import whole
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Checkpoint writer that writes a file next to the checkpoint and renames it.
-
-    Lightning writes to the folder of temporary files. Moving a file from another file system is not
-    atomic.
-    """
+    """Checkpoint writer that writes a file next to the checkpoint and renames it."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None

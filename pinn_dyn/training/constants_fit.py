@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import torch
@@ -11,12 +11,8 @@ from torch import Tensor
 
 _FAR = 3.0
 """Prior standard deviations from which a constant is reported: 3 of 1,000 by chance."""
-_REPORTED = 5
-_CHECKS = {
-    "drive gain": "units and sign of its input",
-    **dict.fromkeys(("torque offset", "force offset"), "sign of its input"),
-}
-"""Advice by the kind of the constant. The default is to check the units of the columns."""
+_CHECKS = {"drive gain": "units and sign", "torque offset": "sign", "force offset": "sign"}
+"""Properties of an input to check, by the kind of the constant."""
 
 
 class Prior(NamedTuple):
@@ -36,8 +32,7 @@ class Fit:
         prior: prior of z.
         residual: root mean square of the normalized data residuals.
         iterations: number of Gauss-Newton steps.
-        stopped_in: stage in which the fit was interrupted, or None if it is finished. All other
-            values are then those of the last finished stage, or of the prior.
+        stopped_in: stage in which the fit was interrupted, or None if it is finished.
     """
 
     covariance: Tensor
@@ -57,27 +52,18 @@ class Fit:
         """Build the fit of ``count`` parameters from a checkpoint.
 
         Raises:
-            ValueError: if the checkpoint has no valid fit.
+            ValueError: if the checkpoint has no fit of these parameters.
         """
-        numbers = {"residual": (float,), "iterations": (int,), "stopped_in": (int, type(None))}
-        square = {key: [count, count] for key in ("covariance", "information", "root")}
-        shapes = {**square, "mean": [count]}
-        if (
-            not isinstance(state, dict)
-            or state.keys() != numbers.keys() | shapes.keys()
-            or not all(isinstance(state[key], kind) for key, kind in numbers.items())
-            or not all(isinstance(state[key], Tensor) for key in shapes)
-            or not all(list(state[key].shape) == shape for key, shape in shapes.items())
-            or not all(state[key].dtype == torch.float64 for key in shapes)
-            or not all(bool(state[key].isfinite().all()) for key in shapes)
-            or bool(torch.linalg.inv_ex(state["root"]).info)
-        ):
+        prior = [state.get(key) for key in Prior._fields]
+        values = {item.name: state.get(item.name) for item in fields(cls) if item.name != "prior"}
+        tensors = [*prior, values["covariance"], values["information"]]
+        shapes = [x.shape if isinstance(x, Tensor) else None for x in tensors]
+        if shapes != [(count,), *3 * [(count, count)]]:
             raise ValueError(
-                f"the checkpoint has no fit of the model's {count} constants: it is damaged or "
-                "belongs to another model; fit again in a new folder"
+                f"the checkpoint has no fit of the model's {count} constants: fit again in a new "
+                "folder"
             )
-        values = {key: state[key] for key in state if key not in Prior._fields}
-        return cls(prior=Prior(state["mean"], state["root"]), **values)
+        return cls(prior=Prior(*prior), **values)
 
 
 class StoppedFit(KeyboardInterrupt):
@@ -95,7 +81,7 @@ class StoppedFit(KeyboardInterrupt):
 def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
     """Return (I + R^T R)^-1, ``(P, P)``, with information I and the root R of the prior precision.
 
-    The eigenvalues of R^-T I R^-1 are used, since I + R^T R is nearly singular without noise.
+    I + R^T R may be nearly singular.
     """
     back = torch.linalg.inv(root)
     values, vectors = torch.linalg.eigh(back.T @ information @ back)
@@ -104,16 +90,16 @@ def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
 
 
 def far_from_start(names: Sequence[str], z: Tensor, prior: Prior) -> list[str]:
-    """Describe the parameters z ``(P,)`` that are very unlikely under the prior."""
+    """Describe the parameters z ``(P,)`` that are very unlikely under the prior, five at most."""
     spread = torch.linalg.inv(prior.root).norm(dim=1)
     deviation = ((z - prior.mean) / spread).abs()
-    far = [k for k in deviation.argsort(descending=True).tolist() if deviation[k] > _FAR]
     lines = []
-    for k in far[:_REPORTED]:
-        checks = (check for kind, check in _CHECKS.items() if names[k].startswith(kind))
-        lines.append(
-            f"{names[k]} is {float(deviation[k]):.1f} prior standard deviations from its start: "
-            f"check {next(checks, 'the units of the columns')}"
-        )
-    more = len(far) - _REPORTED
-    return [*lines, f"and {more} more"] if more > 0 else lines
+    for k in deviation.argsort(descending=True).tolist()[:5]:
+        if deviation[k] > _FAR:
+            checks = [x for kind, x in _CHECKS.items() if names[k].startswith(kind)]
+            advice = f"{checks[0]} of its input" if checks else "the units of the columns"
+            lines.append(
+                f"{names[k]} is {float(deviation[k]):.1f} prior standard deviations from its "
+                f"start: check {advice}"
+            )
+    return lines

@@ -25,9 +25,9 @@ class Motion(NamedTuple):
 def correlation_length(errors: np.ndarray) -> float:
     """Return the number of successive errors ``(K, N)`` that are worth one independent error.
 
-    The length is 1 + 2 sum over k of rho_k, with the autocorrelation rho up to its first sign
-    change, averaged over the N columns with their squares as weights. It is at least 1. Source:
-    integrated autocorrelation time, Sokal (1997), "Monte Carlo methods in statistical mechanics".
+    It is 1 + 2 sum over k of rho_k, with the autocorrelation rho up to its first sign change,
+    averaged over the N columns. Source: integrated autocorrelation time, Sokal (1997), "Monte Carlo
+    methods in statistical mechanics".
     """
     count = len(errors)
     spectrum = np.fft.rfft(errors, 2 * count, axis=0)
@@ -44,11 +44,10 @@ def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: 
 
     Each trajectory is filtered forwards and backwards by a Butterworth filter of fourth order. a is
     the derivative of the filtered v by differences. Half a period of the cutoff is removed at both
-    ends. The samples are evenly spaced.
+    ends.
 
     Raises:
-        ValueError: if the cutoff is above half the sample rate, or no trajectory is longer than
-            three periods of the cutoff.
+        ValueError: if the cutoff is above half the sample rate, or all trajectories are too short.
     """
     parts: list[Motion] = []
     for item in trajectories:

@@ -43,11 +43,10 @@ class NonFiniteLossError(RuntimeError):
 class DynamicsLearner(L.LightningModule):
     """LightningModule that trains a predictor on windows and validates it by roll-outs.
 
-    A training step of Lightning comprises many optimizer steps, since the hundreds of calls around
-    a training step take as long as an optimizer step of a small network. A training step ends if
-    Lightning may have something to do: before and after each ``log_every_n_steps`` steps, at a
-    validation, and after half a second. With several processes, or a callback that averages
-    weights, a training step is a single optimizer step.
+    A training step of Lightning comprises many optimizer steps, since the calls around a training
+    step take as long as an optimizer step of a small network. It ends if Lightning may have
+    something to do: around each ``log_every_n_steps`` steps, at a validation, and after half a
+    second. With several processes, or a callback that averages weights, it is a single step.
 
     Args:
         model: the predictor.
@@ -55,11 +54,9 @@ class DynamicsLearner(L.LightningModule):
         optimizer: builder of the optimizer from the parameters.
         scheduler: builder of the learning-rate schedule from the optimizer and ``total_steps``.
         validator: metrics on validation trajectories.
-        config: the resolved configuration as plain values, saved in the checkpoint.
-        statistics: scales of the data, saved in the checkpoint.
+        config, statistics: resolved configuration and scales of the data, saved in the checkpoint.
         compile: true to compile the dynamics for training.
-        gradient_clip_val: largest norm, or largest entry, of the gradient. The default is no
-            clipping.
+        gradient_clip_val: largest norm, or largest entry, of the gradient, if any.
         gradient_clip_algorithm: ``"norm"`` or ``"value"``.
 
     Raises:
@@ -90,9 +87,7 @@ class DynamicsLearner(L.LightningModule):
         self.model = model
         self.loss = Penalized(loss) if model.penalized else loss
         self.validator = validator
-        self._optimizer = optimizer
-        self._scheduler = scheduler
-        self._compile = compile
+        self._optimizer, self._scheduler, self._compile = optimizer, scheduler, compile
         self._clip_value, self._by_value = gradient_clip_val, gradient_clip_algorithm == "value"
         self._losses: list[Tensor] = []  # losses of this epoch
 
@@ -105,9 +100,7 @@ class DynamicsLearner(L.LightningModule):
     def training_step(self, dataloader_iter: Iterator[tuple[Windows, int, int]]) -> None:
         """Take optimizer steps, one for each batch, until Lightning has something to do."""
         loop, trainer = self.trainer.fit_loop.epoch_loop, self.trainer
-        before = (
-            loop.batch_progress.current.ready - 1
-        )  # in this epoch; Lightning has counted this step
+        before = loop.batch_progress.current.ready - 1  # steps of this epoch
         if before == 0:
             self._losses.clear()  # of an interrupted epoch
         # Without the hooks of Lightning around a step, which take as long as AdamW.
@@ -124,8 +117,7 @@ class DynamicsLearner(L.LightningModule):
                     break
         finally:
             loop.manual_optimization.optim_step_progress.increment_by(done)
-            # Lightning counts a single step. Loggers and monitors use the private counter, which no
-            # public function changes.
+            # Lightning counts a single step. Loggers and monitors use the private counter.
             loop.batch_progress.increment_by(done - 1)
             loop._batches_that_stepped += done - 1
             if self.device.type == "cuda" and (new := self._losses[count:]):
@@ -175,14 +167,11 @@ class DynamicsLearner(L.LightningModule):
                 raise NonFiniteLossError(
                     f"the training loss became {loss} at step {step} (epoch "
                     f"{self.current_epoch}); earlier checkpoints are kept. Reduce optimizer.lr, or "
-                    "use shorter windows (data.steps, data.stride), and start again"
+                    "use shorter windows (data.steps, data.stride)"
                 )
 
     def log_losses(self, losses: Tensor) -> None:
-        """Log the mean loss once per epoch.
-
-        A call of ``log`` takes as long as a step of a small network.
-        """
+        """Log the mean loss, once per epoch, since a call takes as long as a small step."""
         self.log(
             "train/loss",
             losses.mean(),
@@ -233,39 +222,22 @@ class DynamicsLearner(L.LightningModule):
         return self._optimizer([vector.values]) if type(optimizer) in ELEMENTWISE else optimizer
 
     def configure_optimizers(self) -> Any:
-        """Build the optimizer and the learning-rate schedule, which advances at every step.
-
-        Lightning calls this in the training process with the model on its device. Compiled programs
-        are created here, since they cannot be sent to another process.
-        """
+        """Build the optimizer and the schedule, and the programs, in the training process."""
         if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
             raise ValueError(
-                f"trainer.precision is {self.trainer.precision}, which scales the loss: use "
-                "bf16-mixed or 32"
+                f"trainer.precision {self.trainer.precision} scales the loss: use bf16-mixed or 32"
             )
         self._steps = int(self.trainer.estimated_stepping_batches)
         self._vector = self.parameter_vector()
         self._gradients = self.gradients(self._vector, self._steps)
         optimizer = self.built_optimizer(self._vector)
         scheduler = self._scheduler(optimizer, total_steps=self._steps)
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {
-                "scheduler": scheduler,
-                "interval": "step",
-                "name": "train/learning_rate",
-            },
-        }
+        schedule = {"scheduler": scheduler, "interval": "step", "name": "train/learning_rate"}
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
 
 
 def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> Tensor:
-    """Clip a gradient ``(*members, P)`` by the norm of each member, or by value.
-
-    Args:
-        gradient: gradient of all parameters.
-        largest: largest norm or value. None returns the gradient unchanged.
-        by_value: true to clip by value.
-    """
+    """Clip a gradient ``(*members, P)`` to the largest norm of each member, or value, if any."""
     if largest is None:
         return gradient
     if by_value:

@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 AtLeastTwo = Annotated[int, Field(ge=2)]
 """Number of samples or evaluations: one sample has no spread."""
 
-_MAX_PARAMETERS = 500
 _CHUNK = 500
 """Number of windows whose derivatives are rolled out at once, to limit the memory."""
 _FIRST_NOISE = 0.1
@@ -53,31 +52,26 @@ class LeastSquares:
 
     z are the standardized parameters of the model, with the prior z_0 = 0 and P = 1. After an
     earlier fit, z_0 is its result and P the inverse of its covariance, except for bodies that have
-    ``changed`` since. For example, a payload can be learned from seconds of data. A fit has two
-    stages, each starting from the result of the previous one:
+    ``changed`` since, such as a payload. A fit has two stages:
 
     1. Inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), in units of the spread of the
        forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
        same filter for q, v, a and u does not change a linear law. Joints at rest are excluded,
-       since dry friction may then have any value up to its level. This is the classical
-       identification, with physical constants.
+       since dry friction may then have any value up to its level.
     2. Roll-outs: r = predicted minus measured increments of the windows, in units of their spread,
-       as in the increment loss. Derivatives are computed in forward mode through the integrator.
-       The first roll-outs use a quarter of the steps of the windows.
+       as in the increment loss. The first roll-outs use a quarter of the steps of the windows.
 
     s is the root mean square of the residuals, estimated by repeating each stage. Correlated
     residuals are counted once: successive samples of the motion by :func:`correlation_length`, and
     the residuals of a coordinate within a window.
 
     Args:
-        cutoff: cutoff of the filter before the inverse dynamics, Hz. Choose it above the
-            frequencies of the motion and below those of the noise.
+        cutoff: cutoff of the filter, Hz, above the frequencies of the motion and below the noise.
         rollouts: true for both stages, false for the identification only.
         samples: number of samples of the inverse dynamics.
         evaluations: largest number of evaluations of the residuals in a stage.
         velocity_weight: weight of the velocity half in the roll-outs, as in the loss.
-        changed: bodies, or other owners of constants such as ``tip`` in ``mass of tip``, that have
-            changed since the earlier fit and are fitted anew.
+        changed: bodies, such as ``tip`` in ``mass of tip``, that are fitted anew.
     """
 
     def __init__(
@@ -115,17 +109,11 @@ class LeastSquares:
             stopped: interrupted result of this fit, to continue from the present z.
 
         Raises:
-            ValueError: if the model has no parameters or more than 500, trajectories are too short
-                for the filter, there are fewer residuals than parameters, the covariance does not
-                fit the model, or changed bodies are unknown.
+            ValueError: if trajectories are too short for the filter, there are fewer residuals than
+                parameters, the covariance does not fit the model, or changed bodies are unknown.
             StoppedFit: on an interrupt. The model then has the best z so far.
         """
         count = sum(p.numel() for p in model.parameters())
-        if not 0 < count <= _MAX_PARAMETERS:
-            raise ValueError(
-                f"least squares takes 1 to {_MAX_PARAMETERS} parameters, the model has {count}: "
-                "use a gradient method (optimizer=adamw) or a smaller model"
-            )
         precision = next(model.parameters()).dtype
         model.double()
         prior = stopped.prior if stopped else self._prior(model, covariance)
@@ -136,13 +124,10 @@ class LeastSquares:
         if self.rollouts:
             windows = windows.to(torch.device("cpu"), torch.float64)
             steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
-            _require_enough(
-                size * _informative_blocks(steps) * steps,
-                count,
-                f"{len(windows)} windows of {steps} steps",
-                "use more windows (data.pairs) or longer windows (data.steps)",
-                earlier,
-            )
+            source = f"{len(windows)} windows of {steps} steps"
+            remedy = "use more windows (data.pairs) or longer windows (data.steps)"
+            residuals = size * _informative_blocks(steps) * steps
+            _require_enough(residuals, count, source, remedy, earlier)
             # Short windows first: from a poor start, long windows diverge or end in a poor minimum.
             short = -(-steps // 4)
             enough = size * _informative_blocks(short) * short >= count
@@ -170,10 +155,7 @@ class LeastSquares:
         z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()
         if covariance is None:
             if self.changed:
-                raise ValueError(
-                    f"changed is {self.changed}, but there is no earlier fit: give its run by "
-                    "start_from=<run>"
-                )
+                raise ValueError(f"changed is {self.changed}, but there is no earlier fit")
             return Prior(0 * z, torch.eye(len(z)).to(z))
         owners = [name.split(" of ", 1)[-1] for name in names]
         if unknown := [owner for owner in self.changed if owner not in owners]:
@@ -186,18 +168,11 @@ class LeastSquares:
                 f"the earlier fit has {len(covariance)} constants, this model {len(z)}: use the "
                 "friction and the drive gains of the earlier run"
             )
-        free = torch.tensor([owner in self.changed for owner in owners])
-        held = ~free
-        spread = torch.where(
-            held[:, None] & held, covariance.to(z), torch.diag(_CHANGED**2 * free.to(z))
-        )
-        factor, failed = torch.linalg.cholesky_ex(spread)
-        if failed:
-            raise ValueError(
-                "the covariance of the earlier fit is not positive definite: its checkpoint is "
-                "damaged, fit the model again"
-            )
+        held = torch.tensor([owner not in self.changed for owner in owners])
+        free = torch.diag(_CHANGED**2 * (~held).to(z))
+        spread = torch.where(held[:, None] & held, covariance.to(z), free)
         # The inverse would be indefinite by rounding if many constants are known precisely.
+        factor = torch.linalg.cholesky(spread)
         root = torch.linalg.solve_triangular(factor, torch.eye(len(z)).to(z), upper=False)
         return Prior(z, root)
 
@@ -213,16 +188,10 @@ class LeastSquares:
             spread = model.force_scale(q, v, a, u)
         moves = v.abs() > REST * v.std(0)
         if not moves.any():
-            raise ValueError(
-                "least squares: no joint moves in the training trajectories: excite the robot"
-            )
-        _require_enough(
-            int(moves.sum()),
-            len(prior.mean),
-            f"{len(q)} samples of filtered motion, without joints at rest,",
-            "record longer motions of all joints, or raise optimizer.samples",
-            earlier,
-        )
+            raise ValueError("least squares: no joint moves in the training trajectories")
+        source = f"{len(q)} samples of filtered motion, without joints at rest,"
+        remedy = "record longer motions of all joints, or raise optimizer.samples"
+        _require_enough(int(moves.sum()), len(prior.mean), source, remedy, earlier)
         samples = model.samples(q, v, a, u)
 
         def errors() -> Tensor:
@@ -255,9 +224,8 @@ class LeastSquares:
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
-        correlated = float(measured.shape[1])
         stage = f"roll-outs of {float(windows.t[-1]):.3g} s"
-        return self._solve(stage, model, prior, residuals, correlated=correlated)
+        return self._solve(stage, model, prior, residuals, correlated=float(measured.shape[1]))
 
     def _solve(
         self,
@@ -270,7 +238,7 @@ class LeastSquares:
     ) -> Fit:
         """Fit twice, the second time with the noise level of the first fit; set the model in place.
 
-        ``residuals`` returns the residuals of the present model, ``(..., R)``, or their derivatives
+        ``residuals`` returns the residuals ``(..., R)`` of the present model, or their derivatives
         ``(..., R, P)``. ``correlated`` residuals are worth one independent residual.
         """
         z = parameters_to_vector(model.parameters()).detach()
@@ -327,28 +295,20 @@ def _evaluate(
 
 
 def _informative_blocks(steps: int) -> int:
-    """Return the number of informative residual blocks: 1 for one-step windows, otherwise 2.
-
-    In one step dq/dt = v makes the residual of q zero.
-    """
+    """Return 1 for one-step windows, in which dq/dt = v makes the residual of q zero, or else 2."""
     return 1 if steps == 1 else 2
 
 
 def _require_enough(count: int, constants: int, source: str, remedy: str, earlier: bool) -> None:
-    """Check that there are at least as many residuals as constants.
+    """Check that there are at least as many residuals as constants, or warn after an earlier fit.
 
-    Fewer residuals would be fitted exactly, so that the noise seems to be zero. After an earlier
-    fit this is only a warning, since few constants are free.
-
-    Raises:
-        ValueError: if there are fewer residuals than constants.
+    Fewer residuals would be fitted exactly, so that the noise seems to be zero.
     """
-    if count >= constants:
-        return
     message = (
-        f"{source} give {count} residuals for {constants} constants, expected at least as many, "
-        f"since fewer would be fitted exactly, without noise: {remedy}"
+        f"least squares: {source} give {count} residuals for {constants} constants, expected at "
+        f"least as many: {remedy}"
     )
-    if not earlier:
-        raise ValueError(f"least squares: {message}")
-    log.warning("least squares: %s", message)
+    if count < constants and not earlier:
+        raise ValueError(message)
+    if count < constants:
+        log.warning(message)

@@ -23,20 +23,18 @@ from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.losses import WindowLoss
 
 COVARIANCE = "covariance"
-"""Key of the covariance of the constants in a checkpoint."""
 _FIT = "fit"
+"""Keys of the covariance of the constants, and of the fit, in a checkpoint."""
 
 
 class LeastSquaresLearner(DynamicsLearner):
     """LightningModule that fits a model by least squares in a single training step.
 
-    A fit has the same run folder, checkpoints, validation and logs as other trainings. The trainer
-    has ``steps: 1`` and ``validations: 1``, and one batch contains all windows. SIGTERM and Ctrl-C
-    interrupt a fit at any time. It continues from the checkpoint that is then written.
+    The trainer has ``steps: 1`` and ``validations: 1``, and one batch contains all windows. SIGTERM
+    and Ctrl-C interrupt a fit at any time. It continues from the checkpoint that is then written.
 
     Args:
-        model: the model to fit.
-        solver: the least-squares solver.
+        model, solver: the model to fit, and the least-squares solver.
         covariance: covariance of the initial constants from an earlier fit, if any.
         loss, validator, config, statistics: see :class:`DynamicsLearner`.
 
@@ -75,8 +73,7 @@ class LeastSquaresLearner(DynamicsLearner):
             statistics=statistics,
             compile=False,
         )
-        self.solver = solver
-        self.covariance = covariance
+        self.solver, self.covariance = solver, covariance
 
     def training_step(self, batch: Windows, batch_idx: int) -> None:  # type: ignore[override]
         """Fit the model on all training trajectories and windows, in double precision."""
@@ -103,11 +100,7 @@ class LeastSquaresLearner(DynamicsLearner):
             checkpoint[_FIT] = self.result.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Continue the fit of the checkpoint, if any.
-
-        Raises:
-            ValueError: if the fit in the checkpoint is damaged.
-        """
+        """Continue the fit of the checkpoint, if any."""
         if _FIT in checkpoint:
             count = sum(p.numel() for p in self.model.parameters())
             self.result = Fit.from_state(checkpoint[_FIT], count)
@@ -128,9 +121,7 @@ def _sigterm_interrupts() -> Iterator[None]:
             before(number, frame)  # the handler of the trainer
         raise KeyboardInterrupt
 
-    if (
-        threading.current_thread() is not threading.main_thread()
-    ):  # only the main thread receives signals
+    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
         yield
         return
     signal.signal(signal.SIGTERM, interrupt)

@@ -6,28 +6,16 @@ from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.optim import (
-    SGD,
-    Adadelta,
-    Adagrad,
-    Adam,
-    Adamax,
-    AdamW,
-    NAdam,
-    RAdam,
-    RMSprop,
-)
+from torch.optim import SGD, Adadelta, Adagrad, Adam, Adamax, AdamW, NAdam, RAdam, RMSprop
 
 ELEMENTWISE = (Adam, AdamW, NAdam, RAdam, Adamax, Adagrad, Adadelta, RMSprop, SGD)
-"""Optimizers that treat every number separately. All parameters can be one vector, and E stacked
-models are E independent trainings."""
+"""Optimizers that treat every number separately, so that all parameters can be one vector."""
 
 
 class ParameterVector:
     """The parameters of a model and their gradients as views of two vectors.
 
-    Clipping and elementwise optimizers then need one operation instead of one per parameter, which
-    would take most of the time of a step of a small network.
+    Clipping and elementwise optimizers then need one operation instead of one per parameter.
 
     Args:
         parameters: parameters of one model, or stacked over E members, ``(E, ...)``.
@@ -61,10 +49,8 @@ class ParameterVector:
     def split(self, vector: Tensor) -> list[Tensor]:
         """Split a vector ``(..., P)`` into views of the parameters' shapes, ``(..., *shape)``."""
         parts = vector.split(self._sizes, dim=-1)
-        return [
-            part.view((*part.shape[:-1], *shape))
-            for part, shape in zip(parts, self._shapes, strict=True)
-        ]
+        pairs = zip(parts, self._shapes, strict=True)
+        return [part.view((*part.shape[:-1], *shape)) for part, shape in pairs]
 
     def joined(self, gradients: Sequence[Tensor | None], leading: tuple[int, ...] = ()) -> Tensor:
         """Join gradients ``(*leading, *shape)`` of the parameters to a vector ``(*leading, P)``.

@@ -18,11 +18,7 @@ def rollout_slopes(model: LearnedConstants, windows: Windows) -> Tensor:
         dS/dt = (S_v, -M^-1 (de/dx S + de/dz))
 
     e is the missing force of :class:`LearnedConstants`, with da/dz = -M^-1 de/dz at fixed q, v and
-    u. RK4 of this equation is the derivative of RK4.
-
-    Args:
-        model: model in float64, at the z of interest.
-        windows: B windows of H steps.
+    u. RK4 of this equation is the derivative of RK4. The model is in float64.
     """
     size = model.num_coordinates
     count = sum(p.numel() for p in model.parameters())
@@ -41,7 +37,6 @@ def rollout_slopes(model: LearnedConstants, windows: Windows) -> Tensor:
     x0 = windows.start("qv")
     start = torch.cat([x0, x0.new_zeros(len(windows), 2 * size * count)], dim=-1)
     with torch.no_grad():
-        path = rollout(
-            derivative, start, windows.t, windows.input, substeps=model.integrator.substeps
-        )
+        substeps = model.integrator.substeps
+        path = rollout(derivative, start, windows.t, windows.input, substeps=substeps)
     return path[:, 1:, 2 * size :].unflatten(-1, (2 * size, count))

@@ -15,8 +15,7 @@ Beta = Annotated[float, Field(ge=0, lt=1)]
 """Decay of a moving average."""
 
 SMALLEST = 32
-"""Smallest padded size. Matrices are padded with zeros to powers of two, since fewer sizes need
-fewer calls, and a call takes longer than the arithmetic of the padding."""
+"""Smallest padded size. Matrices are padded to powers of two, which needs fewer calls."""
 
 
 class SOAP(Optimizer):
@@ -28,11 +27,7 @@ class SOAP(Optimizer):
     with the gradient G, the weight decay d and the eigenvectors Q_L of L and Q_R of R, which are
     updated by one power iteration every ``precondition_frequency`` steps. The first step only
     initializes them. Vectors use Adam. In a tensor of more than two dimensions, the first is that
-    of the rows.
-
-    A typical network has ten matrices of up to 32 rows. Processing them one by one takes a hundred
-    calls. Here all matrices of a size are padded with zeros and processed as one batch. No basis
-    mixes the padding with the entries.
+    of the rows. All matrices of a size are padded with zeros and processed as one batch.
 
     Source: Vyas et al. 2024, "SOAP: Improving and Stabilizing Shampoo using Adam".
 
@@ -57,23 +52,16 @@ class SOAP(Optimizer):
         precondition_frequency: PositiveInt = 10,
         eps: PositiveFloat = 1e-8,
     ):
-        defaults = {
-            "lr": lr,
-            "betas": tuple(betas),
-            "weight_decay": weight_decay,
-            "precondition_frequency": precondition_frequency,
-            "eps": eps,
-        }
+        defaults: dict[str, Any] = {"lr": lr, "betas": tuple(betas), "weight_decay": weight_decay}
+        defaults |= {"precondition_frequency": precondition_frequency, "eps": eps}
         super().__init__(params, defaults)
         self._layouts: dict[int, _Layout] = {}
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Take a step. Parameters without a gradient do not change."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+        with torch.enable_grad():
+            loss = None if closure is None else closure()
         for number, group in enumerate(self.param_groups):
             moved: list[Tensor] = [p for p in group["params"] if p.grad is not None]
             if moved:
@@ -92,10 +80,8 @@ class SOAP(Optimizer):
             state["step"] = 0
             state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(gradient) for _ in range(2))
             state["averages"] = [batch.averages(gradient, None, beta2) for batch in layout.batches]
-            state["bases"] = [
-                batch.eigenvectors(pair)
-                for batch, pair in zip(layout.batches, state["averages"], strict=True)
-            ]
+            pairs = zip(layout.batches, state["averages"], strict=True)
+            state["bases"] = [batch.eigenvectors(pair) for batch, pair in pairs]
             return
         state["step"] += 1
         step, mean, square = state["step"], state["exp_avg"], state["exp_avg_sq"]
@@ -106,7 +92,6 @@ class SOAP(Optimizer):
         update = layout.transformed(update, state["bases"], back=True)
         rate = group["lr"] * (1 - beta2**step) ** 0.5 / (1 - beta1**step)
         decay = group["lr"] * group["weight_decay"]
-        # One call updates all parameters.
         update.mul_(rate * (decay - 1)).sub_(layout.laid_out(moved), alpha=decay)
         torch._foreach_add_(moved, layout.unpacked(update))
         for k, batch in enumerate(layout.batches):
@@ -117,20 +102,13 @@ class SOAP(Optimizer):
 
 @dataclass(frozen=True)
 class _Batch:
-    """Matrices ``(K, rows, columns)`` of one padded size, in a vector of numbers.
+    """Matrices ``(K, rows, columns)`` of one padded size, in a vector of numbers."""
 
-    Attributes:
-        start: position of the first number.
-        shape: K, rows and columns.
-        sizes: rows and columns of each matrix without padding, ``(K, 2)``.
-    """
-
-    start: int
+    start: int  # position of the first number
     shape: tuple[int, int, int]
-    sizes: Tensor
+    sizes: Tensor  # rows and columns of each matrix without padding, (K, 2)
 
     def view(self, numbers: Tensor) -> Tensor:
-        """Return the matrices, as a view."""
         count, rows, columns = self.shape
         return numbers[self.start : self.start + count * rows * columns].view(self.shape)
 
@@ -141,11 +119,9 @@ class _Batch:
         g = self.view(gradient)
         if before is None:
             return (1 - beta) * (g @ g.mT), (1 - beta) * (g.mT @ g)
-        left, right = before
-        return (
-            left.baddbmm_(g, g.mT, beta=beta, alpha=1 - beta),
-            right.baddbmm_(g.mT, g, beta=beta, alpha=1 - beta),
-        )
+        for average, factors in zip(before, ((g, g.mT), (g.mT, g)), strict=True):
+            average.baddbmm_(*factors, beta=beta, alpha=1 - beta)
+        return before
 
     def eigenvectors(self, averages: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """Return Q_L and Q_R, the largest eigenvalue first, with the identity in the padding."""
@@ -161,8 +137,7 @@ class _Batch:
         self, averages: tuple[Tensor, Tensor], bases: tuple[Tensor, Tensor], square: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Apply a power iteration to Q_L and Q_R, and reorder the second moments."""
-        results = []
-        moments = self.view(square)
+        results, moments = [], self.view(square)
         for k, (average, basis) in enumerate(zip(averages, bases, strict=True)):
             product = average @ basis
             size = product.shape[-1]
@@ -177,12 +152,7 @@ class _Batch:
 
 
 class _Layout:
-    """Positions of the numbers of all parameters in a vector: batches of matrices, then vectors.
-
-    Args:
-        parameters: the parameters, with gradients.
-        leading: number of dimensions of a parameter before those of its matrix.
-    """
+    """Positions of the numbers of all parameters in a vector: batches of matrices, then vectors."""
 
     def __init__(self, parameters: list[Tensor], leading: int):
         device = parameters[0].device

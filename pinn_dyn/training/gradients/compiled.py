@@ -24,23 +24,14 @@ class Compiled:
     """Engine for loss and gradient by compiled dynamics, or by one compiled program.
 
     A program for loss and gradient is fastest and takes longest to compile. It is used if the
-    training is long and a window needs few evaluations of the dynamics. Otherwise only the dynamics
-    are compiled. On a CPU large batches are split into parts that fit into the cache.
-
-    Args:
-        loss: the loss.
-        model: the trained model. Only its training is compiled.
-        vector: parameters of the model.
-        steps: approximate number of training steps.
+    training of ``steps`` steps is long and a window needs few evaluations of the dynamics.
+    Otherwise only the dynamics are compiled. On a CPU large batches are split into parts.
     """
 
     def __init__(
         self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector, steps: int
     ):
-        self.loss = loss
-        self.model = model
-        self.vector = vector
-        self.steps = steps
+        self.loss, self.model, self.vector, self.steps = loss, model, vector, steps
         self._integrator = CompiledDynamics(model.integrator, model)
         self._program = LossProgram(loss, model, vector)
         self.evaluations = EvaluationCount(loss, model)
@@ -54,12 +45,10 @@ class Compiled:
         if not on_cpu or len(windows) < 2 * CHUNK:
             return self._loss_and_gradient(windows)
         parts = windows.split(CHUNK)
-        return weighted_sum(
-            [len(part) / len(windows) for part in parts], map(self._loss_and_gradient, parts)
-        )
+        shares = [len(part) / len(windows) for part in parts]
+        return weighted_sum(shares, map(self._loss_and_gradient, parts))
 
     def _worth_a_program(self, evaluations: int, on_cpu: bool) -> bool:
-        """Return true if one program for loss and gradient is worth its compilation."""
         # On a GPU a program replaces thousands of launches.
         long = not on_cpu or self.steps >= STEPS_FOR_PROGRAM
         return evaluations == 1 or (evaluations <= MOST_EVALUATIONS and long)
@@ -80,8 +69,7 @@ class EvaluationCount:
     """Number of evaluations of the state derivative by the loss of a window, measured once."""
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
-        self._loss = loss
-        self._model = model
+        self._loss, self._model = loss, model
         self._counts: dict[int, int] = {}
 
     def __call__(self, windows: Windows) -> int:

@@ -17,18 +17,10 @@ gradients ``(E, P)`` of an ensemble."""
 
 
 class Eager:
-    """Engine for loss and gradient by eager autograd.
-
-    Args:
-        loss: the loss.
-        model: the trained model.
-        vector: parameters of the model.
-    """
+    """Engine for loss and gradient by eager autograd."""
 
     def __init__(self, loss: WindowLoss, model: Predictor, vector: ParameterVector):
-        self.loss = loss
-        self.model = model
-        self.vector = vector
+        self.loss, self.model, self.vector = loss, model, vector
 
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
         losses = self.loss(self.model, windows)

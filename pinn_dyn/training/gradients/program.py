@@ -27,15 +27,9 @@ _ROWS = {"qv": ("q", "v", "dq", "dv"), "qp": ("q", "p", "dq", "dp")}
 class LossProgram:
     """Compiled program for the loss of windows and its gradient.
 
-    With compiled dynamics alone, some hundred operations remain in Python and autograd, which take
-    half of the time of a small batch. Here the roll-out, the loss and the gradient are traced as
-    one graph, and compiled for each batch size. Parts of a batch run in parallel threads, or one
-    after another on a GPU.
-
-    Args:
-        loss: the loss, by operations that can be traced.
-        model: the trained model. For an ensemble, the stack of all members or a single member.
-        vector: parameters of the model, or of all members.
+    The roll-out, the loss and the gradient are traced as one graph, and compiled for each batch
+    size. Parts of a batch run in parallel threads, or one after another on a GPU. The model of an
+    ensemble is the stack of all members or a single member.
     """
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
@@ -55,10 +49,11 @@ class LossProgram:
     ) -> Iterable[list[Tensor]]:
         """Return loss and gradient of each batch at its parameter values ``(P,)``."""
         names = _ROWS[self._loss.model.state]
-        arguments = [
-            (value, *_contiguous([*(getattr(batch, name) for name in names), *_samples(batch)]))
-            for value, batch in zip(values, batches, strict=True)
-        ]
+        arguments: list[tuple[Tensor, ...]] = []
+        for value, batch in zip(values, batches, strict=True):
+            rows = [getattr(batch, name) for name in names] + [batch.input.u]
+            rows += [] if batch.input.rate is None else [batch.input.rate]
+            arguments.append((value, *(row.contiguous() for row in rows)))
         # Compile before the threads call the program.
         programs = list(map(self._program, batches, arguments))
         # A single batch also runs in the pool, since small products are faster with one thread.
@@ -116,16 +111,6 @@ class _Loss(nn.Module):
     def forward(self, windows: Windows) -> Tensor:
         with integrated_by(self.model, Unrolled(self.model.integrator)):
             return self.loss(self.model, windows)
-
-
-def _samples(windows: Windows) -> list[Tensor]:
-    u, rate = windows.input.u, windows.input.rate
-    return [u] if rate is None else [u, rate]
-
-
-def _contiguous(values: Iterable[Tensor]) -> Iterable[Tensor]:
-    """Convert tensors to the layout that a program is compiled for."""
-    return [value.contiguous() for value in values]
 
 
 def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:

@@ -12,15 +12,10 @@ from pinn_dyn.mechanics import State
 
 @dataclass(frozen=True)
 class StateWindows(Windows):
-    """Windows with precomputed states of a model.
+    """Windows with precomputed states of a model."""
 
-    Attributes:
-        x0: state at the start, ``(B, 2N)``, with the batch contiguous in memory.
-        dx: increments up to each step, ``(B, H, 2N)``.
-    """
-
-    x0: Tensor
-    dx: Tensor
+    x0: Tensor  # state at the start, (B, 2N), with the batch contiguous in memory
+    dx: Tensor  # increments up to each step, (B, H, 2N)
 
     @classmethod
     def of(cls, windows: Windows, state: State) -> StateWindows:

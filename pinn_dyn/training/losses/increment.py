@@ -22,22 +22,18 @@ class IncrementLoss(WindowLoss):
         loss = mean over windows, steps h and components i of w_i ((dx^_hi - dx_hi) / s_hi)^2
 
     dx_h is the increment of the state from the start of the window to step h, and s_h its standard
-    deviation over the training windows. With one step this is the normalized loss of the paper,
-    ||x_{k+1} - x^_{k+1}||^2; with more steps it is the multi-step loss.
+    deviation over the training windows. With one step this is the normalized loss of the paper.
 
     The weight w of the configuration half is 1, as in the Hamiltonian loss of the paper. It is 0
     for windows of one step if dq/dt = v holds by construction and the roll-out starts at the
-    measured v, as in the Lagrangian loss of the paper. The weight of the velocity or momentum half
-    is ``velocity_weight``. Choose it below 1 if v is derived from q and smoother than the motion. A
-    window costs four evaluations of the dynamics per step.
+    measured v, as in the Lagrangian loss of the paper.
 
     With ``huber`` = d the mean r^2 over the components of each window and step is replaced by::
 
         2 d^2 (sqrt(1 + r^2 / d^2) - 1)
 
-    It is r^2 for small r and 2 d r for large r (pseudo-Huber; Charbonnier et al. 1997,
-    "Deterministic edge-preserving regularization in computed imaging"). The squared error is
-    dominated by the few fast motions of a log. This loss gives the slow motions more weight.
+    It is r^2 for small r and 2 d r for large r, which gives slow motions more weight (pseudo-Huber;
+    Charbonnier et al. 1997, "Deterministic edge-preserving regularization in computed imaging").
 
     A curriculum ``[k_1, ... k_S]`` divides the training into S equal stages. Stage s only uses the
     first k_s steps of a window. Short roll-outs are cheap, and an untrained model does not diverge.
@@ -46,7 +42,8 @@ class IncrementLoss(WindowLoss):
         statistics: scales of the data.
         model: the model that will be trained.
         curriculum: steps in each stage, increasing to the H of the windows. The default is H.
-        velocity_weight: w of the velocity or momentum half.
+        velocity_weight: w of the velocity or momentum half; below 1 if v is smoother than the
+            motion.
         huber: d in units of the spread of the increments. The default is the squared error.
 
     Raises:
@@ -70,17 +67,13 @@ class IncrementLoss(WindowLoss):
         self.register_buffer("scale", scale, persistent=False)
         steps = scale.shape[0]
         self.curriculum = [steps] if curriculum is None else list(curriculum)
-        # Strictly increasing up to the number of steps of a window.
         if self.curriculum != sorted({k for k in self.curriculum if k >= 1} | {steps}):
             raise ValueError(
                 f"curriculum is {curriculum}, expected step counts that increase from at least 1 "
                 f"to the {steps} of the windows (data.steps)"
             )
-        exact_rate = (
-            isinstance(model, ContinuousPredictor)
-            and model.state == "qv"
-            and not model.learns_initial_state
-        )
+        measured_start = isinstance(model, ContinuousPredictor) and not model.learns_initial_state
+        exact_rate = measured_start and model.state == "qv"
         self.exact_coordinates = model.num_coordinates if exact_rate else 0
 
     def selected(self, windows: Windows, progress: float) -> Windows:

@@ -30,25 +30,21 @@ class MidpointLoss(WindowLoss):
     held and linear inputs.
 
     The error of the rule is h^2/24 times the second derivative of a along the motion (h^2/12 with
-    momenta): 1 % of a for an oscillation of r rad/s with r h = 0.5, and 1/2400 with r h = 0.1. The
-    model learns this error with the motion. Halve ``data.stride`` to check its influence.
+    momenta): 1 % of a for an oscillation of r rad/s with r h = 0.5. A window costs one evaluation
+    of the dynamics instead of four by RK4.
 
-    A window costs one evaluation of the dynamics; the roll-out of one step by RK4 costs four. There
-    is no roll-out, so ``integrator`` only matters for validation and test.
+    Assumptions: q and v have little noise, since noise in v is divided by a short h. For noisy logs
+    use longer windows and the increment loss.
 
-    Assumptions: q and v have little noise. Noise in v is divided by a short h, as in a loss on
-    accelerations by finite differences. For noisy logs use longer windows and the increment loss.
-
-    Source: midpoint quadrature of the equation of motion along a Hermite interpolant, as in direct
-    collocation (Betts 2010, "Practical Methods for Optimal Control and Estimation Using Nonlinear
-    Programming"). This loss is not in the paper.
+    Source: direct collocation (Betts 2010, "Practical Methods for Optimal Control and Estimation
+    Using Nonlinear Programming"). This loss is not in the paper.
 
     Args:
         statistics: scales of the data.
         model: the model that will be trained.
 
     Raises:
-        TypeError: if the model has no state derivative, for example ``model=mlp``.
+        TypeError: if the model has no state derivative.
         ValueError: if the windows have more than one step, or the model learns its initial state.
     """
 
@@ -58,13 +54,13 @@ class MidpointLoss(WindowLoss):
         super().__init__()
         if not isinstance(model, ContinuousPredictor):
             raise TypeError(
-                f"model is a {type(model).__name__}, expected one with a state derivative, such as "
-                "model=lnn or model=acceleration: use loss=increment"
+                f"model is a {type(model).__name__}, expected one with a state derivative: use "
+                "loss=increment"
             )
         if model.learns_initial_state:
             raise ValueError(
-                "the model learns the initial velocity of roll-outs, but this loss has no "
-                "roll-out: use loss=increment, or ~model/initial_velocity"
+                "this loss has no roll-out whose initial velocity could be learned: use "
+                "loss=increment, or ~model/initial_velocity"
             )
         scale = statistics.increment_std(model.state)
         if scale.shape[0] != 1:
@@ -86,12 +82,6 @@ class MidpointLoss(WindowLoss):
 
 
 def midpoint(h: Tensor, x0: Tensor, increment: Tensor) -> Tensor:
-    """Return the midpoint of a cubic from x0 to x0 + increment, ``(*batch, 2N)``.
-
-    Args:
-        h: length of the step, s.
-        x0: (q, v) at the start of the step, ``(*batch, 2N)``.
-        increment: increment of (q, v) over the step, ``(*batch, 2N)``.
-    """
+    """Return the midpoint of a cubic from x0 = (q, v) to x0 + increment over a step of h s."""
     (q, v), (dq, dv) = x0.chunk(2, -1), increment.chunk(2, -1)
     return torch.cat([q + 0.5 * dq - h * dv / 8, 1.5 * dq / h - 0.5 * v - 0.25 * dv], dim=-1)

@@ -11,11 +11,7 @@ from pinn_dyn.mechanics import Predictor
 
 
 class WindowLoss(nn.Module, abc.ABC):
-    """Loss of a model on a batch of windows. The initial value is near one.
-
-    A loss is independent of the gradient engine, eager or compiled
-    (:mod:`pinn_dyn.training.gradients`).
-    """
+    """Loss of a model on a batch of windows. The initial value is near one."""
 
     @abc.abstractmethod
     def forward(self, model: Predictor, windows: Windows) -> Tensor:
@@ -25,10 +21,7 @@ class WindowLoss(nn.Module, abc.ABC):
         """
 
     def selected(self, windows: Windows, progress: float) -> Windows:
-        """Return the part of the windows that the loss uses at ``progress`` from 0 to 1.
-
-        The default uses all of the windows.
-        """
+        """Return the part of the windows that the loss uses at ``progress`` from 0 to 1."""
         return windows
 
 
@@ -37,9 +30,6 @@ class Penalized(WindowLoss):
 
     The penalty is evaluated at the start of each window, with the mean acceleration and the mean
     input of the first step.
-
-    Args:
-        loss: loss of the prediction.
     """
 
     def __init__(self, loss: WindowLoss):
