@@ -1,6 +1,6 @@
 """Contract suites: pytest classes that test your own system, head, loss, source, law or plant.
 
-Inherit a suite in a test file and override its fixtures::
+Install pytest, inherit a suite in a test file and override its fixtures::
 
     from pinn_dyn.testing import MechanicalSystemContract
 
@@ -8,8 +8,6 @@ Inherit a suite in a test file and override its fixtures::
         @pytest.fixture
         def system(self):
             return MyRobot().double()
-
-The suites need pytest, which the package does not install.
 """
 
 import pytest

@@ -9,7 +9,7 @@ SPLITS = ("train", "validation", "test")
 
 
 class DataSourceContract:
-    """Suite for a source of trajectories. A minimal source has ``load`` and four attributes."""
+    """Suite for a source of trajectories."""
 
     @pytest.fixture
     def source(self) -> DataSource:

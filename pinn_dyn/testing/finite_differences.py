@@ -18,10 +18,7 @@ def slope(function: Callable[[float], Tensor], step: float = 1e-3) -> Tensor:
 def partial_derivatives(
     function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-3
 ) -> Tensor:
-    """Return the derivatives of a function by each entry of x ``(*batch, n)``, stacked last.
-
-    The function is called with a batch dimension of n directions in front.
-    """
+    """Return the derivatives of a function by each entry of x ``(*batch, n)``, stacked last."""
     n = x.shape[-1]
     directions = torch.eye(n, dtype=x.dtype).reshape(n, *[1] * (x.dim() - 1), n)
     return slope(lambda e: function(x + e * directions), step).movedim(0, -1)
@@ -30,11 +27,7 @@ def partial_derivatives(
 def assert_near(
     actual: Tensor, expected: Tensor, tolerance: float, scale: float | Tensor | None = None
 ) -> None:
-    """Compare with an absolute error of ``tolerance`` times ``scale``.
-
-    The default scale is the largest entry of ``expected``: an entry that is small by cancellation
-    is only as exact as the terms it is computed from.
-    """
+    """Compare with an error of ``tolerance`` times ``scale``, by default the largest entry."""
     scale = float(expected.detach().abs().max()) if scale is None else float(scale)
     torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance * scale)
 

@@ -1,20 +1,11 @@
-"""Suites for heads: Cholesky factor, potential, input matrix, friction and residual force.
-
-Inherit the suite of your head and override its ``head`` fixture: three coordinates, float64,
-parameters moved off their initial values. Derivatives are compared with finite differences.
-"""
+"""Suites for heads of three coordinates. Inherit the suite of your head and override ``head``."""
 
 import copy
 
 import pytest
 import torch
 
-from pinn_dyn.testing.finite_differences import (
-    assert_near,
-    partial_derivatives,
-    product,
-    slope,
-)
+from pinn_dyn.testing.finite_differences import assert_near, partial_derivatives, product, slope
 
 SIZE = 3
 COUNT = 24
@@ -33,14 +24,13 @@ class HeadContract:
         """Return a function that draws random numbers ``(24, n)``, the same in every test."""
         generator = torch.Generator().manual_seed(4)
 
-        def random_rows(columns=SIZE, spread=1.0):
-            return spread * torch.randn(COUNT, columns, generator=generator, dtype=torch.float64)
-
-        return random_rows
+        return lambda columns=SIZE, spread=1.0: (
+            spread * torch.randn(COUNT, columns, generator=generator, dtype=torch.float64)
+        )
 
     @pytest.fixture
     def arguments(self, draw):
-        """Return the arguments of the head, a row for each element of a batch."""
+        """Return the arguments of the head."""
         return (draw(),)
 
     def outputs(self, head, arguments):
@@ -83,8 +73,7 @@ class CholeskyHeadContract(HeadContract):
 
     @pytest.fixture
     def q(self, draw):
-        """Return configurations. Some of them are outside the data."""
-        return draw(spread=2 * self.std)
+        return draw(spread=2 * self.std)  # partly outside the data
 
     @pytest.fixture
     def arguments(self, q):
@@ -104,24 +93,17 @@ class CholeskyHeadContract(HeadContract):
         x = torch.flip(q, (0, 1))
         assert_near(head.product(q, x).detach(), product(matrix, x), 1e-12)
 
-    def test_pushforward_is_the_slope_of_the_factor(self, head, q):
-        dq = torch.flip(q, (0,))
+    def test_passes_are_the_derivatives_of_the_factor(self, head, q, draw):
+        dq, cotangent = torch.flip(q, (0,)), draw(SIZE * SIZE).unflatten(-1, (SIZE, SIZE))
         with torch.no_grad():
-            _, tape = head.linearize(q)
+            value, rate, first = head.linearize_along(q, dq)
             expected = slope(lambda e: head(q + e * dq), 1e-4)
-            scale = 1 + float(expected.abs().max())
-            assert_near(head.pushforward(tape, dq), expected, 1e-6, scale)
-            value, rate, _ = head.linearize_along(q, dq)
-            assert_near(rate, expected, 1e-6, scale)
+            assert_near(rate, expected, 1e-6, 1 + float(expected.abs().max()))
             assert_near(value, head(q), 1e-12)
-
-    def test_pullback_is_the_gradient_of_the_factor(self, head, q, draw):
-        cotangent = draw(SIZE * SIZE).unflatten(-1, (SIZE, SIZE))
-        with torch.no_grad():
-            _, tape = head.linearize(q)
             expected = partial_derivatives(lambda q: (cotangent * head(q)).sum((-2, -1)), q, 1e-4)
-            scale = 1 + float(expected.abs().max())
-            assert_near(head.pullback(tape, cotangent), expected, 1e-6, scale)
+            for tape in (first, head.linearize(q)[1]):
+                gradient = head.pullback(tape, cotangent)
+                assert_near(gradient, expected, 1e-6, 1 + float(expected.abs().max()))
 
     def test_attribute_constant_is_true_for_a_constant_factor_only(self, head, q):
         spread = float((head(q) - head(q[:1])).abs().max().detach())
@@ -149,13 +131,10 @@ class InputMatrixContract(HeadContract):
 
     inputs = 2
 
-    def test_matrix_has_a_row_for_each_coordinate_and_a_column_for_each_input(self, head, draw):
-        assert head(draw()).shape == (COUNT, SIZE, self.inputs)
-
     def test_force_is_the_matrix_times_the_input(self, head, draw):
-        """The comparison needs a matrix that does not depend on the input."""
         q, u = draw(), draw(self.inputs)
         with torch.no_grad():
+            assert head(q).shape == (COUNT, SIZE, self.inputs)
             force = head.force(q, u)
             assert force.shape == (COUNT, SIZE)
             if head.affine:
@@ -175,15 +154,11 @@ class FrictionContract(HeadContract):
         (v,) = arguments
         return torch.cat([head(v), head.transmitted(v, torch.ones_like(v))])
 
-    def test_transmission_never_adds_power(self, head, draw):
+    def test_friction_and_transmission_never_add_power(self, head, draw):
         v, force = draw(), draw(spread=5.0)
-        with torch.no_grad():
-            assert (head.transmitted(v, force) * v <= force * v + 1e-12).all()
-
-    def test_friction_never_adds_power(self, head):
-        """v_i F_i(v) >= 0 for slow, fast and zero velocities of either sign."""
         speeds = torch.logspace(-9, 5, COUNT, dtype=torch.float64)[:, None].expand(-1, SIZE)
         with torch.no_grad():
+            assert (head.transmitted(v, force) * v <= force * v + 1e-12).all()
             for v in (speeds, -speeds):
                 assert (head(v) * v >= 0).all()
             assert not head(torch.zeros(1, SIZE, dtype=torch.float64)).any()

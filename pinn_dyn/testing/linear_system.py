@@ -19,9 +19,8 @@ class LinearSystem(MechanicalSystem):
     def __init__(self, mass: Any, stiffness: Any, damping: Any, inputs: Any, state: State = "qv"):
         inputs = torch.as_tensor(inputs, dtype=torch.float64)
         super().__init__(inputs.shape[0], inputs.shape[1], state)
-        self.mass = nn.Parameter(torch.as_tensor(mass, dtype=torch.float64))
-        self.stiffness = nn.Parameter(torch.as_tensor(stiffness, dtype=torch.float64))
-        self.damping = nn.Parameter(torch.as_tensor(damping, dtype=torch.float64))
+        matrices = (torch.as_tensor(x, dtype=torch.float64) for x in (mass, stiffness, damping))
+        self.mass, self.stiffness, self.damping = map(nn.Parameter, matrices)
         self.inputs = nn.Parameter(inputs)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -37,8 +36,6 @@ class LinearSystem(MechanicalSystem):
     def input_matrix(self, q: Tensor) -> Tensor:
         return self.inputs.expand(*q.shape[:-1], -1, -1)
 
-    # Closed formulas, since M is constant and C = 0. Long roll-outs take a fifth of the time.
-
     def _potential_force(self, q: Tensor) -> Tensor:
         return 0.5 * q @ (self.stiffness + self.stiffness.mT)
 
@@ -50,10 +47,8 @@ class LinearSystem(MechanicalSystem):
 
     def state_space(self) -> tuple[np.ndarray, np.ndarray]:
         """Return F and B of dx/dt = F x + B u, with x = (q, v)."""
-        mass, stiffness, damping, inputs = (
-            matrix.detach().numpy()
-            for matrix in (self.mass, self.stiffness, self.damping, self.inputs)
-        )
+        matrices = (self.mass, self.stiffness, self.damping, self.inputs)
+        mass, stiffness, damping, inputs = (matrix.detach().numpy() for matrix in matrices)
         n, m = inputs.shape
         inverse = np.linalg.inv(mass)
         f = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])

@@ -4,12 +4,7 @@ import torch
 from scipy.integrate import simpson
 
 from pinn_dyn.mechanics import Signal, rollout
-from pinn_dyn.testing.finite_differences import (
-    assert_near,
-    partial_derivatives,
-    product,
-    slope,
-)
+from pinn_dyn.testing.finite_differences import assert_near, partial_derivatives, product, slope
 
 
 class MotionContract:
@@ -19,35 +14,25 @@ class MotionContract:
     """Tolerance between a derivative and the five-point stencil with ``difference_step``."""
     difference_step = 1e-3
     gradient_tolerance = 5e-9
-    """Tolerance for a gradient through a step. The error is at most 7e-10, so that an error of 1 %
-    in the gradient by a single weight is visible."""
+    """Tolerance for a gradient through a step."""
     steps = 10
     """Number of integrator steps in a roll-out, even."""
     step_times_rate = 0.02
     """Step of a roll-out times the largest eigenvalue of the dynamics at its start."""
     rollout_tolerance = 1e-5
-    """Tolerance between roll-outs. The error is of fourth order, and at most 5e-6 in the energy."""
-
-    # Energy.
+    """Tolerance between roll-outs."""
 
     def test_power_is_the_rate_of_the_total_energy(self, system, configurations):
         q, v, _, u = configurations
         a = system.forward_dynamics(q, v, u)
         # A time step in which the velocity does not change by more than about one unit.
         step = self.difference_step / max(1.0, float(a.abs().max()))
-        expected = slope(
-            lambda e: system.total_energy(q + e * v + 0.5 * e * e * a, v + e * a), step
-        )
+        energy = lambda e: system.total_energy(q + e * v + 0.5 * e * e * a, v + e * a)  # noqa: E731
+        expected = slope(energy, step)
         assert_near(system.power(q, v, u), expected, self.difference_tolerance)
 
-    def test_rollouts_keep_the_balance_of_energy_and_are_the_same_in_both_forms(
-        self, system, configurations
-    ):
-        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F).
-
-        The input is linear over the roll-out, so the power is smooth, and both the integrator and
-        Simpson's rule are of fourth order in the step.
-        """
+    def test_rollouts_balance_the_energy_and_agree_in_both_forms(self, system, configurations):
+        """E(T) - E(0) is the integral of v^T A u - v^T (D v + F), under a linear input."""
         end = self.steps * self._step(system, configurations)
         t = torch.linspace(0, end, self.steps + 1, dtype=torch.float64)
         q, v = self._rollout(system, configurations, system.velocity_derivative, t).chunk(2, -1)
@@ -66,14 +51,10 @@ class MotionContract:
         assert_near(change, work, self.rollout_tolerance, scale=turnover)
 
     def _step(self, system, configurations):
-        """Return a step that resolves the fastest motion of the linearized dynamics."""
         q, v, _, u = configurations
         x = torch.cat([q, v], -1)
-        jacobian = partial_derivatives(
-            lambda x: system.velocity_derivative(x, u.expand(*x.shape[:-1], -1)),
-            x,
-            self.difference_step,
-        )
+        rate = lambda x: system.velocity_derivative(x, u.expand(*x.shape[:-1], -1))  # noqa: E731
+        jacobian = partial_derivatives(rate, x, self.difference_step)
         return self.step_times_rate / float(torch.linalg.eigvals(jacobian).abs().max())
 
     def _input(self, configurations, t):
@@ -86,13 +67,8 @@ class MotionContract:
         u = self._input(configurations, t[[0, -1]])
         return rollout(derivative, torch.cat([q, second], -1), t, Signal(t[[0, -1]], u))
 
-    # Gradients.
-
     def test_gradients_through_an_rk4_step_match_finite_differences(self, system, configurations):
-        """Compare the slopes of a scalar of the increments along random directions.
-
-        The directions are in the initial state, in the input and in the parameters.
-        """
+        """Compare slopes along random directions in the initial state, input and parameters."""
         q, v, a, u = configurations
         second = v if system.state == "qv" else system.momentum(q, v)
         x0, u = torch.cat([q, second], -1), torch.stack([u, -u], -2)
@@ -112,9 +88,7 @@ class MotionContract:
         gradients = dict(zip(leaves, slopes, strict=True))
         generator = torch.Generator().manual_seed(1)
         for name, group in groups.items():
-            directions = [
-                torch.randn(leaf.shape, generator=generator, dtype=torch.float64) for leaf in group
-            ]
+            directions = [torch.randn(leaf.shape, generator=generator).double() for leaf in group]
             directions = [direction / direction.norm() for direction in directions]
             starts = [leaf.detach().clone() for leaf in group]
 

@@ -1,8 +1,4 @@
-"""Suite for mechanical systems, analytic or learned. Inherit it and override ``system``.
-
-Derivatives are compared with finite differences of M and V in float64, and the dynamics with the
-balance of energy. No test repeats the computation that it checks.
-"""
+"""Suite for mechanical systems, analytic or learned. Inherit it and override ``system``."""
 
 import copy
 from typing import NamedTuple
@@ -12,25 +8,19 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem, Signal
-from pinn_dyn.testing.finite_differences import (
-    assert_near,
-    partial_derivatives,
-    product,
-    slope,
-)
+from pinn_dyn.testing.finite_differences import assert_near, partial_derivatives, product, slope
 from pinn_dyn.testing.mechanical_motion import MotionContract
 
 
 class Configurations(NamedTuple):
-    """A batch of eight states to test at, float64."""
+    """A batch of eight states to test at: q, v, a ``(8, N)`` and u ``(8, M)``, float64."""
 
-    q: Tensor  # (8, N)
-    v: Tensor  # (8, N)
-    a: Tensor  # (8, N)
-    u: Tensor  # (8, M)
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    u: Tensor
 
 
-# The arguments of each public function of a mechanical system.
 FUNCTIONS = {
     "mass_matrix": "q",
     "damping_matrix": "q",
@@ -63,10 +53,7 @@ def values_of(system, at):
 
 
 class MechanicalSystemContract(MotionContract):
-    """Suite for M, V, D, A and the dynamics.
-
-    Tolerances are relative to the largest entry of the expected value.
-    """
+    """Suite for M, V, D, A and the dynamics. Tolerances are relative to the largest entry."""
 
     exact_tolerance = 1e-9
     """Tolerance between two float64 computations of the same quantity."""
@@ -83,19 +70,13 @@ class MechanicalSystemContract(MotionContract):
         """Return the states to test at. Override it for a range other than [-1, 1]."""
         generator = torch.Generator().manual_seed(0)
         n, m = system.num_coordinates, system.num_inputs
-        values = (
-            2 * torch.rand(8, size, generator=generator, dtype=torch.float64) - 1
-            for size in (n, n, n, m)
-        )
-        return Configurations(*values)
+        rows = (torch.rand(8, k, generator=generator, dtype=torch.float64) for k in (n, n, n, m))
+        return Configurations(*(2 * x - 1 for x in rows))
 
     @pytest.fixture(autouse=True)
     def _no_graph(self):
-        """Record no graph, as in a deployed controller. Gradients have their own test."""
         with torch.no_grad():
             yield
-
-    # Shapes and types.
 
     def test_any_batch_shape_gives_the_same_numbers(self, system, configurations):
         expected = values_of(system, configurations)
@@ -125,19 +106,13 @@ class MechanicalSystemContract(MotionContract):
         arguments = {**configurations._asdict(), "p": configurations.a}
         for function in ("potential_force", "forward_dynamics", "inverse_dynamics", "velocity"):
             for name in FUNCTIONS[function]:
-                longer = torch.cat([arguments[name], arguments[name][..., :1]], -1)
-                changed = {**arguments, name: longer}
+                changed = {**arguments, name: arguments[name].repeat(1, 2)}
                 with pytest.raises(ValueError, match=rf"^{name} has shape"):
                     getattr(system, function)(*(changed[key] for key in FUNCTIONS[function]))
         q, v, _, u = configurations
-        x0, u = torch.cat([q, v], -1), torch.stack([u, u], -2)
         t = torch.tensor([0.0, 0.1], dtype=torch.float64)
         with pytest.raises(ValueError, match=r"^x0 has shape"):
-            system.predict(x0[..., :-1], t, Signal(t, u))
-        with pytest.raises(ValueError, match=r"^u has shape"):
-            system.predict(x0, t, Signal(t, u[..., :-1]))
-
-    # The terms.
+            system.predict(torch.cat([q, v, v], -1), t, Signal(t, torch.stack([u, u], -2)))
 
     def test_mass_matrix_is_symmetric_positive_definite(self, system, configurations):
         mass = system.mass_matrix(configurations.q)
@@ -184,11 +159,9 @@ class MechanicalSystemContract(MotionContract):
         assert_near(force, expected, self.difference_tolerance, scale + lost.abs().max())
 
     def _coriolis_scale(self, system, configurations):
-        """Return the size of (dM/dq) v v if M changes by its own size over one unit of q."""
+        """Return the size of C v if M changes by its own size over one unit of q."""
         speed = configurations.v.abs().max()
         return system.mass_matrix(configurations.q).abs().max() * (speed + speed**2)
-
-    # The dynamics.
 
     def test_inverse_dynamics_undoes_forward_dynamics(self, system, configurations):
         q, v, _, u = configurations
@@ -220,18 +193,14 @@ class MechanicalSystemContract(MotionContract):
         assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
 
     def test_implicit_solver_solves_for_the_dissipation(self, system, configurations):
-        """(1 - s J) k = r, with J built from M and the slope of the dissipative force."""
+        """(1 - s J) k = r, with J from M and the slope of the dissipative force."""
         q, v, _, _ = configurations
         n = q.shape[-1]
         generator = torch.Generator().manual_seed(2)
         rate = torch.randn(8, 2 * n, generator=generator, dtype=q.dtype)
         mass = system.mass_matrix(q)
-        # One column of the slope by v_i at a time.
-        unit = torch.eye(n, dtype=q.dtype)
-        columns = [
-            torch.func.jvp(lambda x: system.dissipative_force(q, x), (v,), (e.expand_as(v),))[1]
-            for e in unit
-        ]
+        unit, lost = torch.eye(n, dtype=q.dtype), lambda x: system.dissipative_force(q, x)
+        columns = [torch.func.jvp(lost, (v,), (e.expand_as(v),))[1] for e in unit]
         damping, inverse = torch.stack(columns, dim=-1), torch.linalg.inv(mass)
         if system.state == "qv":
             second, upper, lower = v, unit.expand_as(mass), inverse @ damping

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.mechanics import RK4, ContinuousPredictor, Signal, double_copy
+from pinn_dyn.mechanics import Signal, double_copy
 from pinn_dyn.models import LearnedVelocity
 from pinn_dyn.models.output_limits import output_limits, set_output_limits
 from tests.models.builders import make_model, make_structured, perturb
@@ -54,20 +54,6 @@ def test_members_start_at_velocities_of_their_own():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_member_is_a_model_with_the_weights_it_came_with(kind):
-    alone = members(kind)
-    ensemble = Ensemble(alone)
-    x0, t, u = motion(kind)
-    for index in range(3):
-        member = ensemble.member(index)
-        assert type(member) is type(alone[index])
-        assert member.state_dict().keys() == alone[index].state_dict().keys()
-        assert torch.equal(
-            member.predict(x0, t, Signal(t, u)), alone[index].predict(x0, t, Signal(t, u))
-        )
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_the_gradient_of_a_member_is_that_of_its_own_loss(kind):
     alone = members(kind)
     ensemble = Ensemble(alone)
@@ -99,26 +85,11 @@ def test_weights_are_saved_loaded_and_copied_with_one_copy_of_the_scales(kind):
     assert torch.equal(double_copy(ensemble).predict(x0, t, Signal(t, u)), expected)
 
 
-def test_a_continuous_stack_takes_the_substeps_of_its_members():
-    alone = members("lnn")
-    for item in alone:
-        item.integrator = RK4(substeps=3)
-    stack = Ensemble(alone).stack
-    assert isinstance(stack, ContinuousPredictor)
-    assert stack.integrator.substeps == 3
-
-
-def test_members_that_do_not_belong_together_are_refused():
-    with pytest.raises(ValueError, match="1 members: expected at least two"):
-        Ensemble(members("lnn", count=1))
-    with pytest.raises(ValueError, match="member 1 has other parameters"):
-        Ensemble([make_model("lnn"), make_model("acceleration")])
+def test_members_of_other_data_are_refused():
     first, second = members("acceleration", count=2)
     second.scale *= 2
     with pytest.raises(ValueError, match="member 1 has other scales"):
         Ensemble([first, second])
-    with pytest.raises(ValueError, match="member is 3, expected one of the 3 members, 0 to 2"):
-        Ensemble(members("lnn")).member(3)
 
 
 def test_members_share_the_widest_of_their_limits():

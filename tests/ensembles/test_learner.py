@@ -77,17 +77,6 @@ def test_each_members_gradient_is_clipped_by_its_own_norm():
     assert norms[1] == pytest.approx(0.5, rel=1e-4)
 
 
-def test_the_ensemble_is_what_is_validated(tmp_path):
-    data = make_data()
-    models = make_models("lnn", data, 2)
-    ensemble, seen = Ensemble(models), []
-    learner = learn(EnsembleLearner, ensemble, models[0], data)
-    learner.validator = lambda model, truth: seen.append(model) or {"error_mean": 1.0}
-    train(tmp_path, learner, EnsembleData(data, 2))
-    assert seen
-    assert all(model is ensemble for model in seen)
-
-
 def test_an_optimizer_that_would_mix_the_members_is_refused(tmp_path):
     data = make_data()
     models = make_models("acceleration", data, 2)

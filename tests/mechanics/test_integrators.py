@@ -63,22 +63,6 @@ def rosenbrock_path(system, x0, t, u, interpolation, substeps=1):
     return system.predict(x0, t, Signal(t, u, interpolation))
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "hold"])
-def test_the_rosenbrock_method_is_of_second_order(interpolation):
-    """Against matrix exponentials, with an input that jumps at every sample."""
-    system = damped_oscillators().requires_grad_(False)
-    t = 0.1 * torch.arange(16, dtype=torch.float64)
-    u, x0 = samples((), 16, 1), samples((), 1, 4, seed=1).squeeze(0)
-    expected = exact_solution(system, x0, t, u, interpolation)
-    errors = [
-        float((rosenbrock_path(system, x0, t, u, interpolation, n) - expected).abs().max())
-        for n in (4, 8, 16)
-    ]
-    assert errors[0] < 0.03
-    assert 3.5 < errors[0] / errors[1] < 4.5
-    assert 3.5 < errors[1] / errors[2] < 4.5
-
-
 @pytest.mark.parametrize("state", ["qv", "qp"])
 def test_the_rosenbrock_method_takes_steps_far_longer_than_the_damping(state):
     """Steps of 0.1 s where the damper acts in 0.1 ms: RK4 would need steps below 0.3 ms."""
@@ -108,41 +92,6 @@ def test_a_rosenbrock_step_over_many_samples_of_the_input_loses_no_impulse(inter
     found = system.predict(x0, t[::10], Signal(t, u, interpolation))[:, 0]
     assert moved[::10].diff().abs().max() > 0.04
     torch.testing.assert_close(found, moved[::10], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", ["lnn", "hnn"])
-def test_the_rosenbrock_method_and_rk4_find_the_same_motion_of_a_network(kind):
-    t = 0.001 * torch.arange(41, dtype=torch.float64)
-    u, x0 = samples((4,), 41, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
-    model = make_structured(kind).eval().requires_grad_(False)
-    expected = model.predict(x0, t, Signal(t, u))
-    model.integrator = Rosenbrock()
-    found = model.predict(x0, t, Signal(t, u))
-    assert (expected[:, -1] - x0).abs().max() > 0.01
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", ["lnn", "hnn"])
-def test_the_gradient_through_the_rosenbrock_method_is_that_of_finite_differences(kind):
-    t = 0.02 * torch.arange(4, dtype=torch.float64)
-    u, x0 = samples((4,), 4, 3), 0.3 * samples((4,), 1, 6, seed=1).squeeze(-2)
-    model = make_structured(kind)
-    model.integrator = Rosenbrock()
-    parameter = model.damping.network.linears[0].weight
-
-    def loss():
-        return model.increments(x0, t, Signal(t, u)).square().sum()
-
-    loss().backward()
-    with torch.no_grad():
-        found = float(parameter.grad[1, 2])
-        step = 1e-5
-        parameter[1, 2] += step
-        above = loss()
-        parameter[1, 2] -= 2 * step
-        below = loss()
-    assert abs(found) > 1e-6
-    assert found == pytest.approx(float(above - below) / (2 * step), rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["lnn", "hnn"])
@@ -190,30 +139,6 @@ def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
         with torch.no_grad(), integrated_by(model, CompiledLoop(model.integrator)):
             found = model.increments(x0, t, Signal(t, u))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_a_compiled_rosenbrock_step_of_an_ensemble_has_the_same_gradients(monkeypatch):
-    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
-    t = 0.02 * torch.arange(3, dtype=torch.float64)
-    u, x0 = samples((2, 4), 3, 1), 0.3 * samples((2, 4), 1, 2, seed=1).squeeze(-2)
-    heads = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
-    heads["potential"] = partial(NetworkPotential, hidden=[3])
-    members = [make_structured("lnn", 1, 1, **heads, integrator=Rosenbrock()) for _ in range(2)]
-    members = [perturb(item, seed=k, spread=0.1) for k, item in enumerate(members)]
-    stack = Ensemble(members).stack
-    parameters = list(stack.parameters())
-    losses, gradients = [], []
-    for compiled in (False, True):
-        if compiled:
-            stack.integrator = CompiledDynamics(stack.integrator, stack)
-        losses.append(stack.increments(x0, t, Signal(t, u)).square().sum())
-        gradients.append(torch.autograd.grad(losses[-1], parameters, materialize_grads=True))
-    assert losses[0].item() > 1e-6
-    torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=0)
-    assert max(float(gradient.abs().max()) for gradient in gradients[0]) > 1e-6
-    for found, expected in zip(*reversed(gradients), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -49,13 +49,6 @@ def test_values_are_those_of_the_definition(kind, count):
         np.testing.assert_allclose(found, expected_value(signal, time), atol=1e-12, rtol=0)
 
 
-def test_a_held_input_jumps_at_its_samples_seen_from_either_side():
-    signal = make_signal("hold")
-    now = float(signal.t[3])
-    assert torch.equal(signal(now), signal.u[:, 3])
-    assert torch.equal(signal(now, side="left"), signal.u[:, 2])
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_the_stages_of_a_step_see_the_signal_from_within_it(kind, count):
@@ -91,18 +84,6 @@ def test_means_over_steps_are_integrals_by_quadrature(kind, count):
         assert float(found[k]) == pytest.approx(area / (end - start), abs=1e-9)
 
 
-def test_cubics_follow_a_sine_of_eight_samples_a_period_where_lines_cut_corners():
-    t = torch.arange(0, 20, np.pi / 4, dtype=torch.float64)
-    times = torch.linspace(2, 17, 400, dtype=torch.float64)
-    exact = torch.sin(times)
-    errors = {}
-    for kind in KINDS:
-        signal = Signal(t, torch.sin(t)[:, None], kind)
-        found = torch.stack([signal(float(time)) for time in times])[:, 0]
-        errors[kind] = float((found - exact).abs().max())
-    assert errors["cubic"] < 0.2 * errors["linear"] < 0.1 * errors["hold"]
-
-
 def test_a_part_of_a_cubic_is_the_cubic_of_the_whole():
     """A window does not know its neighbours, its rates do."""
     whole = make_signal("cubic", count=9)
@@ -122,15 +103,6 @@ def test_stacked_cubics_keep_their_rates():
     for k, one in enumerate(signals):
         assert torch.equal(both.rate[k], one.rate)
     assert both.interpolation == "cubic"
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_it_is_linear_in_its_samples_also_for_autograd(kind):
-    signal = make_signal(kind, batch=(), size=1)
-    u = signal.u.clone().requires_grad_()
-    time = float(signal.t[3:5].mean())
-    (slope,) = torch.autograd.grad(Signal(signal.t, u, kind)(time).sum(), u)
-    assert float((slope * u).sum()) == pytest.approx(float(signal(time)), rel=1e-12)
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,16 +1,9 @@
 """What the base class promises beyond the contract suite."""
 
-import pytest
 import torch
 
-from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.testing import damped_oscillators
 from tests.support.cart_pole import CartPole
-
-
-def test_a_system_without_its_four_terms_cannot_be_built():
-    with pytest.raises(TypeError, match=r"abstract.*mass_matrix"):
-        MechanicalSystem(num_coordinates=2, num_inputs=1)
 
 
 def test_forward_dynamics_solves_the_linear_equation_of_motion():
@@ -36,16 +29,3 @@ def test_forward_dynamics_matches_the_cart_poles_textbook_equations():
     on_bob = bob * rod * cos * ax + bob * rod**2 * turn + bob * g * rod * sin + 0.05 * v[1]
     torch.testing.assert_close(on_cart, push, rtol=1e-12, atol=0)
     torch.testing.assert_close(on_bob, torch.zeros_like(on_bob), rtol=0, atol=1e-12)
-
-
-def test_dynamics_give_the_same_numbers_with_and_without_a_graph():
-    system = CartPole()
-    x = torch.tensor([[0.3, 0.7, -0.5, 1.1]], dtype=torch.float64)
-    u = torch.tensor([[2.0]], dtype=torch.float64)
-    for derivative in (system.velocity_derivative, system.momentum_derivative):
-        with torch.no_grad():
-            without = derivative(x, u)
-        with_graph = derivative(x, u)
-        assert with_graph.requires_grad
-        assert not without.requires_grad
-        torch.testing.assert_close(without, with_graph.detach(), rtol=0, atol=1e-14)

@@ -46,10 +46,6 @@ def test_fields_that_do_not_match_are_refused_by_name(changes, message):
         trajectory(**changes)
 
 
-def test_duration_runs_from_the_first_to_the_last_sample():
-    assert trajectory(samples=11, step=0.1, start=5.0).duration == pytest.approx(1.0)
-
-
 def test_state_stacks_configuration_and_velocity_or_momentum():
     item = trajectory(batch=(2,))
     for state, second in (("qv", item.v), ("qp", 2 * item.v)):
@@ -91,11 +87,6 @@ def test_until_keeps_the_sample_at_the_horizon(horizon, samples, start):
         assert torch.equal(getattr(part, name), getattr(whole, name)[:, :samples]), name
 
 
-def test_until_refuses_a_horizon_beyond_the_end():
-    with pytest.raises(ValueError, match=r"horizon is 1.2 s, but the trajectory lasts only 1 s"):
-        trajectory().until(1.2)
-
-
 def test_stack_adds_a_batch_dimension_and_starts_at_zero():
     early, late = trajectory(), trajectory(start=100.0)
     both = stack([early, late])
@@ -104,10 +95,6 @@ def test_stack_adds_a_batch_dimension_and_starts_at_zero():
     torch.testing.assert_close(both.t, early.t)
     assert torch.equal(both.u[1], late.u)
     assert both.momentum is twice
-
-
-def test_stack_keeps_the_interpolation():
-    assert stack([trajectory(interpolation="hold")] * 2).input.interpolation == "hold"
 
 
 @pytest.mark.parametrize("other", [{"samples": 10}, {"step": 0.2}], ids=["samples", "step"])

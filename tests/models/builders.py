@@ -102,8 +102,8 @@ class InverseOf(CholeskyFactor):
     def linearize(self, q):
         return self.factor(q), (q,)
 
-    def pushforward(self, tape, dq):
-        return torch.func.jvp(self.factor, tape, (dq,))[1]
+    def linearize_along(self, q, dq):
+        return *torch.func.jvp(self.factor, (q,), (dq,)), (q,)
 
     def pullback(self, tape, cotangent):
         return torch.func.vjp(self.factor, *tape)[1](cotangent)[0]

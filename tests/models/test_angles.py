@@ -1,20 +1,16 @@
 """Motion is periodic in the coordinates that are angles."""
 
-from functools import partial
-
 import pytest
 import torch
 
 from pinn_dyn.mechanics import Signal
 from pinn_dyn.models import (
-    MLP,
     AccelerationMLP,
     CoulombFriction,
-    NetworkCholesky,
     NetworkPotential,
     NextStateMLP,
 )
-from pinn_dyn.testing import assert_near, slope
+from pinn_dyn.testing import assert_near
 from tests.models.builders import (
     make_scales,
     make_statistics,
@@ -51,20 +47,6 @@ def test_black_boxes_see_angles_too(kind):
     assert (increments(q + turn.flip(0)) - increments(q)).abs().max() > 1e-4
 
 
-def test_passes_through_angles_are_exact():
-    torch.manual_seed(0)
-    net = MLP(3, 4, [5], "tanh", torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.5, 2.0, 1.5]), [1])
-    net = net.double()
-    x, dx, _, _ = random_batch(3, 3)
-    dy = torch.randn(len(x), 4, dtype=torch.float64)
-    _, tape = net.linearize(x)
-    expected = slope(lambda e: net(x + e * dx), 1e-4)
-    tangent = net.pushforward(tape, dx)
-    assert_near(tangent, expected, 1e-9)
-    # The reverse pass is the adjoint of the tangent pass.
-    assert_near((net.pullback(tape, dy) * dx).sum(-1), (dy * tangent).sum(-1), 1e-12)
-
-
 def test_the_quadratic_well_leaves_angles_out():
     assert NetworkPotential(make_scales(2, 1, angles=[0, 1]), hidden=[4]).stiffness_root is None
     mixed = perturb(NetworkPotential(make_scales(2, 1, angles=[0]), hidden=[4]).double())
@@ -72,10 +54,3 @@ def test_the_quadratic_well_leaves_angles_out():
     turn = torch.tensor([2 * torch.pi, 0.0], dtype=torch.float64)
     assert_near(mixed(q + turn), mixed(q), 1e-12)
     assert_near(mixed.gradient(q + turn), mixed.gradient(q), 1e-12)
-
-
-def test_an_angle_that_is_not_there_is_refused():
-    with pytest.raises(
-        ValueError, match=r"angles is \[3\], expected different positions from 0 to 2"
-    ):
-        make_structured("lnn", mass=partial(NetworkCholesky, hidden=[4]), angles=[3])

@@ -50,15 +50,6 @@ def test_a_step_takes_the_inputs_at_its_ends(model, start, inputs, interpolation
     assert_near(actual, torch.stack(path, 1), 1e-6)
 
 
-def test_a_held_input_does_not_see_the_next_sample(model, start, inputs):
-    other = inputs.clone()
-    other[:, 4] += 1.0
-    held = [model.predict(start, T, Signal(T, u, "hold")) for u in (inputs, other)]
-    linear = [model.predict(start, T, Signal(T, u, "linear")) for u in (inputs, other)]
-    assert torch.equal(*held)
-    assert not torch.equal(*linear)
-
-
 def test_inputs_may_be_sampled_more_finely_than_the_steps(model, start, inputs):
     fine_times = STEP / 4 * torch.arange(17, dtype=torch.float64)
     fine = torch.full((6, 17, 2), 99.0, dtype=torch.float64)

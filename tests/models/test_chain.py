@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.models import MLP, ChainPotential, LagrangianNetwork, NetworkCholesky
-from pinn_dyn.testing import assert_near, partial_derivatives
+from pinn_dyn.testing import assert_near
 from tests.models.builders import CHAIN, make_scales, make_structured, perturb
 
 GRAVITY = torch.tensor([0.3, -0.4, 9.7], dtype=torch.float64)
@@ -127,19 +127,8 @@ def test_the_masked_passes_are_those_of_automatic_differentiation(angles):
     value, tape = network.linearize(x)
     assert_near(value, network(x), 1e-12)
     tangent = torch.func.jvp(network, (x,), (dx,))[1]
-    assert_near(network.pushforward(tape, dx), tangent, 1e-12)
     assert_near(network.linearize_along(x, dx)[1], tangent, 1e-12)
     assert_near(network.pullback(tape, dy), torch.func.vjp(network, x)[1](dy)[0], 1e-12)
-
-
-def test_masked_units_start_as_large_as_others():
-    """What a mask takes from a sum, larger weights give back."""
-    torch.manual_seed(3)
-    network = MLP(7, 28, [128, 128], "tanh", after=[0] * 28)
-    x = torch.randn(2000, 7)
-    first = x @ (network.layers[0].weight * network.get_buffer("mask_0")).T
-    spread = first.detach().std(0)
-    assert 0.5 < float(spread[:30].mean() / spread[-30:].mean()) < 2
 
 
 def test_too_few_units_for_a_chain_are_refused():
@@ -181,30 +170,10 @@ def test_three_rows_hold_the_potential_of_a_true_chain(q):
     assert_near(head.gradient(q), force, 1e-12)
 
 
-@pytest.mark.parametrize("shape", [(JOINTS,), (6, JOINTS), (2, 3, JOINTS)])
-def test_its_force_is_its_gradient(shape):
-    head = make_potential(5)
-    q = _constants(*shape, seed=6)
-    assert head(q).shape == shape[:-1]
-    assert_near(head.gradient(q), partial_derivatives(head, q), 1e-8)
-
-
 def test_it_has_the_period_of_its_joints(q):
     head = make_potential(5)
     shifted = q + 2 * math.pi * torch.tensor([1.0, -2.0, 0.0, 3.0], dtype=torch.float64)
     assert_near(head(shifted), head(q), 1e-12)
-
-
-@pytest.mark.parametrize("rank", [3, 8, 16])
-def test_it_starts_near_the_scale(rank):
-    """Averaged over seeds the spread over configurations is that of the typical energy."""
-    q = 3 * _constants(200, 7, seed=8)
-    spreads = []
-    for seed in range(20):
-        torch.manual_seed(seed)
-        head = ChainPotential(make_scales(7, 1, 2.0, range(7)), rank=rank).double()
-        spreads.append(float(head(q).std()))
-    assert 0.3 < sum(spreads) / len(spreads) / 2.0 < 3
 
 
 @pytest.mark.parametrize("angles", [[], [0, 1, 3]])

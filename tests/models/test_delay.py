@@ -22,9 +22,7 @@ from pinn_dyn.models import (
     NoDelay,
 )
 from pinn_dyn.testing import assert_near
-from pinn_dyn.training.gradients.program import LossProgram
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss
-from pinn_dyn.training.parameter_vector import ParameterVector
 from tests.models.builders import STEP, make_statistics, perturb
 from tests.support.delayed_robots import log
 
@@ -126,11 +124,6 @@ def test_it_is_never_negative_nor_beyond_the_longest_and_comes_back():
     assert float(delay.seconds().detach()) == pytest.approx(0.02, abs=1e-6)
 
 
-def test_an_initial_delay_above_the_longest_is_refused():
-    with pytest.raises(ValueError, match=r"initial delay is 0.2 s, expected at most .* 0.1 s"):
-        LearnedDelay(0.1, 0.2)
-
-
 # On the log of a pendulum.
 
 
@@ -206,11 +199,6 @@ def test_windows_of_held_inputs_are_refused_by_name():
         pendulum_trajectory(interpolation="hold").input.delayed(torch.tensor(0.01))
 
 
-def test_too_few_starts_say_that_the_delay_needs_some():
-    with pytest.raises(ValueError, match="and of 10 before them for the delay"):
-        pendulum_windows(steps=1, history=0.1, count=1195)
-
-
 def test_roll_outs_see_the_input_before_their_start():
     whole = pendulum_trajectory()
     model = set_delay(pendulum_model(make_scales(), LearnedDelay(0.1)), 0.05)
@@ -263,22 +251,3 @@ def test_sums_laws_and_ensembles_refuse_it_by_name():
         Tracking(model, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"model/delay=learned.*one by one"):
         Ensemble([model, make_model("lnn", LearnedDelay(0.1))])
-
-
-@pytest.mark.slow
-def test_one_compiled_program_has_the_same_loss_and_gradients():
-    windows = pendulum_windows(steps=1, history=0.1, count=64).to(
-        torch.device("cpu"), torch.float32
-    )
-    scales = windows.statistics()
-    model = set_delay(pendulum_model(scales).float(), 0.0337)
-    loss = IncrementLoss(scales, model)
-    value = loss(model, windows)
-    parameters = list(model.parameters())
-    expected = torch.autograd.grad(value, parameters, allow_unused=True)
-    vector = ParameterVector(parameters)
-    compiled, gradient = LossProgram(loss, model, vector)(windows, 64)
-    assert float(compiled) == pytest.approx(float(value.detach()), rel=1e-5)
-    place = next(k for k, p in enumerate(parameters) if p is model.delay.share)
-    found = float(vector.split(gradient)[place])
-    assert found == pytest.approx(float(expected[place]), rel=1e-3)

@@ -3,19 +3,15 @@
 import copy
 import io
 import pickle
-from functools import partial
 
 import pytest
 import torch
 
 from pinn_dyn.mechanics import Signal
-from pinn_dyn.mechanics.compilation import CompiledDynamics, integrated_by
-from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential, Positive
 from pinn_dyn.testing import assert_near
-from tests.models.builders import STEP, make_model, make_structured, perturb, random_batch
+from tests.models.builders import STEP, make_model, perturb, random_batch
 
 KINDS = ["lnn", "hnn", "next_state", "acceleration"]
-CONTINUOUS = ["lnn", "hnn", "acceleration"]
 T = STEP * torch.arange(4, dtype=torch.float64)
 
 
@@ -54,16 +50,6 @@ def test_a_prediction_starts_at_the_initial_state_and_moves(kind):
     assert torch.equal(path[:, 0], x0)
     assert float((path[:, 1:] - path[:, :-1]).abs().amax((0, 1)).min()) > 1e-3
     assert_near(model.increments(x0, T, Signal(T, u)), path - x0[:, None], 1e-12)
-
-
-def test_float32_is_close_to_float64(kind):
-    double, single = make_model(kind), make_model(kind).float()
-    x0, u = windows()
-    expected = double.increments(x0, T, Signal(T, u))
-    x0, u = windows(dtype=torch.float32)
-    actual = single.increments(x0, T, Signal(T, u))
-    assert actual.dtype == torch.float32
-    assert_near(actual.double(), expected, 2e-5)
 
 
 def test_saved_weights_give_identical_predictions(kind):
@@ -121,42 +107,3 @@ def test_every_parameter_that_moves_the_state_has_a_gradient(kind):
 
 
 # Compiled derivatives.
-
-
-def loss_and_gradients(model, x0, t, u):
-    increments = model.increments(x0, t, Signal(t, u))
-    parameters = list(model.parameters())
-    gradients = torch.autograd.grad(
-        (increments / STEP).square().mean(), parameters, allow_unused=True, materialize_grads=True
-    )
-    return increments.detach(), gradients
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", CONTINUOUS)
-def test_a_compiled_model_has_the_same_increments_and_gradients(monkeypatch, kind):
-    """Traced and differentiated ahead of time; building the programs would take minutes."""
-    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
-    # Few small layers: compiling takes longer the more there are.
-    heads = {
-        "mass": partial(NetworkCholesky, hidden=[4]),
-        "potential": partial(NetworkPotential, hidden=[6, 5]),
-        "damping": partial(NetworkCholesky, hidden=[], positivity=Positive(floor=0.0)),
-        "input": partial(NetworkInput, hidden=[]),
-    }
-    if kind == "acceleration":
-        model = make_model(kind, dtype=torch.float32)
-    else:
-        model = make_structured(kind, 2, 2, dtype=torch.float32, **heads)
-    x0, u = windows(dtype=torch.float32)
-    expected, expected_gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
-    with integrated_by(model, CompiledDynamics(model.integrator, model)):
-        actual, gradients = loss_and_gradients(model, x0, T[:2], u[:, :2])
-    assert_near(actual, expected, 1e-4)
-    overall = max(float(g.abs().max()) for g in expected_gradients)
-    assert overall > 1e-3
-    for (name, _), a, e in zip(
-        model.named_parameters(), gradients, expected_gradients, strict=True
-    ):
-        difference = float((a - e).abs().max())
-        assert difference <= 1e-4 * max(float(e.abs().max()), 1e-2 * overall), name

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from pinn_dyn.mechanics import Rosenbrock, Signal
+from pinn_dyn.mechanics import Signal
 from pinn_dyn.models import (
     AsymmetricCoulomb,
     CoulombFriction,
@@ -72,12 +72,6 @@ def test_friction_starts_at_its_level_and_width(prior):
     torch.testing.assert_close(friction.slope(torch.zeros(2)), 0.05 * force / width)
 
 
-def test_the_default_width_is_larger_for_networks():
-    scales = {prior: unit_scales(1, prior=prior) for prior in (False, True)}
-    widths = {prior: float(CoulombFriction(x).width().detach()) for prior, x in scales.items()}
-    assert widths == pytest.approx({False: 0.11, True: 0.04})
-
-
 def sliding_mass():
     """A free mass with friction alone: the model, m, c and w."""
     model = make_structured("lnn", n=1, m=1, friction=CoulombFriction)
@@ -89,18 +83,6 @@ def sliding_mass():
     mass = float(model.mass_matrix(torch.zeros(1, 1, dtype=torch.float64)).detach())
     level, width = (float(x().detach()) for x in (model.friction.level, model.friction.width))
     return model, mass, level, width
-
-
-def test_the_rosenbrock_method_takes_steps_far_longer_than_friction():
-    """Near rest the speed decays at c/(m w): steps of 20 of its times come to rest all the same."""
-    model, mass, level, width = sliding_mass()
-    model.integrator = Rosenbrock()
-    t = 20 * mass * width / level * torch.arange(21, dtype=torch.float64)
-    x0 = torch.tensor([[0.0, 0.2 * width]], dtype=torch.float64)
-    with torch.no_grad():
-        v = model.predict(x0, t, Signal(t, torch.zeros(1, 21, 1, dtype=torch.float64)))[0, :, 1]
-    assert (v.abs() <= x0[0, 1]).all()
-    assert v[-1].abs() < 1e-6 * x0[0, 1]
 
 
 def test_friction_alone_stops_a_free_mass_and_takes_its_energy():
@@ -151,17 +133,6 @@ def test_a_network_transmits_its_input_through_the_gear(law):
     arrives = model.friction.transmitted(v, drive)
     assert_near(model.inverse_dynamics(q, v, a), arrives, 1e-9)
     assert float((arrives - drive).detach().abs().max()) > 1e-3
-    assert not model.input_affine
-
-
-@pytest.mark.parametrize("law", BY_LOAD)
-@pytest.mark.parametrize("seed", range(3))
-def test_known_mechanics_gain_no_energy_from_a_loaded_gear(law, seed):
-    model = anywhere(known_model(friction=law, gain_spread=0.5), std=0.7, seed=seed)
-    q, v, u = (5 * torch.randn(3, 50, 4, generator=torch.Generator().manual_seed(seed))).double()
-    entering = (v * model.drive_gain() * u).sum(-1)
-    lost = (v * model.dissipative_force(q, v)).sum(-1)
-    assert (model.power(q, v, u) <= entering - lost).all()
     assert not model.input_affine
 
 

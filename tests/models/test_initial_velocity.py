@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory, rollout
 from pinn_dyn.models import AccelerationMLP, LearnedVelocity, Scales
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
@@ -81,18 +80,6 @@ def test_a_roll_out_starts_there_and_counts_from_the_measured_state(kind):
         torch.testing.assert_close(
             found[:, 1:], rollout(model.state_derivative, start, t, Signal(t, u))[:, 1:]
         )
-
-
-def test_members_of_an_ensemble_start_where_they_start_alone():
-    alone = [
-        perturb(make_structured("lnn", 2, 2, initial_velocity=LEARNED), seed=k, spread=0.1)
-        for k in range(2)
-    ]
-    x0, t, u = motion()
-    found = x0[:, None] + Ensemble(alone).member_increments(x0, t, Signal(t, u))
-    expected = torch.stack([item.predict(x0, t, Signal(t, u)) for item in alone])
-    assert (expected[0] - expected[1]).abs().max() > 1e-3
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
 def test_a_wrong_measured_velocity_is_mended():

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torch import nn
 
 from pinn_dyn.models import KnownMechanics, KnownSystem
 from pinn_dyn.systems import RigidChain, SoftArm
@@ -122,22 +121,10 @@ class Unnamed(SoftArm):
         self.constants = {}
 
 
-class Misnamed(SoftArm):
-    def __init__(self):
-        super().__init__()
-        self.constants = {"weight": ["N"]}
-
-
 class Unmeasured(SoftArm):
     def __init__(self):
         super().__init__()
         self.constants = {"stiffness": ["N/m"]}
-
-
-class Owned(SoftArm):
-    def __init__(self):
-        super().__init__()
-        self.sag = nn.Parameter(torch.zeros(1))
 
 
 @pytest.mark.parametrize(
@@ -145,9 +132,7 @@ class Owned(SoftArm):
     [
         (Unnamed(), r"structure Unnamed names no constants .* \{'mass': \['kg'\]\}"),
         (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain names no constants"),
-        (Misnamed(), "constants names weight, which is not a buffer; expected one of mass, stiff"),
-        (Unmeasured(), "constants has 1 units of stiffness, expected 3"),
-        (Owned(), r"has the parameters sag, expected constants that are buffers"),
+        (Unmeasured(), "constants has 1 units of stiffness, expected one for each entry"),
         (SoftArm(stiffness=0.0), r"stiffness 1: start is .* expected positive"),
         (SoftArm(2), "the data have 3 coordinates and 3 inputs, the structure SoftArm has 6 and 6"),
         (CartPole(), "the structure CartPole has 2 and 1"),

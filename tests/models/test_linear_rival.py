@@ -52,15 +52,6 @@ def test_arx_of_one_lag_recovers_a_linear_system(interpolation):
     torch.testing.assert_close(q_hat, q, rtol=0, atol=1e-8)
 
 
-def test_the_lags_are_chosen_on_validation_and_more_of_them_do_no_harm():
-    train, validation = oscillators(4), oscillators(2, seed=5)
-    (test,) = oscillators(1, seed=9)
-    rival = fit_linear_rival(train, validation, step=STEP, degree=1)
-    assert rival.fixed_step == STEP
-    q_hat, q = predicted(rival, test)
-    torch.testing.assert_close(q_hat, q, rtol=0, atol=1e-6)
-
-
 def delayed(count, seed):
     """q_{k+1} - q_k = 0.3 u_{k-2}: only who looks three samples back can know it."""
     rng = np.random.default_rng(seed)
@@ -127,25 +118,6 @@ def test_degree_two_recovers_a_quadratic_system_and_degree_one_cannot():
         errors[degree] = float((x[:, :1] - test.q).abs().max())
     assert errors[2] < 1e-6
     assert errors[1] > 1e-3
-
-
-def test_a_step_of_several_samples_is_taken():
-    train = oscillators(4, interpolation="linear", samples=481, stride=4)
-    (test,) = oscillators(1, interpolation="linear", samples=481, stride=4, seed=9)
-    rival = LinearRival(train, step=STEP / 2, lags=2, degree=1, ridge=1e-12)
-    q_hat, q = predicted(rival, test, step=STEP / 2)
-    # It sees every second sample of a white input: right on the whole, not exactly.
-    assert (q_hat - q).norm() < 0.5 * (q - q[:1]).norm()
-
-
-def test_a_batch_is_each_of_its_trajectories():
-    rival = LinearRival(oscillators(3), step=STEP, lags=3, degree=1, ridge=1e-7)
-    first, second = oscillators(2, seed=4)
-    x0 = torch.stack([item.states("qv")[0] for item in (first, second)])
-    u = torch.stack([first.u, second.u])
-    together = rival.predict(x0, first.t, Signal(first.t, u, "hold"))
-    alone = rival.predict(x0[1], first.t, Signal(first.t, u[1], "hold"))
-    torch.testing.assert_close(together[1], alone)
 
 
 def test_errors_say_what_was_expected():

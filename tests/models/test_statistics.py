@@ -24,18 +24,6 @@ def test_a_dictionary_gives_the_same_statistics_back():
             assert after == before, item.name
 
 
-def test_typical_force_is_the_root_mean_square_of_the_inputs():
-    generator = torch.Generator().manual_seed(0)
-    u = torch.tensor([1.0, -2.0]) + torch.tensor([0.5, 3.0]) * torch.randn(
-        1000, 2, generator=generator, dtype=torch.float64
-    )
-    values = make_statistics(3, 2).to_dict()
-    values["u_mean"] = u.mean(0).tolist()
-    values["u_std"] = u.std(0, correction=0).tolist()
-    statistics = Statistics.from_dict(values)
-    torch.testing.assert_close(statistics.u_rms, u.square().mean(0).sqrt())
-
-
 @pytest.mark.parametrize("repeat", [1, 2])
 def test_network_input_is_state_and_inputs(repeat):
     statistics = make_statistics(3, 2)

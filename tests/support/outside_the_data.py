@@ -18,7 +18,7 @@ class OutsideTheDataContract:
     """Of the eigenvalues of M anywhere, in units of the smallest on the data."""
     largest = 4.0
     """Of the eigenvalues of M anywhere, in units of the largest on the data."""
-    duration = 100.0
+    duration = 20.0
     """Of a roll-out without input, s."""
     tolerance = 1e-5
     """Of the integrator, relative."""

@@ -112,50 +112,11 @@ def test_the_pseudo_huber_loss_is_the_squared_error_of_small_errors_and_linear_i
     assert twice == pytest.approx(2 * huge, rel=1e-3)
 
 
-@pytest.mark.parametrize("huber", [None, 0.5])
-def test_each_member_of_an_ensemble_has_its_own_loss(huber):
-    loss = IncrementLoss(STATISTICS, MODELS["lnn"](), huber=huber)
-    both = loss.error(torch.stack([PREDICTED, MEASURED]), MEASURED)
-    alone = loss.error(PREDICTED, MEASURED)
-    torch.testing.assert_close(both, torch.stack([alone, torch.zeros(())]))
-
-
 @pytest.mark.parametrize("kind", MODELS)
 def test_the_loss_of_one_step_equals_a_hand_computation(kind):
     loss = IncrementLoss(ONE_STEP, MODELS[kind]())
     found = float(loss.error(PREDICTED[:, :1], MEASURED[:, :1]))
     assert found == pytest.approx(BY_HAND_ONE_STEP[kind], rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "statistics", "sees"),
-    [
-        ("lnn", ONE_STEP, False),
-        ("acceleration", ONE_STEP, False),
-        ("hnn", ONE_STEP, True),
-        ("next state", ONE_STEP, True),
-        ("lnn", STATISTICS, True),
-        ("acceleration", STATISTICS, True),
-        ("hnn", STATISTICS, True),
-        ("next state", STATISTICS, True),
-    ],
-)
-def test_the_configuration_half_counts_but_in_one_step_where_it_holds_by_construction(
-    kind, statistics, sees
-):
-    loss = IncrementLoss(statistics, MODELS[kind]())
-    measured = MEASURED[:, : len(statistics.qv_increment_std)]
-    moved = measured.clone()
-    moved[..., 0] += 1
-    assert (float(loss.error(moved, measured)) > 0) == sees
-    moved = measured.clone()
-    moved[..., 1] += 1
-    assert float(loss.error(moved, measured)) > 0
-
-
-@pytest.mark.parametrize("kind", MODELS)
-def test_exact_predictions_have_no_loss(kind):
-    assert float(IncrementLoss(STATISTICS, MODELS[kind]()).error(MEASURED, MEASURED)) == 0
 
 
 class Drift(ContinuousPredictor):
@@ -199,21 +160,6 @@ def test_a_curriculum_rolls_out_and_compares_the_first_steps_alone(windows, prog
         dq = (with_q[:, 1:, :1] - windows.q[:, None] - windows.dq) / spread[:, :1]
         both = torch.cat([dq[:, :steps], residual], -1)
         assert found == pytest.approx(float(both.square().mean()), rel=1e-6)
-
-
-def test_every_epoch_belongs_to_one_stage(windows):
-    """Also where the fraction of the training is not a round number."""
-    for epochs in range(1, 60):
-        loss = IncrementLoss(windows.statistics(), Drift(), curriculum=list(range(1, 11)))
-        stages = [len(loss.selected(windows, k / epochs).t) - 1 for k in range(epochs)]
-        assert stages == [1 + epoch * 10 // epochs for epoch in range(epochs)]
-
-
-def test_without_a_curriculum_all_steps_count_from_the_start(windows):
-    model = Drift()
-    loss = IncrementLoss(windows.statistics(), model).double()
-    loss(model, loss.selected(windows, 0.0))
-    assert model.calls == 40
 
 
 @pytest.mark.parametrize("curriculum", [[], [1, 2], [1, 20], [0, 10], [5, 2, 10], [1, 1, 10]])

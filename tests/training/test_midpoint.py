@@ -9,12 +9,11 @@ import torch
 from numpy.polynomial import Polynomial
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 from pinn_dyn.training import MidpointLoss
 from pinn_dyn.training.losses.midpoint import midpoint
-from tests.models.builders import make_model, perturb
-from tests.support.windows import for_members, make_windows, one_step
+from tests.models.builders import make_model
+from tests.support.windows import make_windows, one_step
 
 
 class Force(ContinuousPredictor):
@@ -84,26 +83,6 @@ def test_on_an_oscillation_the_error_is_that_of_the_docstring(state, constant):
         by_hand = by_hand[:, 1].mean() if constant == 24 else by_hand.mean()
         assert float(loss(model, windows)) == pytest.approx(float(by_hand), rel=1e-4)
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.02)
-
-
-def test_a_window_costs_one_evaluation():
-    model = make_model("lnn")
-    calls = []
-    derivative = model.state_derivative
-    model.state_derivative = lambda x, u: calls.append(x.shape) or derivative(x, u)
-    loss = MidpointLoss(one_step(size=2), model).double()
-    loss(model, make_windows(4, size=2))
-    assert calls == [(4, 4)]
-
-
-def test_members_of_an_ensemble_have_the_losses_they_have_alone():
-    members = [perturb(make_model("lnn"), seed=k) for k in range(3)]
-    batches = [make_windows(4, size=2, seed=k) for k in range(3)]
-    loss = MidpointLoss(one_step(size=2), members[0]).double()
-    found = loss(Ensemble(members).stack, for_members(batches))
-    alone = [loss(model, batch) for model, batch in zip(members, batches, strict=True)]
-    torch.testing.assert_close(found, torch.stack(alone), rtol=1e-10, atol=0)
-    assert len({float(value) for value in alone}) == 3
 
 
 def test_it_refuses_a_model_without_a_derivative_and_windows_of_several_steps():

@@ -17,9 +17,7 @@ from pinn_dyn.models import (
     NetworkPotential,
     Positive,
 )
-from pinn_dyn.testing import assert_near, slope
-from pinn_dyn.training import IncrementLoss
-from tests.models.autodiff import lagrangian_derivative, rk4_increment
+from pinn_dyn.testing import assert_near
 from tests.models.builders import make_statistics, perturb, random_batch
 
 STEP = 0.05
@@ -46,12 +44,6 @@ def batch():
     return torch.cat([q, v], -1), u
 
 
-def test_its_state_moves_as_the_lagrangian_of_its_terms_says():
-    model = make_network("qv")
-    x, u = batch()
-    assert_near(model.state_derivative(x, u), lagrangian_derivative(model, x, u), 1e-9)
-
-
 def test_it_predicts_the_motion_of_the_same_network_on_momenta():
     on_velocity, on_momentum = make_network("qv"), make_network("qp")
     on_momentum.load_state_dict(on_velocity.state_dict())
@@ -66,50 +58,6 @@ def test_it_predicts_the_motion_of_the_same_network_on_momenta():
     q_end, p_end = ours.chunk(2, -1)
     assert_near(torch.cat([q_end, on_momentum.velocity(q_end, p_end)], -1), expected, 1e-6)
     assert (expected - x).abs().max() > 0.1
-
-
-def test_gradients_of_a_step_are_those_of_the_lagrangian_and_finite_differences():
-    model = make_network("qv")
-    x, u = batch()
-    t = torch.tensor([0.0, STEP], dtype=torch.float64)
-    statistics = make_statistics(2, 2)
-    one_step = replace(statistics, qv_increment_std=statistics.qv_increment_std[:1])
-    loss = IncrementLoss(one_step, model).double()
-    target = torch.zeros(len(x), 1, 4, dtype=torch.float64)
-
-    def value(increments):
-        return loss.error(increments.unsqueeze(1), target)
-
-    def ours():
-        return value(model.increments(x, t, Signal(t, torch.stack([u, 0.5 * u], -2)))[..., -1, :])
-
-    def plain():
-        rate = partial(lagrangian_derivative, model)
-        return value(rk4_increment(rate, x, u, 0.5 * u, STEP))
-
-    parameters = dict(model.named_parameters())
-    both = [
-        torch.autograd.grad(
-            side(), list(parameters.values()), allow_unused=True, materialize_grads=True
-        )
-        for side in (ours, plain)
-    ]
-    largest = max(float(g.abs().max()) for g in both[1])
-    for (name, parameter), actual, expected in zip(parameters.items(), *both, strict=True):
-        assert_near(actual, expected, 1e-8, max(float(expected.abs().max()), 1e-6 * largest))
-        flat = parameter.detach().view(-1)
-        index = len(flat) // 2
-        start = float(flat[index])
-
-        def shifted(e, flat=flat, index=index, start=start):
-            flat[index] = start + e
-            with torch.no_grad():
-                found = ours()
-            flat[index] = start
-            return found
-
-        difference = abs(float(slope(shifted)) - float(actual.view(-1)[index]))
-        assert difference < 1e-7 * largest, name
 
 
 def test_its_mass_starts_where_that_of_a_lagrangian_network_does():
