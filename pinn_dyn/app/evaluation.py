@@ -20,7 +20,6 @@ from pinn_dyn.evaluation import (
     Evaluation,
     build_baselines,
     common_stride,
-    default_horizon,
     default_windows,
     evaluate_models,
     model_names,
@@ -29,6 +28,8 @@ from pinn_dyn.mechanics import stack_until
 
 log = logging.getLogger(__name__)
 
+LONGEST = 5.0
+"""Default horizon of longer trajectories, s."""
 THRESHOLDS = {"small": 0.01, "large": 0.1}
 """Thresholds of the valid prediction times, in the units of q."""
 _COLUMNS = ("pairs", "parameters", "training_seconds", "training_cpu_seconds")
@@ -76,7 +77,7 @@ def evaluate(
     source = source or sources[0]
     splits = {item: item.load() for item in {*sources, source}}
     motions = getattr(splits[source], split)
-    horizon = horizon or default_horizon(stack_until(motions).duration)
+    horizon = horizon or min(stack_until(motions).duration, LONGEST)
     truth = stack_until(motions, horizon)
     if len(truth.q) < len(motions):
         log.warning(

@@ -44,7 +44,6 @@ from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import (
     Prediction,
     common_stride,
-    default_horizon,
     default_windows,
     predict_trajectories,
     predict_windows,
@@ -100,7 +99,6 @@ __all__ = [
     "compare_terms",
     "comparison_table",
     "controller_comparison_figure",
-    "default_horizon",
     "default_windows",
     "diverged_trajectories",
     "error_figure",

@@ -40,6 +40,7 @@ from pinn_dyn.evaluation.metrics import (
 from pinn_dyn.evaluation.plots import save, with_unit
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
 from pinn_dyn.evaluation.tables import (
+    SEEDS_COLUMNS,
     best_baseline,
     over_seeds,
     summary_columns,
@@ -61,13 +62,6 @@ log = logging.getLogger(__name__)
 
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 """Names of the splits of the data in tables and figures."""
-SEEDS_COLUMNS = {
-    "model": "model",
-    "seeds": "seeds",
-    "error_mean": "mean error ± std over seeds",
-    "error_worst": "worst trajectory ± std over seeds",
-}
-"""Columns of the table over seeds that a page and the terminal show."""
 _PRINTED = 8  # coordinates: larger matrices do not fit a terminal
 
 

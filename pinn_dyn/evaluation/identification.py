@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -22,24 +21,6 @@ COLUMNS = ["name", "value", "low", "high", "unit", "start", "known"]
 """Columns of the table of constants."""
 OPEN = 0.5
 """Part of the prior variance above which a constant or direction is not determined."""
-_COMBINED = 1 / 3  # relative width below which a sum or ratio is determined
-_WIDE = 0.1  # relative half width above which a constant alone is not determined
-_GAIN = "drive gain of "
-
-
-class _Posterior(NamedTuple):
-    """All P physical constants at the fit and at its start, with their covariances.
-
-    ``covariance`` is S of :func:`constants_table`, ``prior`` the covariance without data.
-    """
-
-    names: list[str]
-    units: list[str]
-    values: np.ndarray
-    lower: np.ndarray
-    start: np.ndarray
-    covariance: np.ndarray
-    prior: np.ndarray
 
 
 class Direction(NamedTuple):
@@ -61,112 +42,51 @@ def constants_table(
 ) -> pd.DataFrame:
     """Return all constants in SI units with their 95 % intervals.
 
-    The columns are name, value, low, high, unit, start (the center of the prior) and known. The
-    equation of motion is linear in the constants c, except for widths of friction and drive gains,
-    but not in the parameters z. The interval is value +- 1.96 sigma of the linear problem, with
-    the information I of the data on z at the fit, and the precision P_0 of the prior at the start::
+    The equation of motion is linear in the constants c, except for widths of friction and drive
+    gains, but not in the parameters z. The interval is value +- 1.96 sigma of the linear problem,
+    with the information I of the data on z at the fit, and the precision P_0 of the prior at the
+    start::
 
         S = (G^-T I G^-1 + G_0^-T P_0 G_0^-1)^-1,    G = dc/dz at the fit, G_0 at the start
 
-    A constant that the data do not determine keeps the width of the prior. No interval extends
-    below the lower limit of a constant, such as zero for a mass. ``known`` is the part of the
-    prior variance that the data removed: the value is that of the prior if it is near 0.
+    No interval extends below the lower limit of a constant, such as zero for a mass. ``start`` is
+    the center of the prior, and ``known`` the part of the prior variance that the data removed.
 
     Args:
         model: the fitted model.
         fit: the result of the fit.
         input_units: units of the inputs, for the drive gains; without, their unit is ``Nm/u``.
     """
-    posterior = _posterior(model, fit, input_units)
-    variance, before = posterior.covariance.diagonal(), posterior.prior.diagonal()
-    width = 1.96 * np.sqrt(variance)
-    return pd.DataFrame(
-        {
-            "name": posterior.names,
-            "value": posterior.values,
-            "low": np.maximum(posterior.values - width, posterior.lower),
-            "high": posterior.values + width,
-            "unit": posterior.units,
-            "start": posterior.start,
-            "known": 1 - variance / before,
-        }
-    )
-
-
-def determined_together(
-    model: LearnedConstants, fit: Fit, input_units: Sequence[str] = ()
-) -> pd.DataFrame:
-    """Return sums and ratios that the data determine although they do not determine the parts.
-
-    Candidates are sums of two constants of one unit, such as a sliding mass and the armature of
-    its drive, and ratios of the armature or friction of a joint to its drive gain. Both parts have
-    intervals wider than 10 % of their values to either side, and the interval of the sum or ratio
-    is less than a third of the width that either part alone would give. Arguments and columns are
-    those of :func:`constants_table`.
-    """
-    posterior = _posterior(model, fit, input_units)
-    sigma = np.sqrt(posterior.covariance.diagonal())
-    wide = np.flatnonzero(1.96 * sigma > _WIDE * np.abs(posterior.values)).tolist()
-    rows = []
-    for pair in map(list, combinations(wide, 2)):
-        first, second = (posterior.names[k] for k in pair)
-        units = [posterior.units[k] for k in pair]
-        if units[0] == units[1]:
-            name, unit, function = f"{first} + {second}", units[0], _sum
-        elif second == f"{_GAIN}{first.split(' of ', 1)[1]}" and posterior.lower[pair[0]] >= 0:
-            name, unit, function = f"{first} / {second}", f"{units[0]}/({units[1]})", _ratio
-        else:
-            continue
-        value, slopes = function(*posterior.values[pair])
-        start, slopes_before = function(*posterior.start[pair])
-        block = np.ix_(pair, pair)
-        variance = max(slopes @ posterior.covariance[block] @ slopes, 0.0)
-        if variance**0.5 < _COMBINED * np.abs(slopes * sigma[pair]).min():
-            low = max(value - 1.96 * variance**0.5, posterior.lower[pair].sum())
-            before = slopes_before @ posterior.prior[block] @ slopes_before
-            high = value + 1.96 * variance**0.5
-            rows.append([name, value, low, high, unit, start, 1 - variance / before])
-    return pd.DataFrame(rows, columns=COLUMNS)
-
-
-def _sum(a: float, b: float) -> tuple[float, np.ndarray]:
-    """Return a + b and its derivatives."""
-    return a + b, np.ones(2)
-
-
-def _ratio(a: float, b: float) -> tuple[float, np.ndarray]:
-    """Return a / b and its derivatives."""
-    return a / b, np.array([1 / b, -a / b**2])
-
-
-def _posterior(model: LearnedConstants, fit: Fit, input_units: Sequence[str]) -> _Posterior:
     model = double_copy(model)
     constants = model.physical_constants()
+    values = torch.cat([item.values for item in constants]).detach().numpy()
     jacobian = _jacobian(model)
     vector_to_parameters(fit.prior.mean.double(), model.parameters())
-    start = torch.cat([item.values for item in model.physical_constants()])
+    start = torch.cat([item.values for item in model.physical_constants()]).detach().numpy()
     first = _jacobian(model)
     change = torch.linalg.lstsq(jacobian, first).solution
     information = change.T @ fit.information @ change
-    covariance, prior = (
-        first @ posterior_covariance(matrix, fit.prior.root) @ first.T
+    variance, before = (
+        (first @ posterior_covariance(matrix, fit.prior.root) @ first.T).diagonal().numpy()
         for matrix in (information, torch.zeros_like(information))
     )
-    values = torch.cat([item.values for item in constants])
-    return _Posterior(
-        names=[name for item in constants for name in item.names],
-        units=[unit for item in constants for unit in _units(item, input_units)],
-        values=values.detach().numpy(),
-        lower=np.concatenate([np.full(len(item.names), item.lower) for item in constants]),
-        start=start.detach().numpy(),
-        covariance=covariance.numpy(),
-        prior=prior.numpy(),
-    )
+    lower = np.concatenate([np.full(len(item.names), item.lower) for item in constants])
+    width = 1.96 * np.sqrt(variance)
+    columns = {
+        "name": [name for item in constants for name in item.names],
+        "value": values,
+        "low": np.maximum(values - width, lower),
+        "high": values + width,
+        "unit": [unit for item in constants for unit in _units(item, input_units)],
+        "start": start,
+        "known": 1 - variance / before,
+    }
+    return pd.DataFrame(columns)
 
 
 def _units(item: Named, input_units: Sequence[str]) -> list[str]:
-    """Return the units of constants; those of drive gains contain the unit of the input."""
-    if not (item.names[0].startswith(_GAIN) and input_units and all(input_units)):
+    """Return the units of constants; the unit of a drive gain contains the unit of its input."""
+    if not (item.names[0].startswith("drive gain of ") and input_units and all(input_units)):
         return item.units
     pairs = zip(item.units, input_units, strict=True)
     return [unit.removesuffix("u") + input_unit for unit, input_unit in pairs]
@@ -184,7 +104,7 @@ def _jacobian(model: LearnedConstants) -> Tensor:
 
 
 def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
-    """Return descriptions of the directions of the parameters that only the prior determines.
+    """Describe the directions of the parameters that only the prior determines.
 
     The directions span the eigenvectors of the covariance whose variance is more than half of the
     prior's, see :func:`named_directions`. Those of drives come first, then bodies.
@@ -202,8 +122,8 @@ def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]
     """Return directions that span the orthonormal rows of ``space`` ``(D, P)``, with their names.
 
     In this basis each direction contains a parameter that no other direction contains, so that a
-    single undetermined parameter is named alone. The text names the parameters with the largest
-    entries. The directions are in the order of their parameters.
+    single undetermined parameter is named alone. The directions are in the order of these
+    parameters.
     """
     if not len(space):
         return []
@@ -214,11 +134,9 @@ def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]
         direction = row / np.linalg.norm(row)
         largest = np.argsort(-np.abs(direction))
         direction = direction * np.sign(direction[largest[0]])  # the first has no sign
-        share, chosen = 0.0, []
-        for j in largest[:4]:
-            if share > 0.8:
-                break
-            share += float(direction[j] ** 2)
-            chosen.append(f"{'+' if direction[j] > 0 else '-'} {names[j]}")
+        before = np.cumsum(direction[largest] ** 2) - direction[largest] ** 2
+        chosen = [
+            f"{'+' if direction[j] > 0 else '-'} {names[j]}" for j in largest[:4][before[:4] <= 0.8]
+        ]
         directions.append(Direction(int(k), direction, " ".join(chosen).removeprefix("+ ")))
     return directions

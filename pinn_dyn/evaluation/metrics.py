@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -33,8 +34,7 @@ class RolloutMetrics:
         squared_error_mean, squared_error_variance: mean and (population) variance of e^2.
         error_first_half, error_second_half: mean of e over either half of the horizon.
         valid_time: for each named threshold the first time in s at which e exceeds it, the horizon
-            if it never does; mean over all trajectories. A rollout that is NaN throughout is valid
-            for 0 s.
+            if it never does; mean over all trajectories.
     """
 
     trajectories: int
@@ -67,60 +67,45 @@ def rollout_metrics(
         q: true configuration, ``(K, T, N)``, finite.
         t: times, ``(T,)``, s.
         thresholds: name and value, in the units of q, for each valid prediction time.
-
-    Raises:
-        ValueError: if the shapes do not match.
     """
-    if q.ndim != 3 or q_hat.shape != q.shape or t.shape != q.shape[1:2]:
-        raise ValueError(
-            f"q_hat has shape {tuple(q_hat.shape)}, q {tuple(q.shape)} and t {tuple(t.shape)}: "
-            "expected (K, T, N) twice and (T,)"
-        )
+    if q_hat.shape != q.shape:
+        raise ValueError(f"q_hat has shape {tuple(q_hat.shape)} and q {tuple(q.shape)}")
     t = t.double() - t[0].double()
     prediction = Prediction(t, q_hat.double(), q.double())
-    error = prediction.error()
-    diverged = diverged_trajectories(prediction)
-    horizon = float(t[-1])
-
-    second_half = t > horizon / 2
-    valid = error[~diverged]
-    square = valid.square()
+    error, diverged = prediction.error(), diverged_trajectories(prediction)
+    valid, second_half = error[~diverged], t > t[-1] / 2
     per_trajectory = torch.where(diverged, torch.inf, error.mean(dim=1))
     worst = int(per_trajectory.argmax())
+    exceeded = {name: ~(error <= value) for name, value in thresholds.items()}  # NaN exceeds all
     return RolloutMetrics(
-        trajectories=q.shape[0],
+        trajectories=len(q),
         diverged=int(diverged.sum()),
-        horizon=horizon,
+        horizon=float(t[-1]),
         error_mean=_mean(valid),
         error_std=_variance(valid) ** 0.5,
-        error_median=float(valid.quantile(0.5)) if valid.numel() else float("inf"),
+        error_median=float(valid.quantile(0.5)) if valid.numel() else math.inf,
         error_worst=float(per_trajectory[worst]),
         worst_trajectory=worst,
-        squared_error_mean=_mean(square),
-        squared_error_variance=_variance(square),
+        squared_error_mean=_mean(valid.square()),
+        squared_error_variance=_variance(valid.square()),
         error_first_half=_mean(valid[:, ~second_half]),
         error_second_half=_mean(valid[:, second_half]),
-        valid_time={name: _valid_time(error, t, value) for name, value in thresholds.items()},
+        valid_time={
+            name: float(torch.where(late.any(1), t[late.int().argmax(1)], t[-1]).mean())
+            for name, late in exceeded.items()
+        },
     )
 
 
 def member_metrics(prediction: Prediction) -> dict[str, float]:
-    """Return the errors of the members of an ensemble, and how well their spread tells the error.
+    """Return the errors of the E members of an ensemble, and how well their spread tells the error.
 
-    - ``members``: E.
-    - ``member_error_mean``, ``member_error_std``: mean and (sample) standard deviation over the
-      members of the mean error of each.
-    - ``member_diverged``: diverged rollouts of single members.
-    - ``spread_mean``: mean over time of the spread s(t), see :meth:`Prediction.spread`.
-    - ``spread_over_error``: sqrt((1 + 1/E) mean(s^2) / mean(e^2)), with e the error of the
-      ensemble. It is 1 if the truth is distributed like the members, and below 1 if the ensemble
-      is overconfident. Errors that all members share, such as those of their data, give no spread.
-
-    Diverged rollouts of the ensemble are left out of the means of s and e.
+    ``spread_over_error`` is sqrt((1 + 1/E) mean(s^2) / mean(e^2)), with the spread s(t) of
+    :meth:`Prediction.spread` and the error e(t) of the ensemble: 1 if the truth is distributed
+    like the members, below 1 if the ensemble is overconfident. ``member_error_std`` is the (sample)
+    standard deviation of the mean errors of the members. Diverged rollouts of the ensemble are left
+    out of the means of s and e.
     Source: Fortin et al. (2014), "Why should ensemble spread match the RMSE of the ensemble mean?"
-
-    Raises:
-        ValueError: if the prediction has no members.
     """
     valid = ~diverged_trajectories(prediction)
     spread, error = prediction.spread()[valid], prediction.error()[valid]
@@ -130,13 +115,13 @@ def member_metrics(prediction: Prediction) -> dict[str, float]:
         for q_hat in prediction.members
     ]
     errors = torch.tensor([item.error_mean for item in members], dtype=torch.float64)
-    ratio = float("inf")
-    if 0 < _mean(error.square()) < float("inf"):
+    ratio = math.inf
+    if 0 < _mean(error.square()) < math.inf:
         ratio = (1 + 1 / len(members)) * _mean(spread.square()) / _mean(error.square())
     return {
         "members": len(members),
         "member_error_mean": float(errors.mean()),
-        "member_error_std": float(errors.std()) if errors.isfinite().all() else float("inf"),
+        "member_error_std": float(errors.std().nan_to_num(math.inf)),
         "member_diverged": sum(item.diverged for item in members),
         "spread_mean": _mean(spread),
         "spread_over_error": ratio**0.5,
@@ -144,7 +129,7 @@ def member_metrics(prediction: Prediction) -> dict[str, float]:
 
 
 def diverged_trajectories(prediction: Prediction) -> Tensor:
-    """Return which trajectories diverged, ``(K,)``, bool.
+    """Return the trajectories that diverged, ``(K,)``, bool.
 
     A trajectory has diverged if q_hat is not finite anywhere, or if e(t) exceeds 1000 times the
     spread of the true q anywhere. The spread is the root mean square distance of q from its mean,
@@ -152,8 +137,7 @@ def diverged_trajectories(prediction: Prediction) -> Tensor:
     """
     q, error = prediction.q, prediction.error()
     spread = (q - q.mean(dim=(0, 1))).square().sum(-1).mean().sqrt()
-    bound = DIVERGENCE_FACTOR * float(spread) if spread > 0 else float("inf")
-    # The error of a q_hat that is not finite is not finite, so the comparison is false.
+    bound = DIVERGENCE_FACTOR * float(spread) if spread > 0 else math.inf
     return ~((error <= bound) & torch.isfinite(error)).all(dim=1)
 
 
@@ -162,9 +146,8 @@ def state_squared_error(prediction: Prediction) -> dict[str, float]:
 
         e_x(t)^2 = |q_hat(t) - q(t)|^2 + |v_hat(t) - v(t)|^2
 
-    The keys are ``state_squared_error_mean`` and ``state_squared_error_variance``. Both are over
-    all times of the rollouts that did not diverge. The dictionary is empty if the prediction has
-    no velocities.
+    Both are over all times of the rollouts that did not diverge. The dictionary is empty if the
+    prediction has no velocities.
     """
     if prediction.v_hat is None or prediction.v is None:
         return {}
@@ -181,36 +164,28 @@ def left_data(prediction: Prediction, train: Sequence[Trajectory]) -> dict[str, 
     """Count the rollouts that leave the training data, beyond which a model knows nothing.
 
     A rollout has left the data once a predicted coordinate lies below ``low - (high - low)`` or
-    above ``high + (high - low)``, with the extremes low and high of all training trajectories, or
-    is not finite. ``left_data`` is the number of such rollouts, and ``left_data_after`` the first
-    time in s at which one leaves, infinite if none does.
+    above ``high + (high - low)``, with the extremes of all training trajectories, or is not finite.
+    ``left_data_after`` is the first time in s at which one leaves, infinite if none does.
 
     Args:
         prediction: K rollouts.
-        train: the training trajectories, q ``(T, N)`` each.
+        train: training trajectories, q ``(T, N)`` each.
     """
-    low = torch.stack([item.q.amin(dim=0) for item in train]).amin(dim=0)
-    high = torch.stack([item.q.amax(dim=0) for item in train]).amax(dim=0)
-    width = high - low
-    q_hat = prediction.q_hat
+    q = torch.cat([item.q for item in train])
+    low, high = q.amin(dim=0), q.amax(dim=0)
+    width, q_hat = high - low, prediction.q_hat
     inside = ((q_hat >= low - width) & (q_hat <= high + width)).all(dim=-1)
     left = ~inside.all(dim=0)
     first = float(prediction.t[int(left.int().argmax())] - prediction.t[0])
     return {
         "left_data": int((~inside.all(dim=1)).sum()),
-        "left_data_after": first if left.any() else float("inf"),
+        "left_data_after": first if left.any() else math.inf,
     }
 
 
-def _valid_time(error: Tensor, t: Tensor, threshold: float) -> float:
-    exceeded = ~(error <= threshold)  # so that NaN exceeds every threshold
-    first = exceeded.int().argmax(dim=1)
-    return float(torch.where(exceeded.any(dim=1), t[first], t[-1]).mean())
-
-
 def _mean(values: Tensor) -> float:
-    return float(values.mean()) if values.numel() else float("inf")
+    return float(values.mean()) if values.numel() else math.inf
 
 
 def _variance(values: Tensor) -> float:
-    return float(values.var(correction=0)) if values.numel() else float("inf")
+    return float(values.var(correction=0)) if values.numel() else math.inf

@@ -23,11 +23,8 @@ from pinn_dyn.mechanics import (
 )
 from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop, RecordedSteps
 
-LONGEST = 5.0
-"""Default horizon in s for longer trajectories."""
-
 WINDOWS = (0.1, 0.5, 1.0)
-"""Default windows in s."""
+"""Default windows, s."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +35,9 @@ class Prediction:
         t: times, ``(T,)``, s.
         q_hat: predicted configuration, ``(K, T, N)``; not finite where the rollout broke down.
         q: true configuration, ``(K, T, N)``.
-        members: predictions of E members, ``(E, K, T, N)``. They are the members of an ensemble,
-            whose mean is q_hat, or draws of fitted constants.
-        v_hat, v: predicted and true velocity, ``(K, T, N)``; only for full rollouts of a single
-            model.
+        members: predictions of the members of an ensemble, whose mean is q_hat, or of draws of
+            fitted constants, ``(E, K, T, N)``.
+        v_hat, v: predicted and true velocity, ``(K, T, N)``; only for full rollouts of one model.
     """
 
     t: Tensor
@@ -65,22 +61,14 @@ class Prediction:
         return Prediction(self.t[::samples], **thinned)
 
     def deviation(self) -> Tensor:
-        """Return the standard deviation of each coordinate over the E members, ``(K, T, N)``.
-
-        Raises:
-            ValueError: if the prediction has no members.
-        """
-        if self.members is None:
-            raise ValueError("a single model has no spread: expected the prediction of an ensemble")
+        """Return the standard deviation of each coordinate over the E members, ``(K, T, N)``."""
+        assert self.members is not None, "a single model has no spread"
         return self.members.std(dim=0)
 
     def spread(self) -> Tensor:
         """Return the spread s(t) of the E members of an ensemble, ``(K, T)``::
 
-            s(t)^2 = sum over members i of |q_hat_i(t) - mean(t)|^2 / (E - 1)
-
-        Raises:
-            ValueError: as :meth:`deviation`.
+        s(t)^2 = sum over members i of |q_hat_i(t) - mean(t)|^2 / (E - 1)
         """
         return torch.linalg.vector_norm(self.deviation(), dim=-1)
 
@@ -88,11 +76,10 @@ class Prediction:
 def predict_trajectories(
     model: Predictor, truth: Trajectory, *, step: float | None = None
 ) -> Prediction:
-    """Roll out a model from each true initial state under the true input.
+    """Roll out a model in float64 from each true initial state under the true input.
 
-    The rollout runs in float64 on a copy of the model in evaluation mode. A long rollout takes
-    compiled steps, which changes the result by rounding errors only. If a trajectory breaks down
-    (the mass matrix is no longer positive definite), its q_hat is NaN from there on.
+    If a trajectory breaks down (the mass matrix is no longer positive definite), its q_hat is NaN
+    from there on.
 
     Args:
         model: predictor with N coordinates and M inputs.
@@ -101,25 +88,20 @@ def predict_trajectories(
             sample times of the data.
 
     Raises:
-        ValueError: if the trajectories are not stacked, the step is no multiple of the sample
-            time, or a momentum is needed and was not recorded.
+        ValueError: if the step is no multiple of the sample time.
     """
-    _require_stacked(truth)
     stride = 1 if step is None else samples_of("step", step, truth.t)
     copy = model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0])
-    states = _roll_out(
-        copy,
-        truth.states(model.state, slice(1))[:, 0].double(),
-        truth.t[::stride],
-        truth.input_since(model.input_history).to(truth.q.device, torch.float64),
-    )
+    x0 = truth.states(model.state, slice(1))[:, 0].double()
+    input = truth.input_since(model.input_history).to(truth.q.device, torch.float64)
+    states = _roll_out(copy, x0, truth.t[::stride], input)
     paths = states[..., : model.num_coordinates]
     v_hat = _velocities(copy, states)
     return Prediction(
         truth.t[::stride].double(),
         paths.mean(0),
         truth.q[:, ::stride].double(),
-        _members(paths),
+        paths if len(paths) > 1 else None,
         v_hat,
         None if v_hat is None else truth.v[:, ::stride].double(),
     )
@@ -131,7 +113,7 @@ def predict_windows(
     """Roll out a model as :func:`predict_trajectories` does, with resets to the true state.
 
     At the time of a reset the prediction is the end of the window before. The last window is
-    left out if the trajectory ends within it. All windows are rolled out as one batch.
+    left out if the trajectory ends within it.
 
     Args:
         model: predictor with N coordinates and M inputs.
@@ -140,46 +122,36 @@ def predict_windows(
         step: step of the rollout in s, an integer multiple of the sample time, or None.
 
     Raises:
-        ValueError: as :func:`predict_trajectories`, if the window is no multiple of the step, or
-            if the trajectory is shorter than one window.
+        ValueError: if step, window and sample time do not fit, or the trajectory is too short.
     """
-    _require_stacked(truth)
     stride, samples = samples_of_window(window, step, truth.t)
     windows = (truth.t.shape[0] - 1) // samples
     if windows < 1:
         raise ValueError(
-            f"window is {window} s, but the trajectories last only {truth.duration:g} s: "
-            "use a shorter window"
+            f"window is {window} s, but the trajectories last only {truth.duration:g} s"
         )
     last = windows * samples
     x0 = truth.states(model.state, slice(0, last, samples)).double()
     input = truth.input_since(model.input_history)
     past = input.t.shape[0] - truth.t.shape[0]
-    # (K windows, past + samples + 1, M): neighbours share the sample between them, and their past.
     input = input.part(slice(past + last + 1)).to(truth.q.device, torch.float64)
-    size = past + samples + 1
+    size = past + samples + 1  # neighbors share the sample between them, and their past
     pieces = input.mapped(lambda u: u.unfold(1, size, samples).movedim(-1, -2).flatten(0, 1))
     pieces = replace(pieces, t=input.t[:size])
-    ends = _roll_out(
-        model_for_roll_outs(model, truth.q.device, samples // stride, x0.shape[:2].numel()),
-        x0.flatten(0, 1),
-        pieces.t[past::stride],
-        pieces,
-    )[..., 1:, : model.num_coordinates]
+    copy = model_for_roll_outs(model, truth.q.device, samples // stride, x0.shape[:2].numel())
+    states = _roll_out(copy, x0.flatten(0, 1), pieces.t[past::stride], pieces)
+    ends = states[..., 1:, : model.num_coordinates]
     q = truth.q[:, : last + 1 : stride].double()
     start = q[:, :1].expand(ends.shape[0], -1, -1, -1)
     paths = torch.cat([start, ends.reshape(ends.shape[0], q.shape[0], -1, q.shape[-1])], dim=2)
-    return Prediction(truth.t[: last + 1 : stride].double(), paths.mean(0), q, _members(paths))
-
-
-def _members(paths: Tensor) -> Tensor | None:
-    return paths if paths.shape[0] > 1 else None
+    members = paths if len(paths) > 1 else None
+    return Prediction(truth.t[: last + 1 : stride].double(), paths.mean(0), q, members)
 
 
 def model_for_roll_outs(
     model: Predictor, device: torch.device, steps: int, batch: int
 ) -> Predictor:
-    """Return the model in float64, with compiled (on a GPU recorded) steps for long rollouts."""
+    """Copy the model in float64, with compiled (on a GPU recorded) steps for long rollouts."""
     copy = double_copy(model, device)
     members, inner = (copy.size, copy.stack) if isinstance(copy, Ensemble) else (1, copy)
     if isinstance(inner, ContinuousPredictor) and device.type == "cuda":
@@ -213,70 +185,37 @@ def _velocities(model: Predictor, states: Tensor) -> Tensor | None:
     return torch.cat([model.velocity(*piece) for piece in pieces]).reshape(q.shape)
 
 
-def _require_stacked(truth: Trajectory) -> None:
-    if truth.q.ndim != 3:
-        raise ValueError(
-            f"truth.q has shape {tuple(truth.q.shape)}, expected (K, T, N): stack([...]) the "
-            "test trajectories first"
-        )
-
-
 def samples_of_window(window: float, step: float | None, t: Tensor) -> tuple[int, int]:
-    """Return the number of sample times in a step and in a window.
-
-    Raises:
-        ValueError: unless the step is an integer multiple of the sample time of t, ``(T,)``, and
-            the window one of the step.
-    """
+    """Return the number of sample times in a step and in a window."""
     stride = 1 if step is None else samples_of("step", step, t)
     samples = samples_of("window", window, t)
     if samples % stride:
-        raise ValueError(
-            f"window is {window} s and step is {step} s: expected a window that is an integer "
-            "multiple of the step"
-        )
+        raise ValueError(f"window is {window} s and step is {step} s: expected a multiple of it")
     return stride, samples
 
 
-def default_horizon(duration: float) -> float:
-    """Return the duration of the trajectories, up to 5 s."""
-    return min(duration, LONGEST)
-
-
 def default_windows(horizon: float, grid: float) -> list[float]:
-    """Return the windows of 0.1, 0.5 and 1 s that fit the grid and are below the horizon.
+    """Return the windows of 0.1, 0.5 and 1 s that are multiples of the grid, below the horizon.
 
     If none fits, return the multiple of the grid next to a tenth of the horizon.
-
-    Args:
-        horizon: length of the rollouts, s.
-        grid: time between two compared samples, s.
     """
-    fitting = [w for w in WINDOWS if w < 0.99 * horizon and _whole(w / grid)]
+    ratios = {w: w / grid for w in WINDOWS if 0.5 * grid < w < 0.99 * horizon}
+    fitting = [window for window, ratio in ratios.items() if abs(ratio - round(ratio)) < 1e-3]
     tenth = max(1, round(horizon / 10 / grid)) * grid
     return fitting or ([tenth] if tenth < horizon else [])
 
 
 def common_stride(steps: Sequence[float], t: Tensor) -> int:
-    """Return the number of samples between the common times of rollouts with different steps.
-
-    Args:
-        steps: step of each model, s.
-        t: sample times of the data, ``(T,)``, s.
+    """Return the number of samples between the common times of rollouts with different steps in s.
 
     Raises:
-        ValueError: if a step is no multiple of the sample time, or the rollouts have only
-            their start in common.
+        ValueError: if a step is no multiple of the sample time of t, ``(T,)``, or the rollouts have
+            only their start in common.
     """
     stride = math.lcm(*(samples_of("step", step, t) for step in set(steps)))
     if stride > len(t) - 1:
-        shown = ", ".join(f"{step:g}" for step in sorted(set(steps)))
         raise ValueError(
-            f"models with steps of {shown} s have no time in common within {float(t[-1] - t[0]):g} "
-            "s: evaluate them separately, or give those that take any a step that fits (step=...)"
+            f"models with steps of {sorted(set(steps))} s have no time in common within "
+            f"{float(t[-1] - t[0]):g} s: evaluate them separately, or with step=..."
         )
     return stride
-
-
-def _whole(ratio: float) -> bool:
-    return round(ratio) >= 1 and abs(ratio - round(ratio)) < 1e-3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,21 +14,24 @@ from pinn_dyn.data.whole import write_whole
 
 MAX_COLUMNS = 9
 """Number of columns that a page and the terminal show of a summary. The CSV file has all."""
-
-# Columns are recognized by the end of their names, as in window_0.1s_error_mean.
-_LOWER_IS_BETTER = (
-    *("error_mean", "error_median", "error_worst", "error_first_half", "error_second_half"),
-    *("diverged", "torque_error", "torque_share"),
-)
+SEEDS_COLUMNS = {
+    "model": "model",
+    "seeds": "seeds",
+    "error_mean": "mean error ± std over seeds",
+    "error_worst": "worst trajectory ± std over seeds",
+}
+"""Columns of the table over seeds that a page and the terminal show."""
+_LOWER_IS_BETTER = r".*(error_(mean|median|worst|\w+_half)|diverged|torque_(error|share))"
 _NAMES = ["dataset.name", "model_name", "search.draw"]
+_WINDOW = r"window_(.*)s_error_mean"
 _HEADERS = {
     "run": "run",
     "error_mean": "mean error ± std",
     "error_worst": "worst trajectory",
     "diverged": "diverged",
     "left_data": "left the data",
-    "valid_time": "valid time [s]",
-    "window": "error, reset",
+    "valid_time_.*": "valid time [s]",
+    _WINDOW: "error, reset every {} s",
     "torque_share": "torque error / spread",
     "residual_share": "residual force, share",
     "spread_over_error": "spread / error",
@@ -42,9 +46,6 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
     Left out are the seed and all keys that follow it, keys that vary together with an earlier key,
     and keys that the names of the model and of the data set, or the draw of a search, determine.
-
-    Args:
-        configs: nested configurations of the runs.
     """
     settings = pd.json_normalize(list(configs))
     text = settings.map(str)
@@ -63,9 +64,9 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def model_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a name for each run, equal for runs whose configurations differ in the seed only.
+    """Return a name for each run: its model, and the settings in which runs of this model differ.
 
-    The name of the model is followed by the settings in which runs of this model differ.
+    Runs whose configurations differ in the seed only have equal names.
     """
     settings = varied_settings(configs)
     labels = []
@@ -93,38 +94,28 @@ def over_seeds(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     table = groups.size().rename("seeds").to_frame()
     for name in figures:
         table[name] = groups[name].mean()
-        finite = table[name].abs() < math.inf
-        table[f"{name}_std"] = groups[name].std(ddof=1).where(finite)
+        table[f"{name}_std"] = groups[name].std(ddof=1).where(table[name].abs() < math.inf)
     return table.reset_index(drop=not by)
 
 
 def summary_columns(summary: pd.DataFrame) -> dict[str, str]:
     """Return the columns of a summary that a page and the terminal show, with their headings.
 
-    Columns without information are left out, as a count of diverged rollouts that is 0. From the
-    windowed errors the longest window is taken, from the valid times the largest threshold.
+    Columns without information are left out, as a count of diverged rollouts that is 0. The longest
+    window and the largest threshold are shown.
     """
     headers = {}
-    for key, header in _HEADERS.items():
-        names = [key]
-        if key == "valid_time":
-            names = [name for name in summary if name.startswith("valid_time_")]
-        elif key == "window":
-            names = [name for name in summary if _is_windowed(name)]
-            header = f"error, reset every {_span(names[-1])}" if names else ""
-        name = names[-1] if names else ""
-        counted = key in ("diverged", "left_data")
-        if name in summary and not (summary[name].isna() | (counted & (summary[name] == 0))).all():
-            headers[name] = header
+    for pattern, header in _HEADERS.items():
+        names = [name for name in summary if re.fullmatch(pattern, name)]
+        column = summary[names[-1]] if names else pd.Series()
+        if (column.notna() & (column != 0)).any():
+            headers[names[-1]] = header.format(_span(names[-1]))
     return dict(list(headers.items())[:MAX_COLUMNS])
 
 
-def _is_windowed(name: str) -> bool:
-    return name.startswith("window_") and name.endswith("_error_mean")
-
-
 def _span(name: str) -> str:
-    return name.removeprefix("window_").removesuffix("s_error_mean") + " s"
+    """Return the window of the column of a windowed error."""
+    return re.sub(_WINDOW, r"\1", name)
 
 
 def formatted(
@@ -132,7 +123,8 @@ def formatted(
 ) -> pd.DataFrame:
     """Return a table as text under its headings, numbers with three significant digits.
 
-    A mean is followed by ± and its standard deviation. Names of baselines are in brackets.
+    A mean is followed by ± and its standard deviation. Instead of an infinite error stands the
+    number of diverged trajectories. Names of baselines are in brackets.
 
     Args:
         frame: table.
@@ -147,6 +139,10 @@ def formatted(
             deviation = "error_std"
         if deviation in frame:
             column += frame[deviation].map(lambda x: "" if pd.isna(x) else f" ± {number(x)}")
+        diverged = _diverged(name)
+        if diverged in frame and "trajectories" in frame:
+            counts = [frame[key].map(number) for key in (diverged, "trajectories")]
+            column = column.mask(frame[name] == math.inf, "diverged: " + " of ".join(counts))
         if star:
             column += best(frame, name).map({True: star, False: ""})
         if name in ("run", "model") and "baseline" in frame:
@@ -171,14 +167,14 @@ def number(value: object) -> str:
 
 
 def best(frame: pd.DataFrame, name: str) -> pd.Series:
-    """Return which rows have the best entry of a column, bool.
+    """Return the rows with the best entry of a column, bool.
 
     Among errors, only the rows with the fewest diverged trajectories compete, since a mean leaves
     diverged trajectories out. No row is best unless it beats all baselines.
     """
     none = pd.Series(False, index=frame.index)
     valid_time = "valid_time_" in name
-    if not (valid_time or name.endswith(_LOWER_IS_BETTER)) or frame[name].nunique() < 2:
+    if not (valid_time or re.fullmatch(_LOWER_IS_BETTER, name)) or frame[name].nunique() < 2:
         return none
     figures = _competing(frame, name) * (-1 if valid_time else 1)
     baseline = frame["baseline"].astype(bool) if "baseline" in frame else none
@@ -190,23 +186,27 @@ def best(frame: pd.DataFrame, name: str) -> pd.Series:
 
 def _competing(frame: pd.DataFrame, name: str) -> pd.Series:
     """Return a column, infinite where more trajectories diverged than in the best row."""
-    figures = frame[name].astype(float)
-    start, separator, _ = name.rpartition("error_")
-    diverged = f"{start}diverged"
-    if separator and "torque" not in name and diverged in frame:
-        figures = figures.where(frame[diverged] == frame[diverged].min(), math.inf)
+    figures, diverged = frame[name].astype(float), _diverged(name)
+    if diverged in frame:
+        return figures.where(frame[diverged] == frame[diverged].min(), math.inf)
     return figures
+
+
+def _diverged(name: str) -> str:
+    """Return the column that counts the diverged trajectories of an error, or an empty name."""
+    prefix, separator, _ = name.rpartition("error_")
+    return f"{prefix}diverged" if separator else ""
 
 
 def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
     """Return a sentence for each baseline that is more accurate than all models in some error."""
     errors: dict[str, list[str]] = {}
     baseline = summary["baseline"].astype(bool)
-    for name in (name for name in summary if name == "error_mean" or _is_windowed(name)):
+    for name in (x for x in summary if re.fullmatch(f"error_mean|{_WINDOW}", x)):
         figures = _competing(summary, name)
         if baseline.any() and not figures[~baseline].min() < figures[baseline].min():
             row = summary.loc[figures[baseline].idxmin()]
-            error = "mean error" if name == "error_mean" else f"reset every {_span(name)}"
+            error = "mean error" if name == "error_mean" else f"reset every {_span(name)} s"
             errors.setdefault(row["run"], []).append(f"{error} {number(row[name])}")
     return [
         f"No model is more accurate than the baseline '{name}': {', '.join(texts)}."

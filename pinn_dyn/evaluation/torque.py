@@ -24,8 +24,7 @@ class TorqueError:
 
     Attributes:
         mean: mean of |tau_hat - tau|_2 over samples.
-        share: sqrt(sum_i mean (tau_hat_i - tau_i)^2 / sum_i var tau_i). A common factor of all
-            terms does not change it. A constant torque reaches 1.
+        share: sqrt(sum_i mean (tau_hat_i - tau_i)^2 / sum_i var tau_i).
         rms: root mean square of tau_hat_i - tau_i, ``(N,)``.
         spread: standard deviation of tau_i, ``(N,)``; 0 for a joint without a motor.
     """
@@ -49,7 +48,7 @@ def torque_error(
 
     The acceleration is that of the true system. For measured data it is the slope of the velocity
     by local polynomials of degree 3 (Savitzky and Golay 1964), fitted to 0.05 s or 5 samples,
-    whichever is longer; its noise is part of the error.
+    whichever is longer.
 
     Args:
         model: the learned system.
@@ -72,34 +71,24 @@ def torque_error(
     spread = tau.std(dim=0, correction=0).nan_to_num(0.0)
     spread = torch.where(spread > 1e-9 * spread.max(), spread, 0.0)
     rms, total = error.square().mean(dim=0).sqrt(), float(spread.norm())
-    return TorqueError(
-        mean=float(error.norm(dim=-1).mean()),
-        share=float(rms.norm()) / total if total > 0 else float("inf"),
-        rms=rms,
-        spread=spread,
-    )
+    share = float(rms.norm()) / total if total > 0 else float("inf")
+    return TorqueError(float(error.norm(dim=-1).mean()), share, rms, spread)
 
 
 def residual_share(model: MechanicalSystem, truth: Trajectory) -> float:
-    """Return rms |r| / (rms |A u| + rms |r|) along measured motions; 0 for a mechanical robot.
-
-    Args:
-        model: a model with a residual force.
-        truth: K trajectories stacked, q ``(K, T, N)``.
-    """
+    """Return rms |r| / (rms |A u| + rms |r|) along K stacked motions, with the residual force r."""
     q, v, u = _samples(model, truth, _SHARE_SAMPLES)
     with torch.no_grad():
         residual = model.residual_force(q, v, u)
         applied = model.inverse_dynamics(q, v, model.forward_dynamics(q, v, u))  # A u + r
-        numerator, driven = _rms(residual), _rms(applied - residual)
-    return numerator / (numerator + driven)
+    return _rms(residual) / (_rms(residual) + _rms(applied - residual))
 
 
 def part_shares(model: Sum, truth: Trajectory) -> pd.DataFrame:
     """Return the contributions of the parts of a sum: columns part, term, rms, share.
 
-    The terms are the forces M a + C v, G and D v + F, with the acceleration of the sum. The rms is
-    that of the norm of the force, N m or N, and the share is relative to the rms of all parts.
+    The terms are the forces M a + C v, G and D v + F, with the acceleration of the sum. ``rms`` is
+    that of the norm of the force, N m or N, and ``share`` is relative to the rms of all parts.
     """
     q, v, u = _samples(model, truth, _SHARE_SAMPLES)
     rows = []
@@ -117,7 +106,7 @@ def part_shares(model: Sum, truth: Trajectory) -> pd.DataFrame:
 
 
 def _samples(model: MechanicalSystem, truth: Trajectory, limit: int) -> list[Tensor]:
-    """Return q, v and the acting u, ``(S, .)`` each with S <= limit, in the model's precision."""
+    """Return S <= limit samples of q, v and the acting u, ``(S, .)``, in the model's precision."""
     like = next(model.parameters(), torch.empty(0, dtype=torch.float64))
     u = model.acting_samples(truth).detach()
     return [_thinned(x, limit).to(like) for x in (truth.q, truth.v, u)]
@@ -137,10 +126,7 @@ def _acceleration(truth: Trajectory) -> Tensor:
     steps = truth.t.double().diff()
     step = float(steps.mean())
     if len(truth.t) < 5 or float((steps - step).abs().max()) > 1e-3 * step:
-        raise ValueError(
-            f"the trajectories have {len(truth.t)} samples, {float(steps.min()):g} to "
-            f"{float(steps.max()):g} s apart: accelerations need at least 5 at a constant step"
-        )
+        raise ValueError(f"{len(truth.t)} samples: accelerations need at least 5 at a constant step")
     length = min(max(5, 2 * round(_SMOOTHING / step / 2) + 1), 2 * ((len(truth.t) - 1) // 2) + 1)
     slope = savgol_filter(truth.v.double().numpy(), length, 3, deriv=1, delta=step, axis=-2)
     return torch.from_numpy(slope)

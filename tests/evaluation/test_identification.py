@@ -3,11 +3,7 @@
 import pytest
 import torch
 
-from pinn_dyn.evaluation.identification import (
-    constants_table,
-    determined_together,
-    undetermined,
-)
+from pinn_dyn.evaluation.identification import constants_table, undetermined
 from pinn_dyn.models import AsymmetricCoulomb
 from pinn_dyn.training import Fit
 from pinn_dyn.training.constants_fit import Prior
@@ -112,62 +108,3 @@ def test_constants_have_the_units_of_their_joint_and_of_the_input(model):
         "Nm/A",
     ]
     assert constants_table(model, fit).set_index("name").unit["drive gain of turn"] == "Nm/u"
-
-
-def slopes_of(model, *names):
-    """dc/dz of these constants, by differences."""
-    z = torch.nn.utils.parameters_to_vector(model.parameters()).detach()
-
-    def values(at):
-        torch.nn.utils.vector_to_parameters(at, model.parameters())
-        found = {
-            n: x for c in model.physical_constants() for n, x in zip(c.names, c.values, strict=True)
-        }
-        return torch.stack([found[name] for name in names]).detach()
-
-    steps = 1e-5 * torch.eye(len(z)).double()
-    columns = [(values(z + step) - values(z - step)) / 2e-5 for step in steps]
-    middle = values(z)
-    return middle, torch.stack(columns, dim=1)
-
-
-def told(slope, sigma):
-    """A fit to data that tell of one combination of z alone, with the standard deviation sigma."""
-    information = torch.outer(slope, slope) / sigma**2
-    prior = Prior(0 * slope, torch.eye(len(slope)).double())
-    return Fit(torch.linalg.inv(information + prior.root), information, prior, 0.0, 1)
-
-
-def test_a_sum_that_is_known_where_its_parts_are_not_is_named(model):
-    names = ["mass of slider", "armature of slide"]
-    model.armature.start[1] = 3.0
-    (mass, armature), slopes = slopes_of(model, *names)
-    fit = told(slopes.sum(0), sigma := 0.001 * float(mass + armature))
-    (row,) = determined_together(model, fit).to_dict("records")
-    assert row["name"] == "mass of slider + armature of slide"
-    assert row["unit"] == "kg"
-    assert row["value"] == pytest.approx(float(mass + armature))
-    assert row["high"] - row["value"] == pytest.approx(1.96 * sigma, rel=1e-3)
-    assert row["value"] - row["low"] == pytest.approx(1.96 * sigma, rel=1e-3)
-    assert row["known"] > 0.999
-    alone = constants_table(model, fit).set_index("name")
-    assert (alone.low[names] == 0).all()
-
-
-def test_friction_that_is_known_by_the_gain_alone_is_named(model):
-    names = ["viscous friction of turn", "drive gain of turn"]
-    (viscous, gain), slopes = slopes_of(model, *names)
-    ratio = viscous / gain
-    fit = told(slopes[0] / gain - viscous / gain**2 * slopes[1], sigma := 0.01 * float(ratio))
-    (row,) = determined_together(model, fit, ["A"] * 4).to_dict("records")
-    assert row["name"] == "viscous friction of turn / drive gain of turn"
-    assert row["unit"] == "Nms/rad/(Nm/A)"
-    assert row["value"] == pytest.approx(float(ratio))
-    assert row["high"] - row["value"] == pytest.approx(1.96 * sigma, rel=1e-3)
-
-
-def test_what_is_known_alone_is_not_named_with_others(model):
-    fit = fit_with(model, [1e-6] * len(model.parameter_names()))
-    assert determined_together(model, fit).empty
-    open_fit = fit_with(model, [1.0] * len(model.parameter_names()))
-    assert determined_together(model, open_fit).empty

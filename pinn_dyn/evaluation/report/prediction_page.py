@@ -24,7 +24,7 @@ from pinn_dyn.evaluation.report.page import (
     table,
     turned,
 )
-from pinn_dyn.evaluation.tables import summary_columns
+from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns
 
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.evaluation import Evaluation
@@ -92,8 +92,6 @@ def prediction_report(
 
 
 def _summary(item: Evaluation) -> Iterator[Markup]:
-    from pinn_dyn.evaluation.evaluation import SEEDS_COLUMNS
-
     unit = units(item.source.labels)
     yield paragraph(
         "The error is ‖q̂ − q‖₂ in the units of q"
@@ -138,8 +136,7 @@ def _constants(constants: Mapping[str, pd.DataFrame]) -> Iterator[Markup]:
     if constants:
         yield paragraph(
             "Fitted constants with 95 % intervals. The fit starts at the middle of the prior. A "
-            "constant that the data do not determine keeps the width of its prior. The last rows "
-            "are sums and ratios that the data determine although they do not determine the parts."
+            "constant that the data do not determine keeps the width of its prior."
         )
     for run, frame in constants.items():
         undetermined = frame["known"] < 1 - OPEN
