@@ -23,7 +23,7 @@ from pinn_dyn.app.run import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
-from pinn_dyn.evaluation import RolloutValidator, RunDescription, ValidationHistory
+from pinn_dyn.evaluation import RolloutValidator, RunDescription
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
@@ -171,7 +171,6 @@ def build_trainer(
     added = [
         ModelCheckpoint(filename="best", monitor=BEST_BY, **files),
         ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **files),
-        ValidationHistory(),
         TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR),
         *([LearningRateMonitor()] if loggers else []),
     ]
@@ -238,12 +237,10 @@ class Recorder(L.Callback):
 
     def record(self, trainer: L.Trainer, model: torch.nn.Module, steps: int) -> dict[str, Any]:
         """Return the record of the run so far."""
-        seconds, cpu_seconds = self.description.seconds
         return {
             **self.facts,
             "parameters": sum(p.numel() for p in model.parameters()),
-            "training_seconds": seconds,
-            "training_cpu_seconds": cpu_seconds,
+            "training_seconds": self.description.seconds,
             "steps": steps,
             "validation": {key: float(x) for key, x in trainer.callback_metrics.items()},
             **self.description.provenance,

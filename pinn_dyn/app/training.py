@@ -61,7 +61,6 @@ from pinn_dyn.evaluation import (
     RolloutFigures,
     RolloutValidator,
     RunDescription,
-    ValidationHistory,
     cleaning_figure,
     save,
 )
@@ -430,21 +429,17 @@ def _fit(
     last = read_checkpoint(folder / CHECKPOINTS / "last.ckpt")
     record = recorder.record(trainer, learner.model, last["global_step"])
     finish(folder, record)
-    (history,) = (x for x in trainer.callbacks if isinstance(x, ValidationHistory))  # type: ignore[attr-defined]
     figures = learner.model.learned_figures()
     log.info(
-        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s; %s%s",
+        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s",
         record["name"],
         record["seed"],
         record["validation"].get(VALIDATION_ERROR, float("nan")),
         learner.validator,
         record["training_seconds"],
         folder,
-        history.summary(),
         "".join(f"; {key} {value:.4g}" for key, value in figures.items()),
     )
-    if warning := history.warning():
-        log.warning("%s", warning)
 
 
 def _write_report(source: LogSource, folder: Path) -> None:

@@ -65,7 +65,7 @@ from pinn_dyn.evaluation.torque import (
     residual_share,
     torque_error,
 )
-from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator, ValidationHistory
+from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
 
 __all__ = [
     "Calibration",
@@ -82,7 +82,6 @@ __all__ = [
     "RunDescription",
     "TermComparison",
     "TorqueError",
-    "ValidationHistory",
     "animate",
     "best",
     "best_baseline",

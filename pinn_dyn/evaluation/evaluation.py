@@ -30,7 +30,7 @@ from pinn_dyn.evaluation.figures import (
     terms_figure,
     trajectory_figure,
 )
-from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
+from pinn_dyn.evaluation.learned_terms import TermComparison, compare_with_source
 from pinn_dyn.evaluation.metrics import (
     left_data,
     member_metrics,
@@ -294,7 +294,7 @@ def evaluate_models(
             row |= _force_figures(entry, source, torque, parts)
         rows.append(row)
     summary = pd.DataFrame(rows).astype({"seed": "Int64"})
-    terms = {entry.run: _terms(entry.model, source) for entry in entries}
+    terms = {entry.run: compare_with_source(entry.model, source) for entry in entries}
     return Evaluation(
         source=source,
         split=split,
@@ -370,13 +370,3 @@ def _force_figures(
     if isinstance(model, Sum):
         parts.append(part_shares(model, entry.truth).assign(run=entry.run))
     return figures
-
-
-def _terms(model: Predictor, source: DataSource) -> TermComparison | None:
-    """Compare the terms of a mechanical model with the true ones, where these are known."""
-    if source.system is None or not source.configurations:
-        return None
-    if not isinstance(model, MechanicalSystem):
-        return None
-    q = torch.tensor([*source.configurations.values()], dtype=torch.float64)
-    return compare_terms(model, source.system, q, names=[*source.configurations])

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.factor import fit_factor
-from pinn_dyn.control.stability import checked_samples
-from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
+from pinn_dyn.data import DataSource
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, Terms, double_copy
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,7 @@ class TermComparison:
     Attributes:
         names: K names of configurations.
         q: configurations, ``(K, N)``.
-        true: M, D, G, A of the true system.
-        learned: M, D, G, A of the model.
+        true, learned: M, D, G, A of the true system and of the model.
         P: best-fit factor, ``(K, N, N)``, see :func:`pinn_dyn.control.factor.fit_factor`.
         P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``. The proof for the paper's
             controllers needs a positive one.
@@ -43,8 +42,9 @@ class TermComparison:
 
         Each is ``(K, N, .)``, G with one column. The third matrix of M_inverse is (P M)^-1.
         """
-        true, learned = _as_matrices(self.true), _as_matrices(self.learned)
-        versions = {name: (true[name], learned[name], self.P @ true[name]) for name in true}
+        pairs = zip(Terms._fields, self.true, self.learned, strict=True)
+        columns = ((name, *(x.reshape(*self.q.shape, -1) for x in pair)) for name, *pair in pairs)
+        versions = {name: (true, learned, self.P @ true) for name, true, learned in columns}
         mass = versions.pop("M")
         inverse = (_inverse(mass[0]), _inverse(mass[1]), _inverse(mass[2]))
         return {"M": mass, "M_inverse": inverse, **versions}
@@ -71,20 +71,19 @@ class TermComparison:
 
     def to_text(self) -> str:
         """Return the true and the learned matrices, as in the paper's tables, and P."""
-        errors = iter(self.to_frame().itertuples())
+        errors = self.to_frame().set_index(["configuration", "term"])
         lines = []
-        for index, name in enumerate(self.names):
-            lines.append(f"configuration {name}, q = {_array(self.q[index])}")
+        for k, name in enumerate(self.names):
+            lines.append(f"configuration {name}, q = {_array(self.q[k])}")
             for term, (true, learned, _) in self.matrices().items():
-                row = next(errors)
-                identity, best = row.relative_error_identity, row.relative_error_best_P
-                lines.append(f"{term} true\n{_array(true[index])}")
+                identity, best = errors.loc[(name, term)]
+                lines.append(f"{term} true\n{_array(true[k])}")
                 lines.append(f"{term} learned: error {identity:.2g}, with the best P {best:.2g}")
-                lines.append(_array(learned[index]))
-            smallest = float(self.P_min_eigenvalue[index])
+                lines.append(_array(learned[k]))
+            smallest = float(self.P_min_eigenvalue[k])
             verdict = "positive definite" if smallest > 0 else "NOT positive definite"
             lines.append(f"P, best fit of learned = P true: {verdict}, eigenvalue {smallest:.3g}")
-            lines.append(f"{_array(self.P[index])}\n")
+            lines.append(f"{_array(self.P[k])}\n")
         return "\n".join(lines)
 
 
@@ -102,23 +101,23 @@ def compare_terms(
         truth: the true system, with the same N and M.
         q: configurations, ``(K, N)``.
         names: K names of the configurations; None numbers them.
-
-    Raises:
-        TypeError: if the model has no terms, such as a black box.
-        ValueError: if the systems and ``q`` do not match in size.
     """
-    q = checked_samples(model, truth, q)
+    q = q.double()
     labels = list(names) if names else [str(k + 1) for k in range(len(q))]
     with torch.no_grad():
-        true = double_copy(truth, q.device).terms(q)
-        learned = double_copy(model, q.device).terms(q)
+        true, learned = (double_copy(system, q.device).terms(q) for system in (truth, model))
     P = fit_factor(true, learned)
     smallest = torch.linalg.eigvalsh(0.5 * (P + P.transpose(-1, -2)))[..., 0]
     return TermComparison(labels, q, true, learned, P, smallest, model.state == "qp")
 
 
-def _as_matrices(terms: Terms) -> dict[str, Tensor]:
-    return terms._asdict() | {"G": terms.G.unsqueeze(-1)}
+def compare_with_source(model: Predictor, source: DataSource) -> TermComparison | None:
+    """Compare the terms of a mechanical model with those of a simulated robot; None for others."""
+    names, system = list(source.configurations), source.system
+    if system is None or not names or not isinstance(model, MechanicalSystem):
+        return None
+    q = torch.tensor([source.configurations[name] for name in names], dtype=torch.float64)
+    return compare_terms(model, system, q, names=names)
 
 
 def _inverse(matrix: Tensor) -> Tensor:
@@ -135,8 +134,4 @@ def _relative(difference: Tensor, reference: Tensor) -> Tensor:
 def _array(values: Tensor) -> str:
     """Return an array as text with three significant digits; rounding errors print as 0."""
     clean = torch.where(values.abs() < 1e-9 * values.abs().max(), 0.0, values)
-    return np.array2string(
-        clean.numpy(),
-        formatter={"float_kind": lambda value: f"{value:10.3g}"},
-        max_line_width=100,
-    )
+    return np.array2string(clean.numpy(), formatter={"float_kind": "{:10.3g}".format})

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterable, Mapping
 
 import lightning as L
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from matplotlib.figure import Figure
 from torch.utils.tensorboard.summary import hparams
 
@@ -28,9 +28,7 @@ def log_figures(loggers: Iterable[Logger], figures: Mapping[str, Figure], step: 
 class RunDescription(L.Callback):
     """Settings of a run in its log at the start, and its run time at the end.
 
-    A run that fails or is interrupted keeps its settings and last errors, without a success. The
-    run time of a resumed training includes the time before the checkpoint. No list of settings is
-    written for TensorBoard, which would take the list of the first run for all runs.
+    The run time of a resumed training includes the time before the checkpoint.
 
     Args:
         settings: names and values in which this run may differ from others.
@@ -48,30 +46,24 @@ class RunDescription(L.Callback):
         self.settings = dict(settings)
         self.configuration = configuration
         self.provenance = dict(provenance)
-        self._start, self._end = hparams(self.settings, {})[1:]
-        self._started = _clocks()
-        self._before = (0.0, 0.0)
+        # The list of settings would be that of the first run for all runs.
+        _, self._start, self._end = hparams(self.settings, {})
+        self._started = time.perf_counter()
 
     @property
-    def seconds(self) -> tuple[float, float]:
-        """Run time of the training so far: wall-clock and processor time, s."""
-        parts = zip(self._before, _clocks(), self._started, strict=True)
-        wall, cpu = (before + now - start for before, now, start in parts)
-        return wall, cpu
+    def seconds(self) -> float:
+        """Run time of the training so far, s."""
+        return time.perf_counter() - self._started
 
     def state_dict(self) -> dict[str, float]:
-        """Return the run time, for a training that is resumed."""
-        wall, cpu = self.seconds
-        return {"wall_seconds": wall, "cpu_seconds": cpu}
+        return {"wall_seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Restore the run time before the checkpoint."""
-        self._before = (state_dict["wall_seconds"], state_dict["cpu_seconds"])
+        self._started = time.perf_counter() - state_dict["wall_seconds"]
 
+    @rank_zero_only
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Log settings, configuration and provenance."""
-        if not trainer.is_global_zero:
-            return
         parameters = sum(p.numel() for p in pl_module.parameters())
         rows = {**self.provenance, "parameters": str(parameters)}
         for logger in trainer.loggers:
@@ -87,18 +79,13 @@ class RunDescription(L.Callback):
                 for key, value in rows.items():
                     logger.experiment.set_tag(logger.run_id, key, value)
 
+    @rank_zero_only
     def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the run time and the success."""
-        if not trainer.is_global_zero:
-            return
-        # TensorBoard sorts metrics by name: this one comes after those of val/.
-        seconds = {"wall_time/training_seconds": self.seconds[0]}
+        """Log the run time, and the success for TensorBoard."""
         for logger in trainer.loggers:
-            logger.log_metrics(seconds, trainer.global_step - 1)
+            # TensorBoard sorts metrics by name: this one comes after those of val/.
+            logger.log_metrics(
+                {"wall_time/training_seconds": self.seconds}, trainer.global_step - 1
+            )
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.file_writer.add_summary(self._end)
-
-
-def _clocks() -> tuple[float, float]:
-    """Return the wall-clock time, and the processor time of this process and its children, s."""
-    return time.perf_counter(), sum(os.times()[:4])

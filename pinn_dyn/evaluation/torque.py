@@ -126,7 +126,9 @@ def _acceleration(truth: Trajectory) -> Tensor:
     steps = truth.t.double().diff()
     step = float(steps.mean())
     if len(truth.t) < 5 or float((steps - step).abs().max()) > 1e-3 * step:
-        raise ValueError(f"{len(truth.t)} samples: accelerations need at least 5 at a constant step")
+        raise ValueError(
+            f"{len(truth.t)} samples: accelerations need at least 5 at a constant step"
+        )
     length = min(max(5, 2 * round(_SMOOTHING / step / 2) + 1), 2 * ((len(truth.t) - 1) // 2) + 1)
     slope = savgol_filter(truth.v.double().numpy(), length, 3, deriv=1, delta=step, axis=-2)
     return torch.from_numpy(slope)

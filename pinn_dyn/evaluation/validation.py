@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import lightning as L
 import torch
 from matplotlib.figure import Figure
@@ -11,7 +9,7 @@ from pydantic import PositiveFloat, PositiveInt
 
 from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
-from pinn_dyn.evaluation.learned_terms import compare_terms
+from pinn_dyn.evaluation.learned_terms import compare_with_source
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
 from pinn_dyn.evaluation.prediction import (
     Prediction,
@@ -26,11 +24,6 @@ from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
 _LARGEST_RATIO = 10.0
-_MAX_GAP = 1.5  # ratio of the last error to the best: beyond the usual ups and downs
-_ADVICE = (
-    "Evaluate last.ckpt too (evaluate.py checkpoint=last), train on longer windows (data.steps), "
-    "or check whether the validation motions resemble the training motions"
-)
 
 
 class RolloutValidator:
@@ -42,9 +35,8 @@ class RolloutValidator:
         mean over trajectories of min(10, mean over t of e_W(t) / mean of f_W)
 
     Here e_W is the error with the state reset to the measured state every W seconds, and f_W the
-    same error of the baseline that holds its position, over all times and trajectories. So 1 is
-    the result of a model that predicts no motion. A diverged trajectory counts as 10. Windows are
-    rounded to whole steps.
+    same error of the baseline that holds its position, over all times and trajectories. A diverged
+    trajectory counts as 10. Windows are rounded to whole steps.
 
     Args:
         horizon: length of the trajectories, s.
@@ -70,7 +62,7 @@ class RolloutValidator:
         if not self.step <= (horizon if window is None else window) <= horizon:
             raise ValueError(
                 f"window is {window} s, step {self.step} s and horizon {horizon} s, "
-                "expected step <= window <= horizon, or window=null for open loop"
+                "expected step <= window <= horizon"
             )
 
     def __str__(self) -> str:
@@ -79,12 +71,7 @@ class RolloutValidator:
         return f"{self.horizon:g} s, reset every {self.window:g} s"
 
     def check(self, truth: Trajectory) -> None:
-        """Refuse data that do not fit the rollouts, before the training begins.
-
-        Raises:
-            ValueError: if the trajectory is shorter than the horizon, the step is no multiple of
-                the sample time, or the window is no multiple of the step.
-        """
+        """Raise ValueError for data that do not fit horizon, window and step."""
         t = truth.until(self.horizon).t
         if self.window is None:
             samples_of("step", self.step, t)
@@ -100,13 +87,10 @@ class RolloutValidator:
         return predict_windows(model, truth, window=self.window, step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
-        """Return mean, median, worst and windowed error, diverged count, and run time in s.
+        """Return mean, median, worst and windowed error, and the diverged count.
 
-        With a residual force comes its share, see :func:`.residual_share`. The errors of an
-        ensemble are those of its mean prediction, with the mean error and the spread of its
-        members.
+        A residual force adds its share, an ensemble the mean error and the spread of its members.
         """
-        start = time.perf_counter()
         prediction = self.predict(model, truth)
         metrics = rollout_metrics(prediction.q_hat, prediction.q, prediction.t, thresholds={})
         names = ("error_mean", "error_median", "error_worst", "diverged")
@@ -117,7 +101,7 @@ class RolloutValidator:
         if isinstance(model, MechanicalSystem) and model.has_residual:
             errors["residual_share"] = residual_share(model, truth.until(self.horizon))
         errors["error_windowed"] = self._windowed(model, truth, prediction)
-        return {**errors, "rollout_seconds": time.perf_counter() - start}
+        return errors
 
     def _windowed(self, model: Predictor, truth: Trajectory, longest: Prediction) -> float:
         """Return ``error_windowed``, with ``longest`` for the longest window."""
@@ -128,80 +112,11 @@ class RolloutValidator:
         still = HoldPosition(model.num_coordinates, model.num_inputs)
         pairs = [(longest, self.predict(still, truth))]
         for n in steps:
-            pairs.append(
-                (
-                    predict_windows(model, truth, window=n * step, step=step),
-                    predict_windows(still, truth, window=n * step, step=step),
-                )
-            )
+            both = [predict_windows(x, truth, window=n * step, step=step) for x in (model, still)]
+            pairs.append((both[0], both[1]))
         ratios = [item.error().mean(dim=1) / baseline.error().mean() for item, baseline in pairs]
         limited = torch.stack(ratios).nan_to_num(_LARGEST_RATIO).clamp(max=_LARGEST_RATIO)
         return float(limited.mean())
-
-
-class ValidationHistory(L.Callback):
-    """Errors of every validation, from which the best checkpoint is explained.
-
-    Attributes:
-        rows: for each validation the epoch, the mean training loss of that epoch, ``error_mean``
-            and ``error_windowed``.
-    """
-
-    def __init__(self) -> None:
-        self.rows: list[dict[str, float]] = []
-        self._validated = False
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Note that this epoch was validated; the training loss is known at its end."""
-        self._validated = True
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Append the errors of this epoch, if it was validated."""
-        if self._validated:
-            names = ("train/loss", "val/error_mean", "val/error_windowed")
-            metrics = {n: float(trainer.callback_metrics.get(n, torch.nan)) for n in names}
-            self.rows.append({"epoch": trainer.current_epoch, **metrics})
-        self._validated = False
-
-    def state_dict(self) -> dict[str, list[dict[str, float]]]:
-        """Return the rows, for a training that is resumed."""
-        return {"rows": self.rows}
-
-    def load_state_dict(self, state_dict: dict[str, list[dict[str, float]]]) -> None:
-        """Restore the rows."""
-        self.rows = list(state_dict["rows"])
-
-    def summary(self) -> str:
-        """Return the errors of the best and of the last checkpoint; empty without a validation."""
-        rows = {"best.ckpt": self._best(), "last.ckpt": self.rows[-1]} if self.rows else {}
-        return "; ".join(
-            f"{name} (epoch {row['epoch']:.0f}): windowed {row['val/error_windowed']:.3g}, "
-            f"mean {row['val/error_mean']:.3g}"
-            for name, row in rows.items()
-        )
-
-    def warning(self) -> str | None:
-        """Return a warning if the best checkpoint is the first, or far better than the last."""
-        if len(self.rows) < 2:
-            return None
-        best, last = self._best(), self.rows[-1]
-        if best is self.rows[0] and last["train/loss"] < best["train/loss"]:
-            return (
-                "best.ckpt is from the first validation, although the training loss fell from "
-                f"{best['train/loss']:.3g} to {last['train/loss']:.3g} after it: the model fits "
-                f"its windows better and predicts worse. {_ADVICE}"
-            )
-        errors = [row["val/error_windowed"] for row in (best, last)]
-        if not errors[1] <= _MAX_GAP * errors[0]:  # also if the last error is NaN
-            return (
-                f"the windowed error of last.ckpt is {errors[1]:.3g}, that of best.ckpt (epoch "
-                f"{best['epoch']:.0f}) {errors[0]:.3g}: the best checkpoint may be a lucky one. "
-                f"{_ADVICE}"
-            )
-        return None
-
-    def _best(self) -> dict[str, float]:
-        return min(self.rows, key=lambda row: row["val/error_windowed"])
 
 
 class RolloutFigures(L.Callback):
@@ -245,12 +160,9 @@ class RolloutFigures(L.Callback):
             ),
             "rollout/error": error_figure(predictions, title=f"Validation error, {validator}"),
         }
-        names = list(source.configurations)
-        if source.system is not None and isinstance(model, MechanicalSystem) and names:
-            q = torch.tensor([*source.configurations.values()], dtype=torch.float64)
-            comparison = compare_terms(model, source.system, q, names=names)
-            for k, name in enumerate(names):
-                title = f"Learned and true terms at {name}"
-                figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
+        comparison = compare_with_source(model, source)
+        for k, name in enumerate(comparison.names if comparison else []):
+            title = f"Learned and true terms at {name}"
+            figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
         # The step at which Lightning logs the errors of the same validation.
         log_figures(trainer.loggers, figures, trainer.global_step - 1)

@@ -94,13 +94,6 @@ def test_the_text_shows_the_numbers_of_the_paper():
     assert len(max(text.splitlines(), key=len)) <= 100
 
 
-def test_what_has_no_terms_is_refused():
-    with pytest.raises(ValueError, match=r"model has \(N, M\) = \(6, 6\), truth \(3, 3\)"):
-        compare_terms(SoftArm(2), SoftArm(), Q)
-    with pytest.raises(ValueError, match=r"q has shape \(3,\)"):
-        compare_terms(SoftArm(), SoftArm(), Q[0])
-
-
 @pytest.mark.parametrize("state", ["qv", "qp"])
 def test_the_inverse_of_m_is_shown_of_a_model_of_momenta(state):
     arm = SoftArm(damping=0.12)
