@@ -25,7 +25,6 @@ from pinn_dyn.evaluation.control_metrics import (
 from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
 from pinn_dyn.evaluation.figures import (
     error_figure,
-    spread_figure,
     sweep_figure,
     terms_figure,
     trajectory_figure,
@@ -115,7 +114,6 @@ __all__ = [
     "residual_share",
     "rollout_metrics",
     "save",
-    "spread_figure",
     "state_squared_error",
     "steady_state_figure",
     "sweep_figure",

@@ -18,7 +18,6 @@ from pinn_dyn.evaluation.prediction import Prediction
 
 LEVEL = 0.95
 """Default level of an interval."""
-
 _LEVELS = np.array([0.05, *np.arange(0.1, 0.91, 0.1), LEVEL, 0.99])
 _AT = -2  # index of LEVEL in _LEVELS
 
@@ -36,8 +35,8 @@ class Calibration:
 
     level: np.ndarray
     share: np.ndarray
-    corrected: np.ndarray | None
-    factor: float | None
+    corrected: np.ndarray | None = None
+    factor: float | None = None
 
     @property
     def within(self) -> float:
@@ -48,6 +47,12 @@ class Calibration:
     def within_corrected(self) -> float | None:
         """``corrected`` of the 95 % interval."""
         return None if self.corrected is None else float(self.corrected[_AT])
+
+    def __str__(self) -> str:
+        text = f"{100 * self.within:.0f} %"
+        if self.corrected is None:
+            return text
+        return f"{text} ({100 * self.corrected[_AT]:.0f} % with {self.factor:.3g} times the width)"
 
 
 def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
@@ -64,9 +69,6 @@ def standardized_errors(prediction: Prediction) -> Tensor:
 
     The start is left out. The result is infinite where a rollout diverged, and where the members
     agree on something else than the truth.
-
-    Raises:
-        ValueError: if the prediction has no members.
     """
     deviation = prediction.deviation()[:, 1:]
     assert prediction.members is not None
@@ -82,9 +84,8 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
 
     The interval of level p is q_hat +- c_p sqrt(1 + 1/E) s. According to the members, c_p is the
     quantile of :func:`half_widths`. The corrected c_p contains the share p of the validation
-    errors. The correction is needed since members do not know the noise of the measured start, nor
-    errors that all of them share. Source: Lei et al. 2018, "Distribution-free predictive inference
-    for regression", sec. 5.2 (locally weighted conformal inference).
+    errors. Source: Lei et al. 2018, "Distribution-free predictive inference for regression", sec.
+    5.2 (locally weighted conformal inference).
 
     Args:
         held_out: rollouts with members, of motions that took no part in training.
@@ -95,39 +96,35 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
     width = half_widths(len(held_out.members), _LEVELS)
     share = _within(errors, width)
     if validation is None:
-        return Calibration(_LEVELS, share, None, None)
+        return Calibration(_LEVELS, share)
     validation_errors = standardized_errors(validation).flatten().numpy()
     corrected = np.quantile(validation_errors, _LEVELS, method="higher")
-    factor = float(corrected[_AT] / width[_AT])
-    return Calibration(_LEVELS, share, _within(errors, corrected), factor)
+    return Calibration(_LEVELS, share, _within(errors, corrected), corrected[_AT] / width[_AT])
+
+
+def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return the share of errors up to each width; infinite errors are never within."""
+    finite = np.sort(errors[np.isfinite(errors)])
+    return np.searchsorted(finite, width, side="right") / max(len(errors), 1)
 
 
 def calibration_table(runs: Mapping[str, Mapping[float, Calibration]]) -> pd.DataFrame:
     """Return one row per run, window and level, with ``share``, ``corrected`` and ``factor``."""
     frames = [
-        pd.DataFrame(
-            {"level": item.level, "share": item.share, "corrected": item.corrected}
-        ).assign(run=run, window=window, factor=item.factor)
+        pd.DataFrame({"run": run, "window": window, **vars(item)})
         for run, windows in runs.items()
         for window, item in windows.items()
     ]
-    columns = ["run", "window", "level", "share", "corrected", "factor"]
-    return pd.concat(frames, ignore_index=True)[columns] if frames else pd.DataFrame()
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
 def interval_lines(runs: Mapping[str, Mapping[float, Calibration]]) -> list[str]:
     """Return one sentence per run about the coverage of its 95 % intervals."""
-    lines = []
-    for run, windows in runs.items():
-        parts = []
-        for window, item in windows.items():
-            text = f"{100 * item.within:.0f} % after {window:g} s"
-            if item.within_corrected is not None:
-                corrected = f"{100 * item.within_corrected:.0f} %"
-                text += f" ({corrected} with {item.factor:.3g} times the width)"
-            parts.append(text)
-        lines.append(f"{run}: its 95 % intervals contain {', '.join(parts)} of the errors")
-    return lines
+    shares = {
+        run: ", ".join(f"{item} after {window:g} s" for window, item in windows.items())
+        for run, windows in runs.items()
+    }
+    return [f"{run}: share of errors within 95 % intervals: {text}" for run, text in shares.items()]
 
 
 def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:
@@ -160,9 +157,3 @@ def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title
     legend_below(figure, columns=2, fontsize="small")
     figure.suptitle(title)
     return figure
-
-
-def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return the share of errors up to each width; infinite errors are never within."""
-    finite = np.sort(errors[np.isfinite(errors)])
-    return np.searchsorted(finite, width, side="right") / max(len(errors), 1)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -26,7 +25,6 @@ from pinn_dyn.evaluation.calibration import (
 from pinn_dyn.evaluation.figures import (
     ERROR,
     error_figure,
-    spread_figure,
     terms_figure,
     trajectory_figure,
 )
@@ -189,10 +187,6 @@ class Evaluation:
             ),
         )
         yield "error", self.error_figure(title)
-        for run, prediction in self.models.items():
-            if prediction.members is not None:
-                text = f"{title}\n{run}, {len(prediction.members)} members"
-                yield f"spread_{_stem(run)}", spread_figure(prediction, title=text)
         if self.intervals:
             yield "calibration", calibration_figure(self.intervals, title=title)
         for run, comparison in self.terms.items():

@@ -13,7 +13,6 @@ from torch import Tensor
 from pinn_dyn.evaluation.learned_terms import TermComparison
 from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.plots import (
-    COLORS,
     DARK,
     TRUTH,
     Errors,
@@ -56,9 +55,6 @@ def trajectory_figure(
         labels: name and unit of each coordinate; None takes q1 ... qN.
         input_labels: name and unit of each input; None takes u1 ... uM.
         baselines: names of baselines and their rollouts, drawn in thin grey lines.
-
-    Raises:
-        ValueError: if the number of labels does not fit.
     """
     labels = default_labels(labels, "q", truth.q.shape[-1])
     input_labels = default_labels(input_labels, "u", truth.u.shape[-1])
@@ -89,14 +85,6 @@ def trajectory_figure(
     return figure
 
 
-def prediction_errors(predictions: Mapping[str, Prediction]) -> dict[str, Errors]:
-    """Return the configuration errors of rollouts, by name."""
-    return {
-        name: Errors(item.t, item.error(), diverged_trajectories(item))
-        for name, item in predictions.items()
-    }
-
-
 def error_figure(
     predictions: Mapping[str, Prediction],
     *,
@@ -106,59 +94,22 @@ def error_figure(
 ) -> Figure:
     """Draw the configuration error over time: mean and 10-90 % band over the trajectories.
 
-    Diverged trajectories are left out and counted in the legend.
-
-    Args:
-        predictions: model names and their rollouts; the order of the names fixes their colors.
-        title: title of the figure.
-        baselines: names of baselines and their rollouts, drawn in thin grey lines.
-        label: name and unit of the error.
+    Diverged trajectories are left out and counted in the legend. The arguments are those of
+    :func:`trajectory_figure`, and the name and unit of the error as ``label``.
     """
     note = "mean over test trajectories, 10–90 % band" + ("; grey: baselines" if baselines else "")
-    return mean_error_figure(
-        prediction_errors(predictions),
-        prediction_errors(baselines or {}),
-        title=title,
-        label=label,
-        note=note,
-        lost="diverged",
+    models, grey = (
+        {name: Errors(x.t, x.error(), diverged_trajectories(x)) for name, x in items.items()}
+        for items in (predictions, baselines or {})
     )
-
-
-def spread_figure(prediction: Prediction, *, title: str) -> Figure:
-    """Draw the error of an ensemble beside the spread of its members, over time.
-
-    Both are root mean squares over the trajectories that did not diverge. The ensemble is
-    overconfident where the spread lies below the error.
-
-    Args:
-        prediction: the rollouts of an ensemble.
-        title: title of the figure.
-    """
-    figure = Figure(figsize=(8, 4.8), layout="constrained")
-    ax = figure.subplots()
-    valid = ~diverged_trajectories(prediction)
-    curves = {
-        "error of the mean prediction": prediction.error(),
-        "spread of the members": prediction.spread(),
-    }
-    for (name, values), color in zip(curves.items(), COLORS, strict=False):
-        rms = values[valid][:, 1:].square().mean(dim=0).sqrt()
-        ax.plot(prediction.t[1:], rms, color=color, label=name)
-    ax.set(yscale="log", xlabel="time [s]", ylabel=f"root mean square of {ERROR}")
-    ax.grid(True, alpha=0.3)
-    legend_below(figure, title=f"{int(valid.sum())} of {len(valid)} trajectories did not diverge")
-    figure.suptitle(title, fontsize="medium")
-    return figure
+    return mean_error_figure(models, grey, title=title, label=label, note=note, lost="diverged")
 
 
 def terms_figure(comparison: TermComparison, *, configuration: int, title: str) -> Figure:
     """Draw M, D, G and A at one configuration: true X, learned X_L, and P X with the best-fit P.
 
-    The inverse of M replaces M where the model's equations contain the inverse. A model whose
-    terms equal P X moves like the truth: multiplying the equation of motion by P does not change
-    it. The three matrices of a term share one color scale, from minus to plus their largest entry.
-    The color follows the square root of an entry, so that small entries stay visible.
+    The inverse of M replaces M where the model's equations contain the inverse. The three matrices
+    of a term share one color scale. The color follows the square root of an entry.
 
     Args:
         comparison: true and learned terms.
@@ -196,8 +147,7 @@ def terms_figure(comparison: TermComparison, *, configuration: int, title: str) 
 
 def _annotate(ax: Axes, matrix: Tensor, digits: int) -> None:
     """Write each entry into its cell; entries at the level of rounding errors are 0."""
-    ax.set_xticks([])
-    ax.set_yticks([])
+    ax.set(xticks=[], yticks=[])
     smallest = 1e-6 * float(matrix.abs().max())
     for i, row in enumerate(matrix.tolist()):
         for j, value in enumerate(row):
@@ -213,7 +163,7 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: Sequence[str], y: str) ->
 
     Args:
         runs: one row per run.
-        x: column of the horizontal axis; the axis is categorical unless its values are numbers.
+        x: column of the horizontal axis, categorical unless its values are numbers.
         lines: columns whose combinations are drawn as separate lines.
         y: column of the error.
     """
@@ -231,9 +181,7 @@ def sweep_figure(runs: pd.DataFrame, *, x: str, lines: Sequence[str], y: str) ->
         ax.plot(finite.groupby(x, sort=False)[y].mean(), marker="o", label=name, **style)
         ax.plot(finite[x], finite[y], ".", color=style["color"], alpha=0.4)
     ax.set(xlabel=x, ylabel=y)
-    positive = runs[y][runs[y].between(0, math.inf, inclusive="neither")]
-    if len(positive) and positive.max() > 10 * positive.min():
-        ax.set_yscale("log")
+    ax.set_yscale("log")
     if numeric and runs[x].min() > 0 and runs[x].max() > 10 * runs[x].min():
         ax.set_xscale("log")
     ax.grid(True, alpha=0.3)

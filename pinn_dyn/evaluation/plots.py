@@ -37,10 +37,7 @@ class Errors(NamedTuple):
 
 
 def model_style(index: int) -> dict[str, Any]:
-    """Return the line style of the model or control law with this index, the same in all figures.
-
-    The first six differ by color, the next six also by dashes.
-    """
+    """Return the line style of a model or control law by its index, the same in all figures."""
     dashes = _LINE_STYLES[index // len(COLORS) % len(_LINE_STYLES)]
     return {"color": COLORS[index % len(COLORS)], "linestyle": dashes}
 
@@ -52,15 +49,8 @@ def baseline_style(index: int) -> dict[str, Any]:
 
 
 def default_labels(labels: Sequence[str] | None, letter: str, count: int) -> list[str]:
-    """Return the labels, or q1 ... qN without any.
-
-    Raises:
-        ValueError: if there are more or fewer than ``count``.
-    """
-    names = list(labels) if labels else [f"{letter}{k + 1}" for k in range(count)]
-    if len(names) != count:
-        raise ValueError(f"{len(names)} labels for {letter}, expected {count}: {names}")
-    return names
+    """Return the labels, or q1 ... qN without any."""
+    return list(labels) if labels else [f"{letter}{k + 1}" for k in range(count)]
 
 
 def units(labels: Sequence[str]) -> str:
@@ -78,51 +68,39 @@ def with_unit(text: str, labels: Sequence[str]) -> str:
 def panels(
     columns: Sequence[Sequence[str]], t: Tensor | np.ndarray, *, title: str
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Create columns of panels over time.
+    """Create columns of panels over the times t in s; return the axes of each column.
 
-    Args:
-        columns: label of the vertical axis of each panel, for each column.
-        t: times, ``(T,)``, s.
-        title: title of the figure.
-
-    Returns:
-        The figure, and the axes of each column.
+    ``columns`` has the label of the vertical axis of each panel, for each column.
     """
     rows = max(map(len, columns))
     size = (5.8 * len(columns), 1.55 * rows + 1.3)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
-    for column, labels in zip(grid.T, columns, strict=True):
-        for ax, label in zip(column, labels, strict=False):
+    axes = [list(column[: len(labels)]) for column, labels in zip(grid.T, columns, strict=True)]
+    for column, used, labels in zip(grid.T, axes, columns, strict=True):
+        for ax, label in zip(used, labels, strict=True):
             ax.set_ylabel(label)
             ax.grid(True, alpha=0.3)
         for ax in column[len(labels) :]:
             ax.set_axis_off()
-        last = column[len(labels) - 1]
-        last.set_xlabel("time [s]")
-        last.tick_params(labelbottom=True)
+        used[-1].set_xlabel("time [s]")
+        used[-1].tick_params(labelbottom=True)
         figure.align_ylabels(column)
     grid[0, 0].set_xlim(float(t[0]), float(t[-1]))
     figure.suptitle(title, fontsize="medium")
-    axes = [list(column[: len(labels)]) for column, labels in zip(grid.T, columns, strict=True)]
     return figure, axes
 
 
 def legend_below(figure: Figure, columns: int = 4, **settings: Any) -> None:
     """Add one legend below all panels, with each name once."""
-    entries: dict[str, Any] = {}
-    for ax in figure.axes:
-        handles, names = ax.get_legend_handles_labels()
-        entries |= dict(zip(names, handles, strict=True))
+    pairs = [zip(*ax.get_legend_handles_labels(), strict=True) for ax in figure.axes]
+    entries = {name: handle for pair in pairs for handle, name in pair}
     columns = min(len(entries), columns)
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=columns, **settings)
 
 
 def limits(values: Tensor, margin: float = 0.3) -> tuple[float, float]:
-    """Return the ends of a linear axis for these values.
-
-    Short peaks of more than 20 times the 95th percentile do not count.
-    """
+    """Return the ends of a linear axis; peaks of 20 times the 95th percentile do not count."""
     finite = values[torch.isfinite(values)].double()
     if not len(finite):
         return -1.0, 1.0
@@ -137,13 +115,11 @@ def limits(values: Tensor, margin: float = 0.3) -> tuple[float, float]:
 def log_limits(curves: Sequence[Tensor]) -> tuple[float, float]:
     """Return the ends of a logarithmic axis: three decades on both sides of the best curve."""
     positive = [curve[(curve > 0) & torch.isfinite(curve)].double() for curve in curves]
-    positive = [curve for curve in positive if len(curve)]
-    if not positive:
-        return 0.1, 1.0
+    positive = [curve for curve in positive if len(curve)] or [torch.ones(1)]
     best = min(float(curve.median()) for curve in positive)
-    low = min(float(curve.min()) for curve in positive)
-    high = max(float(curve.max()) for curve in positive)
-    return max(low, 1e-3 * best) / 1.5, 1.5 * min(high, 1e3 * best)
+    values = torch.cat(positive)
+    low, high = max(float(values.min()), 1e-3 * best), min(float(values.max()), 1e3 * best)
+    return low / 1.5, 1.5 * high
 
 
 def set_log_axis(ax: Axes, curves: Sequence[Tensor]) -> None:
@@ -170,9 +146,8 @@ def mean_error_figure(
 
     Args:
         models, baselines: names and errors; the order of the models fixes their colors.
-        title: title of the figure.
+        title, note: titles of the figure and of the legend.
         label: name and unit of the error.
-        note: title of the legend.
         lost: word for excluded trajectories, such as "diverged", which the legend counts.
     """
     figure = Figure(figsize=(8, 4.8), layout="constrained")
@@ -185,16 +160,12 @@ def mean_error_figure(
         count = int(excluded.sum())
         text = f"{name} ({count} of {len(error)} {lost})" if count else name
         values = error[~excluded][:, 1:].double()
-        if not len(values):
-            ax.plot([], [], label=text, **style)
-            continue
         means.append(values.mean(dim=0))
-        ax.plot(t[1:], means[-1], label=text, **style)
-        if k < len(models):
-            ends = torch.tensor([0.1, 0.9], dtype=values.dtype)
-            low, high = values.quantile(ends, dim=0)
+        ax.plot(t[1:], means[-1], label=text, **style)  # NaN without trajectories: legend only
+        if k < len(models) and len(values):
+            low, high = np.quantile(values, [0.1, 0.9], axis=0)
             ax.fill_between(t[1:], low, high, color=style["color"], alpha=0.18, linewidth=0)
-        highest = max(highest, float(values.max()))
+        highest = max([highest, *values.amax(dim=1).tolist()])
     ax.set(yscale="log", xlabel="time [s]", ylabel=label)
     if highest > 0:
         ax.set_ylim(log_limits(means)[0], 2 * highest)

@@ -141,8 +141,8 @@ def formatted(
             column += frame[deviation].map(lambda x: "" if pd.isna(x) else f" ± {number(x)}")
         diverged = _diverged(name)
         if diverged in frame and "trajectories" in frame:
-            counts = [frame[key].map(number) for key in (diverged, "trajectories")]
-            column = column.mask(frame[name] == math.inf, "diverged: " + " of ".join(counts))
+            lost, total = (frame[key].map(number) for key in (diverged, "trajectories"))
+            column = column.mask(frame[name] == math.inf, "diverged: " + lost + " of " + total)
         if star:
             column += best(frame, name).map({True: star, False: ""})
         if name in ("run", "model") and "baseline" in frame:

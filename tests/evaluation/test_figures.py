@@ -18,7 +18,6 @@ from pinn_dyn.evaluation import (
     controller_comparison_figure,
     error_figure,
     save,
-    spread_figure,
     steady_state_figure,
     sweep_figure,
     terms_figure,
@@ -83,8 +82,6 @@ def test_a_trajectory_keeps_the_range_of_the_truth(truth, predictions, tmp_path)
     np.testing.assert_array_equal(drawn["ARX"].get_ydata(), predictions["good"].q_hat[1, :, 1])
     assert drawn["ARX"].get_color() == BASELINE
     assert axes["u1"].lines[0].get_drawstyle() == "steps-post"
-    with pytest.raises(ValueError, match="1 labels for q, expected 2"):
-        trajectory_figure(truth, predictions, trajectory=0, title="t", labels=["x"])
 
 
 def test_errors_over_time_leave_out_and_count_the_diverged(predictions):
@@ -101,17 +98,6 @@ def test_errors_over_time_leave_out_and_count_the_diverged(predictions):
     looks = {(line.get_color(), line.get_linestyle()) for line in drawn.values()}
     assert len(looks) == len(drawn)  # no two models look alike
     assert len(ax.collections) == len(models) - 1  # bands: no finite error, no band; no baseline
-
-
-def test_the_spread_of_an_ensemble_is_drawn_beside_its_error(truth):
-    members = torch.stack([truth.q + c * truth.t[:, None] for c in (0.0, 0.1, 0.5)])
-    members[:, 2] = torch.nan
-    (ax,) = spread_figure(Prediction(truth.t, members.mean(0), truth.q, members), title="t").axes
-    error, spread = (line.get_ydata() for line in ax.lines)
-    t = truth.t[1:].numpy()
-    # Both coordinates are off by c t; the third trajectory broke down.
-    np.testing.assert_allclose(error, math.sqrt(2) * 0.2 * t)
-    np.testing.assert_allclose(spread, np.sqrt(2 * np.var([0.0, 0.1, 0.5], ddof=1)) * t)
 
 
 @pytest.mark.parametrize(("inverse_mass", "entry"), [(False, "0.00173"), (True, "593")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,15 @@ from plotly.subplots import make_subplots
 from torch import Tensor
 
 from pinn_dyn.evaluation.figures import ERROR
-from pinn_dyn.evaluation.plots import DARK, TRUTH, limits, log_limits, model_style, with_unit
+from pinn_dyn.evaluation.plots import (
+    DARK,
+    TRUTH,
+    baseline_style,
+    limits,
+    log_limits,
+    model_style,
+    with_unit,
+)
 from pinn_dyn.evaluation.prediction import Prediction
 from pinn_dyn.mechanics import Trajectory
 
@@ -22,7 +31,6 @@ MAX_TRAJECTORIES = 24
 _POINTS = 400  # of one curve
 _PANEL, _ABOVE, _BELOW = 140, 110, 90  # heights of a panel and of the margins, px
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
-_JUMP = {"duration": 0, "redraw": True}
 
 
 class _Curve(NamedTuple):
@@ -59,22 +67,25 @@ def trajectory_browser(
         labels, input_labels: name and unit of each coordinate and input.
         trajectories: indices of the trajectories to offer; the first is shown at first.
     """
-    styles = {name: _line(model_style(k)) for k, name in enumerate(predictions)}
-    styles |= {name: {"color": "#9aa5ae", "dash": "dash", "width": 1.0} for name in baselines}
     rollouts = {**predictions, **baselines}
+    styles = {}
+    for k, name in enumerate(rollouts):
+        style = model_style(k) if name in predictions else baseline_style(1)
+        dash = _DASHES[style["linestyle"]]
+        styles[name] = {"color": style["color"], "dash": dash, "width": style.get("linewidth", 1.5)}
+    size = len(labels)
+    real = {"color": TRUTH, "width": 4}
+    shape = "hv" if truth.input.interpolation == "hold" else "linear"
+    driven = {"color": DARK, "width": 1.2, "shape": shape}
     curves = []
-    for k in range(len(labels)):
-        real = {"color": TRUTH, "width": 4}
+    for k in range(size):
         curves.append(_Curve(k, "truth", real, truth.t, truth.q[..., k]))
         for name, item in rollouts.items():
             curves.append(_Curve(k, name, styles[name], item.t, item.q_hat[..., k]))
-    size = len(labels)
     for name, item in rollouts.items():
         curves.append(_Curve(size, name, styles[name], item.t, item.error()))
-    shape = "hv" if truth.input.interpolation == "hold" else "linear"
     for k in range(len(input_labels)):
-        line = {"color": DARK, "width": 1.2, "shape": shape}
-        curves.append(_Curve(size + 1 + k, "input", line, truth.t, truth.u[..., k]))
+        curves.append(_Curve(size + 1 + k, "input", driven, truth.t, truth.u[..., k]))
 
     titles = [*labels, with_unit(ERROR, labels), *input_labels]
     drawn = make_subplots(len(titles), 1, shared_xaxes=True, vertical_spacing=0.2 / len(titles))
@@ -94,12 +105,12 @@ def trajectory_browser(
         names.add(name)
     frames = {}
     for k in sorted(trajectories):
-        ranges = {
-            f"yaxis{row + 1}": {"range": _range(truth, rollouts, row, k)} for row in range(size + 1)
-        }
-        frames[k] = go.Frame(
-            name=str(k), data=[{"y": curve.samples(k)} for curve in curves], layout=ranges
-        )
+        ends = [limits(truth.q[k, :, row]) for row in range(size)]
+        errors = log_limits([item.error()[k] for item in rollouts.values()])
+        ends.append((math.log10(errors[0]), math.log10(errors[1])))
+        ranges = {f"yaxis{row + 1}": {"range": pair} for row, pair in enumerate(ends)}
+        data = [{"y": curve.samples(k)} for curve in curves]
+        frames[k] = go.Frame(name=str(k), data=data, layout=ranges)
     drawn.frames = list(frames.values())
     for trace, start in zip(drawn.data, frames[first].data, strict=True):
         trace.y = start.y
@@ -109,9 +120,8 @@ def trajectory_browser(
     drawn.update_yaxes(type="log", exponentformat="power", row=size + 1, col=1)
     drawn.update_xaxes(title="time [s]", row=len(titles), col=1)
     plot = _PANEL * len(titles)
-    steps = [
-        {"label": str(k), "method": "animate", "args": [[str(k)], {"frame": _JUMP}]} for k in frames
-    ]
+    jump = {"frame": {"duration": 0, "redraw": True}}
+    steps = [{"label": str(k), "method": "animate", "args": [[str(k)], jump]} for k in frames]
     slider = {
         "active": list(frames).index(first),
         "currentvalue": {"prefix": "trajectory ", "font": {"size": 14}},
@@ -134,21 +144,6 @@ def trajectory_browser(
     return drawn
 
 
-def _line(style: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a line style of matplotlib in the terms of plotly."""
-    return {"color": style["color"], "dash": _DASHES[style["linestyle"]], "width": 1.5}
-
-
 def _thinned(values: Tensor) -> np.ndarray:
     """Return at most 400 equally spaced samples."""
     return values.detach()[:: -(-len(values) // _POINTS)].double().numpy()
-
-
-def _range(
-    truth: Trajectory, rollouts: Mapping[str, Prediction], row: int, k: int
-) -> tuple[float, ...]:
-    """Return the ends of the vertical axis of a panel for one trajectory."""
-    if row < truth.q.shape[-1]:
-        return limits(truth.q[k, :, row])
-    ends = log_limits([item.error()[k] for item in rollouts.values()])
-    return tuple(float(np.log10(end)) for end in ends)

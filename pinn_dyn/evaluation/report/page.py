@@ -8,7 +8,7 @@ import html
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import markdown
 import pandas as pd
@@ -20,7 +20,6 @@ from plotly.offline import get_plotlyjs
 
 from pinn_dyn.evaluation.tables import best, formatted
 
-# Text is escaped when it enters the template, unless it is Markup that this module made.
 _TEMPLATES = Environment(
     loader=PackageLoader("pinn_dyn.evaluation.report"),
     autoescape=True,
@@ -30,8 +29,7 @@ _TEMPLATES = Environment(
 _PLOTLY_OPTIONS = {
     "displaylogo": False,
     "responsive": True,
-    # A report sends nothing to a server.
-    "modeBarButtonsToRemove": ["sendChartToCloud", "lasso2d", "select2d"],
+    "modeBarButtonsToRemove": ["sendChartToCloud", "lasso2d", "select2d"],  # sends nothing
 }
 # Patterns of Markdown that make links and load pictures.
 _LINKS = (
@@ -40,8 +38,7 @@ _LINKS = (
 )
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """A part of a page under its own heading. The functions below make its parts."""
 
     title: str
@@ -50,13 +47,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Origin:
-    """The origin of the numbers of a page.
-
-    Attributes:
-        provenance: names and values: command, commit, data and hardware.
-        runs: one row per trained model: name, seed, folder and so on.
-        configurations: names and resolved configurations as text.
-    """
+    """The origin of the numbers of a page: facts, one row per trained model, configurations."""
 
     provenance: Mapping[str, str]
     runs: pd.DataFrame
@@ -99,7 +90,7 @@ def details(summary: str, *content: Markup) -> Markup:
 
 
 def from_markdown(text: str) -> Markup:
-    """Return a Markdown report with its tables; its headings start at the third level.
+    """Convert a Markdown report with tables; its headings start at the third level.
 
     HTML and links remain plain text, since names in a report come from files of other people.
     """
@@ -109,25 +100,16 @@ def from_markdown(text: str) -> Markup:
     for pattern in _LINKS:
         reader.inlinePatterns.deregister(pattern)
     reader.parser.blockprocessors.deregister("reference")
-    return Markup('<div class="document">{}</div>').format(
-        Markup(reader.convert(html.escape(text, quote=False)))
-    )
+    content = reader.convert(html.escape(text, quote=False))
+    return Markup('<div class="document">{}</div>').format(Markup(content))
 
 
 def picture(content: bytes, kind: str, text: str, width: float | None = None) -> Markup:
-    """Return an embedded image.
-
-    Args:
-        content: bytes of the file.
-        kind: ``gif`` or ``png``.
-        text: description of the image.
-        width: width on a wide screen, px.
-    """
+    """Return an embedded image of the kind ``gif`` or ``png`` with its description."""
     data = base64.b64encode(content).decode()
-    style = Markup("") if width is None else Markup(' style="width: {:.0f}px"').format(width)
-    return Markup(
-        '<div class="figure"><img src="data:image/{};base64,{}" alt="{}"{}></div>'
-    ).format(kind, data, text, style)
+    style = "" if width is None else f"width: {width:.0f}px"
+    image = Markup('<img src="data:image/{};base64,{}" alt="{}" style="{}">')
+    return Markup('<div class="figure">{}</div>').format(image.format(kind, data, text, style))
 
 
 def drawing(figure: Figure, text: str) -> Markup:
@@ -139,37 +121,29 @@ def drawing(figure: Figure, text: str) -> Markup:
 
 def interactive(figure: graph_objects.Figure, name: str) -> Markup:
     """Return an interactive plotly figure with an id."""
-    return Markup(
-        figure.to_html(
-            full_html=False,
-            include_plotlyjs=False,
-            auto_play=False,
-            div_id=name,
-            config=_PLOTLY_OPTIONS,
-            default_height=f"{figure.layout.height}px",
-        )
-    )
+    height = f"{figure.layout.height}px"
+    options = {"config": _PLOTLY_OPTIONS, "default_height": height, "auto_play": False}
+    return Markup(figure.to_html(full_html=False, include_plotlyjs=False, div_id=name, **options))
 
 
 def table(frame: pd.DataFrame, *, headers: Mapping[str, str] | None = None) -> Markup:
     """Return a table, numbers with three significant digits and the best entries in bold.
 
-    Args:
-        frame: table, see :func:`pinn_dyn.evaluation.tables.best` for its best entries.
-        headers: columns to show and their headings; None shows all columns under their names.
+    ``headers`` are the columns to show and their headings; None shows all under their names.
     """
     headers = headers or {name: str(name) for name in frame}
-    text = formatted(frame.reset_index(drop=True), headers)
-    marks = pd.DataFrame({header: best(frame, name) for name, header in headers.items()})
-    marks = marks.reset_index(drop=True).astype(object)
-    is_text = [frame[name].map(lambda value: isinstance(value, str)).all() for name in headers]
-    styles: list[Any] = [
-        {"selector": f".col{k}", "props": "text-align: left; white-space: normal"}
-        for k, left in enumerate(is_text)
-        if left
-    ]
-    styler = text.style.hide(axis="index").format(escape="html").format_index(escape="html", axis=1)
-    styler.set_td_classes(marks.replace({True: "best", False: ""})).set_table_styles(styles)
+    frame = frame.reset_index(drop=True)
+    marks = {header: best(frame, name).map({True: "best"}) for name, header in headers.items()}
+    styler = formatted(frame, headers).style.hide(axis="index").format(escape="html")
+    styler.format_index(escape="html", axis=1).set_td_classes(pd.DataFrame(marks).fillna(""))
+    left = [{"selector": "", "props": "text-align: left; white-space: normal"}]
+    styler.set_table_styles(
+        {
+            header: left
+            for name, header in headers.items()
+            if frame[name].map(lambda value: isinstance(value, str)).all()
+        }
+    )
     return Markup('<div class="table">{}</div>').format(Markup(styler.to_html()))
 
 
