@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from pinn_dyn.app.config import ConfigError, completed, composed, config_folder, explained
-from pinn_dyn.app.sweep import how_to_go_on, write_error
+from pinn_dyn.app.sweep import write_error
 
 
 def main(command: str) -> None:
@@ -46,13 +46,10 @@ def main(command: str) -> None:
         run = partial(_run, command)
         hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
-        raise SystemExit("interrupted") from None
+        raise SystemExit("interrupted: the same command on the same folder goes on") from None
     except (ConfigError, HydraException, OmegaConfBaseException) as error:
         message = str(error) if isinstance(error, ConfigError) else explained(error)
         raise SystemExit(f"Error: {message}") from error
-    finally:
-        if hint := how_to_go_on():
-            print(hint, file=sys.stderr)
 
 
 def _run(command: str, cfg: DictConfig) -> object:

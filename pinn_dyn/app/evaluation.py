@@ -45,9 +45,7 @@ def evaluate(
     windows: Sequence[float] | None = None,
     thresholds: Mapping[str, float] = THRESHOLDS,
 ) -> Evaluation:
-    """Compare trained models on the same test trajectories, beside the baselines.
-
-    Example::
+    """Compare trained models on the same test trajectories, beside the baselines::
 
         evaluation = pinn_dyn.evaluate([pinn_dyn.load("runs/lnn"), pinn_dyn.load("runs/mlp")])
         print(evaluation)  # evaluation.summary is a data frame
@@ -79,11 +77,9 @@ def evaluate(
     motions = getattr(splits[source], split)
     horizon = horizon or min(stack_until(motions).duration, LONGEST)
     truth = stack_until(motions, horizon)
-    if len(truth.q) < len(motions):
-        log.warning(
-            "%d of %d trajectories of %s are shorter than horizon=%g and left out",
-            *(len(motions) - len(truth.q), len(motions), source.name, horizon),
-        )
+    if shorter := len(motions) - len(truth.q):
+        text = "%d of %d trajectories of %s are shorter than horizon=%g and left out"
+        log.warning(text, shorter, len(motions), source.name, horizon)
     steps = [run.model.fixed_step or step or run.statistics.step for run in runs]
     if message := too_long_for(motions, max(steps), source.labels):
         log.warning("%s: %s", source.name, message)
@@ -92,33 +88,34 @@ def evaluate(
 
     models = model_names([run.config["model_name"] for run in runs], [run.config for run in runs])
     names = _run_names(runs, models)
-    entries = []
-    for k, run in enumerate(runs):
-        figures = {name: run.metrics[name] for name in _COLUMNS if name in run.metrics}
-        figures |= {"folder": str(run.folder), **run.model.learned_figures()}
-        entries.append(
-            Entry(
-                names[k],
-                run.model,
-                truth,
-                splits[sources[k]],
-                steps[k],
-                models[k],
-                seed=run.config["seed"],
-                figures=figures,
-                members=run.ensemble,
-            )
+    entries = [
+        Entry(
+            name,
+            run.model,
+            splits[trained_on],
+            own_step,
+            model,
+            seed=run.config["seed"],
+            figures={k: run.metrics[k] for k in _COLUMNS if k in run.metrics}
+            | {"folder": str(run.folder)}
+            | run.model.learned_figures(),
+            members=run.ensemble,
         )
+        for name, model, run, trained_on, own_step in zip(
+            names, models, runs, sources, steps, strict=True
+        )
+    ]
     training = splits[sources[0]]
     predictors = build_baselines(training.train, training.validation, step=grid)
-    baselines = [Entry(name, x, truth, training, grid, name) for name, x in predictors.items()]
-    for k, model in identified(runs, sources).items():
+    baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
+    for k, predictor in identified(runs, sources).items():
         name = f"identification of {names[k]}"
-        baselines.append(Entry(name, model, truth, splits[sources[k]], steps[k], name))
+        baselines.append(Entry(name, predictor, splits[sources[k]], steps[k], name))
     evaluation = evaluate_models(
         entries,
         baselines,
         source,
+        truth,
         split=split,
         stride=stride,
         windows=default_windows(horizon, grid) if windows is None else windows,
@@ -131,9 +128,8 @@ def evaluate(
 
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
     """Return short names: the model, with seed and folder where these tell runs apart."""
-    pairs = zip(runs, models, strict=True)
-    seeds = [f"{name} seed {run.config['seed']}" for run, name in pairs]
-    for names in (models, seeds):
-        if len(set(names)) == len(names):
-            return list(names)
-    return [f"{name} {run.folder.name}" for run, name in zip(runs, seeds, strict=True)]
+    names, seeds = list(models), [f"seed {run.config['seed']}" for run in runs]
+    for words in (seeds, [run.folder.name for run in runs]):
+        if len(set(names)) < len(names):
+            names = [f"{name} {word}" for name, word in zip(names, words, strict=True)]
+    return names

@@ -26,17 +26,13 @@ from pinn_dyn.evaluation import (
 )
 from pinn_dyn.spelling import did_you_mean
 
-_EVALUATIONS = "runs/evaluation/*"
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")
 _SHOWN = ("val/error_mean", "val/diverged", "test/error_mean", "test/diverged", "training_seconds")
 _TEST = ("error_mean", "error_median", "error_worst", "diverged")
 
 
 def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[str, str]]:
-    """Read all runs in folders and below them.
-
-    Args:
-        patterns: run folders, folders of them, or globs.
+    """Read all runs in folders and below them; ``patterns`` are folders or globs.
 
     Returns:
         One row per finished run (folder, seed, ``val/`` errors, training time and sizes), its
@@ -44,15 +40,12 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
     """
     roots = [path for x in patterns for path in glob.glob(str(Path(x).expanduser()))]
     files = [f for root in roots for name in (CONFIG, ERROR) for f in Path(root).rglob(name)]
-    folders = sorted({f.parent for f in files if f.is_file() and f.parent.name != ".hydra"})
     rows, configs, problems = [], [], {}
-    for folder in folders:
+    for folder in sorted({f.parent for f in files if f.parent.name != ".hydra"}):
         try:
             config = yaml.safe_load((folder / CONFIG).read_text())
             if "trainer" not in config:
                 continue  # results of another command
-            if not (folder / METRICS).is_file():
-                raise FileNotFoundError("it has not finished")
             record = json.loads((folder / METRICS).read_text())
             row = {"folder": str(folder), "seed": config["seed"]}
             row |= {key: record[key] for key in _RECORDED if key in record}
@@ -66,11 +59,7 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
 
 
 def select(settings: pd.DataFrame, conditions: Mapping[str, Any]) -> list[int]:
-    """Return the rows that have the values of all conditions; a list means any of its values.
-
-    Raises:
-        ConfigError: if no run has a key, or no run meets the conditions.
-    """
+    """Return the rows that have the values of all conditions; a list means any of its values."""
     for key, value in conditions.items():
         if key not in settings:
             hint = did_you_mean(key, list(settings))
@@ -82,39 +71,25 @@ def select(settings: pd.DataFrame, conditions: Mapping[str, Any]) -> list[int]:
     return list(settings.index)
 
 
-def read_test_errors(folders: Sequence[str], patterns: Sequence[str] | None) -> pd.DataFrame:
-    """Return the test errors of runs from tables of evaluate.py, indexed by folder.
-
-    Args:
-        folders: run folders.
-        patterns: folders of evaluate.py, or globs; None takes the latest evaluation of these runs.
+def read_test_errors(folders: Sequence[str], patterns: Sequence[str]) -> pd.DataFrame:
+    """Return the test errors of runs, indexed by folder, from folders of evaluate.py or globs.
 
     Raises:
         ConfigError: if the evaluations have different horizons, so that errors do not compare.
     """
-    paths = [Path(p, "summary.csv") for x in patterns or [_EVALUATIONS] for p in glob.glob(x)]
-    paths = [path for path in paths if path.is_file()]
+    paths = [path for x in patterns for p in glob.glob(x) for path in Path(p).glob("summary.csv")]
     tables = [pd.read_csv(x) for x in sorted(paths, key=lambda path: -path.stat().st_mtime)]
-    tables = [
-        x[x["folder"].isin(folders)].dropna(axis=1, how="all") for x in tables if "folder" in x
-    ]
-    tables = [table for table in tables if len(table)][: None if patterns else 1]
-    if patterns and not tables:
+    table = pd.concat([x[x["folder"].isin(folders)] for x in tables]) if tables else pd.DataFrame()
+    if table.empty:
         raise ConfigError(f"evaluations: {patterns} have no results of these runs")
-    if not tables:
-        return pd.DataFrame(index=pd.Index([], name="folder"))
-    table = pd.concat(tables).drop_duplicates("folder").set_index("folder")
+    table = table.drop_duplicates("folder").set_index("folder")
     if table["horizon"].nunique() > 1:
         raise ConfigError(f"evaluations: horizons differ: {sorted(set(table['horizon']))} s")
     return table[[name for name in table if name.endswith(_TEST)]].add_prefix("test/")
 
 
 def gather(cfg: DictConfig) -> None:
-    """Write and print the table of runs, and plot an error against a setting.
-
-    Raises:
-        ConfigError: if there is no run, or a column does not exist.
-    """
+    """Write and print the table of runs, and plot an error against a setting."""
     config = checked("gather", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     patterns = [config["runs"]] if isinstance(config["runs"], str) else config["runs"]
@@ -126,7 +101,9 @@ def gather(cfg: DictConfig) -> None:
         runs = runs.loc[chosen]
         settings = varied_settings([configs[k] for k in chosen]).set_index(runs.index)
         runs = runs.join(settings)
-        runs = runs.join(read_test_errors([*runs["folder"]], config["evaluations"]), on="folder")
+        if config["evaluations"]:
+            errors = read_test_errors([*runs["folder"]], config["evaluations"])
+            runs = runs.join(errors, on="folder")
         repeated = runs.duplicated([*settings, "seed"], keep="last")
         runs = runs[~repeated]
         table = over_seeds(runs, [*settings])

@@ -1,11 +1,9 @@
-"""Identification by inverse dynamics alone: the baseline of every fit that adds roll-outs."""
+"""Identification by inverse dynamics alone: the baseline of fits that add roll-outs."""
 
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
-from typing import Any
 
 from pinn_dyn.app.build import build_data, build_model
 from pinn_dyn.app.config import build_part
@@ -24,40 +22,25 @@ def identified(runs: Sequence[Run], sources: Sequence[DataSource]) -> dict[int, 
     one have no counterpart.
 
     Returns:
-        The models, by the number of the first run that each belongs to.
+        The models, by the index of the first run of each.
     """
-    fits = [
-        k
-        for k, run in enumerate(runs)
-        if run.covariance is not None and run.config.get("start_from") is None
-    ]
-    settings = {k: _settings(runs[k]) for k in fits}
-    seen = [settings[k] for k in fits if not runs[k].config["optimizer"].get("rollouts", True)]
+    settings = {}
+    for k, run in enumerate(runs):
+        if run.covariance is not None and run.config.get("start_from") is None:
+            optimizer = {**run.config["optimizer"], "rollouts": False}
+            settings[k] = run.config["model"], optimizer, run.data and run.data["train"]["hashes"]
+    seen = [x for k, x in settings.items() if not runs[k].config["optimizer"].get("rollouts", True)]
     models = {}
-    for k in fits:
+    for k, (_, optimizer, _) in settings.items():
         if settings[k] in seen:
             continue
         seen.append(settings[k])
+        run, source = runs[k], sources[k]
+        models[k] = build_model(run.config, run.statistics)
+        windows = build_data(run.config, source).windows
         try:
-            models[k] = _fitted(runs[k], sources[k])
+            build_part("optimizer", optimizer).fit(models[k], source.load().train, windows)
         except ValueError as error:
-            log.warning("no row 'identification' of %s: %s", runs[k].folder, error)
+            log.warning("no row 'identification' of %s: %s", run.folder, error)
+            del models[k]
     return models
-
-
-def _settings(run: Run) -> tuple[Any, ...]:
-    optimizer = {key: value for key, value in run.config["optimizer"].items() if key != "rollouts"}
-    return run.config["model"], optimizer, run.data and run.data["train"]["hashes"]
-
-
-def _fitted(run: Run, source: DataSource) -> Predictor:
-    model = build_model(run.config, run.statistics)
-    solver = build_part("optimizer", {**run.config["optimizer"], "rollouts": False})
-    start = time.process_time()
-    windows = build_data(run.config, source).windows
-    solver.fit(model, source.load().train, windows)
-    log.info(
-        "identification: inverse dynamics on the training motions, %.1f s of processor time",
-        time.process_time() - start,
-    )
-    return model

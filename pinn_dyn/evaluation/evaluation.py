@@ -22,12 +22,7 @@ from pinn_dyn.evaluation.calibration import (
     calibration_table,
     interval_lines,
 )
-from pinn_dyn.evaluation.figures import (
-    ERROR,
-    error_figure,
-    terms_figure,
-    trajectory_figure,
-)
+from pinn_dyn.evaluation.figures import ERROR, error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_with_source
 from pinn_dyn.evaluation.metrics import (
     left_data,
@@ -60,7 +55,6 @@ log = logging.getLogger(__name__)
 
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
 """Names of the splits of the data in tables and figures."""
-_PRINTED = 8  # coordinates: larger matrices do not fit a terminal
 
 
 @dataclass(frozen=True)
@@ -70,7 +64,6 @@ class Entry:
     Attributes:
         run: name of the row.
         model: the predictor.
-        truth: test trajectories stacked.
         training: the data that the model was trained on.
         step: step of the rollouts, s.
         name: name of the model and of its settings; rows of one name differ in the seed.
@@ -81,7 +74,6 @@ class Entry:
 
     run: str
     model: Predictor
-    truth: Trajectory
     training: Splits
     step: float
     name: str
@@ -153,16 +145,15 @@ class Evaluation:
             f"{row.left_data_after:.3g} s."
             for row in rows.itertuples()
         ]
-        intervals = interval_lines(self.intervals)
-        return [*unbeaten_baselines(self.summary), *leaving, *intervals]
+        return [*unbeaten_baselines(self.summary), *leaving, *interval_lines(self.intervals)]
 
     def __str__(self) -> str:
-        terms = [f"{k}: learned and true terms\n{x.to_text()}" for k, x in self.terms.items()]
-        lines = terms if len(self.source.labels) <= _PRINTED else []
-        lines.append(f"{self.source.name}: {self.trajectories}")
-        lines.append(to_text(self.summary, summary_columns(self.summary)))
-        lines.append("* best in its column, and better than all baselines (in brackets)")
-        lines += self.remarks()
+        lines = [
+            f"{self.source.name}: {self.trajectories}",
+            to_text(self.summary, summary_columns(self.summary)),
+            "* best in its column, and better than all baselines (in brackets)",
+            *self.remarks(),
+        ]
         if len(self.by_model) < len(self.summary):
             lines += ["", "over seeds:", to_text(self.by_model, SEEDS_COLUMNS)]
         return "\n".join(lines)
@@ -174,6 +165,7 @@ class Evaluation:
             trajectory: index of the trajectory to draw.
         """
         title = f"{self.source.name}, {self.trajectories}"
+        labels = self.source.labels
         yield (
             "trajectory",
             trajectory_figure(
@@ -181,12 +173,14 @@ class Evaluation:
                 self.models,
                 trajectory=trajectory,
                 title=f"{self.source.name}, {self.split} trajectory {trajectory}, open loop",
-                labels=self.source.labels,
+                labels=labels,
                 input_labels=self.source.input_labels,
                 baselines=self.best_baseline,
             ),
         )
-        yield "error", self.error_figure(title)
+        error = with_unit(ERROR, labels)
+        figure = error_figure(self.models, baselines=self.baselines, title=title, label=error)
+        yield "error", figure
         if self.intervals:
             yield "calibration", calibration_figure(self.intervals, title=title)
         for run, comparison in self.terms.items():
@@ -194,11 +188,6 @@ class Evaluation:
                 text = f"{run}: learned and true terms, {name}"
                 figure = terms_figure(comparison, configuration=k, title=text)
                 yield f"terms_{_stem(run)}_{name}", figure
-
-    def error_figure(self, title: str) -> Figure:
-        """Return the figure of the error over time."""
-        label = with_unit(ERROR, self.source.labels)
-        return error_figure(self.models, baselines=self.baselines, title=title, label=label)
 
     def save(self, folder: str | Path, trajectory: int = 0) -> None:
         """Write the tables as CSV, the figures as PNG, and the page ``report.html``.
@@ -239,6 +228,7 @@ def evaluate_models(
     entries: Sequence[Entry],
     baselines: Sequence[Entry],
     source: DataSource,
+    truth: Trajectory,
     *,
     split: str,
     stride: int,
@@ -251,52 +241,58 @@ def evaluate_models(
         entries: trained models.
         baselines: predictors that the models have to beat.
         source: the data set of the test trajectories.
+        truth: the test trajectories stacked, q ``(K, T, N)``.
         split: ``test`` or ``validation``.
         stride: samples between two times of comparison, the same for all rows.
         windows: times between two resets to the measured state, s, one windowed error each.
         thresholds: names and values of the valid prediction times, in the units of q.
     """
     rows: list[dict[str, Any]] = []
-    torque: list[pd.DataFrame] = []
-    parts: list[pd.DataFrame] = []
+    torque, parts = [pd.DataFrame()], [pd.DataFrame()]
     predictions: dict[str, Prediction] = {}
     intervals: dict[str, dict[float, Calibration]] = {}
     for index, entry in enumerate(tqdm([*entries, *baselines], desc="evaluating", disable=None)):
-        row = {
-            "run": entry.run,
-            "model": entry.name,
-            "seed": entry.seed,
-            "baseline": index >= len(entries),
-            **entry.figures,
-            "step": entry.step,
-        }
-        prediction = _predict(entry, entry.truth, stride)
-        predictions[entry.run] = prediction
-        metrics = rollout_metrics(
-            prediction.q_hat, prediction.q, prediction.t, thresholds=thresholds
-        )
-        row |= metrics.to_dict() | state_squared_error(prediction)
-        row |= left_data(prediction, entry.training.train)
-        if prediction.members is not None:
-            row |= member_metrics(prediction)
+        model, run = entry.model, entry.run
+        row = {"run": run, "model": entry.name, "seed": entry.seed}
+        row |= {"baseline": index >= len(entries), **entry.figures, "step": entry.step}
+        item = predictions[run] = _predict(entry, truth, stride)
+        row |= rollout_metrics(item.q_hat, item.q, item.t, thresholds=thresholds).to_dict()
+        row |= state_squared_error(item) | left_data(item, entry.training.train)
+        row |= {} if item.members is None else member_metrics(item)
         for window in windows:
-            figures, item = _windowed(entry, window, stride, calibrated=split == "test")
-            row |= figures
-            if item is not None:
-                intervals.setdefault(entry.run, {})[window] = item
-        if isinstance(entry.model, MechanicalSystem):
-            row |= _force_figures(entry, source, torque, parts)
+            item = _predict(entry, truth, stride, window)
+            metrics = rollout_metrics(item.q_hat, item.q, item.t, thresholds={})
+            name = f"window_{window:g}s"
+            row |= {f"{name}_error_mean": metrics.error_mean, f"{name}_diverged": metrics.diverged}
+            if entry.members is not None:
+                result = _calibration(entry, item, stride, window if split == "test" else None)
+                intervals.setdefault(run, {})[window] = result
+                row[f"{name}_within"] = result.within
+                if result.corrected is not None:
+                    row[f"{name}_within_corrected"] = result.within_corrected
+                    row[f"{name}_factor"] = result.factor
+        if isinstance(model, MechanicalSystem):
+            try:
+                error = torque_error(model, truth, system=source.system)
+                row |= {"torque_error": error.mean, "torque_share": error.share}
+                torque.append(error.to_frame(source.labels).assign(run=run))
+            except ValueError as message:
+                log.warning("no torque error: %s", message)
+            if model.has_residual:
+                row["residual_share"] = residual_share(model, truth)
+        if isinstance(model, Sum):
+            parts.append(part_shares(model, truth).assign(run=run))
         rows.append(row)
     summary = pd.DataFrame(rows).astype({"seed": "Int64"})
     terms = {entry.run: compare_with_source(entry.model, source) for entry in entries}
     return Evaluation(
         source=source,
         split=split,
-        truth=entries[0].truth,
+        truth=truth,
         summary=summary,
         by_model=over_seeds(summary, ["model", "baseline"]),
-        torque=pd.concat(torque, ignore_index=True) if torque else pd.DataFrame(),
-        parts=pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(),
+        torque=pd.concat(torque, ignore_index=True),
+        parts=pd.concat(parts, ignore_index=True),
         predictions=predictions,
         intervals=intervals,
         terms={run: item for run, item in terms.items() if item is not None},
@@ -321,46 +317,14 @@ def _predict(
     return replace(prediction, members=rollout(entry.members).members)
 
 
-def _windowed(
-    entry: Entry, window: float, stride: int, calibrated: bool
-) -> tuple[dict[str, float], Calibration | None]:
-    """Return the columns of one windowed error, and the calibration of its intervals."""
-    prediction = _predict(entry, entry.truth, stride, window)
-    metrics = rollout_metrics(prediction.q_hat, prediction.q, prediction.t, thresholds={})
-    name = f"window_{window:g}s"
-    figures: dict[str, float] = {
-        f"{name}_error_mean": metrics.error_mean,
-        f"{name}_diverged": metrics.diverged,
-    }
-    if entry.members is None:
-        return figures, None
-    # The validation motions selected the checkpoint, but no weights were fitted to them.
-    validation = None
+def _calibration(
+    entry: Entry, held_out: Prediction, stride: int, window: float | None
+) -> Calibration:
+    """Return the calibration of intervals, corrected on the validation data if there is a window.
+
+    The validation motions selected the checkpoint, but no weights were fitted to them.
+    """
     motions = stack_until(entry.training.validation)
-    if calibrated and motions.duration >= window:
-        validation = _predict(entry, motions, stride, window)
-    item = calibration(prediction, validation)
-    figures[f"{name}_within"] = item.within
-    if item.within_corrected is not None and item.factor is not None:
-        figures |= {f"{name}_within_corrected": item.within_corrected}
-        figures |= {f"{name}_factor": item.factor}
-    return figures, item
-
-
-def _force_figures(
-    entry: Entry, source: DataSource, torque: list[pd.DataFrame], parts: list[pd.DataFrame]
-) -> dict[str, float]:
-    """Return the columns about forces, and append the tables per joint and per part."""
-    model, figures = entry.model, {}
-    assert isinstance(model, MechanicalSystem)
-    try:
-        error = torque_error(model, entry.truth, system=source.system)
-        figures = {"torque_error": error.mean, "torque_share": error.share}
-        torque.append(error.to_frame(source.labels).assign(run=entry.run))
-    except ValueError as message:
-        log.warning("no torque error: %s", message)
-    if model.has_residual:
-        figures["residual_share"] = residual_share(model, entry.truth)
-    if isinstance(model, Sum):
-        parts.append(part_shares(model, entry.truth).assign(run=entry.run))
-    return figures
+    if window is None or motions.duration < window:
+        return calibration(held_out, None)
+    return calibration(held_out, _predict(entry, motions, stride, window))

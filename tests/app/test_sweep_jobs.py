@@ -200,7 +200,7 @@ def test_ctrl_c_ends_the_whole_sweep_which_then_goes_on(tmp_path, launcher):
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
         code, said = ended(process, log)
         assert code not in (0, None), said
-        assert "the sweep is not finished; go on with: python train.py -m " in said
+        assert "interrupted: the same command on the same folder goes on" in said
         assert not (first / "metrics.json").exists()
         # By one process: that of joblib has its workers import PyTorch again.
         at["anew"], words = False, [*words, "hydra/launcher=basic"]

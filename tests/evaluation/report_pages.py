@@ -116,14 +116,15 @@ def evaluation(names=("hnn", "lnn"), source=Source):
         )
     )
     entries = [
-        Entry(name, Replay(real, 0.01 * (k + 1), broken=k == 1), real, data, 0.01, name, seed=0)
+        Entry(name, Replay(real, 0.01 * (k + 1), broken=k == 1), data, 0.01, name, seed=0)
         for k, name in enumerate(names)
     ]
-    baselines = [Entry("hold position", HoldPosition(3, 3), real, data, 0.01, "hold position")]
+    baselines = [Entry("hold position", HoldPosition(3, 3), data, 0.01, "hold position")]
     item = evaluate_models(
         entries,
         baselines,
         source,
+        real,
         split="test",
         stride=1,
         windows=[0.5],

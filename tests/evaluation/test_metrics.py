@@ -247,9 +247,6 @@ def test_errors_name_what_does_not_fit():
         predict_windows(model, truth, window=0.75, step=0.5)
     with pytest.raises(ValueError, match=r"window is 4\.0 s, but .* last only 3 s"):
         predict_windows(model, truth, window=4.0)
-    alone = Trajectory(truth.q[0], truth.v[0], Signal(truth.t, truth.u[0]))
-    with pytest.raises(ValueError, match=r"expected \(K, T, N\)"):
-        predict_trajectories(model, alone)
     uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
     with pytest.raises(ValueError, match="sample time varies"):
         predict_trajectories(model, uneven, step=0.25)
@@ -309,11 +306,6 @@ def test_an_ensemble_is_predicted_with_its_members(windowed):
     deviation = found.members.numpy().std(axis=0, ddof=1)[..., 0]
     torch.testing.assert_close(found.spread(), torch.from_numpy(deviation), rtol=0, atol=1e-12)
     assert predict(PointMass()).members is None
-
-
-def test_a_single_model_has_no_spread():
-    with pytest.raises(ValueError, match="a single model has no spread"):
-        predict_trajectories(PointMass(), ramps()).spread()
 
 
 def test_a_truth_that_is_like_a_member_is_calibrated_and_a_common_error_is_not():
