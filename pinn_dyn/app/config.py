@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
+import pkgutil
 import re
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
-from hydra.errors import HydraException, InstantiationException, MissingConfigException
-from hydra.utils import instantiate
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -47,17 +46,9 @@ def completed(command: str, words: list[str]) -> list[str]:
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
-    """Convert a configuration to nested dicts, lists and values, with interpolations resolved.
-
-    Raises:
-        ConfigError: naming the values that are missing or cannot be computed.
-    """
-    if missing := sorted(OmegaConf.missing_keys(cfg)):
-        raise ConfigError(
-            f"no value for {', '.join(missing)}: give it on the command line, as '{missing[0]}=...'"
-        )
+    """Convert a configuration to nested dicts, lists and values, with interpolations resolved."""
     try:
-        values = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        values = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
         raise ConfigError(explained(error)) from error
     assert isinstance(values, dict)
@@ -75,24 +66,8 @@ def check(command: str, config: dict[str, Any]) -> None:
     check_arguments(SETTINGS[command], config)
 
 
-def _check_names(command: str, cfg: DictConfig) -> None:
-    """Check the keys of a command alone: a value may be missing because its key is misspelled."""
-    from pinn_dyn.app.settings import SETTINGS
-
-    names = list(inspect.signature(SETTINGS[command]).parameters)
-    for key in map(str, cfg):
-        if key not in names:
-            raise ConfigError(f"the configuration has no key '{key}'{did_you_mean(key, names)}")
-
-
 def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
-    """Convert the configuration of a command to plain values, and check them.
-
-    Raises:
-        ConfigError: as :func:`plain` and :func:`check`.
-    """
-    if OmegaConf.missing_keys(cfg):
-        _check_names(command, cfg)
+    """Convert the configuration of a command to plain values, and check them."""
     config = plain(cfg)
     check(command, config)
     return config
@@ -107,13 +82,14 @@ def composed(command: str, words: list[str], config_dir: str | None = None) -> d
         config_dir: folder with further options of groups, as ``--config-dir``.
 
     Raises:
-        ConfigError: as :func:`checked`, or with the message of Hydra.
+        ConfigError: as :func:`check`, or with the message of Hydra.
     """
     search_path = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
-    folder = str(config_folder(command))
     before = HydraConfig.instance().cfg
     try:
-        with hydra.initialize_config_dir(version_base="1.3", config_dir=folder):
+        with hydra.initialize_config_dir(
+            version_base="1.3", config_dir=str(config_folder(command))
+        ):
             overrides = [*search_path, *_first_of_sweeps(completed(command, words))]
             try:
                 cfg = hydra.compose(command, overrides=overrides, return_hydra_config=True)
@@ -168,18 +144,22 @@ def build_part(
         ConfigError: if an argument does not fit, or with the message of the constructor.
     """
     check_value(name, config)
-    later = bool(partial_ or arguments or extra)
     try:
-        # Plain lists and dicts reach the constructors: no package below knows a config object.
-        built = instantiate({**config, "_partial_": later}, _convert_="all")
-        if isinstance(built, partial):  # those of Hydra 1.4 cannot be sent to another process
-            built = partial(built.func, *built.args, **built.keywords)
-        return built if partial_ or not later else built(*arguments, **extra)
-    except Exception as error:  # constructors may raise anything; Hydra wraps their errors
-        cause = error.__cause__ if isinstance(error, InstantiationException) else None
-        raise ConfigError(f"{name}: {_reason(cause or error)}") from error
+        maker = _built({**config, "_partial_": True})
+        return maker if partial_ else maker(*arguments, **extra)
+    except Exception as error:  # constructors may raise anything
+        reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{name}: {reason}") from error
 
 
-def _reason(error: BaseException) -> str:
-    plain_message = isinstance(error, (ValueError, InstantiationException))
-    return str(error) if plain_message else f"{type(error).__name__}: {error}"
+def _built(part: Any) -> Any:
+    """Build the objects that plain values describe."""
+    if isinstance(part, list):
+        return [_built(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    values = {k: _built(x) for k, x in part.items() if k not in ("_target_", "_partial_")}
+    if "_target_" not in part:
+        return values
+    maker = partial(pkgutil.resolve_name(part["_target_"]), **values)
+    return maker if part.get("_partial_") else maker()

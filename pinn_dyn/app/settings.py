@@ -1,8 +1,6 @@
-"""The keys of the programs: a dataclass each, whose fields a configuration must have or may have.
+"""Keys of the programs, annotated with the classes of the objects that they describe.
 
-The fields are annotated with the classes of the objects that the program builds, so that
-:mod:`~pinn_dyn.app.validation` can check them. ``X | Callable[..., X]`` describes an object that
-takes further arguments from the program, a learning rate schedule the optimizer, say.
+``X | Callable[..., X]`` is an object that takes further arguments from the program.
 """
 
 from __future__ import annotations
@@ -40,7 +38,6 @@ class TrainSettings:
     threads: PositiveInt
     start_from: str | None = None
     resume: str | None = None
-    resume_from: Literal["last", "best"] | None = None
     trust: Names | None = None
     search: EqualSearch | dict[str, int] | None = None  # a run folder holds the draw alone
     dataset: DataSource
@@ -76,26 +73,10 @@ class TrainerArguments:
 
 
 STAND_INS[L.Trainer] = TrainerArguments
-_LENGTH = "trainer.steps and trainer.validations"
-_LENGTHS = (
-    *("max_epochs", "max_steps", "max_time", "min_epochs", "min_steps"),
-    *("limit_train_batches", "overfit_batches", "val_check_interval"),
-)
 SET_BY_PROGRAM.update(
     {
-        **{f"trainer.{name}": _LENGTH for name in _LENGTHS},
-        "trainer.accumulate_grad_batches": "data.batch_size",
-        "trainer.callbacks": "callbacks",
-        "trainer.default_root_dir": "hydra.run.dir",
-        "trainer.limit_val_batches": "validator",
-        "trainer.logger": "logger",
-        "data.batches_per_epoch": "trainer.steps",
-        "data.source": "dataset",
-        "optimizer.maximize": "loss",
-        "optimizer.params": "model",
-        "plant.system": "robot",
-        "scheduler.optimizer": "optimizer",
-        "scheduler.total_steps": "trainer.steps",
+        *("data.batches_per_epoch", "data.source", "plant.system", "optimizer.maximize"),
+        *("optimizer.params", "scheduler.optimizer", "scheduler.total_steps"),
     }
 )
 
