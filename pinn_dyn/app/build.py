@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Callable
+import pkgutil
 from pathlib import Path
 from typing import Any
 
@@ -14,42 +15,34 @@ from pinn_dyn.app.run import ModelBuilder
 from pinn_dyn.app.trainer import epochs, tensorboard
 from pinn_dyn.app.training import build_data as build_windows
 from pinn_dyn.app.training import build_predictor
-from pinn_dyn.app.validation import argument_names
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
 
-# Arguments that say where a logger or a callback writes: the run folder decides that.
-_PLACES = ("name", "version", "filename", "dirpath", "save_dir")
+# Arguments that say where a logger or a callback writes.
+_DESTINATIONS = ("name", "version", "filename", "dirpath", "save_dir")
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
     """Build the data source of ``config["dataset"]``; a simulated one gets the cache folder."""
     part = config["dataset"]
-    if "cache" in argument_names(part["_target_"]):
+    if "cache" in inspect.signature(pkgutil.resolve_name(part["_target_"])).parameters:
         part = {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn"), **part}
     return build_part("dataset", part)
 
 
 def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:
     """Build the windows of ``config["data"]``, on a source or else that of ``config``."""
-    length = config["trainer"]
-    _, batches, _ = epochs(length["steps"], length["validations"])
+    batches = epochs(config["trainer"]["steps"], config["trainer"]["validations"])[1]
     builder = build_part("data", config["data"], partial_=True)
     return build_windows(builder, source or build_source(config), config["seed"], batches)
 
 
 def model_builder(config: dict[str, Any]) -> ModelBuilder:
-    """Return the builder of ``config["model"]``.
-
-    Raises:
-        ConfigError: if the model was built in Python, so that no configuration describes it.
-    """
+    """Return the builder of ``config["model"]``."""
     if config["model"] is None:
-        raise ConfigError(
-            "its model was built in Python: give a builder, pinn_dyn.load(folder, model=...)"
-        )
+        raise ConfigError("the model was built in Python: use pinn_dyn.load(folder, model=builder)")
     return build_part("model", config["model"], partial_=True)
 
 
@@ -63,31 +56,27 @@ def training_arguments(
 ) -> dict[str, Any]:
     """Build the arguments of :func:`~pinn_dyn.train` from the configuration of train.py.
 
-    Args:
-        config: the checked configuration.
-        folder: the run folder.
-        resumed: drop the places where callbacks and loggers write from the configuration.
+    Loggers and callbacks of a resumed training write to the run folder, whatever the file says.
     """
 
-    def builder(name: str) -> Callable[..., Any]:
-        return build_part(name, config[name], partial_=True)
-
-    def own(part: dict[str, Any]) -> dict[str, Any]:
-        return {k: x for k, x in part.items() if not resumed or k not in _PLACES}
+    def writers(group: str) -> dict[str, dict[str, Any]]:
+        parts = {name: part for name, part in config[group].items() if part is not None}
+        ignored = _DESTINATIONS if resumed else ()
+        return {n: {k: x for k, x in p.items() if k not in ignored} for n, p in parts.items()}
 
     optimizer = config["optimizer"]
     settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
-    parts = {name: part for name, part in config["callbacks"].items() if part is not None}
+    builders = ("data", "loss", "scheduler", "validator")
     return {
         "source": build_source(config),
         "model": model_builder(config),
-        **{name: builder(name) for name in ("data", "loss", "scheduler", "validator")},
+        **{name: build_part(name, config[name], partial_=True) for name in builders},
         "optimizer": build_part("optimizer", optimizer, partial_=optimizer.get("_partial_", False)),
         "steps": settings.pop("steps"),
         "validations": settings.pop("validations"),
         "trainer": settings,
-        "callbacks": [build_part(f"callbacks.{k}", own(part)) for k, part in parts.items()],
-        "loggers": [_logger(k, own(part), folder) for k, part in config["logger"].items()],
+        "callbacks": [build_part(f"callbacks.{k}", x) for k, x in writers("callbacks").items()],
+        "loggers": [_logger(name, part, folder) for name, part in writers("logger").items()],
         **{name: config[name] for name in ("seed", "ensemble", "compile", "threads")},
     }
 
@@ -97,15 +86,7 @@ def _logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
     if name == "tensorboard":
         return tensorboard(folder)
     extra: dict[str, Any] = {"tags": {"folder": str(folder.resolve())}} if name == "mlflow" else {}
-    try:
-        return build_part(f"logger.{name}", config, save_dir=str(folder), **extra)
-    except ConfigError as error:
-        if not isinstance(error.__cause__, ModuleNotFoundError):
-            raise
-        raise ConfigError(
-            f"logger.{name}: a package is missing, install it with pip install "
-            f"'pinn_dyn[{name}]', or leave out logger={name} ({error.__cause__})"
-        ) from error
+    return build_part(f"logger.{name}", config, save_dir=str(folder), **extra)
 
 
 def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:
@@ -117,15 +98,11 @@ def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Referenc
 def build_law(
     config: dict[str, Any], name: str, learned: Predictor, truth: MechanicalSystem
 ) -> Controller:
-    """Build one of ``config["controllers"]`` on the terms that it names, with its observer.
-
-    Raises:
-        ConfigError: if the law cannot be built on these terms.
-    """
+    """Build one of ``config["controllers"]`` on the terms that it names, with its observer."""
     part = config["controllers"][name]
-    models = {"learned": learned, "truth": truth}
+    model = learned if part["terms"] == "learned" else truth
     gains = {f"{key}_gain": value for key, value in config["gains"].items()}
-    law = build_part(f"controllers.{name}.law", {**gains, **part["law"]}, models[part["terms"]])
+    law = build_part(f"controllers.{name}.law", {**gains, **part["law"]}, model)
     if part.get("observer") is None:
         return law
     return build_part(f"controllers.{name}.observer", part["observer"], law)

@@ -1,8 +1,4 @@
-"""The commands: entry points of train.py, check.py and the others, and of the installed scripts.
-
-A command is the function of its name in the module of its name beside this one, and its
-configuration is ``conf/<name>.yaml``.
-"""
+"""Entry points of train.py and the other programs, and of the installed scripts."""
 
 from __future__ import annotations
 
@@ -27,7 +23,7 @@ from pinn_dyn.app.sweep import write_error
 
 
 def main(command: str) -> None:
-    """Run a command, such as train, on the configuration that the command line describes.
+    """Run ``pinn_dyn.app.<command>`` on the configuration that the command line describes.
 
     The configuration is checked before anything is written. An error that the user can mend ends
     the program with one line, without a traceback.
@@ -47,9 +43,10 @@ def main(command: str) -> None:
         hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted: the same command on the same folder goes on") from None
-    except (ConfigError, HydraException, OmegaConfBaseException) as error:
-        message = str(error) if isinstance(error, ConfigError) else explained(error)
-        raise SystemExit(f"Error: {message}") from error
+    except (HydraException, OmegaConfBaseException) as error:
+        raise SystemExit(f"Error: {explained(error)}") from error
+    except ConfigError as error:
+        raise SystemExit(f"Error: {error}") from error
 
 
 def _run(command: str, cfg: DictConfig) -> object:
@@ -75,8 +72,6 @@ def hush() -> None:
     warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
 
 
-train = partial(main, "train")
-evaluate = partial(main, "evaluate")
-control = partial(main, "control")
-gather = partial(main, "gather")
-check = partial(main, "check")
+train, evaluate, control, gather, check = (
+    partial(main, name) for name in ("train", "evaluate", "control", "gather", "check")
+)

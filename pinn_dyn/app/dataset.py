@@ -15,9 +15,6 @@ def dataset(name: str, **settings: Any) -> DataSource:
     Args:
         name: file name without suffix.
         settings: arguments of its class that replace those of the file.
-
-    Raises:
-        ValueError: if there is no such data set, or an argument does not fit.
     """
     overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
     return build_source(composed("train", overrides))

@@ -16,11 +16,12 @@ import torch
 def described(value: Any) -> Any:
     """Return the configuration that builds a value: ``_target_`` and arguments.
 
-    A builder, that is a class or a ``functools.partial``, gets ``_partial_: true``. An object is
-    described by the attributes that have the names of its constructor's arguments.
+    A class or a ``functools.partial`` gets ``_partial_: true``. An object is described by the
+    attributes that have the names of its constructor's arguments.
 
     Raises:
         TypeError: on a value that no configuration can build, such as a lambda.
+        AttributeError: on an object without such attributes.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -38,11 +39,8 @@ def described(value: Any) -> Any:
         return {**described(value.func), **described(value.keywords)}
     if isinstance(value, type) or inspect.isfunction(value):
         return {"_target_": _path(value), "_partial_": True}
-    arguments = {}
-    for name in inspect.signature(type(value)).parameters:
-        if not hasattr(value, name):
-            raise TypeError(f"{type(value).__name__} has no attribute {name!r}")
-        arguments[name] = described(getattr(value, name))
+    names = inspect.signature(type(value)).parameters
+    arguments = {name: described(getattr(value, name)) for name in names}
     return {"_target_": _path(type(value)), **arguments}
 
 

@@ -9,12 +9,10 @@ from typing import Any
 import pandas as pd
 from pydantic import PositiveInt
 
-from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import ModelBuilder, Run
 from pinn_dyn.app.trainer import even_validations
 from pinn_dyn.app.training import MODELS, train
 from pinn_dyn.data import DynamicsData, LogSource
-from pinn_dyn.data.logs import LogError
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
@@ -22,8 +20,7 @@ from pinn_dyn.mechanics import Predictor
 Signals = str | Sequence[str] | Mapping[str, Any]
 
 STEPS = 1000
-"""Default steps of the optimizer: a minute or two."""
-_VALIDATIONS = 10  # at most
+"""Default steps of the optimizer."""
 _PAIRS, _BATCH = 10_000, 128  # at most
 _WINDOW, _STEP = 2, 0.02  # steps of a training window, and their length in s
 _HORIZON = 2.0  # s, at most, of the roll-outs that choose the best checkpoint
@@ -47,34 +44,27 @@ def fit(
     """Train a model on a data frame with one row per sample, and return the run.
 
     The frame is read, checked, split and cleaned like a log file, see
-    :class:`~pinn_dyn.data.logs.LogSource`. Of five runs or more, 15 % are kept whole for validation
-    and 15 % for the test. Of fewer runs, the last 15 % of each are the test and the 15 % before
-    them the validation. For other splits, call :func:`~pinn_dyn.train` on a ``LogSource``.
+    :class:`~pinn_dyn.data.logs.LogSource`. Of five runs or more, 15 % are for validation and 15 %
+    for the test. Of fewer runs, the last 15 % of each are the test and the 15 % before them the
+    validation. For other splits, call :func:`~pinn_dyn.train` on a ``LogSource``.
 
     Args:
         frame: the log.
-        q, u, v: columns of the configuration, the input and, if it was measured, the velocity:
-            ``{"columns": [...], "unit": "deg"}`` with one unit for all or one for each, and the
-            other arguments of :class:`~pinn_dyn.data.logs.Columns`; or names, in SI units.
-        time: column of the time, described like q; a name means s.
+        q, u, v: columns of the configuration, the input and, if measured, the velocity: names in
+            SI units, or ``{"columns": [...], "unit": "deg"}`` and other arguments of
+            :class:`~pinn_dyn.data.logs.Columns`.
+        time: column of the time, described like q.
         run: column that tells runs apart; None if all rows are one run.
         model: as in :func:`~pinn_dyn.train`.
         cleaning: names and steps of the cleaning, in order.
         steps: steps of the optimizer.
         seed: seed of the weights, the batches and the choice of runs.
-        options: other arguments of :func:`~pinn_dyn.train`, such as ``folder="runs/arm"``,
-            ``ensemble=5`` or ``optimizer=partial(torch.optim.AdamW, lr=0.002)``.
+        options: other arguments of :func:`~pinn_dyn.train`, such as ``folder="runs/arm"``.
 
     Raises:
-        TypeError: on anything but a data frame.
         ValueError: if columns, units, clocks or settings cannot be used; names them.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
-    if not isinstance(frame, pd.DataFrame):
-        raise TypeError(
-            f"frame is a {type(frame).__name__}, expected a data frame; for other data, see "
-            "pinn_dyn.train and pinn_dyn.dataset"
-        )
     signals = {"time": time, "q": q, "u": u} | ({} if v is None else {"v": v})
     columns: dict[str, Any] = {
         name: value if isinstance(value, Mapping) else {"columns": value, "unit": _SI[name]}
@@ -83,10 +73,7 @@ def fit(
     source = LogSource(
         name="frame", files=frame, trajectory=run, steps=cleaning, seed=seed, **columns
     )
-    try:
-        splits = source.load()
-    except LogError as error:
-        raise ConfigError(str(error)) from error
+    splits = source.load()
     t = splits.train[0].t
     stride = max(round(_STEP / float(t[1] - t[0])), 1)
     starts = sum(max(len(item.t) - _WINDOW * stride, 0) for item in splits.train)
@@ -106,7 +93,7 @@ def fit(
         **{
             "data": windows,
             "validator": partial(RolloutValidator, horizon=horizon),
-            "validations": even_validations(steps, _VALIDATIONS),
+            "validations": even_validations(steps, 10),
             **options,
         },
     )

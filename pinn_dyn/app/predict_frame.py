@@ -14,11 +14,6 @@ from pinn_dyn.mechanics import Predictor, Signal
 def predict_frame(model: Predictor, source: LogSource, frame: pd.DataFrame) -> pd.DataFrame:
     """Predict q and v along each run of a frame, from its first row and under its inputs.
 
-    Args:
-        model: the predictor, in float64.
-        source: columns, units and cleaning of the log.
-        frame: rows of the log.
-
     Raises:
         LogError: if the frame lacks columns of the log or fails its checks.
         ValueError: if a model that predicts in fixed steps does not fit the sample time.
@@ -47,9 +42,7 @@ def _along(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predict along K cleaned runs of S samples, ``step`` s apart.
 
-    Returns:
-        The clock of their samples, ``(S,)``, the times of the prediction, ``(T,)``, both in s
-        from the start, and the states, ``(K, T, 2N)``.
+    Returns the clock ``(S,)``, the times of the prediction ``(T,)``, s, and states ``(K, T, 2N)``.
     """
     samples = (model.fixed_step or step) / step
     if round(samples) < 1 or abs(samples - round(samples)) > 1e-3 * samples:

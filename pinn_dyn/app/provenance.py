@@ -1,4 +1,4 @@
-"""Origin of the numbers of a report: command, commit, data, runs and configurations."""
+"""Origin of the numbers of a report."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.report import Origin
 
 
-def data_hash(source: DataSource) -> str:
-    """Return a hash of the trajectories of a source, 16 hexadecimal digits."""
-    return cache_key({split: part["hashes"] for split, part in data_identity(source).items()})
+def data_hash(identity: Mapping[str, Any]) -> str:
+    """Return a hash of the trajectories of a data set, 16 hexadecimal digits."""
+    return cache_key({split: part["hashes"] for split, part in identity.items()})
 
 
 def provenance() -> dict[str, str]:
@@ -53,39 +53,37 @@ def write_provenance(
 
     Args:
         runs: the runs by their names in the tables.
-        source: the data that they share.
+        source: the data of the test.
         config: the resolved configuration of this program.
         beside: further content of the file.
         folder: folder of the file.
     """
-    record = {"command": command_line(), "data_hash": data_hash(source), **provenance()}
-    record_file = {"config": config, **beside, **record}
-    write_whole(folder / "provenance.json", json.dumps(record_file, indent=2))
+    record = {"command": command_line(), "data_hash": data_hash(data_identity(source))}
+    record |= provenance()
     rows = [
         {
             "run": name,
             "model": run.config["model_name"],
             "seed": run.config["seed"],
             "folder": str(run.folder),
+            "data hash": data_hash(run.data) if run.data else "unknown",
             "trained on commit": run.metrics.get("commit", "unknown"),
             "trained on": run.metrics.get("hardware", "unknown"),
         }
         for name, run in runs.items()
     ]
-    configurations = {"Configuration of this program": _text(config)}
-    configurations |= {f"Configuration of {name}": _text(run.config) for name, run in runs.items()}
-    changed = {"yes": ", with uncommitted changes", "no": ""}
-    facts = {"data set": source.name} | {
-        name.replace("_", " "): value
-        for name, value in record.items()
-        if name != "uncommitted_changes"
-    }
-    facts["commit"] += changed.get(record["uncommitted_changes"], "")
-    return Origin(facts, pd.DataFrame(rows), configurations)
-
-
-def _text(config: dict[str, Any]) -> str:
-    return yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+    content = json.dumps({"config": config, **beside, "runs": rows, **record}, indent=2)
+    write_whole(folder / "provenance.json", content)
+    texts = {"this program": config} | {name: run.config for name, run in runs.items()}
+    facts = {"data set": source.name} | {k.replace("_", " "): x for k, x in record.items()}
+    return Origin(
+        facts,
+        pd.DataFrame(rows),
+        {
+            f"Configuration of {name}": yaml.safe_dump(value, sort_keys=False, allow_unicode=True)
+            for name, value in texts.items()
+        },
+    )
 
 
 def _git(*arguments: str) -> str:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from scipy.stats import qmc
 
-log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 Activation = Literal["softplus", "silu", "tanh"]
 
 
@@ -20,10 +16,9 @@ Activation = Literal["softplus", "silu", "tanh"]
 class EqualSearch:
     """One draw of the settings that matter, the same for all models.
 
-    Draw k is point k of a scrambled Sobol sequence (:class:`scipy.stats.qmc.Sobol`), so that a few
-    draws cover the ranges evenly and a larger budget continues the draws of a smaller one. Draw 0
-    leaves the configuration as it is. ``hidden`` and ``activation`` are set in every network of a
-    model, ``substeps`` in its integrator.
+    Draw k is point k of a scrambled Sobol sequence (:class:`scipy.stats.qmc.Sobol`), which covers
+    the ranges evenly. Draw 0 leaves the configuration as it is. ``hidden`` and ``activation`` are
+    set in every network of a model, ``substeps`` in its integrator.
 
     Args:
         draw: number of the draw.
@@ -49,36 +44,35 @@ class EqualSearch:
         A fit by least squares has none of these settings, so that all draws are the same.
         """
         config = {**config, "search": {"draw": self.draw}}
-        if self.draw == 0:
-            return config
-        if "lr" not in config["optimizer"]:
-            log.info("search: draw %d changes nothing, there is no learning rate", self.draw)
+        if self.draw == 0 or "lr" not in config["optimizer"]:
             return config
         point = iter(qmc.Sobol(d=7, seed=0).random_base2(self.draw.bit_length())[self.draw])
-        optimizer = dict(config["optimizer"])
-        for name in ("lr", "weight_decay"):
-            low, high = getattr(self, name)
-            optimizer[name] = float(low * (high / low) ** next(point))
-        width, depth = _choice(self.width, next(point)), _choice(self.depth, next(point))
+
+        def chosen(choices: Sequence[Any]) -> Any:
+            return choices[int(next(point) * len(choices))]
+
+        def drawn_between(low: float, high: float) -> float:
+            return float(low * (high / low) ** next(point))
+
+        optimizer = {
+            **config["optimizer"],
+            "lr": drawn_between(*self.lr),
+            "weight_decay": drawn_between(*self.weight_decay),
+        }
+        width, depth = chosen(self.width), chosen(self.depth)
         drawn = {
             "hidden": [width] * depth,
-            "activation": _choice(self.activation, next(point)),
-            "substeps": _choice(self.substeps, next(point)),
+            "activation": chosen(self.activation),
+            "substeps": chosen(self.substeps),
         }
-        length = _choice(self.length, next(point))
-        validations = config["trainer"]["validations"]
-        between = max(round(config["trainer"]["steps"] / validations * length), 1)
+        trainer, length = config["trainer"], chosen(self.length)
+        between = max(round(trainer["steps"] / trainer["validations"] * length), 1)
         return {
             **config,
             "optimizer": optimizer,
             "model": _with(config["model"], drawn),
-            "trainer": {**config["trainer"], "steps": validations * between},
+            "trainer": {**trainer, "steps": trainer["validations"] * between},
         }
-
-
-def _choice(choices: Sequence[T], share: float) -> T:
-    """Return the choice at a relative position from 0 to 1."""
-    return choices[int(share * len(choices))]
 
 
 def _with(part: Any, drawn: dict[str, Any]) -> Any:

@@ -1,9 +1,8 @@
-"""Configurations of run folders, which may come from anyone: the classes that they may build.
+"""Trust in configurations of run folders: the classes that they may build.
 
-A ``_target_`` names code that is called with the keys beside it: ``os.system`` deletes files as
-readily as ``pinn_dyn.models.LagrangianNetwork`` builds a network. So the configuration of a run
-folder is searched before anything is built, at every depth. It may name the classes below, and
-those of a package that the user trusts by ``trust=my_package``.
+A ``_target_`` names code that is run: ``os.system`` as readily as a network of this package. So the
+configuration of a run folder, which may come from anyone, is searched before anything is built. It
+may name the classes below, and those of packages that the user trusts by ``trust=my_package``.
 """
 
 from __future__ import annotations
@@ -14,11 +13,7 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pinn_dyn.app.validation import ConfigError, places
-
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml takes a tenth of the time
 
 _PACKAGES = (
     *("control", "data", "data.logs", "evaluation", "mechanics", "models", "systems"),
@@ -28,7 +23,6 @@ _PACKAGES = (
 
 _CALLBACKS = "EarlyStopping EMAWeightAveraging GradientAccumulationScheduler LearningRateMonitor "
 _CALLBACKS += "ModelCheckpoint StochasticWeightAveraging Timer WeightAveraging"
-_OPTIMIZERS = "Adadelta Adagrad Adam AdamW Adamax NAdam RAdam RMSprop SGD"
 _SCHEDULERS = "ConstantLR CosineAnnealingLR CosineAnnealingWarmRestarts CyclicLR ExponentialLR "
 _SCHEDULERS += "LinearLR MultiStepLR OneCycleLR PolynomialLR StepLR"
 _CLASSES = {
@@ -38,10 +32,10 @@ _CLASSES = {
     "lightning.pytorch": "Trainer",
     "lightning.pytorch.callbacks": _CALLBACKS,
     "lightning.pytorch.loggers": "CSVLogger MLFlowLogger TensorBoardLogger",
-    "torch.optim": _OPTIMIZERS,
+    "torch.optim": "Adadelta Adagrad Adam AdamW Adamax NAdam RAdam RMSprop SGD",
     "torch.optim.lr_scheduler": _SCHEDULERS,
 }
-ALLOWED = {f"{package}.{name}" for package, names in _CLASSES.items() for name in names.split()}
+_ALLOWED = {f"{package}.{name}" for package, names in _CLASSES.items() for name in names.split()}
 
 # Arguments that say where something is written or sent to, with the values in our own conf/.
 _DESTINATIONS: dict[str, tuple[Any, ...]] = {
@@ -51,25 +45,11 @@ _DESTINATIONS: dict[str, tuple[Any, ...]] = {
     "profiler": ("simple", "advanced", None),
     "tracking_uri": ("sqlite:///runs/mlflow/mlflow.db",),
 }
-_FILE_NAMES = ("name", "filename", "version")
 
 
 def packages(trust: str | list[str] | None) -> tuple[str, ...]:
     """Return the packages that the user trusts."""
     return tuple([trust] if isinstance(trust, str) else trust or ())
-
-
-def read_foreign(path: Path, trust: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Read the configuration of a run folder, without the folder of its cache.
-
-    Raises:
-        ConfigError: if it cannot be read, or as :func:`require_trusted`.
-    """
-    config = read_yaml(path)
-    if isinstance(dataset := config.get("dataset"), dict):
-        dataset.pop("cache", None)
-    require_trusted(config, str(path), trust)
-    return config
 
 
 def require_trusted(config: dict[str, Any], source: str, trust: tuple[str, ...] = ()) -> None:
@@ -84,28 +64,14 @@ def require_trusted(config: dict[str, Any], source: str, trust: tuple[str, ...] 
         ConfigError: naming the key.
     """
     for path, value in places(config):
+        key = f"{source}: {path or 'the configuration'}"
         if isinstance(value, dict):
-            _require_trusted_mapping(f"{source}: {path or 'the configuration'}", value, trust)
+            _require_trusted_mapping(key, value, trust)
         elif isinstance(value, str) and "${" in value:
-            raise ConfigError(f"{source}: {path} is the expression {value!r}, expected a value")
+            raise ConfigError(f"{key} is the expression {value!r}, expected a value")
     check_name(f"{source}: model_name", config.get("model_name", "model"))
     for name in (config.get("dataset") or {}).get("configurations") or ():
         check_name(f"{source}: dataset.configurations", name)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a mapping from a YAML file, without tags that name Python objects.
-
-    Raises:
-        ConfigError: naming the file, if it cannot be read.
-    """
-    try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path} cannot be read, it may be damaged: {error}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} holds no configuration: expected a mapping of names to values")
-    return values
 
 
 def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, ...]) -> None:
@@ -113,35 +79,29 @@ def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, 
         special = not isinstance(key, str) or key.startswith("_") or "${" in key
         if special and key not in ("_target_", "_partial_"):
             raise ConfigError(f"{path} has the key {key!r}, which no configuration of a run has")
-    if "_target_" not in part:
+    if "_target_" not in part or _is_trusted(target := part["_target_"], trust):
         return
-    target = part["_target_"]
-    if not may_build(target, trust):
+    if not may_build(target, ()):
         raise ConfigError(
             f"{path}._target_ is {target!r}. A configuration from a run folder may name the "
-            "classes of pinn_dyn and a few others only, because their code is run. If this is your "
-            "own class and you trust the author of the folder, add "
-            f"trust={str(target).split('.')[0]} to the command (SECURITY.md)"
+            "classes of pinn_dyn and a few others only. If this is your own class and you trust "
+            f"the author of the folder, add trust={str(target).split('.')[0]} (SECURITY.md)"
         )
-    if _is_trusted(target, trust):
-        return
     for key, allowed in _DESTINATIONS.items():
         if key in part and part[key] not in allowed:
             raise ConfigError(
                 f"{path}.{key} is {part[key]!r}: a configuration from a run folder does not choose "
                 f"where something is written. If you trust it, add trust={target} to the command"
             )
-    for key in _FILE_NAMES:
+    for key in ("name", "filename", "version"):
         if part.get(key) is not None:
             check_name(f"{path}.{key}", part[key])
 
 
 def may_build(target: Any, trust: tuple[str, ...]) -> bool:
     """Return whether a configuration from a run folder may name a class."""
-    if not isinstance(target, str):
-        return False
-    package, _, name = target.rpartition(".")
-    if package.startswith("pinn_dyn.") and package.removeprefix("pinn_dyn.") in _PACKAGES:
+    package, _, name = str(target).rpartition(".")
+    if package.removeprefix("pinn_dyn.") in _PACKAGES and package.startswith("pinn_dyn."):
         module = importlib.import_module(package)
         value = getattr(module, name, None) if name in module.__all__ else None
         if isinstance(value, type) and value.__module__.startswith("pinn_dyn."):
@@ -149,28 +109,28 @@ def may_build(target: Any, trust: tuple[str, ...]) -> bool:
     if package == "examples.cleaning_steps" and _has_own_examples():
         value = getattr(importlib.import_module(package), name, None)
         return isinstance(value, type) and value.__module__ == package
-    return target in ALLOWED or _is_trusted(target, trust)
+    return str(target) in _ALLOWED or _is_trusted(target, trust)
 
 
 def _has_own_examples() -> bool:
-    """Return whether ``examples`` is the folder beside this package, and no other one."""
+    """Return whether ``examples`` is the folder beside this package."""
     spec = importlib.util.find_spec("examples")  # does not import it
     folders = [] if spec is None else list(spec.submodule_search_locations or [])
     beside = Path(__file__).resolve().parents[2] / "examples"
     return {Path(folder).resolve() for folder in folders} == {beside}
 
 
-def _is_trusted(target: str, trust: tuple[str, ...]) -> bool:
+def _is_trusted(target: Any, trust: tuple[str, ...]) -> bool:
     """Return whether a class is defined in a trusted package, not only imported there."""
     for package in trust:
-        if target == package or target.startswith(f"{package}."):
+        if target == package or str(target).startswith(f"{package}."):
             home = getattr(pkgutil.resolve_name(target), "__module__", None) or ""
             return target == package or f"{home}.".startswith(f"{package}.")
     return False
 
 
 def check_name(path: str, name: Any) -> None:
-    """Refuse a name that would lead out of a folder: files are named by it.
+    """Refuse a name of a file that would lead out of its folder.
 
     Raises:
         ConfigError: naming the key.

@@ -18,40 +18,27 @@ def compiler(monkeypatch):
     return set_compiler
 
 
-def config(choice, steps=STEPS_FOR_DERIVATIVE, accelerator="cpu"):
-    return choice, steps, {"accelerator": accelerator}
+def compiles(choice, steps=STEPS_FOR_DERIVATIVE, accelerator="cpu"):
+    return trainer.compiles(choice, steps, {"accelerator": accelerator})
 
 
-@pytest.mark.parametrize("choice", [True, False])
-@pytest.mark.parametrize("steps", [2, STEPS_FOR_DERIVATIVE])
-def test_a_choice_holds_for_any_length(compiler, choice, steps):
-    assert trainer.compiles(*config(choice, steps)) is choice
-
-
-def test_auto_compiles_long_trainings_alone(compiler):
-    assert trainer.compiles(*config("auto", STEPS_FOR_DERIVATIVE))
-    assert not trainer.compiles(*config("auto", STEPS_FOR_DERIVATIVE - 2))
-
-
-def test_auto_compiles_where_there_is_a_compiler_alone(compiler):
+def test_auto_compiles_long_trainings_where_there_is_a_compiler(compiler):
+    assert compiles("auto")
+    assert not compiles("auto", STEPS_FOR_DERIVATIVE - 2)
+    assert compiles(True, 2)
+    assert not compiles(False)
     compiler(False)
-    assert not trainer.compiles(*config("auto"))
+    assert not compiles("auto")
+    with pytest.raises(ConfigError, match=r"no C\+\+ compiler.*set compile=false"):
+        compiles(True)
 
 
 def test_a_gpu_needs_triton_too(compiler, monkeypatch):
-    monkeypatch.setattr(trainer, "find_spec", lambda name: None if name == "triton" else name)
-    assert not trainer.compiles(*config("auto", accelerator="gpu"))
-    assert trainer.compiles(*config("auto"))
-    with pytest.raises(ConfigError, match=r"no Triton.*install it, or set compile=false"):
-        trainer.compiles(*config(True, accelerator="gpu"))
-    monkeypatch.setattr(trainer, "find_spec", lambda name: name)
-    assert trainer.compiles(*config("auto", accelerator="gpu"))
-
-
-def test_true_without_a_compiler_says_what_to_install(compiler):
-    compiler(False)
-    with pytest.raises(ConfigError, match=r"no C\+\+ compiler.*install it, or set compile=false"):
-        trainer.compiles(*config(True))
+    monkeypatch.setattr(trainer, "find_spec", lambda name: None)
+    assert not compiles("auto", accelerator="gpu")
+    assert compiles("auto")
+    with pytest.raises(ConfigError, match=r"no Triton.*set compile=false"):
+        compiles(True, accelerator="gpu")
 
 
 def test_arguments_of_a_part_and_of_the_parts_in_it_are_checked():

@@ -92,7 +92,7 @@ def test_a_joint_that_turns_is_not_measured_in_metres():
     structure = RigidChain(urdf=text)
     check_structure("structure", structure, log_of(["q1", "q2"], q_unit=["mm", "deg"]))
     check_structure("structure", structure, log_of(["q1", "q2"], q_unit="1"))
-    with pytest.raises(ConfigError, match=r"q1 is in rad, and joint slider of structure slides"):
+    with pytest.raises(ConfigError, match=r"q1 is in rad, expected m for the joint slider"):
         check_structure("structure", structure, log_of(["q1", "q2"], q_unit=["deg", "mm"]))
 
 

@@ -7,16 +7,6 @@ import yaml
 from pinn_dyn.app.config import build_part, composed
 from tests.app.entry import NO_FIGURES, TINY, run_script
 
-RANGES = {
-    "draw": 1,
-    "lr": [1e-3, 1e-2],
-    "weight_decay": [1e-3, 1e-1],
-    "width": [8],
-    "depth": [1],
-    "activation": ["tanh"],
-    "length": [1.0],
-    "substeps": [1],
-}
 MODELS = ["lnn", "hnn", "mlp", "acceleration"]
 
 
@@ -37,12 +27,7 @@ def values(part, key):
     return own + [found for value in part.values() for found in values(value, key)]
 
 
-def test_the_first_draw_is_the_experiment():
-    before, after = drawn("experiment=soft_arm_1 model=lnn", 0)
-    assert after == before
-
-
-@pytest.mark.parametrize("draw", [1, 2, 7, 30])
+@pytest.mark.parametrize("draw", [1, 7])
 def test_every_model_gets_the_same_draw(draw):
     found = [drawn(f"experiment=soft_arm_1 model={model}", draw) for model in MODELS]
     optimizers = [
@@ -61,6 +46,8 @@ def test_every_model_gets_the_same_draw(draw):
 
 
 def test_heads_of_a_structured_model_are_drawn_and_nothing_else():
+    before, after = drawn("experiment=trunk", 0)
+    assert after == before
     before, after = drawn("experiment=trunk", 1)
     assert before["model"]["input"]["linear"] == after["model"]["input"]["linear"]
     assert set(map(str, values(after["model"], "activation"))) != set(
@@ -89,8 +76,6 @@ def test_runs_of_a_search_are_ordinary_ones_told_apart_by_their_draw(tmp_path, m
     assert "optimizer.lr" not in table
 
 
-def test_a_fit_without_a_learning_rate_is_the_same_at_every_draw(caplog):
-    caplog.set_level("INFO")
+def test_a_fit_without_a_learning_rate_is_the_same_at_every_draw():
     before, after = drawn("experiment=known dataset=emps model.structure.urdf=x", 1)
     assert after == before
-    assert "draw 1 changes nothing, there is no learning rate" in caplog.text
