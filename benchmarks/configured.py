@@ -45,4 +45,4 @@ def build_trainer(config: dict[str, Any], folder: Path) -> L.Trainer:
         settings=trainer.few_settings(config), configuration="", provenance={}
     )
     loggers = [trainer.tensorboard(folder)]
-    return trainer.build_trainer(folder, settings, [], loggers, [description], length)
+    return trainer.build_trainer(folder, settings, [description], loggers, length)

@@ -1,4 +1,4 @@
-"""A trained model as users meet it: arrays and data frames in, arrays and data frames out."""
+"""Trained models for users: arrays and data frames in, arrays and data frames out."""
 
 from __future__ import annotations
 
@@ -37,11 +37,7 @@ ModelBuilder = Callable[..., Predictor]
 
 
 class TermArrays(NamedTuple):
-    """The learned terms at configurations ``(*batch, N)``.
-
-    ``M`` mass matrix ``(*batch, N, N)``, ``D`` damping matrix ``(*batch, N, N)``,
-    ``G`` potential force ``(*batch, N)``, ``A`` input matrix ``(*batch, N, M)``.
-    """
+    """The learned terms at configurations ``(*batch, N)``, see :meth:`Run.terms`."""
 
     M: np.ndarray
     D: np.ndarray
@@ -58,9 +54,9 @@ class Run:
     Attributes:
         folder: the run folder; temporary for a training in Python without one, see :meth:`save`.
         config: configuration of the training as plain values.
-        model: the model in float64 and evaluation mode, for tensors: control laws, evaluations.
-        statistics: scales of the training data: means, spreads and ranges of q, v and u, and
-            ``step``, the step of the training windows, s.
+        model: the model in float64 and evaluation mode, for tensors.
+        statistics: means, spreads and ranges of the training data, and ``step``, the step of the
+            training windows, s.
         metrics: record of the training; ``metrics["validation"]`` has the validation errors.
         data: identity of the data, see :func:`~pinn_dyn.data.data_identity`; empty if unknown.
         finished: whether the training has ended.
@@ -97,10 +93,7 @@ class Run:
 
     @cached_property
     def log(self) -> LogSource | None:
-        """Columns, units and cleaning of the log that the run was trained on; None without a log.
-
-        Its data are read only when they are needed.
-        """
+        """The log that the run was trained on; None without a log."""
         from pinn_dyn.app.build import build_source
 
         if isinstance(self._made_in_python, LogSource):
@@ -137,13 +130,7 @@ class Run:
 
     @property
     def ensemble(self) -> Ensemble | None:
-        """The models whose spread gives prediction intervals; None for a single network.
-
-        They are the members of an ensemble, or draws of the constants that least squares fitted.
-
-        Raises:
-            ValueError: if the covariance of the constants does not fit the model.
-        """
+        """The members of an ensemble, or draws of the constants that least squares fitted."""
         if isinstance(self.model, Ensemble):
             return self.model
         return None if self.covariance is None else posterior_draws(self.model, self.covariance)
@@ -176,31 +163,28 @@ class Run:
         """Predict the motion from a start under an input, or along a data frame.
 
         ``predict(start, u, t)`` returns the states x(t_k), ``(*batch, T, 2N)``. The input between
-        its samples is interpolated as in the training data: linearly by default.
+        its samples is interpolated as in the training data.
 
-        ``predict(frame)`` returns q and v in the columns, units and index of a log. The frame needs
-        the columns of the log that the model was trained on, and is cleaned by the same steps.
-        Every run starts from its first row; later values of q and v are not used. Without measured
-        velocities the columns of v are named ``dq1/dt``. A model of fixed steps is interpolated
-        linearly between them. Rows that the cleaning drops at an end are NaN.
+        ``predict(frame)`` returns q and v in the columns, units and index of a log, whose columns
+        the frame needs. It is cleaned by the same steps. Every run starts from its first row; later
+        values of q and v are not used. Without measured velocities the columns of v are named
+        ``dq1/dt``. Rows that the cleaning drops at an end are NaN.
 
         Args:
             start: (q, v), ``(*batch, 2N)``, or (q, p) if ``model.state`` is ``"qp"``; or a frame.
             u: inputs at the times t, ``(*batch, T, M)``, or a :class:`~pinn_dyn.Signal`.
-            t: increasing times, ``(T,)``, s; None takes those of a Signal.
+            t: increasing times, ``(T,)``, s; None uses those of a Signal.
 
         Raises:
-            TypeError: if u or t is missing, or given for a frame.
+            TypeError: if the input is missing.
             ValueError: on shapes that do not fit the model, values that are not finite, times
                 outside the input, or a frame without the columns of the log.
         """
         if isinstance(start, pd.DataFrame):
-            if u is not None or t is not None:
-                raise TypeError("predict(frame) takes the inputs from the frame: leave out u and t")
             if self.log is None:
                 raise ValueError(
-                    f"predict(frame): the model was trained on {self.config['dataset'].get('name')}"
-                    ", which has no columns of a log: use predict(start, u, t)"
+                    f"the model was trained on {self.config['dataset'].get('name')}, which has no "
+                    "columns of a log: use predict(start, u, t)"
                 )
             return predict_frame(self.model, self.log, start)
         x0, times, signal = self._motion(start, u, t)
@@ -222,11 +206,6 @@ class Run:
         constants that least squares fitted. c is the quantile of Student's t with E - 1 degrees of
         freedom. Measurement noise and errors that all members share are not included; evaluate.py
         reports the ``factor`` that validation motions needed (``calibration.csv``).
-
-        Args:
-            start, u, t: as in :meth:`predict`.
-            level: probability between 0 and 1.
-            factor: scale of the width.
 
         Returns:
             The lower and the upper ends, ``(*batch, T, 2N)`` each.
@@ -253,36 +232,31 @@ class Run:
     ) -> tuple[Tensor, Tensor, Signal]:
         """Return start, times and input of a prediction, in one batch."""
         x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
-        signal, times = self._input(u, t)
-        batch = torch.broadcast_shapes(x0.shape[:-1], signal.batch)
-        signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
-        return x0.expand(*batch, -1), times, signal
-
-    def _input(self, u: Values | Signal | None, t: Values | None) -> tuple[Signal, Tensor]:
-        """Return the input, and the times of the prediction."""
         size = self.model.num_inputs
         if isinstance(u, Signal):
             self._array("u", u.u, size, "M")
             signal = u.to("cpu", torch.float64)
             times = signal.t if t is None else _tensor("t", t)
             first, last = float(signal.t[0]), float(signal.t[-1])
-            outside = (times < first - 1e-9) | (times > last + 1e-9)
-            if outside.any():
+            if times.min() < first - 1e-9 or times.max() > last + 1e-9:
                 raise ValueError(
-                    f"t has the time {float(times[outside][0]):g} s, outside the input, which is "
-                    f"known from {first:g} to {last:g} s"
+                    f"t is from {float(times.min()):g} to {float(times.max()):g} s, outside the "
+                    f"input, which is known from {first:g} to {last:g} s"
                 )
-            return signal, times
-        if u is None or t is None:
-            raise TypeError("predict lacks the input: expected predict(start, u, t)")
-        times, samples = _tensor("t", t), self._array("u", u, size, "M")
-        if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
-            raise ValueError(
-                f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}, expected "
-                f"(*batch, T, {size}) and (T,): one input for each time"
-            )
-        part = self.config.get("log") or self.config["dataset"]
-        return Signal(times, samples, part.get("interpolation", "linear")), times
+        elif u is None or t is None:
+            raise TypeError("the input is missing: expected predict(start, u, t)")
+        else:
+            times, samples = _tensor("t", t), self._array("u", u, size, "M")
+            if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
+                raise ValueError(
+                    f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}, expected "
+                    f"(*batch, T, {size}) and (T,): one input for each time"
+                )
+            part = self.config.get("log") or self.config["dataset"]
+            signal = Signal(times, samples, part.get("interpolation", "linear"))
+        batch = torch.broadcast_shapes(x0.shape[:-1], signal.batch)
+        signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
+        return x0.expand(*batch, -1), times, signal
 
     # Terms of the equation of motion.
 
@@ -293,44 +267,30 @@ class Run:
         Raises:
             TypeError: if the model is a black box or an ensemble.
         """
-        if isinstance(self.model, Ensemble):
-            raise TypeError(
-                "an ensemble has no terms, since a mean of systems is no system: use a member"
-            )
         if not isinstance(self.model, MechanicalSystem):
+            kind = "an ensemble" if isinstance(self.model, Ensemble) else "a black box"
             raise TypeError(
-                f"model={self.config['model_name']} is a black box and has no terms M, D, G and A: "
-                "train model=lnn or model=hnn"
+                f"model={self.config['model_name']} is {kind} and has no terms M, D, G and A: use "
+                "a member, or train model=lnn or model=hnn"
             )
         return self.model
 
     def terms(self, q: Values) -> TermArrays:
-        """Return M(q), D(q), G(q) and A(q) at configurations q ``(*batch, N)``.
+        """Return M, D ``(*batch, N, N)``, G ``(*batch, N)`` and A ``(*batch, N, M)`` at q.
 
         Raises:
             TypeError: if the model is a black box or an ensemble.
-            ValueError: on a q of the wrong size.
         """
         terms = self.system.terms(self._coordinates("q", q))
         return TermArrays(*(term.numpy() for term in terms))
 
     def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
-        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``, from q, v, a ``(*batch, N)``.
-
-        Raises:
-            TypeError: if the model is a black box or an ensemble.
-            ValueError: on an argument of the wrong size.
-        """
+        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``, from q, v, a ``(*batch, N)``."""
         values = [self._coordinates(name, x) for name, x in (("q", q), ("v", v), ("a", a))]
         return self.system.inverse_dynamics(*torch.broadcast_tensors(*values)).numpy()
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
-        """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``.
-
-        Raises:
-            TypeError: if the model is a black box or an ensemble.
-            ValueError: on an argument of the wrong size.
-        """
+        """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``."""
         system = self.system
         position, velocity = self._coordinates("q", q), self._coordinates("v", v)
         position, velocity = torch.broadcast_tensors(position, velocity)

@@ -1,4 +1,4 @@
-"""The command train.py: compose a configuration, build its objects, call :func:`pinn_dyn.train`."""
+"""The command train.py."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import math
 import signal
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -15,48 +15,47 @@ from omegaconf import DictConfig
 from pinn_dyn.app import training
 from pinn_dyn.app.build import training_arguments
 from pinn_dyn.app.config import ConfigError, build_part, check, checked
-from pinn_dyn.app.run import VALIDATION_ERROR
-from pinn_dyn.app.run_folder import CHECKPOINTS, flattened, load_run, read_checkpoint
+from pinn_dyn.app.run import VALIDATION_ERROR, Run
+from pinn_dyn.app.run_folder import (
+    CHECKPOINTS,
+    flattened,
+    load_run,
+    newest_checkpoint,
+    read_checkpoint,
+)
 from pinn_dyn.app.trainer import few_settings
 from pinn_dyn.app.trust import check_name, packages, require_trusted
 
 log = logging.getLogger(__name__)
 
-_RESUME = ("resume=", "resume_from=", "trust=")
-# Groups of the configuration that do not change what is learned.
-_IGNORED = ("callbacks", "logger", "name", "model_name", "threads")
+_RESUME = ("resume=", "trust=")
+# Keys that do not change what is learned.
+_IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "search", "resume")
 
 
 def train(cfg: DictConfig) -> float:
-    """Train one model; returns the validation error, which a sweep minimizes.
+    """Train one model; return the validation error, which a sweep minimizes.
 
     A folder that holds this training is not trained again: a finished training is loaded, an
     interrupted one is resumed.
-
-    Raises:
-        ConfigError: if the configuration, the data or the run folder cannot be used.
-        NonFiniteLossError: if the loss becomes NaN or infinite.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     trust = packages(cfg.get("trust"))
-    resume_from: Literal["last", "best"] = cfg.get("resume_from") or "last"
     resumed = cfg.get("resume") is not None
     if resumed:
         folder = Path(cfg.resume)
-        config = _recorded(folder, resume_from, trust)
+        config = _recorded(folder, trust)
     else:
         config = checked("train", cfg)
         check_name("model_name", config["model_name"])  # files are named by it
         check_name("dataset.name", config["dataset"].get("name", "data"))
         if config.get("search"):
             config = build_part("search", config["search"]).applied(config)
-    start = config.get("start_from")
     try:
         run = training.train(
             **training_arguments(config, folder, resumed=resumed),
-            start_from=None if start is None else _start(Path(start), trust),
+            start_from=_start(config.get("start_from"), trust),
             folder=folder,
-            resume_from=resume_from,
             config=config,
             settings=_settings(config),
         )
@@ -69,25 +68,25 @@ def train(cfg: DictConfig) -> float:
     return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
 
 
-def _recorded(folder: Path, name: str, trust: tuple[str, ...]) -> dict[str, Any]:
+def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:
     """Return the configuration of a training that is resumed."""
     overrides = HydraConfig.get().overrides.task
     if ignored := [word for word in overrides if not word.lstrip("+").startswith(_RESUME)]:
         raise ConfigError(
             f"resume uses the configuration of the run: leave out {', '.join(ignored)}"
         )
-    path = folder / CHECKPOINTS / f"{name}.ckpt"
-    if path.is_file():
-        training.resumable(folder, name)  # names the checkpoint to use instead of a damaged one
-    config = read_checkpoint(path)["hyper_parameters"]["config"]
+    path, saved = newest_checkpoint(folder)
+    if path is None:
+        saved = read_checkpoint(path := folder / CHECKPOINTS / "last.ckpt")  # says what is wrong
+    config = saved["hyper_parameters"]["config"]
     require_trusted(config, str(path), trust)
     check("train", config)
     return config
 
 
-def _start(folder: Path, trust: tuple[str, ...]) -> Any:
+def _start(folder: str | None, trust: tuple[str, ...]) -> Run | None:
     try:
-        return load_run(folder, "best", trust)
+        return None if folder is None else load_run(Path(folder), "best", trust)
     except ConfigError as error:
         raise ConfigError(f"start_from: {error}") from error
 
@@ -95,12 +94,10 @@ def _start(folder: Path, trust: tuple[str, ...]) -> Any:
 def _settings(config: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that loggers compare: a few, and those of the command line."""
     settings, values = few_settings(config), flattened(config)
+    settings |= {f"search.{key}": x for key, x in (config.get("search") or {}).items()}
     for override in HydraConfig.get().overrides.task:
         key, _, value = override.lstrip("+").partition("=")
-        # The draw of a search is a setting, its ranges are not.
-        if key.startswith("search") and key != "search.draw":
-            continue
-        if not key.startswith("~") and key.split(".")[0] not in (*_IGNORED, "resume"):
+        if key.split(".")[0] not in _IGNORED and not key.startswith("~"):
             value = values.get(key, value)
             number = isinstance(value, (bool, int, float))
             settings.setdefault(key, value if number else str(value))

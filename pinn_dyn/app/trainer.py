@@ -1,4 +1,4 @@
-"""Parts of a training that write, log and compile: trainer, learner, record."""
+"""Trainer, learner and record of a training."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import torch
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
@@ -43,12 +44,12 @@ CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")
 
 @contextlib.contextmanager
 def naming(part: str) -> Iterator[None]:
-    """Name the part of the configuration that a constructor or a check complains about."""
+    """Name the part of the configuration that an error is about."""
     try:
         yield
     except ConfigError:
         raise
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, MisconfigurationException) as error:
         raise ConfigError(f"{part}: {error}") from error
 
 
@@ -68,17 +69,14 @@ def build_learner(
     with naming("loss"):
         single = model.member(0) if isinstance(model, Ensemble) else model
         window_loss = loss(statistics=statistics, model=single)
-    common: dict[str, Any] = {
-        "loss": window_loss,
-        "validator": validator,
-        "config": config,
-        "statistics": statistics,
-    }
+    common: dict[str, Any] = dict(
+        loss=window_loss, validator=validator, config=config, statistics=statistics
+    )
     with naming("optimizer"):
         if isinstance(optimizer, LeastSquares):
             return LeastSquaresLearner(model, solver=optimizer, **common)  # type: ignore[arg-type]
         learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
-        common |= {"optimizer": optimizer, "scheduler": scheduler, "compile": compile}
+        common |= dict(optimizer=optimizer, scheduler=scheduler, compile=compile)
         return learner(model, **common, **clipping)
 
 
@@ -107,38 +105,36 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
     return validations * parts, between // parts, parts
 
 
-def require_device(trainer: Mapping[str, Any]) -> None:
-    """Refuse to train on a GPU that torch does not see, before the data are simulated."""
-    accelerator = trainer.get("accelerator", "auto")
-    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
-        reason = (
-            "no GPU answers (nvidia-smi lists them)"
-            if torch.version.cuda or torch.version.hip
-            else f"torch {torch.__version__} is a build without CUDA (pytorch.org has others)"
-        )
-        raise ConfigError(
-            f"trainer.accelerator is {accelerator}, but {reason}: use trainer.accelerator=cpu"
-        )
-
-
 def compiles(compile: bool | Literal["auto"], steps: int, trainer: Mapping[str, Any]) -> bool:
-    """Decide whether to compile the dynamics: with ``"auto"`` in long trainings.
+    """Return whether to compile the dynamics: with ``"auto"`` in long trainings.
 
     Raises:
         ConfigError: if compilation is demanded and there is no compiler.
     """
-    missing = _missing_compiler(trainer)
+    accelerator = trainer.get("accelerator", "auto")
+    on_gpu = torch.cuda.is_available() if accelerator == "auto" else accelerator != "cpu"
+    missing = "" if has_cpp_compiler() else "C++ compiler (g++ or clang++) on the path"
+    if on_gpu and not missing and not find_spec("triton"):
+        missing = "Triton (pip install triton)"
     if compile is True and missing:
-        raise ConfigError(f"compile is true, but {missing}: install it, or set compile=false")
+        raise ConfigError(f"compile is true, but there is no {missing}: set compile=false")
     return steps >= STEPS_FOR_DERIVATIVE and not missing if compile == "auto" else compile
 
 
-def _missing_compiler(trainer: Mapping[str, Any]) -> str:
-    if not has_cpp_compiler():
-        return "there is no C++ compiler (g++ or clang++) on the path"
-    accelerator = trainer.get("accelerator", "auto")
-    on_gpu = torch.cuda.is_available() if accelerator == "auto" else accelerator != "cpu"
-    return "there is no Triton (pip install triton)" if on_gpu and not find_spec("triton") else ""
+class _MovableCheckpoint(ModelCheckpoint):
+    """Checkpoints that keep their best score if the run folder was moved or copied."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the score and the paths, in the present folder."""
+
+        def moved(path: str) -> str:
+            return str(Path(str(self.dirpath), Path(path).name)) if path else ""
+
+        paths = ("best_model_path", "kth_best_model_path", "last_model_path")
+        scores = {moved(path): score for path, score in state_dict["best_k_models"].items()}
+        changes = {"dirpath": self.dirpath, "best_k_models": scores}
+        changes |= {key: moved(state_dict[key]) for key in paths}
+        super().load_state_dict({**state_dict, **changes})
 
 
 def build_trainer(
@@ -146,41 +142,37 @@ def build_trainer(
     settings: Mapping[str, Any],
     callbacks: Sequence[L.Callback],
     loggers: Sequence[Logger],
-    recorders: Sequence[L.Callback],
     length: tuple[int, int, int],
-    batch_size: int,
 ) -> L.Trainer:
     """Build the trainer with its callbacks and loggers, all writing to ``folder``.
 
     Args:
         folder: the run folder.
         settings: arguments of :class:`lightning.Trainer`.
-        callbacks: callbacks of the user, before those of the program.
+        callbacks: callbacks beside the checkpoints and the progress.
         loggers: loggers.
-        recorders: callbacks after those of the program.
         length: as returned by :func:`epochs`.
-        batch_size: windows in a batch, which the devices share.
 
     Raises:
-        ConfigError: if the strategy starts the program again on each device, or the devices cannot
-            share a batch equally.
+        ConfigError: if an argument does not fit, or the strategy starts the program again on each
+            device.
     """
     # A resumed training finds its checkpoints by these names.
     files: dict[str, Any] = {"dirpath": str(folder / CHECKPOINTS), "enable_version_counter": False}
     bar = settings.get("enable_progress_bar", True) and sys.stdout.isatty()
-    added = [
-        ModelCheckpoint(filename="best", monitor=BEST_BY, **files),
-        ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **files),
-        TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR),
-        *([LearningRateMonitor()] if loggers else []),
-    ]
     count, batches, interval = length
     arguments = {
         **{key: value for key, value in settings.items() if key not in CLIPPING},
         "enable_progress_bar": bar,
         "max_epochs": count,
         "check_val_every_n_epoch": interval,
-        "callbacks": [*callbacks, *added, *recorders],
+        "callbacks": [
+            *callbacks,
+            _MovableCheckpoint(filename="best", monitor=BEST_BY, **files),
+            _MovableCheckpoint(filename="last", save_on_train_epoch_end=True, **files),
+            TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR),
+            *([LearningRateMonitor()] if loggers else []),
+        ],
         "logger": list(loggers),
         "plugins": [WholeCheckpoints()],
         "default_root_dir": str(folder),
@@ -194,13 +186,8 @@ def build_trainer(
         trainer = L.Trainer(**arguments)
     if isinstance(trainer.strategy.launcher, _SubprocessScriptLauncher):
         raise ConfigError(
-            "trainer: on several devices this strategy starts the whole program again, a sweep "
-            "included: use trainer.strategy=ddp_spawn_find_unused_parameters_true"
-        )
-    if batch_size % trainer.world_size:
-        raise ConfigError(
-            f"data.batch_size is {batch_size}, expected a multiple of the {trainer.world_size} "
-            "devices that share a batch"
+            "trainer: this strategy starts the whole program again on each device: use "
+            "trainer.strategy=ddp_spawn_find_unused_parameters_true"
         )
     return trainer
 
@@ -211,39 +198,35 @@ def tensorboard(folder: Path) -> TensorBoardLogger:
 
 
 def few_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that loggers compare if nobody chose others."""
+    """Return the settings that loggers compare by default."""
     settings = {"model": config["model_name"], "dataset": config["dataset"]["name"]}
-    numbers = {"data": ("pairs", "steps", "stride", "batch_size"), "optimizer": ("lr",)}
-    numbers["trainer"] = ("steps",)
-    for part, keys in numbers.items():
-        values = config[part] or {}
-        settings |= {f"{part}.{key}": values[key] for key in keys if key in values}
+    for key in ("data.pairs", "data.steps", "data.stride", "optimizer.lr", "trainer.steps"):
+        part, name = key.split(".")
+        if name in (config[part] or {}):
+            settings[key] = config[part][name]
     return {**settings, "seed": config["seed"]}
 
 
-class Recorder(L.Callback):
-    """Puts the metrics of the run and the identity of its data into every checkpoint."""
+class Recorder(RunDescription):
+    """Description of a run, which puts its metrics and the identity of its data into checkpoints.
 
-    def __init__(
-        self,
-        config: Mapping[str, Any],
-        pairs: int,
-        identity: Mapping[str, Any],
-        description: RunDescription,
-    ):
-        self.facts = {"name": config["name"], "seed": config["seed"], "pairs": pairs}
-        self.identity = identity
-        self.description = description
+    Attributes:
+        facts: name, seed and number of training windows.
+        identity: identity of the data.
+    """
+
+    facts: dict[str, Any]
+    identity: Mapping[str, Any]
 
     def record(self, trainer: L.Trainer, model: torch.nn.Module, steps: int) -> dict[str, Any]:
         """Return the record of the run so far."""
         return {
             **self.facts,
             "parameters": sum(p.numel() for p in model.parameters()),
-            "training_seconds": self.description.seconds,
+            "training_seconds": self.seconds,
             "steps": steps,
             "validation": {key: float(x) for key, x in trainer.callback_metrics.items()},
-            **self.description.provenance,
+            **self.provenance,
         }
 
     def on_save_checkpoint(

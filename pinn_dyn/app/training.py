@@ -1,11 +1,10 @@
-"""Training in Python: built objects in, a trained run out. train.py calls the same function."""
+"""Training in Python: built objects in, a trained run out."""
 
 from __future__ import annotations
 
 import contextlib
 import copy
 import logging
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -32,13 +31,13 @@ from pinn_dyn.app.run import TRAJECTORIES, VALIDATION_ERROR, ModelBuilder, Run
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     DATA,
+    FINISHED,
     claimed,
     finish,
-    is_finished,
+    in_one_line,
     load_run,
     read_checkpoint,
     require_same_data,
-    restore_record,
 )
 from pinn_dyn.app.trainer import (
     CLIPPING,
@@ -50,7 +49,6 @@ from pinn_dyn.app.trainer import (
     even_validations,
     few_settings,
     naming,
-    require_device,
     tensorboard,
 )
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store
@@ -60,7 +58,6 @@ from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import (
     RolloutFigures,
     RolloutValidator,
-    RunDescription,
     cleaning_figure,
     save,
 )
@@ -118,7 +115,6 @@ def train(
     loggers: Sequence[Logger] | None = None,
     start_from: Run | None = None,
     folder: str | Path | None = None,
-    resume_from: Literal["last", "best"] = "last",
     model_name: str | None = None,
     config: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
@@ -126,7 +122,7 @@ def train(
     """Train a model on the data of a source, and return the run with the best checkpoint.
 
     Some arguments are builders: classes, or :func:`functools.partial` of a class with keyword
-    arguments. The training completes them with what depends on the data, for example::
+    arguments. The training adds the arguments that depend on the data, for example::
 
         model=partial(LagrangianNetwork, mass=partial(NetworkCholesky, hidden=[64, 64]))
         data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)
@@ -138,7 +134,7 @@ def train(
     Args:
         source: the data.
         model: builder, called with ``statistics=``; or ``"lnn"``, ``"hnn"``, ``"acceleration"`` or
-            ``"mlp"`` for a network of default size; or a built predictor.
+            ``"mlp"``; or a built predictor.
         loss: builder, called with ``statistics=`` and ``model=``.
         optimizer: builder, called with the parameters; or a least-squares fit.
         scheduler: builder, called with the optimizer and ``total_steps=``.
@@ -155,7 +151,6 @@ def train(
         loggers: loggers; None writes a TensorBoard log to the folder.
         start_from: a run whose weights the training starts from.
         folder: the run folder; None uses a temporary one, see :meth:`Run.save`.
-        resume_from: checkpoint to resume an interrupted training from.
         model_name: short name of the model for tables; None takes that of ``model``.
         config: description of the run that its checkpoint keeps; None describes the arguments.
         settings: settings that loggers compare; None takes a few of the configuration.
@@ -178,8 +173,11 @@ def train(
         model_name, model = model_name or model, MODELS[model]
     made_in_python = config is None
     if config is None:
+        factory = model.func if isinstance(model, partial) else model
+        name = model_name or getattr(factory, "__name__", type(factory).__name__)
         config = {
-            "model_name": model_name or _name(model),
+            "name": f"{source.name}/{name}",
+            "model_name": name,
             "seed": seed,
             "compile": compile,
             "ensemble": ensemble,
@@ -194,32 +192,40 @@ def train(
             "validator": described(validator),
             "trainer": {"steps": steps, "validations": validations, **trainer},
         }
-        config["name"] = f"{source.name}/{config['model_name']}"
     config = dict(config)
     with contextlib.ExitStack() as stack:
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(threads)
         stack.enter_context(isolate_rng())
-        stack.enter_context(warnings.catch_warnings())
         hush()
-        stack.enter_context(claimed(run_folder, config))
-        if is_finished(run_folder):
+        checkpoint, saved = stack.enter_context(claimed(run_folder, config))
+        if saved.get(FINISHED):
             log.info("already trained, to train again delete %s", run_folder)
-            restore_record(run_folder)
         else:
             if made_in_python and temporary is None:
                 store(source, run_folder / TRAJECTORIES)
-            checkpoint = resumable(run_folder, resume_from)
-            L.seed_everything(seed, verbose=False)
-            require_device(trainer)
-            is_compiled = compiles(compile, steps, trainer)  # refused before data are simulated
-            length = epochs(steps, validations)
-            windows = build_data(data, source, seed, length[1])
-            statistics = _statistics(windows)
-            identity = data_identity(source)
             if checkpoint is not None:
-                saved = read_checkpoint(checkpoint).get(DATA, {})
-                require_same_data(run_folder, saved, source.name, identity)
+                log.info("resuming in %s from step %d", run_folder, saved["global_step"])
+            # A missing compiler or device is refused before data are simulated.
+            is_compiled = compiles(compile, steps, trainer)
+            length = epochs(steps, validations)
+            if callbacks is None:
+                callbacks = [RolloutFigures(every_n_validations=4)]
+            if loggers is None:
+                loggers = [tensorboard(run_folder)]
+            loop = build_trainer(run_folder, trainer, callbacks, loggers, length)
+            L.seed_everything(seed, verbose=False)
+            windows = build_data(data, source, seed, length[1])
+            statistics = _statistics(windows, loop.world_size)
+            recorder = Recorder(
+                settings=few_settings(config) if settings is None else settings,
+                configuration=yaml.safe_dump(config, sort_keys=False, allow_unicode=True),
+                provenance=provenance(),
+            )
+            recorder.identity = data_identity(source)
+            recorder.facts = {"name": config["name"], "seed": seed, "pairs": len(windows.windows)}
+            loop.callbacks.insert(0, recorder)  # type: ignore[attr-defined]
+            require_same_data(run_folder, saved.get(DATA, {}), source.name, recorder.identity)
             if isinstance(source, LogSource):
                 _write_report(source, run_folder)
             with naming("validator"):
@@ -245,56 +251,31 @@ def train(
             if isinstance(learner, LeastSquaresLearner) and start_from is not None:
                 if start_from.covariance is None:
                     raise ConfigError(
-                        f"start_from: {start_from.folder} has no covariance of its constants, "
-                        "which a fit by optimizer=least_squares leaves: fit it again, or leave "
-                        "start_from out"
+                        f"start_from: {start_from.folder} has no covariance of its constants: fit "
+                        "it by optimizer=least_squares, or leave start_from out"
                     )
                 learner.covariance = start_from.covariance
-            description = RunDescription(
-                settings=few_settings(config) if settings is None else settings,
-                configuration=yaml.safe_dump(config, sort_keys=False, allow_unicode=True),
-                provenance=provenance(),
+            batches = EnsembleData(windows, ensemble) if ensemble > 1 else windows
+            record = _fit(loop, learner, batches, checkpoint, run_folder, source, recorder)
+            log.info(
+                "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s",
+                *(config["name"], seed, record["validation"].get(VALIDATION_ERROR, float("nan"))),
+                *(rollouts, record["training_seconds"], run_folder),
             )
-            recorder = Recorder(config, len(windows.windows), identity, description)
-            _fit(
-                build_trainer(
-                    run_folder,
-                    trainer,
-                    [RolloutFigures(every_n_validations=4)] if callbacks is None else callbacks,
-                    [tensorboard(run_folder)] if loggers is None else loggers,
-                    [description, recorder],
-                    length,
-                    windows.batch_size,
-                ),
-                learner,
-                EnsembleData(windows, ensemble) if ensemble > 1 else windows,
-                checkpoint,
-                run_folder,
-                source,
-            )
-    run = load_run(run_folder, "best", trust=None, model=_reloadable(model))
+    # The builder of a built model gives a model for the weights of the checkpoint.
+    builder = (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
+    run = load_run(run_folder, "best", trust=None, model=builder)
     return replace(run, _made_in_python=source if made_in_python else None, _temporary=temporary)
-
-
-def _name(model: ModelBuilder | Predictor) -> str:
-    while isinstance(model, partial):
-        model = model.func
-    return model.__name__ if isinstance(model, type) else type(model).__name__
-
-
-def _reloadable(model: ModelBuilder | Predictor) -> ModelBuilder:
-    """Return a builder that gives a model for the weights of a checkpoint."""
-    return (lambda statistics: copy.deepcopy(model)) if isinstance(model, Predictor) else model
 
 
 def _description(source: DataSource) -> dict[str, Any]:
     """Describe a source that was made in Python: its trajectories are stored in the run folder."""
-    labels = {"labels": list(source.labels), "input_labels": list(source.input_labels)}
     stored = {
         "_target_": "pinn_dyn.data.StoredSource",
         "path": TRAJECTORIES,
         "name": source.name,
-        **labels,
+        "labels": list(source.labels),
+        "input_labels": list(source.input_labels),
         "angles": list(source.angles),
     }
     if not isinstance(source, LogSource):
@@ -303,41 +284,6 @@ def _description(source: DataSource) -> dict[str, Any]:
     columns = {name: described(getattr(source, name)) for name in _COLUMNS}
     log_part = {"_target_": "pinn_dyn.data.LogSource", "files": "*", **columns}
     return {"dataset": stored, "log": log_part}
-
-
-def resumable(folder: Path, name: str = "last") -> Path | None:
-    """Return the checkpoint that the training of a folder resumes from; None for a new one.
-
-    Raises:
-        ConfigError: if the checkpoint is damaged; names the one to resume from instead.
-    """
-    path = folder / CHECKPOINTS / f"{name}.ckpt"
-    if not path.is_file():
-        return None
-    try:
-        step = _step(path)
-    except ConfigError as error:
-        best = path.with_name("best.ckpt")
-        try:
-            step = _step(best)
-        except ConfigError:
-            raise ConfigError(
-                f"{error}\n{best} is no better: delete {folder} and train again"
-            ) from error
-        raise ConfigError(
-            f"{error}\nResume from the best checkpoint, of step {step}: python train.py "
-            f"resume={folder} resume_from=best"
-        ) from error
-    log.info("resuming the training in %s from step %d", folder, step)
-    return path
-
-
-def _step(path: Path) -> int:
-    """Return the step of a checkpoint from which a training can resume."""
-    saved = read_checkpoint(path)
-    if missing := [key for key in ("global_step", "loops", "optimizer_states") if key not in saved]:
-        raise ConfigError(f"{path} has no {', '.join(missing)}")
-    return saved["global_step"]
 
 
 def build_data(
@@ -349,11 +295,15 @@ def build_data(
         return data(source=source, batches_per_epoch=batches, **seeds)
 
 
-def _statistics(windows: DynamicsData) -> Statistics:
+def _statistics(windows: DynamicsData, devices: int) -> Statistics:
     log.info("%s: loading data", windows.source.name)
     with naming("data"):
         if warning := too_long_for(windows.splits.train, windows.step, windows.source.labels):
             log.warning("%s: %s", windows.source.name, warning)
+        if windows.batch_size % devices:
+            raise ValueError(
+                f"batch_size is {windows.batch_size}, no multiple of {devices} devices"
+            )
         return windows.statistics
 
 
@@ -397,7 +347,7 @@ def _take_weights(model: Predictor, run: Run) -> None:
     except RuntimeError as error:
         raise ConfigError(
             f"start_from: the run {run.folder} trained another model than this configuration has, "
-            f"expected the same classes and sizes: {' '.join(str(error).split())[:300]}"
+            f"expected the same classes and sizes: {in_one_line(error)}"
         ) from error
     log.info("starting from the weights of %s", run.folder)
 
@@ -409,37 +359,27 @@ def _fit(
     checkpoint: Path | None,
     folder: Path,
     source: DataSource,
-) -> None:
-    """Run the trainer, and write the record of the training."""
-    least_squares = learner if isinstance(learner, LeastSquaresLearner) else None
+    recorder: Recorder,
+) -> dict[str, Any]:
+    """Run the trainer; write and return the record of the training."""
+    solver = learner if isinstance(learner, LeastSquaresLearner) else None
+    last = folder / CHECKPOINTS / "last.ckpt"
     try:
-        with naming("optimizer") if least_squares else contextlib.nullcontext():
+        with naming("optimizer") if solver else contextlib.nullcontext():
             trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit as stop:  # Lightning's end of an interrupted training
-        if least_squares and least_squares.result is not None:
-            trainer.save_checkpoint(folder / CHECKPOINTS / "last.ckpt")
-            write_constants(learner.model, least_squares.result, source, folder)
+        if solver and solver.result is not None:
+            trainer.save_checkpoint(last)
+            write_constants(learner.model, solver.result, source, folder)
         raise KeyboardInterrupt from stop
     if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
         trainer.validate(learner, data, verbose=False)
-    if least_squares and least_squares.result is not None:
-        write_constants(learner.model, least_squares.result, source, folder)
-    (recorder,) = (x for x in trainer.callbacks if isinstance(x, Recorder))  # type: ignore[attr-defined]
+    if solver and solver.result is not None:
+        write_constants(learner.model, solver.result, source, folder)
     # Other processes have counted the steps of theirs.
-    last = read_checkpoint(folder / CHECKPOINTS / "last.ckpt")
-    record = recorder.record(trainer, learner.model, last["global_step"])
+    record = recorder.record(trainer, learner.model, read_checkpoint(last)["global_step"])
     finish(folder, record)
-    figures = learner.model.learned_figures()
-    log.info(
-        "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s%s",
-        record["name"],
-        record["seed"],
-        record["validation"].get(VALIDATION_ERROR, float("nan")),
-        learner.validator,
-        record["training_seconds"],
-        folder,
-        "".join(f"; {key} {value:.4g}" for key, value in figures.items()),
-    )
+    return record
 
 
 def _write_report(source: LogSource, folder: Path) -> None:

@@ -14,7 +14,7 @@ from pinn_dyn.app.run_folder import load_run
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.models import LagrangianNetwork
 from pinn_dyn.models.output_limits import free_weights
-from tests.app.entry import NO_FIGURES, SET_POINTS, TINY, refused_text, run_script, train
+from tests.app.entry import NO_FIGURES, SET_POINTS, run_script, train
 
 
 @pytest.fixture(scope="module")
@@ -115,16 +115,3 @@ def test_a_controller_takes_one_member(tmp_path, monkeypatch, ensemble_run):
     first, second = errors(ensemble_run), errors(ensemble_run, "member=1")
     assert first[0] != second[0]
     assert first[1:] == second[1:]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["ensemble=0"], "ensemble is 0, expected"),
-    ],
-)
-def test_what_an_ensemble_cannot_do_is_refused(tmp_path, capsys, arguments, message):
-    text = refused_text(
-        capsys, "train.py", *TINY, NO_FIGURES, f"hydra.run.dir={tmp_path}", "model=lnn", *arguments
-    )
-    assert message in text

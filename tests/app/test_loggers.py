@@ -7,7 +7,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from tests.app.entry import NO_FIGURES, TINY, refused_text, train
+from tests.app.entry import NO_FIGURES, train
 
 FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}
 
@@ -69,13 +69,6 @@ def test_figures_are_logged_at_the_step_of_the_errors_that_they_explain(hnn_run)
     assert last == log.Scalars("val/error_mean")[-1].step == 3
 
 
-def test_the_scalars_that_tensorboard_compares_first_hold_the_validation_error(hnn_run):
-    names = sorted(tensorboard(hnn_run).Tags()["scalars"])
-    assert "wall_time/training_seconds" in names
-    # The learning rate comes with the first hundred steps only.
-    assert "val/error_mean" in sorted({*names, "train/learning_rate"})[:5]
-
-
 def test_a_training_that_fails_is_among_the_others_without_success(tmp_path):
     run = tmp_path / "run"
     with pytest.raises(SystemExit):
@@ -111,15 +104,3 @@ def test_mlflow_keeps_settings_errors_figures_and_the_configuration_offline(tmp_
         assert (files / name / "step_0000003.png").read_bytes().startswith(b"\x89PNG")
     # TensorBoard goes on beside it.
     assert set(tensorboard(run).Tags()["images"]) == FIGURES
-
-
-def test_a_logger_without_its_package_names_what_to_install(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("lightning.pytorch.loggers.mlflow._MLFLOW_AVAILABLE", False)
-    said = refused_text(
-        capsys,
-        "train.py",
-        *TINY,
-        "logger=mlflow",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    )
-    assert "pip install 'pinn_dyn[mlflow]'" in said

@@ -16,14 +16,6 @@ def test_a_training_says_a_line_per_epoch(tmp_path, capsys):
     assert all(re.fullmatch(r"validation error \d\S*", rest) for *_, rest in lines)
 
 
-def test_a_terminal_has_a_bar_instead(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    train(tmp_path / "run", "model=lnn", *LENGTH, NO_FIGURES)
-    captured = capsys.readouterr()
-    assert "Epoch 2: 100%" in captured.out
-    assert "epoch 1 of" not in captured.out
-
-
 def test_epochs_between_validations_have_lines_too(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pinn_dyn.app.trainer.LONGEST_EPOCH", 1)
     train(tmp_path / "run", "model=lnn", "trainer.steps=2", NO_FIGURES)

@@ -86,11 +86,6 @@ def test_finished_parts_are_skipped_and_missing_parts_are_made(calls, tmp_path, 
     assert calls[5:] == ["train.py", "evaluate.py", "control.py"]
 
 
-def test_an_unknown_entry_is_refused(calls):
-    with pytest.raises(SystemExit, match="no entry arm/none"):
-        reproduce.main(["--only", "arm/none"])
-
-
 def test_the_comparison_has_new_and_recorded_errors(calls, tmp_path, monkeypatch):
     reproduce.main(["--only", "arm/lnn"])
     index = pd.MultiIndex.from_tuples([("arm", "lnn", 0)], names=["robot", "model", "seed"])

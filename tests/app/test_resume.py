@@ -10,7 +10,6 @@ from pickle import UnpicklingError
 import lightning as L
 import pytest
 import torch
-import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import pinn_dyn
@@ -117,14 +116,17 @@ def test_a_finished_training_is_not_repeated(run, monkeypatch):
     assert trained(run).metrics == finished.metrics
 
 
-def test_copies_for_people_are_not_read(run):
-    finished = trained(run)
-    (run / "config.yaml").write_text("seed: 7")
-    (run / "metrics.json").write_text("damaged")
-    loaded = pinn_dyn.load(run)
-    assert loaded.config["seed"] == 0
-    assert loaded.metrics == finished.metrics
-    assert loaded.data.keys() == {"train", "validation", "test"}
+def test_a_moved_training_keeps_its_best_score(run, tmp_path):
+    run = run.rename(tmp_path / "moved")
+    key = next(k for k in checkpoint(run)["callbacks"] if "'monitor': 'val/error_w" in k)
+    saved = checkpoint(run)
+    state = saved["callbacks"][key]
+    saved["callbacks"][key] = {**state, "best_model_score": torch.tensor(0.0), "kth_value": 0.0}
+    saved["callbacks"][key]["best_k_models"] = {state["best_model_path"]: torch.tensor(0.0)}
+    change(run, callbacks=saved["callbacks"])
+    best = checkpoint(run, "best")["global_step"]
+    trained(run)
+    assert checkpoint(run, "best")["global_step"] == best  # no later score is better than zero
 
 
 def test_a_terminated_training_ends_with_a_status_and_can_be_resumed(tmp_path):
@@ -168,13 +170,23 @@ def command(tmp_path, monkeypatch, diverging):
     return shutil.copytree(diverging, tmp_path / "run")
 
 
-def test_a_training_resumes_from_the_best_checkpoint(command, capsys):
-    cut(command)
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (cut, "last.ckpt cannot be read, it may be cut short"),
+        (lambda run: change(run, payload=Marker("was_here")), "last.ckpt cannot be read"),
+    ],
+)
+def test_a_damaged_last_checkpoint_is_replaced_by_the_best_one(command, capsys, damage, message):
+    damage(command)
     step = checkpoint(command, "best")["global_step"]
     assert step < 30
     before = set(command.rglob("events.out.tfevents.*"))
-    run_script("train.py", f"resume={command}", "resume_from=best")
-    assert f"resuming the training in {command} from step {step}" in capsys.readouterr().out
+    run_script("train.py", f"resume={command}")
+    text = capsys.readouterr().out
+    assert message in text
+    assert f"from step {step}" in text
+    assert not os.path.exists("was_here")
     assert pinn_dyn.load(command).finished
     assert checkpoint(command)["global_step"] == 30
     (log,) = set(command.rglob("events.out.tfevents.*")) - before
@@ -182,34 +194,11 @@ def test_a_training_resumes_from_the_best_checkpoint(command, capsys):
     assert [event.step for event in events] == list(range(step + 4, 30, 5))
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (cut, "last.ckpt cannot be read, it may be cut short"),
-        (lambda run: change(run, optimizer_states=None), "has no optimizer_states"),
-        (lambda run: change(run, state_dict=None), "last.ckpt cannot be read"),
-        (lambda run: change(run, payload=Marker("was_here")), "last.ckpt cannot be read"),
-    ],
-)
-def test_a_damaged_last_checkpoint_names_the_best_one(command, capsys, damage, message):
-    damage(command)
-    text = refused_text(capsys, "train.py", f"resume={command}")
-    assert message in text
-    assert f"python train.py resume={command} resume_from=best" in " ".join(text.split())
-    cut(command, "best")
-    text = refused_text(capsys, "train.py", f"resume={command}")
-    assert "best.ckpt is no better: delete" in text
-    assert not os.path.exists("was_here")
-
-
 def test_lightning_reads_no_code_from_a_checkpoint(command, monkeypatch):
     """Behind the check of the checkpoint, which is replaced here."""
     change(command, payload=Marker("was_here"))
     good = checkpoint(command, "best")
-    monkeypatch.setattr("pinn_dyn.app.training.read_checkpoint", lambda path: good)
     monkeypatch.setattr("pinn_dyn.app.run_folder.read_checkpoint", lambda path: good)
-    monkeypatch.setattr("pinn_dyn.app.train.read_checkpoint", lambda path: good)
-    monkeypatch.setattr("pinn_dyn.app.training.is_finished", lambda folder: False)
     with pytest.raises(UnpicklingError, match="Weights only load failed"):
         run_script("train.py", f"resume={command}")
     assert not os.path.exists("was_here")
@@ -249,11 +238,6 @@ def test_resume_refuses_changed_data(command, capsys):
     text = refused_text(capsys, "train.py", f"resume={command}")
     assert "soft_arm_1 has changed since" in text
     assert "train trajectory 1 in train has other values" in text
-
-
-def test_the_configuration_of_a_run_is_written_for_people(diverging):
-    config = yaml.safe_load((diverging / "config.yaml").read_text())
-    assert config == checkpoint(diverging)["hyper_parameters"]["config"]
 
 
 # Writing.

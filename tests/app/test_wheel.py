@@ -1,6 +1,5 @@
 """The wheel: its commands work far from the repository, with the configuration inside."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -73,26 +72,6 @@ def call(installed, folder, *command):
     return done.stdout
 
 
-# Many commands in one process: starting one takes longer than what it does here.
-MANY = """
-import json, sys
-from importlib.metadata import distribution
-
-commands = {entry.name: entry for entry in distribution("pinn_dyn").entry_points}
-for name, *arguments in json.loads(sys.argv[1]):
-    sys.argv = [name, *arguments]
-    print("=== command")
-    try:
-        commands[name].load()()
-    except SystemExit as end:
-        assert not end.code, end.code
-"""
-
-
-def call_many(installed, folder, *commands):
-    return call(installed, folder, "-c", MANY, json.dumps(commands)).split("=== command")[1:]
-
-
 def test_the_wheel_holds_every_module_template_and_configuration(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
     modules = {
@@ -106,23 +85,6 @@ def test_the_wheel_holds_every_module_template_and_configuration(wheel):
     assert {name for name in inside if ".dist-info/" not in name} == modules | configurations
 
 
-def test_every_command_teaches(installed, tmp_path):
-    names = ["train", "evaluate", "control", "gather", "check"]
-    *helps, composed, completion = call_many(
-        installed,
-        tmp_path,
-        *[[f"pinn-dyn-{name}", "--help"] for name in names],
-        ["pinn-dyn-train", "experiment=soft_arm_1", "--cfg", "job"],
-        ["pinn-dyn-train", "-sc", "install=bash"],
-    )
-    for name, text in zip(names, helps, strict=True):
-        assert f"python {name}.py" in text
-    assert "model_name: ${hydra:runtime.choices.model}" in composed
-    assert "steps: 30000" in composed
-    assert "complete -o nospace" in completion
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_training_runs_and_is_gathered(installed, tmp_path):
     script = str(installed / "bin" / "pinn-dyn-train")
     call(installed, tmp_path, script, "model=lnn", *TINY, NO_FIGURES, "hydra.run.dir=run")
@@ -130,7 +92,9 @@ def test_a_training_runs_and_is_gathered(installed, tmp_path):
     sources = (tmp_path / "run" / ".hydra" / "hydra.yaml").read_text()
     assert str(installed / "pinn_dyn" / "conf") in sources
     assert str(ROOT / "conf") not in sources
-    gathering = ["pinn-dyn-gather", "runs=[run]", "hydra.run.dir=table"]
-    (text,) = call_many(installed, tmp_path, gathering)
-    assert "runs: 1" in text
+    gather = str(installed / "bin" / "pinn-dyn-gather")
+    assert "runs: 1" in call(installed, tmp_path, gather, "runs=[run]", "hydra.run.dir=table")
+    assert "python check.py" in call(
+        installed, tmp_path, str(installed / "bin" / "pinn-dyn-check"), "--help"
+    )
     assert (tmp_path / "table" / "sweep.csv").is_file()

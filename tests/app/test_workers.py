@@ -69,9 +69,7 @@ def workers_of(session):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("after", [0, 0.5, 3])
-def test_a_killed_sweep_leaves_no_process(tmp_path, after):
-    """Killed so many seconds after its workers were started, before their first job or in it."""
+def test_a_killed_sweep_leaves_no_process(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["-m", *TINY, NO_FIGURES, "model=lnn", "seed=0,1", "hydra.sweep.dir=sweep"]
     words += ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "trainer.steps=400"]
@@ -80,7 +78,7 @@ def test_a_killed_sweep_leaves_no_process(tmp_path, after):
         process = fork_script("train.py", *words, **at)
         while len(workers_of(process.pid)) < 2 and process.is_alive():
             time.sleep(0.02)
-        time.sleep(after)
+        time.sleep(0.5)
         assert len(workers_of(process.pid)) == 2
         process.kill()
         process.join()

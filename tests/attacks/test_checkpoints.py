@@ -8,6 +8,7 @@ import torch
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run_folder import load_run
+from tests.app.entry import NO_FIGURES, TINY, refused_text, train
 
 
 def flip_a_bit(path):
@@ -64,13 +65,35 @@ DAMAGE = {
 }
 
 
+@pytest.fixture
+def run(tmp_path, lnn_run):
+    return shutil.copytree(lnn_run, tmp_path / "run")
+
+
 @pytest.mark.parametrize(("change", "expected"), DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_checkpoint_is_refused_by_name(tmp_path, lnn_run, change, expected):
-    run = tmp_path / "run"
-    shutil.copytree(lnn_run, run)
+def test_a_damaged_checkpoint_is_refused_by_name(run, change, expected):
     path = run / "checkpoints" / "best.ckpt"
     change(path)
     with pytest.raises(ConfigError, match=expected) as caught:
         load_run(run, "best")
     assert str(path) in str(caught.value)
-    assert len(str(caught.value)) < 900
+
+
+def test_weights_of_another_model_are_refused(run, hnn_run):
+    path = run / "checkpoints" / "best.ckpt"
+    other = torch.load(hnn_run / "checkpoints" / "best.ckpt", weights_only=True)
+    edit(lambda saved: saved.update(state_dict=other["state_dict"]))(path)
+    with pytest.raises(ConfigError, match=r"best.ckpt.*: weights of another model: .*Lagrangian"):
+        load_run(run)
+
+
+def test_a_run_folder_is_what_its_checkpoint_says(tmp_path, run, capsys):
+    other = train(tmp_path / "other", "model=lnn", "seed=1", NO_FIGURES)
+    for name in ("best", "last"):
+        shutil.copy(other / "checkpoints" / f"{name}.ckpt", run / "checkpoints")
+    (run / "metrics.json").write_text("damaged")
+    loaded = load_run(run)
+    assert loaded.config["seed"] == loaded.metrics["seed"] == 1
+    words = ["model=lnn", NO_FIGURES, f"hydra.run.dir={run}"]
+    text = refused_text(capsys, "train.py", *TINY, *words)
+    assert "holds a training of another configuration: seed=0 (there 1)" in " ".join(text.split())

@@ -4,7 +4,6 @@ import pytest
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run_folder import load_run
-from pinn_dyn.app.trust import read_yaml
 from tests.app.entry import TINY, refused_text
 from tests.attacks.targets import calls
 from tests.support.foreign_runs import foreign
@@ -116,18 +115,3 @@ def test_the_folder_does_not_choose_the_cache(tmp_path, lnn_run):
     elsewhere = str(tmp_path / "elsewhere")
     run = foreign(lnn_run, tmp_path / "run", lambda c: c["dataset"].update(cache=elsewhere))
     assert "cache" not in load_run(run, "best").config["dataset"]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "- a list\n",
-        "a: [1, 2\n",
-        "x: !!python/object/apply:os.system ['touch was_here']\n",
-        "x: !!python/name:os.system\n",
-    ],
-)
-def test_a_yaml_file_that_holds_no_mapping_of_plain_values_is_refused(tmp_path, text):
-    (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"config\.yaml"):
-        read_yaml(tmp_path / "config.yaml")
