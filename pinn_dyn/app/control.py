@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,9 @@ from torch import Tensor
 
 from pinn_dyn.app.build import build_law, build_reference, build_source
 from pinn_dyn.app.config import ConfigError, build_part, checked
-from pinn_dyn.app.control_results import write_results, write_stability
+from pinn_dyn.app.control_results import write_results
 from pinn_dyn.app.provenance import write_provenance
+from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import load_run, write_config
 from pinn_dyn.app.trust import packages
 from pinn_dyn.control import (
@@ -27,13 +26,10 @@ from pinn_dyn.control import (
     ModelBasedLaw,
     ProportionalDerivative,
     export_law,
-    model_report,
 )
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
-from pinn_dyn.evaluation.report import Origin, measured_model_report
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 
 log = logging.getLogger(__name__)
@@ -45,101 +41,81 @@ def control(cfg: DictConfig) -> float:
     """Close the loop of each controller; return the RMS error of the first controller.
 
     Raises:
-        ConfigError: on a run that is no mechanical model, or a part that does not fit the robot.
+        ConfigError: on a run without a mechanical model or a simulated robot, or a part that does
+            not fit the robot.
     """
     config = checked("control", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
     torch.set_num_threads(config["threads"])
     run = load_run(Path(config["run"]), config["checkpoint"], packages(config.get("trust")))
-    with _errors_of("run"):
-        model = run.model
-        if isinstance(model, Ensemble):
-            model = model.member(config["member"])
-        if not isinstance(model, MechanicalSystem):
-            raise ValueError(
-                f"{run.folder} holds a black box ({run.config['model_name']}), which has no terms "
-                "M, G and A for a control law: give a run of model=lnn or model=hnn"
-            )
-    learned = double_copy(model)
+    try:
+        return _close_loops(run, config, folder)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(str(error)) from error
+
+
+def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     source = build_source(run.config)
+    if source.system is None:
+        raise ConfigError(
+            f"{source.name} is measured data, without a simulated robot to close a loop with; "
+            "pinn_dyn.control.export_law writes a law on the model for your own loop"
+        )
+    learned = _learned_system(run, config)
     origin = write_provenance(
         {run.config["name"]: run}, source, config, {"run": run.config}, folder
     )
-    if source.system is None:
-        return _report_without_truth(learned, source, folder, origin)
-
     robot = build_part("robot", {**run.config["dataset"]["system"], **config["robot"]})
     reference = build_reference(config, robot)
     q0, v0 = _initial_states(config)
     runs = len(reference(0.0).q.reshape(-1, robot.num_coordinates) if q0 is None else q0)
     if config["trajectory"] >= runs:
-        raise ConfigError(
-            f"trajectory is {config['trajectory']}, expected one of the {runs} runs, 0 to "
-            f"{runs - 1}"
-        )
+        raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {runs - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    box, threshold = config["stability"], config["guard"].get("threshold")
-    if "learned" not in laws and (config["export"] or box or threshold):
-        raise ConfigError(
-            "export, stability and guard.threshold need the controller 'learned', and there are "
-            f"only {', '.join(laws)}: leave them out"
-        )
-    for key in ("q_low", "q_high") if box else ():
-        if len(box[key]) != robot.num_coordinates:
-            raise ConfigError(
-                f"stability.{key} is {box[key]}, expected {robot.num_coordinates} numbers, one for "
-                "each coordinate of the robot"
-            )
+    if "learned" not in laws and (
+        config["export"] or config["stability"] or config["guard"].get("threshold")
+    ):
+        raise ConfigError("export, stability and guard need the controller 'learned'")
     if config["export"] is not None:
-        with _errors_of("export"):
-            path = export_law(laws["learned"], Path(config["export"]))
+        path = export_law(laws["learned"], Path(config["export"]))
         log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
-    if threshold is not None:
-        with _errors_of("guard"):
-            laws["learned"] = _guarded(laws["learned"], config, source)
+    if config["guard"].get("threshold") is not None:
+        laws["learned"] = _guarded(laws["learned"], config, source)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     noisy = np.any(sensor.q_noise) or np.any(sensor.v_noise)
-    with _errors_of("plant"):
-        plant = None if config["rate"] is None else build_part("plant", config["plant"], robot)
-    with _errors_of("controllers, reference or rate"):
-        result = close_loops(
-            laws,
-            reference,
-            robot,
-            q0=q0,
-            v0=v0,
-            plant=plant,
-            actuator=build_part("actuator", config["actuator"]),
-            sensor=sensor if noisy else None,
-            progress=True,
-            **{key: config[key] for key in ("duration", "rate", "samples_rate", "delay")},
-            **{key: config[key] for key in ("settle_fraction", "settled_after")},
-        )
+    result = close_loops(
+        laws,
+        reference,
+        robot,
+        q0=q0,
+        v0=v0,
+        plant=None if config["rate"] is None else build_part("plant", config["plant"], robot),
+        actuator=build_part("actuator", config["actuator"]),
+        sensor=sensor if noisy else None,
+        progress=True,
+        **{key: config[key] for key in ("duration", "rate", "samples_rate", "delay")},
+        **{key: config[key] for key in ("settle_fraction", "settled_after")},
+    )
     for name, record in result.records.items():
         for index, reason in enumerate(record.stopped):
             if reason:
                 log.warning("%s, run %d was stopped: %s", name, index, reason)
-    stability = None
-    if box is not None:
-        with _errors_of("stability"):
-            stability = write_stability(learned, robot, result.records["learned"], config, folder)
-    return write_results(result, source, robot, reference, config, folder, stability, origin)
+    return write_results(result, source, learned, robot, reference, config, folder, origin)
 
 
-def _report_without_truth(
-    learned: MechanicalSystem, source: DataSource, folder: Path, origin: Origin
-) -> float:
-    """Report on the learned model alone, for measured data without a known truth."""
-    q = torch.cat([_thinned(item.q) for item in source.load().train]).double()
-    text = model_report(learned, q, region=f"the training data of {source.name}")
-    write_whole(folder / "stability.md", text)
-    print(text)
-    title = f"{source.name}: learned model of measured data"
-    page = measured_model_report(title=title, report=text, origin=origin)
-    write_whole(folder / "report.html", page)
-    log.info("%s is measured data without a robot: no loop is closed", source.name)
-    return float("nan")
+def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem:
+    model = run.model
+    if isinstance(model, Ensemble):
+        model = model.member(config["member"])
+    elif config["member"]:
+        raise ConfigError(f"member is {config['member']}, but {run.folder} holds a single model")
+    if not isinstance(model, MechanicalSystem):
+        raise ConfigError(
+            f"{run.folder} holds a black box ({run.config['model_name']}), which has no terms "
+            "M, G and A for a control law: give a run of model=lnn or model=hnn"
+        )
+    return double_copy(model)
 
 
 def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | None]:
@@ -156,10 +132,7 @@ def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | Non
 def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
     """Return the learned law with a guard on its distance from the training data."""
     if not isinstance(law, ModelBasedLaw):
-        raise ValueError(
-            f"controllers.learned is a {type(law).__name__}, expected one of the laws alone: leave "
-            "out its observer, or the guard"
-        )
+        raise ConfigError("guard.threshold needs a law without an observer: leave one of them out")
     gains, guard, train = config["gains"], config["guard"], source.load().train
     fallback = None
     if guard.get("fallback"):
@@ -174,12 +147,3 @@ def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Con
 
 def _thinned(samples: Tensor) -> Tensor:
     return samples[:: max(1, samples.shape[0] // _REGION_SAMPLES)]
-
-
-@contextlib.contextmanager
-def _errors_of(part: str) -> Iterator[None]:
-    """Name the part of the configuration that an error is about."""
-    try:
-        yield
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"{part}: {error}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -39,60 +38,58 @@ from pinn_dyn.evaluation import (
 from pinn_dyn.evaluation.control_figures import ERROR, control_errors
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.plots import with_unit
-from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
+from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.control_page import shown_columns
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
 
-log = logging.getLogger(__name__)
-
-_STRIP_TIMES = (0.0, 0.1, 0.3, 0.6, 1.0)  # s, those of the paper's figure
+_STRIP_TIMES = (0.0, 0.1, 0.3, 0.6, 1.0)  # s, as in the paper's figure
 _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 
 
 def write_results(
     result: ControlResult,
     source: DataSource,
+    learned: MechanicalSystem,
     robot: MechanicalSystem,
     reference: Reference,
     config: dict[str, Any],
     folder: Path,
-    stability: StabilityResult | None,
     origin: Origin,
 ) -> float:
-    """Write tables, figures, animation, report; returns the RMS error of the first controller."""
+    """Write tables, figures, animation and report; return the RMS error of the first law."""
     records, summary = result.records, result.table
+    first = next(iter(records))
     result.save(folder)
-    figures = _figures(records, source, robot, reference, config)
+    figures, stability = _figures(records, source, robot, reference, config), None
+    if config["stability"] is not None:
+        stability, figure = _stability(learned, robot, records["learned"], config, folder)
+        figures["steady_state"] = figure
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
     with SummaryWriter(str(folder / "tensorboard")) as writer:
-        # One row per metric, which needs no scrolling.
         text = summary.set_index("controller").T.to_string(float_format="{:.4g}".format)
         writer.add_text("closed_loop/summary", f"<pre>{text}</pre>")
         configuration = (folder / CONFIG).read_text(encoding="utf-8")
         writer.add_text("run/configuration", f"```yaml\n{configuration}\n```")
-        for name in figures:
-            # Drawing a figure of seven joints again takes seconds; the saved image is at hand.
+        for name in figures:  # drawing them again would take seconds
             picture = imread(folder / f"{name}.png")
             writer.add_image(f"closed_loop/{name}", picture, dataformats="HWC")
-    first = next(iter(records))
-    animation = folder / f"animation_{first}.gif"
-    if config["animate"]:
+    animation = folder / f"animation_{first}.gif" if config["animate"] else None
+    if animation is not None and isinstance(robot, Drawable):
         animate(records[first], config["trajectory"], robot, animation)
+    else:
+        animation = None
 
-    duration, runs = f"{config['duration']:g} s", len(records[first].stopped)
-    print(f"\n{source.name}: closed loop of {duration}, {runs} run{'s' if runs > 1 else ''}")
+    runs = len(records[first].stopped)
+    print(f"\n{source.name}: {runs} run{'s' if runs > 1 else ''} of {config['duration']:g} s")
     print(to_text(summary, shown_columns(summary)))
     report = control_report(
         title=f"{source.name}: closed loop on a learned model",
-        summary=summary,
-        coordinates=result.coordinates,
-        inputs=result.inputs,
-        records=records,
+        result=result,
         figures=figures,
         labels=source.labels,
-        animation=animation if animation.is_file() else None,
+        animation=animation,
         stability=stability,
         origin=origin,
     )
@@ -101,18 +98,14 @@ def write_results(
     return result.metrics[first].summary["rms_error"]
 
 
-def write_stability(
+def _stability(
     learned: MechanicalSystem,
     robot: MechanicalSystem,
     record: ClosedLoopRecord,
     config: dict[str, Any],
     folder: Path,
-) -> StabilityResult:
-    """Proposition 1 over a box, and the predicted steady state of every set point of the runs.
-
-    Raises:
-        ValueError: if the runs are not of set points, or the system is not fully actuated.
-    """
+) -> tuple[str, Figure]:
+    """Write Proposition 1 over a box, and the predicted steady states of the set points."""
     box = config["stability"]
     low, high = (torch.tensor(box[key], dtype=torch.float64) for key in ("q_low", "q_high"))
     generator = torch.Generator().manual_seed(config["seed"])
@@ -123,11 +116,8 @@ def write_stability(
     write_table(conditions, folder, "stability_region")
 
     q_ref = record.reference.q[:, 0]
-    if bool((record.reference.q != record.reference.q[:, :1]).any()):
-        raise ValueError(
-            "the reference moves: a steady state is predicted for set points only, use "
-            "reference=set_point or a RandomSetPoints"
-        )
+    if (record.reference.q != q_ref[:, None]).any():
+        raise ValueError("stability needs set points, and the reference moves")
     predicted = predict_steady_state(learned, robot, q_ref, *gains)
     measured = torch.linalg.vector_norm(record.q[:, -1] - q_ref, dim=-1)
     table = predicted.assign(measured_error=measured.numpy())
@@ -141,9 +131,7 @@ def write_stability(
         measured,
         title="Steady-state error of the learned regulator and its predicted bound",
     )
-    save(figure, folder / "steady_state.png")
-    log.info("the stability report is in %s", folder / "stability.md")
-    return StabilityResult(text, table)
+    return text, figure
 
 
 def _figures(
@@ -154,13 +142,9 @@ def _figures(
     config: dict[str, Any],
 ) -> dict[str, Figure]:
     run = config["trajectory"]
-    figures = {
-        "comparison": controller_comparison_figure(
-            records,
-            title=f"{source.name}: error of the closed loop",
-            label=with_unit(ERROR, source.labels),
-        ),
-    }
+    title = f"{source.name}: error of the closed loop"
+    label = with_unit(ERROR, source.labels)
+    figures = {"comparison": controller_comparison_figure(records, title=title, label=label)}
     worst = {
         int(control_errors(x).nan_to_num(torch.inf).mean(1).argmax()) for x in records.values()
     }
@@ -173,12 +157,12 @@ def _figures(
             input_labels=source.input_labels,
             held=config["rate"] is not None,
         )
-    first = next(iter(records.values()))
+    name, first = next(iter(records.items()))
     if isinstance(robot, Drawable):
         end = float(first.t[samples_before_stop(first, run) - 1])
         times = [time for time in _STRIP_TIMES if time <= end]
         if first.stopped[run] is None or len(times) > 1:  # one pose is no motion
-            title = f"{source.name}, {next(iter(records))} controller"
+            title = f"{source.name}, {name} controller"
             figures["strip"] = pose_strip(first, run, robot, times, title=title)
     if isinstance(reference, Helix) and isinstance(robot, HasTip):
         figures["tip_path"] = tip_path_figure(
@@ -191,7 +175,7 @@ def _figures(
 
 
 def _tip_path(arm: HasTip, q: Tensor) -> Tensor:
-    """Positions of the tip, ``(T, 3)``, NaN after a stop."""
+    """Return positions of the tip, ``(T, 3)``, NaN after a stop."""
     alive = q.isfinite().all(-1)
     path = q.new_full((len(q), 3), torch.nan)
     path[alive] = arm.tip_position(q[alive])

@@ -3,7 +3,7 @@
 from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
-from pinn_dyn.control.effects import Actuator, Delay, Sensor
+from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.export import export_law, load_law
 from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.control.helix import Helix
@@ -22,11 +22,10 @@ from pinn_dyn.control.references import (
     RandomSetPoints,
     SetPoint,
     Sines,
-    check_limits,
 )
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.control.stability import certify
-from pinn_dyn.control.stability_report import model_report, stability_report
+from pinn_dyn.control.stability_report import stability_report
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
     "ComputedTorque",
     "Controller",
     "DataRegion",
-    "Delay",
     "DisturbanceObserver",
     "Guarded",
     "Helix",
@@ -54,13 +52,11 @@ __all__ = [
     "SystemPlant",
     "Tracking",
     "certify",
-    "check_limits",
     "close_loop",
     "close_loop_continuous",
     "export_law",
     "fit_factor",
     "load_law",
-    "model_report",
     "predict_steady_state",
     "required_gain",
     "stability_report",

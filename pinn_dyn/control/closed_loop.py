@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
+
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
-from pinn_dyn.control.effects import Actuator, Delay, Sensor
-from pinn_dyn.control.plants import check_start
+from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import require_finite
 
 
 def close_loop(
@@ -33,11 +35,8 @@ def close_loop(
         u_wanted(t_k) = law(t_k, q + noise, v + noise, reference(t_k))
         u(t_k) = actuator(u_wanted(t_k-d)),    t_k = k / rate,  k = 0 ... duration * rate
 
-    A copy is stopped, and the others go on, once its state is not finite or q leaves its bound,
-    the sensor or the law return a number that is not finite, or the controller reports a fault.
-    The record of a stopped copy is NaN after that instant. The law sees a stopped copy at the
-    state that was measured last, and the plant is started again without it. Ctrl-C ends the run
-    early and returns the record up to then.
+    A copy is stopped if its state, measurement or input is not finite, q leaves its bound, or the
+    controller reports a fault. The other copies go on. Ctrl-C returns the record up to then.
 
     Args:
         plant: the plant that is controlled.
@@ -46,24 +45,19 @@ def close_loop(
         q0, v0: initial configurations and velocities, ``(K, N)`` each.
         duration: length of the run in s, an integer multiple of 1 / rate.
         rate: control instants per second, 1/s.
-        actuator: limits of the input; none if None.
-        sensor: noise of the measurement; none if None.
-        delay: dead time of the input in control instants; zero input arrives before the first.
-        q_bound: a copy with an entry of |q| beyond it has diverged, in the units of q.
+        actuator: limits of the input.
+        sensor: noise of the measurement.
+        delay: dead time of the input in control instants, with zero input before.
+        q_bound: a copy with |q| beyond this bound has diverged, in the units of q.
         progress: label of a progress bar; no bar if None.
 
     Raises:
-        ValueError: on sizes that do not agree, initial states that are not finite, a duration that
-            is no multiple of 1 / rate, or a delay longer than the duration.
+        ValueError: on sizes that do not agree, initial states that are not finite, or a duration
+            that is no multiple of 1 / rate.
     """
     q0, v0 = q0.double(), v0.double()
     run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)
-    queue = Delay(delay)
-    if delay >= len(run.t):
-        raise ValueError(
-            f"delay is {delay} instants, and the run has {len(run.t)}: no input would ever arrive; "
-            f"expected less than that, in instants of {1 / rate:g} s"
-        )
+    queue = deque([q0.new_zeros(len(q0), plant.num_inputs)] * delay)
     if sensor is not None:
         sensor.reset()
     q, v, moving = q0.clone(), v0.clone(), run.running.clone()
@@ -80,7 +74,8 @@ def close_loop(
                     q[moving], v[moving] = plant.advance(u[moving], 1 / rate)
                 run.observe(k, q, v)
                 run.measure(k, *((q, v) if sensor is None else sensor(q, v)))
-                u = run.apply(k, queue(run.ask(k)))
+                queue.append(run.ask(k))
+                u = run.apply(k, queue.popleft())
                 if not run.running.any():
                     break
     except KeyboardInterrupt:
@@ -105,19 +100,30 @@ class LoopRun:
         q_bound: float,
     ):
         n, m = plant.num_coordinates, plant.num_inputs
-        _check_sizes(plant, controller, reference)
-        check_start(q0, v0, n)
-        self.t = _instants(duration, rate)
+        for name, sizes, expected in (
+            ("reference", (reference.num_coordinates,), (n,)),
+            ("controller", (controller.num_coordinates, controller.num_inputs), (n, m)),
+            ("q0", tuple(q0.shape), (len(q0), n)),
+            ("v0", tuple(v0.shape), (len(q0), n)),
+        ):
+            if sizes != expected:
+                raise ValueError(f"{name} has sizes {sizes}, expected {expected} of the plant")
+        require_finite("q0", q0)
+        require_finite("v0", v0)
+        steps = round(duration * rate)
+        if steps < 1 or abs(duration * rate - steps) > 1e-6:
+            raise ValueError(f"duration is {duration} s, expected a multiple of {1 / rate:g} s")
+        self.t = torch.arange(steps + 1, dtype=torch.float64) / rate
         self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
         self._shape_of_u = (len(q0), m)
         self._controller, self._actuator = controller, actuator
         self._interval, self._q_bound = 1 / rate, q_bound
-        self._seen = q0.clone(), v0.clone()
+        self._measured = q0.clone(), v0.clone()
         self._motions = [motion_of_copies(reference, float(t), q0) for t in self.t]
         samples = (len(q0), len(self.t))
         self._q, self._v = (q0.new_full((*samples, n), torch.nan) for _ in range(2))
         self._u, self._u_wanted = (q0.new_full((*samples, m), torch.nan) for _ in range(2))
-        self._diagnostics: dict[str, Tensor] = {}
+        self._diagnostics: dict[str, Tensor] = defaultdict(lambda: self._q[..., 0] * torch.nan)
         self._stopped: list[str | None] = [None] * len(q0)
         controller.reset()
         if actuator is not None:
@@ -131,26 +137,25 @@ class LoopRun:
 
     def observe(self, k: int, q: Tensor, v: Tensor) -> None:
         """Record the true state at instant k; stop the copies that have diverged."""
+        time = float(self.t[k])
         finite = finite_rows(q) & finite_rows(v)
-        self.stop(~finite, float(self.t[k]), "the plant diverged: its state is not finite")
+        self.stop(~finite, time, "the plant diverged: its state is not finite")
         self._q[self.running, k] = q[self.running]
         self._v[self.running, k] = v[self.running]
         beyond = (q.abs() > self._q_bound).any(-1)
-        reason = f"the plant diverged: |q| is beyond {self._q_bound:g}"
-        self.stop(beyond, float(self.t[k]), reason)
+        self.stop(beyond, time, f"the plant diverged: |q| is beyond {self._q_bound:g}")
 
     def measure(self, k: int, q: Tensor, v: Tensor) -> None:
         """Store the measurement at instant k; stop the copies where it is not finite."""
-        lost = ~(finite_rows(q) & finite_rows(v))
-        self.stop(lost, float(self.t[k]), "the measurement is not finite")
-        for seen, new in zip(self._seen, (q, v), strict=True):
-            seen[self.running] = new[self.running]
+        finite = finite_rows(q) & finite_rows(v)
+        self.stop(~finite, float(self.t[k]), "the measurement is not finite")
+        for stored, value in zip(self._measured, (q, v), strict=True):
+            stored[self.running] = value[self.running]
 
     def ask(self, k: int) -> Tensor:
         """Return the law's input at instant k; meaningless for a stopped copy."""
         time = float(self.t[k])
-        q, v = self._seen
-        u = self._controller(time, q, v, self._motions[k])
+        u = self._controller(time, *self._measured, self._motions[k])
         if u.shape != self._shape_of_u:
             raise ValueError(
                 f"the controller's input has shape {tuple(u.shape)}, expected {self._shape_of_u}"
@@ -172,45 +177,16 @@ class LoopRun:
 
     def record(self, samples: int) -> ClosedLoopRecord:
         """Return the record of the first instants."""
-        motions = self._motions[:samples]
-        q_ref, v_ref, a_ref = (torch.stack(values, 1) for values in zip(*motions, strict=True))
+        motions = zip(*self._motions[:samples], strict=True)
+        reference = Motion(*(torch.stack(values, 1) for values in motions))
         q, v, u, u_wanted = (x[:, :samples] for x in (self._q, self._v, self._u, self._u_wanted))
         diagnostics = {name: values[:, :samples] for name, values in self._diagnostics.items()}
-        reference = Motion(q_ref, v_ref, a_ref)
         t = self.t[:samples]
         return ClosedLoopRecord(t, q, v, u, u_wanted, reference, self._stopped, diagnostics)
 
     def _diagnose(self, k: int, values: dict[str, Tensor]) -> None:
         for name, value in values.items():
-            if name not in self._diagnostics:
-                self._diagnostics[name] = self._q.new_full(self._q.shape[:2], torch.nan)
             self._diagnostics[name][self.running, k] = value[self.running].to(self._q)
-
-
-def _check_sizes(
-    plant: Plant | MechanicalSystem, controller: Controller, reference: Reference
-) -> None:
-    for part, name in ((controller, "controller"), (reference, "reference")):
-        if part.num_coordinates != plant.num_coordinates:
-            raise ValueError(
-                f"the {name} has {part.num_coordinates} coordinates and the plant "
-                f"{plant.num_coordinates}: they must be for the same robot"
-            )
-    if controller.num_inputs != plant.num_inputs:
-        raise ValueError(
-            f"the controller has {controller.num_inputs} inputs and the plant "
-            f"{plant.num_inputs}: they must be for the same robot"
-        )
-
-
-def _instants(duration: float, rate: float) -> Tensor:
-    steps = round(duration * rate)
-    if steps < 1 or abs(duration * rate - steps) > 1e-6:
-        raise ValueError(
-            f"duration is {duration} s, expected an integer multiple of {1 / rate:g} s, the time "
-            f"between instants at {rate:g} Hz"
-        )
-    return torch.arange(steps + 1, dtype=torch.float64) / rate
 
 
 def finite_rows(x: Tensor) -> Tensor:
@@ -219,17 +195,5 @@ def finite_rows(x: Tensor) -> Tensor:
 
 
 def motion_of_copies(reference: Reference, time: float, like: Tensor) -> Motion:
-    """Return the reference at one time for each copy: ``(K, N)`` like another tensor.
-
-    Raises:
-        ValueError: if it is neither one motion for all copies nor one for each.
-    """
-    motion = reference(time)
-    for name, value in zip(Motion._fields, motion, strict=True):
-        if value.shape not in (like.shape, like.shape[1:]):
-            raise ValueError(
-                f"the reference's {name} has shape {tuple(value.shape)}, expected "
-                f"{tuple(like.shape[1:])} or {tuple(like.shape)}: one motion for all copies, or "
-                "one for each"
-            )
-    return Motion(*(value.to(like).expand_as(like) for value in motion))
+    """Return the reference at one time for each copy: ``(K, N)`` like another tensor."""
+    return Motion(*(value.to(like).expand_as(like) for value in reference(time)))

@@ -9,10 +9,7 @@ from torch import Tensor
 
 
 class Motion(NamedTuple):
-    """What a reference asks for at one time.
-
-    ``q`` configuration, ``v`` velocity, ``a`` acceleration, each ``(*batch, N)``; SI units, rad.
-    """
+    """Desired configuration q, velocity v and acceleration a at one time, ``(*batch, N)`` each."""
 
     q: Tensor
     v: Tensor
@@ -26,16 +23,11 @@ class Reference(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, t: float) -> Motion:
-        """The desired motion at time t in s, ``(N,)`` each or ``(K, N)`` for K of them."""
+        """Return the desired motion at time t in s, ``(N,)`` each or ``(K, N)`` for K runs."""
 
 
 class Controller(abc.ABC):
-    """A control law u = u(t, q, v, reference), batched.
-
-    Attributes:
-        num_coordinates: N, the dimension of q.
-        num_inputs: M, the dimension of u.
-    """
+    """A control law u = u(t, q, v, reference) with N coordinates and M inputs, batched."""
 
     def __init__(self, num_coordinates: int, num_inputs: int):
         self.num_coordinates = num_coordinates
@@ -46,24 +38,19 @@ class Controller(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """The input u ``(*batch, M)`` at time t in s, from the measured q and v ``(*batch, N)``."""
+        """Return u ``(*batch, M)`` at time t in s, from the measured q and v ``(*batch, N)``."""
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """Named numbers about the latest call, ``(*batch,)`` each, which the loop records."""
+        """Return named numbers about the latest call for the record, ``(*batch,)`` each."""
         return {}
 
     def faults(self) -> dict[str, Tensor]:
-        """Reasons to stop after the latest call, each with a mask ``(*batch,)`` of whom."""
+        """Return reasons to stop after the latest call, each with its mask ``(*batch,)``."""
         return {}
 
 
 class Plant(abc.ABC):
-    """What is controlled: K copies of a robot, started and moved together.
-
-    Attributes:
-        num_coordinates: N, the dimension of q.
-        num_inputs: M, the dimension of u.
-    """
+    """K copies of a robot with N coordinates and M inputs, started and moved together."""
 
     num_coordinates: int
     num_inputs: int
@@ -74,8 +61,7 @@ class Plant(abc.ABC):
 
     @abc.abstractmethod
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        """Hold the input u ``(K, M)`` for a time in s; returns q and v after it, ``(K, N)`` each.
+        """Hold the input u ``(K, M)`` for a time in s; return q and v after it, ``(K, N)`` each.
 
-        A copy that leaves the finite numbers, or that its solver cannot follow, comes back as NaN
-        and stays so; the others go on.
+        A copy that diverges becomes NaN and stays so, and does not affect the other copies.
         """

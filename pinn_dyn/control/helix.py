@@ -13,7 +13,7 @@ from scipy.interpolate import make_interp_spline
 
 from pinn_dyn.control.contracts import Motion, Reference
 from pinn_dyn.control.references import smooth_step
-from pinn_dyn.systems import HasLimits, HasTip
+from pinn_dyn.systems import HasTip
 
 _KNOTS_PER_TURN = 64
 _ITERATIONS = 300
@@ -28,36 +28,33 @@ class Helix(Reference):
 
         p(phi) = p_0 + radius ((cos phi - 1) e_1 + sin phi e_2) + pitch phi / (2 pi) e_3
 
-    p_0 is the tip's position in ``posture``, with which the motion begins; e_3 is the axis, and
-    (e_1, e_2, e_3) are the axes of the base in cyclic order, so a helix about z starts in the
-    direction of y and has its centre ``radius`` before p_0 along x. The angle phi runs at
-    2 pi / period, reached from rest, and left again, within ``rise_time`` by a quintic; velocity
-    and acceleration are continuous.
+    p_0 is the tip's position in ``posture``, e_3 is the axis, and (e_1, e_2, e_3) are the axes of
+    the base in cyclic order: a helix about z starts in the direction of y, and its centre is at
+    -radius along x. The angle phi runs at 2 pi / period. It rises from rest and falls again within
+    ``rise_time`` by a quintic, with continuous velocity and acceleration.
 
     The joints follow by inverse kinematics: of all configurations that put the tip at p(phi), the
-    one nearest to ``posture``, ||q - posture|| minimal, found from its neighbour by damped least
-    squares (Wampler 1986; null-space motion: Liegeois 1977). So the tip's position is given and its
-    orientation is not, any arm with three joints or more can do it, and a closed path closes in
-    the joints as well. A quintic spline q(phi) runs through 64 such configurations per turn;
+    solution is the one nearest to ``posture``, by damped least squares (Wampler 1986) with
+    null-space motion (Liegeois 1977). The orientation of the tip is free, so an arm needs three
+    joints or more. A quintic spline q(phi) runs through 64 such configurations per turn, and
     v = q' dphi/dt and a = q'' (dphi/dt)^2 + q' d^2phi/dt^2 are its exact derivatives.
 
     Args:
-        arm: the robot; its joint limits are checked where it has some (:class:`HasLimits`).
+        arm: the robot.
         posture: configuration at the start, ``(N,)``, rad.
         radius: m.
         pitch: advance along the axis in one turn, m; 0 is a circle, negative advances backwards.
-        period: of one turn at full speed, s.
+        period: duration of one turn at full speed, s.
         turns: number of turns, not necessarily whole.
-        axis: of the base, along which the helix advances.
-        rise_time: s, at most turns * period; by default half a period, or the longest if shorter.
+        axis: axis of the base along which the helix advances.
+        rise_time: s, at most turns * period; None takes half a period, if that is not longer.
 
     Attributes:
         duration: turns * period + rise_time, s.
         path_error: largest distance of the tip from the helix, also between knots, m.
 
     Raises:
-        ValueError: on a posture of another size or outside the joint limits, or a helix that the
-            arm cannot follow within its joint limits.
+        ValueError: on a helix that the arm cannot follow, or a longer rise time.
     """
 
     def __init__(
@@ -74,15 +71,8 @@ class Helix(Reference):
         longest = turns * period
         rise_time = min(0.5 * period, longest) if rise_time is None else rise_time
         if rise_time > longest:
-            raise ValueError(
-                f"rise_time is {rise_time:g} s, expected at most turns * period = {longest:g} s"
-            )
+            raise ValueError(f"rise_time is {rise_time:g} s, longer than turns * period")
         home = np.asarray(posture, dtype=float)
-        if home.shape != (arm.num_coordinates,):
-            raise ValueError(
-                f"posture has {home.size} entries, expected {arm.num_coordinates}, one for each "
-                "joint of the robot"
-            )
         self.num_coordinates = arm.num_coordinates
         self.rise_time, self.duration = float(rise_time), float(longest + rise_time)
         self._omega = 2 * math.pi / period
@@ -92,14 +82,21 @@ class Helix(Reference):
         self._origin = _tip(arm, home)
 
         knots = np.linspace(0.0, self._end, max(6, math.ceil(_KNOTS_PER_TURN * turns)) + 1)
-        q = np.empty((len(knots), arm.num_coordinates))
-        guess = home
-        for k, phi in enumerate(knots):
-            q[k] = guess = self._solve(arm, home, guess, phi)
-        self._curve = make_interp_spline(knots, q, k=5)
+        q = [home]
+        for phi in knots:
+            q.append(self._solve(arm, home, q[-1], phi))
+        self._curve = make_interp_spline(knots, q[1:], k=5)
         self._slopes = self._curve.derivative(1), self._curve.derivative(2)
         between = (knots[:-1, None] + np.diff(knots)[:, None] * [0.25, 0.5, 0.75]).ravel()
-        self.path_error = self._measure(arm, between)
+        points = np.array([self._point(phi) for phi in between])
+        errors = np.linalg.norm(_tip(arm, self._curve(between)) - points, axis=-1)
+        self.path_error = float(errors.max())
+        if not self.path_error < _MAX_PATH_ERROR:
+            raise ValueError(
+                f"the tip misses the helix by {self.path_error:.3g} m at phi = "
+                f"{between[errors.argmax()]:.3g} rad, near a singular configuration: take another "
+                "posture, or a smaller radius or pitch"
+            )
 
     def path(self, t: float) -> np.ndarray:
         """Return the desired tip position at time t in s, ``(3,)``, m, in the frame of the base."""
@@ -120,11 +117,8 @@ class Helix(Reference):
         s, slope, _ = smooth_step(x)
         # The integral of the quintic s from 0 to x, and 1/2 + (x - 1) beyond its end.
         risen = x**4 * (2.5 - 3 * x + x**2) if x < 1 else x - 0.5
-        return (
-            self._omega * self.rise_time * risen,
-            self._omega * s,
-            self._omega / self.rise_time * slope,
-        )
+        phi = self._omega * self.rise_time * risen
+        return phi, self._omega * s, self._omega / self.rise_time * slope
 
     def _point(self, phi: float) -> np.ndarray:
         r = self._radius
@@ -144,50 +138,13 @@ class Helix(Reference):
             )
             length = float(np.linalg.norm(change))
             if np.linalg.norm(error) < _CLOSE and length < _CLOSE:
-                self._require_within_limits(arm, q, phi)
                 return q
             q = q + change * min(1.0, _LONGEST_STEP / max(length, _CLOSE))
         raise ValueError(
-            f"the arm cannot follow the helix: at t = {self._time(phi):.4g} s its tip should be at "
-            f"{np.round(target, 4).tolist()} m, and after {_ITERATIONS} steps the inverse "
-            f"kinematics are {np.linalg.norm(error):.3g} m from it and still moving, as at the "
-            "edge of the reach: take a smaller radius or pitch, fewer turns, or another posture"
+            f"the arm cannot follow the helix: at phi = {phi:.3g} rad its tip stays "
+            f"{np.linalg.norm(error):.3g} m from {np.round(target, 4).tolist()} m: take a smaller "
+            "radius or pitch, fewer turns, or another posture"
         )
-
-    def _measure(self, arm: HasTip, angles: np.ndarray) -> float:
-        """Return the largest path error at the angles, and check the joint limits there."""
-        q = self._curve(angles)
-        for row, phi in zip(q, angles, strict=True):
-            self._require_within_limits(arm, row, phi)
-        points = np.array([self._point(phi) for phi in angles])
-        errors = np.linalg.norm(_tip(arm, q) - points, axis=-1)
-        worst = int(np.argmax(errors))
-        if not errors[worst] < _MAX_PATH_ERROR:
-            raise ValueError(
-                f"the joints cannot follow the helix smoothly: at t = "
-                f"{self._time(angles[worst]):.4g} s the tip is {errors[worst]:.3g} m beside it, "
-                f"allowed is {_MAX_PATH_ERROR:g} m, as near a singular configuration: take a "
-                "smaller radius or pitch, or another posture"
-            )
-        return float(errors[worst])
-
-    def _require_within_limits(self, arm: HasTip, q: np.ndarray, phi: float) -> None:
-        if not isinstance(arm, HasLimits):
-            return
-        outside = (q < arm.q_low - 1e-9) | (q > arm.q_high + 1e-9)
-        if outside.any():
-            i = int(np.argmax(outside))
-            raise ValueError(
-                f"the arm cannot follow the helix within its joint limits: at "
-                f"t = {self._time(phi):.4g} s joint {arm.joint_names[i]!r} would be at "
-                f"{q[i]:.4g} rad, allowed are {arm.q_low[i]:.4g} to {arm.q_high[i]:.4g} rad: take "
-                "a smaller radius or pitch, or another posture"
-            )
-
-    def _time(self, phi: float) -> float:
-        """Return the time at which the angle is phi, s, for messages."""
-        times = np.linspace(0.0, self.duration, 10_001)
-        return float(np.interp(phi, [self._angle(t)[0] for t in times], times))
 
 
 def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:

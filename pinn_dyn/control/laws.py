@@ -37,14 +37,10 @@ class StateFeedback(Controller):
 
     @abc.abstractmethod
     def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
-        """The formula alone: tensors in, u ``(*batch, M)`` out, no checks and no side effects."""
+        """Return u ``(*batch, M)`` by the formula alone, without checks and side effects."""
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """The input u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
-
-        Raises:
-            ValueError: on a last dimension that is not N; names the argument.
-        """
+        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
         self._check(q, v, reference)
         with torch.no_grad():
             return self.law(q, v, *reference)
@@ -56,7 +52,7 @@ class StateFeedback(Controller):
             require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
 
     def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
+        """Return K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
         K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
         return K_P * (reference.q - q) + K_D * (reference.v - v)
 
@@ -69,19 +65,17 @@ class ModelBasedLaw(StateFeedback):
         N <= M:  A^+ = A^T (A A^T + d^2 I)^-1         N > M:  A^+ = (A^T A + d^2 I)^-1 A^T
 
     - Fully actuated, M = N and d = 0: A^+ is the inverse, and A A^+ tau = tau.
-    - Under-actuated, M < N: A A^+ tau is only the part of tau in the range of A (its orthogonal
-      projection); the rest is not compensated.
+    - Under-actuated, M < N: A A^+ tau is the orthogonal projection of tau on the range of A.
     - Over-actuated, M > N: A^+ tau is the input of least norm that gives tau.
 
-    d = 0 gives infinite or NaN inputs where A loses its rank; d > 0 keeps them finite, below
-    |tau| / (2 d), at the price of A A^+ tau != tau everywhere.
+    d = 0 gives infinite or NaN inputs where A loses its rank. d > 0 keeps them below |tau| / (2 d),
+    at the price of A A^+ tau != tau everywhere.
 
     Args:
         model: the mechanical system whose terms the law uses, in float64.
         position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
         inverse_damping: d, in the unit of the entries of A.
-        max_condition: largest condition number of A(q), the ratio of its largest to its smallest
-            singular value, that is no fault; infinity to accept all but NaN.
+        max_condition: largest condition number of A(q) that is no fault.
 
     Raises:
         TypeError: on a model that is no mechanical system.
@@ -101,26 +95,24 @@ class ModelBasedLaw(StateFeedback):
         if not isinstance(model, MechanicalSystem):
             raise TypeError(
                 f"{type(self).__name__}: model is a {type(model).__name__}, expected a mechanical "
-                "system: a black box has no terms M, G and A for a control law; use a run of "
-                "model=lnn or model=hnn"
+                "system with terms M, G and A, such as model=lnn or model=hnn"
             )
         if model.input_history:
             raise ValueError(
                 f"{type(self).__name__}: the model has a learned input delay "
-                f"({model.learned_figures()}), and the law acts as if its input acted at once: "
-                "lower the gains until the delay does not matter and set "
-                "model.delay = pinn_dyn.models.NoDelay(), or train with ~model/delay"
+                f"({model.learned_figures()}), which the law ignores: train with ~model/delay, or "
+                "set model.delay = pinn_dyn.models.NoDelay() and lower the gains"
             )
         if not model.input_affine:
             raise ValueError(
                 f"{type(self).__name__}: the model has a force that is not linear in the input "
-                "(model/input=nonlinear or model/friction=load_dependent), and the control laws "
-                "invert A(q): train with model/input=network, or another friction"
+                "(model/input=nonlinear or model/friction=load_dependent), and the law inverts "
+                "A(q): train with model/input=network, or another friction"
             )
         if model.has_residual:
             raise ValueError(
-                f"{type(self).__name__}: the model has a residual force (model/residual=network), "
-                "which the control laws cannot invert: train with model/residual=none"
+                f"{type(self).__name__}: the law cannot invert the model's residual force: train "
+                "with model/residual=none"
             )
         super().__init__(model.num_coordinates, model.num_inputs, position_gain, velocity_gain)
         self.model = model
@@ -132,11 +124,7 @@ class ModelBasedLaw(StateFeedback):
         self._condition = None
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """The input u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
-
-        Raises:
-            ValueError: on a last dimension that is not N; names the argument.
-        """
+        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
         self._check(q, v, reference)
         with torch.no_grad():
             A = self.model.input_matrix(q)
@@ -148,14 +136,14 @@ class ModelBasedLaw(StateFeedback):
 
     @abc.abstractmethod
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """The formula of the law, given A(q) ``(*batch, N, M)``."""
+        """Return u by the formula of the law, given A(q) ``(*batch, N, M)``."""
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """``input_condition``: condition number of A(q), ``(*batch,)``; NaN where A has none."""
+        """Return ``input_condition``, the condition number of A(q), ``(*batch,)``."""
         return {} if self._condition is None else {"input_condition": self._condition}
 
     def faults(self) -> dict[str, Tensor]:
-        """Where the condition number of A(q) exceeds its limit or is NaN."""
+        """Return where the condition number of A(q) exceeds its limit or is NaN."""
         if self._condition is None:
             return {}
         reason = (
@@ -185,11 +173,10 @@ class Regulation(ModelBasedLaw):
 
         u = A^+(q) G(q) + A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
 
-    At a set point v_ref = 0, and this is the paper's law; along a moving reference it is PD with
-    gravity compensation and without feed-forward. Stability is shown for M = N and A of
-    full rank (paper, Corollary on perfect learning: the terms may be those of the plant times one
-    common matrix P(q)). Arguments, A^+ where M differs from N, and errors: :class:`ModelBasedLaw`.
-    K_P in N/m or Nm/rad and K_D in Ns/m or Nms/rad where A has no unit.
+    Stability is shown for M = N, A of full rank and v_ref = 0 (paper, Corollary on perfect
+    learning: the terms may be those of the plant times one common matrix P(q)). Arguments and
+    errors: :class:`ModelBasedLaw`. K_P in N/m or Nm/rad and K_D in Ns/m or Nms/rad where A has no
+    unit.
     """
 
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
@@ -205,10 +192,9 @@ class Tracking(ModelBasedLaw):
         u = A^+(q) (M(q_r) a_r + C(q_r, v_r) v_r + D(q_r) v_r + F(v_r) + G(q_r))
             + A(q)^T (K_P (q_r - q) + K_D (v_r - v))
 
-    with the dry friction F beside the paper's terms where a model has one. The paper's text takes
-    C from d2L/(dq dv), which gives (dM/dt) v alone; here C v = (dM/dt) v - d(v^T M v / 2)/dq, the
-    whole of what the Euler-Lagrange equation gives. Arguments, A^+ where M differs from N, and
-    errors: :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
+    with the dry friction F of the model and C v = (dM/dt) v - d(v^T M v / 2)/dq. The paper takes C
+    from d2L/(dq dv), which gives (dM/dt) v alone. Arguments and errors: :class:`ModelBasedLaw`.
+    Units of the gains as for :class:`Regulation`.
     """
 
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
@@ -225,7 +211,7 @@ class ComputedTorque(ModelBasedLaw):
 
     With the true terms, M = N and A of full rank, the error e = q_r - q obeys
     d2e/dt2 = -K_D de/dt - K_P e: K_P in 1/s^2 and K_D in 1/s; K_D = 2 sqrt(K_P) is critically
-    damped. Arguments, A^+ where M differs from N, and errors: :class:`ModelBasedLaw`.
+    damped. Arguments and errors: :class:`ModelBasedLaw`.
     """
 
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
@@ -234,10 +220,9 @@ class ComputedTorque(ModelBasedLaw):
 
 
 def pseudo_inverse_times(A: Tensor, tau: Tensor, damping: float) -> Tensor:
-    """A^+ tau, ``(*batch, M)``; formulas in :class:`ModelBasedLaw`.
+    """Return A^+ tau, ``(*batch, M)``; formulas in :class:`ModelBasedLaw`.
 
-    A row of the batch where A lost its rank or is not finite gives infinities or NaN, and leaves
-    the other rows as they are: no LAPACK error stops the loop.
+    A row of the batch where A lost its rank or is not finite gives infinities or NaN.
 
     Args:
         A: input matrix, ``(*batch, N, M)``.
@@ -265,38 +250,15 @@ def pseudo_inverse_times(A: Tensor, tau: Tensor, damping: float) -> Tensor:
 
 
 def condition_number(A: Tensor) -> Tensor:
-    """Largest over smallest of the min(N, M) singular values of A, ``(*batch,)``.
-
-    NaN where A is zero or not finite.
-    """
+    """Return the condition number of A, ``(*batch,)``; NaN where A is zero or not finite."""
     # svdvals refuses a whole batch for one NaN, so it gets none; the sum brings the NaN back.
     values = torch.linalg.svdvals(torch.nan_to_num(A, nan=0.0, posinf=0.0, neginf=0.0))
     return values[..., 0] / values[..., -1] + 0 * A.sum((-2, -1))
 
 
 def diagonal_gain(name: str, value: Gain, size: int) -> Tensor:
-    """The diagonal of a gain matrix K = diag(k_1 ... k_N), ``(N,)``, float64.
-
-    Paper, Propositions on regulation and tracking: K_P and K_D must be positive definite.
-
-    Args:
-        name: what to call the gain in an error.
-        value: one number for all coordinates, or N of them.
-        size: N.
-
-    Raises:
-        ValueError: on a gain that is no number, not finite, not positive, or not 1 or N of them.
-    """
-    expected = f"expected one positive number or {size} of them, one for each coordinate"
-    try:
-        gain = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{name} is {value!r}: {expected}") from error
-    if gain.ndim > 1 or (gain.ndim == 1 and gain.shape[0] != size):
-        raise ValueError(f"{name} has shape {tuple(gain.shape)}: {expected}")
-    if not bool((torch.isfinite(gain) & (gain > 0)).all()):
-        raise ValueError(
-            f"{name} is {gain.tolist()}: {expected}; the closed loop is only proven stable for "
-            "positive definite gains"
-        )
+    """Return the diagonal of a positive definite gain matrix, ``(size,)``, float64."""
+    gain = torch.as_tensor(value, dtype=torch.float64)
+    if gain.shape not in ((), (size,)) or not (gain.isfinite() & (gain > 0)).all():
+        raise ValueError(f"{name} is {gain.tolist()}, expected 1 or {size} positive numbers")
     return gain.expand(size).clone()

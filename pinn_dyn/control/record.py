@@ -1,4 +1,4 @@
-"""What a closed loop leaves behind."""
+"""The record of a closed loop."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ from pinn_dyn.control.contracts import Motion
 
 @dataclass(frozen=True)
 class ClosedLoopRecord:
-    """K runs of a closed loop, sampled at its control instants.
-
-    What belongs to the plant or the law is NaN after a run has stopped.
+    """K runs of a closed loop, sampled at its control instants; NaN after a run was stopped.
 
     Attributes:
         t: control instants, ``(T,)``, s.
         q, v: true state of the plant, ``(K, T, N)``.
         u: input applied to the plant, ``(K, T, M)``.
-        u_wanted: input that the law asked for, before limits and delay, ``(K, T, M)``.
+        u_wanted: input of the law before limits and delay, ``(K, T, M)``.
         reference: desired motion, ``(K, T, N)`` each.
         stopped: for each run None, or when and why it was stopped.
-        diagnostics: what the controller reports of itself, ``(K, T)`` each.
+        diagnostics: diagnostics of the controller, ``(K, T)`` each.
     """
 
     t: Tensor

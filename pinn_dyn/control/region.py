@@ -26,21 +26,17 @@ class DataRegion:
         distance(q, v) = min_i |x - x_i| / r
 
     r is the 99th percentile, over the drawn states, of the distance to the nearest drawn state of
-    *another* trajectory: the distance that a new trajectory of the same kind keeps from the data.
-    So 1 is the edge of the data, and states inside are below 1. With neighbors of the same
-    trajectory, r would be as small as the sample time, and each new trajectory an outlier.
+    *another* trajectory. So 1 is the edge of the data. A single trajectory is cut into ten pieces,
+    which count as trajectories.
 
     Args:
-        q: configurations of the training trajectories, ``(T_k, N)`` each.
-        v: their velocities, ``(T_k, N)`` each.
+        q, v: configurations and velocities of the training trajectories, ``(T_k, N)`` each.
         angles: indices of the coordinates that are angles of unlimited joints.
         samples: S, largest number of states that are drawn.
         seed: seed of the draw.
 
-    A single trajectory is cut into ten pieces of equal length, which count as trajectories.
-
     Raises:
-        ValueError: on states of a single trajectory, or trajectories that all hold the same states.
+        ValueError: if the trajectories hold the same states.
     """
 
     def __init__(
@@ -69,14 +65,16 @@ class DataRegion:
         drawn = np.random.default_rng(seed).choice(len(states), count, replace=False)
         states, trajectory = states[drawn] / self._scale, trajectory[drawn]
         self._tree = cKDTree(states)
-        self.radius = _distance_between_trajectories(states, trajectory)
+        distances = [
+            cKDTree(states[trajectory != k]).query(states[trajectory == k])[0]
+            for k in np.unique(trajectory)
+        ]
+        self.radius = float(np.percentile(np.concatenate(distances), 99))
+        if not 0 < self.radius < np.inf:
+            raise ValueError("a region needs two different trajectories: give more data or samples")
 
     def distance(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return the distance from the data, ``(*batch,)``, 1 at the edge; NaN for a NaN state.
-
-        Raises:
-            ValueError: on a last dimension that is not N.
-        """
+        """Return the distance from the data, ``(*batch,)``, 1 at the edge; NaN for a NaN state."""
         require_last_dim("q", q, self.num_coordinates, "N")
         require_last_dim("v", v, self.num_coordinates, "N")
         states = self._features(q, v) / self._scale
@@ -86,32 +84,9 @@ class DataRegion:
 
     def _features(self, q: Tensor, v: Tensor) -> np.ndarray:
         x = torch.cat([q, v], dim=-1).detach().cpu().double().numpy()
-        if not self.angles:
-            return x
         angles = x[..., self.angles]
-        return np.concatenate(
-            [np.delete(x, self.angles, axis=-1), np.sin(angles), np.cos(angles)], axis=-1
-        )
-
-
-def _distance_between_trajectories(states: np.ndarray, trajectory: np.ndarray) -> float:
-    """Return the 99th percentile of the distances to the nearest state of another trajectory."""
-    if len(np.unique(trajectory)) < 2:
-        raise ValueError(
-            f"the {len(states)} states drawn come from one trajectory, expected two at least: give "
-            "more data, or a larger number of samples"
-        )
-    distances = [
-        cKDTree(states[trajectory != k]).query(states[trajectory == k])[0]
-        for k in np.unique(trajectory)
-    ]
-    radius = float(np.percentile(np.concatenate(distances), 99))
-    if not radius > 0:
-        raise ValueError(
-            "all trajectories hold the same states, expected different ones: the size of the "
-            "region cannot be told from them"
-        )
-    return radius
+        others = np.delete(x, self.angles, axis=-1)
+        return np.concatenate([others, np.sin(angles), np.cos(angles)], axis=-1)
 
 
 class Guarded(Controller):
@@ -120,17 +95,14 @@ class Guarded(Controller):
         u = fallback(t, q, v, reference)  if there is one and distance(q, v) > threshold
             law(t, q, v, reference)       otherwise
 
-    Each instant is judged alone, without hysteresis: a state near the edge may switch back and
-    forth. One warning is logged per run, at the first state outside.
+    There is no hysteresis: a state near the edge may switch back and forth. One warning is logged
+    per run.
 
     Args:
         law: the law to guard.
-        fallback: the law outside, a PD law say; None for a guard that only warns.
+        fallback: the law outside, such as PD; None for a guard that only warns.
         region: the training data of the law's model.
         threshold: distance from which a state is outside; 1 is the edge of the data.
-
-    Raises:
-        ValueError: on sizes that do not match.
     """
 
     def __init__(
@@ -142,39 +114,34 @@ class Guarded(Controller):
         threshold: PositiveFloat = 2.0,
     ):
         super().__init__(law.num_coordinates, law.num_inputs)
-        sizes = {"region": region.num_coordinates}
-        if fallback is not None:
-            sizes["fallback"] = fallback.num_coordinates
-        for name, size in sizes.items():
-            if size != self.num_coordinates:
-                raise ValueError(
-                    f"{name} has {size} coordinates, expected those of the law, "
-                    f"{self.num_coordinates}"
-                )
-        self.law = law
-        self.region = region
-        self.threshold = threshold
+        self.law, self.region, self.threshold = law, region, threshold
         self._fallback = fallback
-        self._distance: Tensor | None = None
-        self._warned = False
+        self.reset()
 
     def reset(self) -> None:
         self.law.reset()
         if self._fallback is not None:
             self._fallback.reset()
-        self._distance = None
+        self._distance: Tensor | None = None
         self._warned = False
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         u = self.law(t, q, v, reference)
         self._distance = self.region.distance(q, v)
         outside = self._distance > self.threshold
-        if not outside.any():
-            return u
-        if not self._warned:
+        if outside.any() and not self._warned:
             self._warned = True
-            self._warn(t, self._distance)
-        if self._fallback is None:
+            log.warning(
+                "t = %.4g s: %d of %d states are outside the training data, at distances up to "
+                "%.3g (1: the edge of the data; limit: %g); the %s law goes on",
+                t,
+                int(outside.sum()),
+                outside.numel(),
+                float(self._distance.nan_to_num(nan=0.0).max()),
+                self.threshold,
+                "learned" if self._fallback is None else "fallback",
+            )
+        if self._fallback is None or not outside.any():
             return u
         return torch.where(outside.unsqueeze(-1), self._fallback(t, q, v, reference), u)
 
@@ -182,42 +149,18 @@ class Guarded(Controller):
         """Return those of the law, ``distance``, and ``outside`` and ``fallback`` as 0 or 1."""
         if self._distance is None:
             return {}
-        guard = {
-            "distance": self._distance,
-            "outside": (self._distance > self.threshold).to(self._distance),
-            "fallback": self._handed_over(self._distance).to(self._distance),
-        }
+        outside = (self._distance > self.threshold).to(self._distance)
+        fallback = 0 * outside if self._fallback is None else outside
+        guard = {"distance": self._distance, "outside": outside, "fallback": fallback}
         return self.law.diagnostics() | guard
 
     def faults(self) -> dict[str, Tensor]:
         """Return the faults of the law, and of the fallback where the fallback acts."""
-        if self._distance is None:
-            return {}
-        handed = self._handed_over(self._distance)
-        faults = {reason: mask & ~handed for reason, mask in self.law.faults().items()}
-        if self._fallback is not None and handed.any():
+        if self._distance is None or self._fallback is None:
+            return self.law.faults()
+        outside = self._distance > self.threshold
+        faults = {reason: mask & ~outside for reason, mask in self.law.faults().items()}
+        if outside.any():
             for reason, mask in self._fallback.faults().items():
-                faults[reason] = faults.get(reason, torch.zeros_like(mask)) | (mask & handed)
+                faults[reason] = faults.get(reason, torch.zeros_like(mask)) | (mask & outside)
         return faults
-
-    def _handed_over(self, distance: Tensor) -> Tensor:
-        outside = distance > self.threshold
-        return torch.zeros_like(outside) if self._fallback is None else outside
-
-    def _warn(self, t: float, distance: Tensor) -> None:
-        flat = distance.nan_to_num(nan=0.0).flatten()
-        farthest = int(flat.argmax())
-        count = int((flat > self.threshold).sum())
-        log.warning(
-            "t = %.4g s: %d of %d states outside the training data, the farthest (index %d) at "
-            "distance %.3g, with 1 the edge of the data and %g the limit; %s",
-            t,
-            count,
-            flat.numel(),
-            farthest,
-            float(flat[farthest]),
-            self.threshold,
-            "the model is not to be trusted there, and the law goes on with it"
-            if self._fallback is None
-            else "the fallback law takes over there",
-        )

@@ -1,17 +1,13 @@
-"""The paper's Proposition 1 in numbers: its conditions, its deltas and the error they allow.
+"""Proposition 1 of the paper in numbers: its conditions, its deltas and the error they allow.
 
-Plant and law, paper eqs. (armdynamics) and (controller_PD), with N = M::
+Plant and law, paper eqs. (armdynamics) and (controller_PD), with N = M, and their closed loop::
 
     M(q) dv/dt + C(q, v) v + G(q) + D(q) v = A(q) u
     u = A_L^-1 G_L + A_L^T (K_P (q_ref - q) - K_D v)
-
-together give the closed loop::
-
     M dv/dt + C v + (D + Khat_D) v = Delta_all + Khat_P (q_ref - q)
     Delta_all = A A_L^-1 G_L - G,     Khat_P = A A_L^T K_P,     Khat_D = A A_L^T K_D
 
-The arm rests where q - q_ref = h(q) = Khat_P^-1 Delta_all. None of this depends on the factor P;
-docs/stability.md derives it line by line. Shapes: K configurations q ``(K, N)``; float64 inside.
+The arm rests where q - q_ref = h(q) = Khat_P^-1 Delta_all. docs/stability.md derives the numbers.
 """
 
 from __future__ import annotations
@@ -23,7 +19,7 @@ from torch import Tensor
 from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.control.laws import Gain, diagonal_gain
 from pinn_dyn.mechanics import MechanicalSystem, Terms, double_copy
-from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.mechanics.arrays import matvec, require_last_dim
 
 
 def certify(
@@ -47,14 +43,12 @@ def certify(
 
         - ``condition_1``: smallest eigenvalue of the symmetric part of A A_L^T, eq. (PD_transpose),
           which must be positive;
-        - ``position_eigenvalue``, ``velocity_eigenvalue``: the same of Khat_P and Khat_D, which
-          condition 1 does not make positive where gains differ between coordinates;
+        - ``position_eigenvalue``, ``velocity_eigenvalue``: the same of Khat_P and Khat_D;
         - ``delta_all``: |A A_L^-1 G_L - G|, to compare with ``potential_force``, |G|;
         - ``rest_error``: |Khat_P^-1 Delta_all|, the distance from q_ref of an arm that rests at q.
 
     Raises:
-        ValueError: on sizes that do not match, an underactuated system, gains that are not
-            positive, or an A or A_L without full rank.
+        ValueError: on sizes that do not match, N != M, or an A or A_L without full rank.
     """
     model, truth, q = prepare(model, truth, q)
     K_P = diagonal_gain("position_gain", position_gain, q.shape[-1]).to(q)
@@ -78,17 +72,13 @@ def certify(
 def factor_bounds(P: Tensor, true: Terms, learned: Terms) -> dict[str, Tensor]:
     """Return the deltas of Proposition 1 for a factor P ``(K, N, N)``, with N = M.
 
-    With Delta_A = A_L - P A, Delta_G = G_L - P G, Delta_I = A_L^-1 - (P A)^-1 and X = (P A)^-1, the
+    With Delta_A = A_L - P A, Delta_G = G_L - P G, Delta_I = A_L^-1 - X and X = (P A)^-1, the
     spectral norms, ``(K,)`` each:
 
     - ``condition_2``: |X Delta_A|, which must be below 1, eq. (smallenss_A_2);
     - ``delta_A``, ``delta_G``, ``delta_I``: |Delta_A|, |Delta_G|, |Delta_I|;
-    - ``delta_I_bound``: |X Delta_A X| / (1 - |X Delta_A|), the paper's bound on delta_I, infinite
-      where condition 2 fails;
-    - ``delta_all_bound``: |P^-1| delta_G + |A| delta_I_bound (|P G| + delta_G), the triangle
-      inequality on the three terms of the paper's Delta_all.
-
-    Source: paper, Proposition 1 and its proof.
+    - ``delta_I_bound``: |X Delta_A X| / (1 - |X Delta_A|), infinite where condition 2 fails;
+    - ``delta_all_bound``: |P^-1| delta_G + |A| delta_I_bound (|P G| + delta_G).
     """
     PA, PG = P @ true.A, matvec(P, true.G)
     X = torch.linalg.inv(PA)
@@ -109,16 +99,11 @@ def factor_bounds(P: Tensor, true: Terms, learned: Terms) -> dict[str, Tensor]:
 
 
 def checked_samples(model: MechanicalSystem, truth: MechanicalSystem, q: Tensor) -> Tensor:
-    """Return configurations ``(K, N)`` of two systems of the same size in float64.
-
-    Raises:
-        ValueError: if the sizes differ.
-    """
+    """Return configurations ``(K, N)`` of two systems of the same N and M in float64."""
     sizes = [(system.num_coordinates, system.num_inputs) for system in (model, truth)]
     if sizes[0] != sizes[1]:
         raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
-    if q.ndim != 2 or q.shape[-1] != truth.num_coordinates:
-        raise ValueError(f"q has shape {tuple(q.shape)}, expected (K, {truth.num_coordinates})")
+    require_last_dim("q", q, truth.num_coordinates, "N")
     return q.double()
 
 
@@ -128,20 +113,14 @@ def prepare(
     """Return float64 copies of two systems and of configurations, after checking them."""
     q = checked_samples(model, truth, q)
     if truth.num_coordinates != truth.num_inputs:
-        raise ValueError(
-            f"truth has N = {truth.num_coordinates} coordinates and M = {truth.num_inputs} inputs: "
-            "Proposition 1 needs N = M. See model_report for a report without it"
-        )
+        raise ValueError(f"Proposition 1 needs N = M inputs, the robot has M = {truth.num_inputs}")
     model, truth = double_copy(model, q.device), double_copy(truth, q.device)
     for name, system in (("A", truth), ("A_L", model)):
         with torch.no_grad():
             smallest = torch.linalg.svdvals(system.input_matrix(q))[..., -1]
         k = int(smallest.argmin())
         if not smallest[k] > 1e-12:
-            raise ValueError(
-                f"{name} is singular at q[{k}] = {q[k].tolist()}: Proposition 1 needs A and A_L of "
-                "full rank. Leave such configurations out"
-            )
+            raise ValueError(f"{name} is singular at q[{k}] = {q[k].tolist()}: leave it out")
     return model, truth, q
 
 

@@ -1,18 +1,16 @@
-"""Stability reports in Markdown, for a known truth and for a learned model alone."""
+"""The stability report in Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import MechanicalSystem, double_copy
-
 MEASUREMENT_TOLERANCE = 1e-6
-"""A measured error counts as above its bound beyond this, as a simulation ends too early."""
+"""Excess of a measured error over its bound that does not count: simulations end early."""
 
 
 def stability_report(
@@ -45,17 +43,16 @@ def stability_report(
         worst = conditions[key].min() if "eigenvalue" in name else conditions[key].max()
         rows.append([name, conditions[key].median(), worst, "-" if good is None else _share(good)])
     coordinates = [name for name in conditions if name[:1] == "q"]
-    farthest = conditions.nlargest(3, "rest_error")
-    places = [[str(k), _vector(r[coordinates]), r["rest_error"]] for k, r in farthest.iterrows()]
+    farthest = conditions.nlargest(3, "rest_error")[[*coordinates, "rest_error"]]
     sections = [
         f"# {title}",
         f"Proposition 1 of the paper at {len(conditions)} configurations; nothing is checked "
-        "between them. Every number is explained in docs/stability.md. The eigenvalues must be "
-        "positive, and condition 2 below 1. P is the factor that fits M, D, G and A together; with "
+        "between them. docs/stability.md explains the numbers. The eigenvalues must be positive, "
+        "and condition 2 below 1. P is the factor that fits M, D, G and A together; with "
         "P = A_L A^-1, condition 2 is 0 everywhere.",
         _table(["", "median", "worst", "holds at"], rows),
-        "Configurations with the largest error at rest:",
-        _table(["index", "q", "distance from the set point"], places),
+        "Configurations with the largest `rest_error`, the distance from the set point at rest:",
+        _table(list(farthest), farthest.to_numpy().tolist()),
     ]
     if steady_states is not None:
         sections += _steady_states(steady_states, measured)
@@ -77,42 +74,6 @@ def stability_report(
     return "\n\n".join(sections) + "\n"
 
 
-def model_report(model: MechanicalSystem, q: Tensor, *, region: str) -> str:
-    """Return a report in Markdown for a learned model whose truth is not known.
-
-    Args:
-        model: the learned system; N and M may differ.
-        q: configurations, ``(K, N)``.
-        region: name of the region that the configurations come from.
-    """
-    with torch.no_grad():
-        terms = double_copy(model, q.device).terms(q.double())
-    mass, singular = torch.linalg.eigvalsh(terms.M), torch.linalg.svdvals(terms.A)
-    damping = torch.linalg.eigvalsh(terms.D)[..., 0]
-    rows = []
-    for name, values, worst in (
-        ("smallest eigenvalue of M_L", mass[..., 0], torch.argmin),
-        ("condition number of M_L", mass[..., -1] / mass[..., 0], torch.argmax),
-        ("smallest eigenvalue of D_L", damping, torch.argmin),
-        ("condition number of A_L", singular[..., 0] / singular[..., -1], torch.argmax),
-    ):
-        k = int(worst(values))
-        rows.append([name, values.median(), values[k], _vector(q[k].tolist())])
-    square = model.num_coordinates == model.num_inputs
-    actuation = "as Proposition 1 needs" if square else "Proposition 1 says nothing about it"
-    return (
-        f"# Learned model alone over {region}\n\n{len(q)} configurations. N = "
-        f"{model.num_coordinates} and M = {model.num_inputs}, {actuation}.\n\n"
-        + _table(["", "median", "worst", "at q"], rows)
-        + f"\n\nM_L is positive definite at {_share(mass[..., 0] > 0)} configurations, D_L "
-        f"positive semi-definite at {_share(damping >= 0)}. The law inverts A_L: where its "
-        "condition number is large, a small error in G_L becomes a large error in u. Conditions 1 "
-        "and 2, the factor P and the steady-state error need the true A and G. A model can have "
-        "good numbers here "
-        "and be wrong: judge it by test trajectories and careful first runs.\n"
-    )
-
-
 def _steady_states(table: pd.DataFrame, measured: Tensor | None) -> list[str]:
     error = pd.Series(torch.nan if measured is None else measured.numpy(), table.index)
     held = table.assign(measured=error)[table["holds"]]
@@ -123,28 +84,21 @@ def _steady_states(table: pd.DataFrame, measured: Tensor | None) -> list[str]:
         ["slowest pole, 1/s", table["slowest_pole"].max()],
         ["control step below, s", 2 / table["fastest_pole"].max()],
     ]
-    for name in ("bound", "error", "measured"):
-        values = held[name].dropna()
-        if len(values):
-            rows.append(
-                [f"{name}, median / largest", f"{values.median():.3g} / {values.max():.3g}"]
-            )
+    for name in ("bound", "error", "measured") if len(held) else ():
+        text = f"{held[name].median():.3g} / {held[name].max():.3g}"
+        rows.append([f"{name}, median / largest", text])
     return [
         "## Steady-state error",
-        "‖q - q_ref‖ of the set points where the conditions hold: L < 1 in a ball around the set "
-        "point, condition 1 in the ball, and all poles of the linearized loop on the left. A "
-        "sampled controller needs a step below 2 / |fastest pole|, which alone does not suffice. A "
-        "run has to last several times 1 / |slowest pole| before its end is a steady state.",
+        "‖q - q_ref‖ of the set points where the conditions hold: L < 1 and condition 1 in a ball "
+        "around the set point, and all poles of the linearized loop on the left. A sampled "
+        "controller needs at least a step below 2 / |fastest pole|. A run must last several times "
+        "1 / |slowest pole| to reach its steady state.",
         _table(["", "value"], rows),
     ]
 
 
 def _share(good: Tensor | pd.Series) -> str:
     return f"{int(good.sum())} of {len(good)}"
-
-
-def _vector(values: Iterable[float]) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
 
 
 def _table(header: list[str], rows: list[list[Any]]) -> str:

@@ -1,15 +1,9 @@
-"""The steady state of the regulated arm: a bound around the set point, the point, its poles.
-
-With the closed loop of ``stability.py`` the arm rests where::
-
-    q - q_ref = h(q) = Khat_P^-1 Delta_all,     Khat_P = A A_L^T K_P
-
-docs/stability.md derives it. Shapes: K set points ``(K, N)``; float64 inside.
-"""
+"""The steady state of the regulated arm of ``stability.py``, where q - q_ref = h(q)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import pandas as pd
 import torch
@@ -34,33 +28,28 @@ def predict_steady_state(
 ) -> pd.DataFrame:
     """Predict the steady states of the true arm under the learned regulator, a row per set point.
 
-    The steady state is a fixed point of q -> q_ref + h(q). If |dh/dq| <= L < 1 in a ball around
-    q_ref of radius |h(q_ref)| / (1 - L) or more, the map has exactly one fixed point there, and it
-    lies within that radius (contraction mapping theorem). L is the slope at q_ref plus twice the
-    largest change of the slope at 16 points of the sphere around it. The poles are those of
-    M x'' + (D + Khat_D) x' + Khat_P (I - dh/dq) x = 0 at the fixed point q_ss.
+    If |dh/dq| <= L < 1 in a ball around q_ref of radius |h(q_ref)| / (1 - L) or more, the map
+    q -> q_ref + h(q) has exactly one fixed point q_ss there, and it lies within that radius. L is
+    the slope at q_ref plus twice the largest change of the slope at 16 points of the sphere around
+    it. The poles are those of M x'' + (D + Khat_D) x' + Khat_P (I - dh/dq) x = 0 at q_ss.
 
     Args:
         model: the learned system.
         truth: the true system, with the same N = M.
         q_ref: set points, ``(K, N)``.
-        position_gain, velocity_gain: diagonals of K_P and K_D, one number or N; only the poles
-            depend on K_D.
+        position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
 
     Returns:
-        The columns ``q1`` to ``qN`` of q_ref, ``rest1`` to ``restN`` of q_ss by Newton's method
-        (NaN where it does not converge), and
+        The columns ``q1`` to ``qN`` of q_ref, ``rest1`` to ``restN`` of q_ss (NaN where Newton's
+        method does not converge), and
 
         - ``slope``: L;
         - ``bound``: |h(q_ref)| / (1 - L), infinite where no ball with L < 1 is large enough;
-        - ``error``: |q_ss - q_ref|, the prediction, which is not a bound;
+        - ``error``: |q_ss - q_ref|, a prediction and no bound;
         - ``condition_1``: smallest eigenvalue of the symmetric part of A A_L^T over the ball;
         - ``slowest_pole``: largest real part of the poles, 1/s, negative where stable;
         - ``fastest_pole``: largest absolute value of the poles, 1/s;
-        - ``holds``: true where the bound is claimed: finite, with condition 1, and stable.
-
-    Raises:
-        ValueError: as for :func:`certify`.
+        - ``holds``: true where the bound is finite, condition 1 holds, and the loop is stable.
     """
     model, truth, q_ref = prepare(model, truth, q_ref)
     K_P = diagonal_gain("position_gain", position_gain, q_ref.shape[-1]).to(q_ref)
@@ -96,17 +85,11 @@ def required_gain(
 
         kappa = L_w + |w(q_ref)| / error,     w(q) = K_P h(q) = (A A_L^T)^-1 Delta_all
 
-    with L_w the largest |dw/dq| over the ball of radius 1.05 ``error`` around q_ref, as in
-    :func:`predict_steady_state`. This is the "kappa high enough" of Proposition 1.
-
-    Raises:
-        ValueError: as for :func:`certify`.
+    with L_w the largest |dw/dq| over the ball of radius 1.05 ``error`` around q_ref. This is the
+    "kappa high enough" of Proposition 1.
     """
     model, truth, q_ref = prepare(model, truth, q_ref)
-
-    def w(q: Tensor) -> Tensor:
-        return _input_error(model, truth, q)
-
+    w = partial(_input_error, model, truth)
     with torch.no_grad():
         radius = torch.full_like(q_ref[:, 0], _SLACK * error)
         slope = _largest_slope(w, _jacobian(w, q_ref), q_ref, radius)
@@ -166,21 +149,15 @@ def _equilibrium(h: Callable[[Tensor], Tensor], q_ref: Tensor) -> Tensor:
 
 
 def _poles(
-    model: MechanicalSystem,
-    truth: MechanicalSystem,
-    q_ss: Tensor,
-    slope: Tensor,
-    K_P: Tensor,
-    K_D: Tensor,
+    model: MechanicalSystem, truth: MechanicalSystem, q: Tensor, slope: Tensor, *gains: Tensor
 ) -> Tensor:
-    finite = torch.isfinite(q_ss).all(-1)
-    q = torch.where(finite[:, None], q_ss, 0.0)
-    terms = truth.terms(q)
-    K_A = terms.A @ model.input_matrix(q).mT
-    eye = torch.eye(q.shape[-1], dtype=q.dtype, device=q.device)
-    stiffness = (K_A * K_P) @ (eye - torch.where(finite[:, None, None], slope, 0.0))
-    lower = -torch.linalg.solve(terms.M, torch.cat([stiffness, terms.D + K_A * K_D], -1))
-    upper = torch.cat([torch.zeros_like(eye), eye], -1).expand_as(lower)
+    finite = torch.isfinite(q).all(-1)
+    terms, zero = truth.terms(q.nan_to_num()), torch.zeros_like(slope)
+    K_P, K_D = (terms.A @ model.input_matrix(q.nan_to_num()).mT * gain for gain in gains)
+    eye = torch.eye(q.shape[-1]).to(slope)
+    stiffness = K_P @ (eye - slope.nan_to_num())
+    lower = -torch.linalg.solve(terms.M, torch.cat([stiffness, terms.D + K_D], -1))
+    upper = torch.cat([zero, eye.expand_as(zero)], -1)
     poles = torch.linalg.eigvals(torch.cat([upper, lower], -2))
     return torch.where(finite[:, None], poles, torch.nan)
 
@@ -195,5 +172,4 @@ def _jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> Tensor:
 def _spectral_norm(matrix: Tensor) -> Tensor:
     """Return the largest singular value, infinite where an entry is not finite."""
     finite = torch.isfinite(matrix).all(-1).all(-1)
-    norm = torch.linalg.matrix_norm(torch.where(finite[..., None, None], matrix, 0.0), 2)
-    return torch.where(finite, norm, torch.inf)
+    return torch.where(finite, torch.linalg.matrix_norm(matrix.nan_to_num(), 2), torch.inf)

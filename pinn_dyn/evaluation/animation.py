@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
-from PIL import Image
 from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
@@ -19,40 +17,44 @@ from pinn_dyn.evaluation.plots import COLORS, TRUTH
 from pinn_dyn.systems import Drawable
 
 _TIP = "#CC0000"
-_FRAME, _LAST_FRAME = 50, 1000  # ms
+_FRAMES_PER_SECOND = 20
 
 
-def animate(record: ClosedLoopRecord, run: int, robot: object, path: Path) -> None:
-    """Write a GIF of one run in real time, up to its end or stop, if the robot gives its lines.
+def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> None:
+    """Write a GIF of one run in real time, up to its end or stop, which is shown for a second.
 
     The reference is grey, the path of the tip red.
 
     Args:
         record: K runs.
         run: index of the run.
-        robot: nothing is written for a robot that is not :class:`Drawable`.
+        robot: a system that gives its lines.
         path: the GIF; its folder is created.
     """
-    if not isinstance(robot, Drawable):
-        return
-    samples = _frames(record, run)
     shape, goal = _shapes(record, run, robot)
+    t = record.t[: len(shape)].double()
+    times = torch.arange(float(t[0]), float(t[-1]), 1 / _FRAMES_PER_SECOND, dtype=t.dtype)
+    last = len(t) - 1
+    samples = [*(t - times[:, None]).abs().argmin(dim=1).tolist(), *[last] * _FRAMES_PER_SECOND]
     figure = Figure(figsize=(4.8, 4.8), dpi=90)
-    canvas = FigureCanvasAgg(figure)
     ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
     _set_space(ax, _scene(record, run, shape, goal), robot.z_is_down)
-    images: list[Image.Image] = []
-    for sample in samples:
+
+    def draw(sample: int) -> None:
         for line in list(ax.lines):
             line.remove()
         _draw_pose(ax, shape, goal, sample)
-        text = _caption(record, run, sample, last=sample == samples[-1])
+        text = f"t = {float(t[sample]):.2f} s"
+        if sample == last and record.stopped[run]:
+            text += f"\nstopped: {record.stopped[run]}"
         figure.suptitle(text, x=0.03, y=0.98, ha="left", fontsize="medium", family="monospace")
-        if not images:
-            _legend(figure, ax)
-        canvas.draw()
-        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
-    _save_gif(images, path)
+
+    draw(0)
+    _legend(figure, ax)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    animation = FuncAnimation(figure, draw, samples)
+    animation.save(path, PillowWriter(_FRAMES_PER_SECOND))
 
 
 def pose_strip(
@@ -80,32 +82,6 @@ def pose_strip(
     figure.suptitle(title)
     figure.subplots_adjust(left=0.0, right=0.98, bottom=0.12, top=0.86, wspace=0.05)
     return figure
-
-
-def _frames(record: ClosedLoopRecord, run: int) -> list[int]:
-    """Return the samples to draw at 20 frames per second, with the last one before a stop."""
-    t = record.t[: samples_before_stop(record, run)].double()
-    times = torch.arange(float(t[0]), float(t[-1]), 1e-3 * _FRAME, dtype=t.dtype)
-    samples = (t - times[:, None]).abs().argmin(dim=1).tolist()
-    return [*dict.fromkeys([*samples, len(t) - 1])]
-
-
-def _caption(record: ClosedLoopRecord, run: int, sample: int, *, last: bool) -> str:
-    reason = record.stopped[run]
-    note = f"\nstopped: {reason}" if last and reason else ""
-    return f"t = {float(record.t[sample]):.2f} s{note}"
-
-
-def _save_gif(images: Sequence[Image.Image], path: Path) -> None:
-    """Write the GIF. The last frame has all colors, gives the palette, and lasts a second."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    palette = images[-1].quantize(64)
-    first, *following = [
-        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
-    ]
-    times = [_FRAME] * len(following) + [_LAST_FRAME]
-    first.save(path, format="GIF", save_all=True, append_images=following, duration=times, loop=0)
 
 
 def _shapes(record: ClosedLoopRecord, run: int, robot: Drawable) -> tuple[Tensor, Tensor]:

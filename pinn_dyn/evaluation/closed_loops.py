@@ -20,10 +20,10 @@ from pinn_dyn.control import (
     Reference,
     Sensor,
     SystemPlant,
-    check_limits,
     close_loop_continuous,
 )
 from pinn_dyn.control import close_loop as close_sampled_loop
+from pinn_dyn.control.references import check_limits
 from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation.control_metrics import (
     ClosedLoopMetrics,
@@ -31,7 +31,7 @@ from pinn_dyn.evaluation.control_metrics import (
     comparison_table,
 )
 from pinn_dyn.evaluation.tables import write_table
-from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory, double_copy
+from pinn_dyn.mechanics import MechanicalSystem, double_copy
 from pinn_dyn.systems import HasDomain, HasLimits
 
 _DOMAIN_SAMPLES = 101  # of a reference
@@ -43,7 +43,7 @@ class ControlResult:
 
     Attributes:
         records: K closed loops of each law, by the name of the law.
-        metrics: figures of each law, by its name.
+        metrics: metrics of each law, by its name.
     """
 
     records: dict[str, ClosedLoopRecord]
@@ -64,26 +64,13 @@ class ControlResult:
         """One row per law and input."""
         return _concatenated({name: m.inputs for name, m in self.metrics.items()})
 
-    def trajectories(self, law: str) -> list[Trajectory]:
-        """Return the K motions under a law, up to the sample at which a run was stopped."""
-        record = self.records[law]
-        motions = []
-        for q, v, u in zip(record.q, record.v, record.u, strict=True):
-            samples = int((q.isfinite() & v.isfinite()).all(-1).sum())
-            signal = Signal(record.t[:samples], u[:samples], "hold")
-            motions.append(Trajectory(q[:samples], v[:samples], signal))
-        return motions
-
     def save(self, folder: Path | str) -> None:
         """Write the tables as CSV files and the records as ``record_<law>.npz``."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for name, table in (
-            ("summary", self.table),
-            ("coordinates", self.coordinates),
-            ("inputs", self.inputs),
-        ):
-            write_table(table, folder, name)
+        write_table(self.table, folder, "summary")
+        write_table(self.coordinates, folder, "coordinates")
+        write_table(self.inputs, folder, "inputs")
         for name, record in self.records.items():
             arrays: dict[str, Any] = {
                 **{key: getattr(record, key).numpy() for key in ("t", "q", "v", "u", "u_wanted")},
@@ -91,8 +78,7 @@ class ControlResult:
                 **{key: value.numpy() for key, value in record.diagnostics.items()},
                 "stopped": np.array([reason or "" for reason in record.stopped]),
             }
-            path = folder / f"record_{name}.npz"
-            with whole(path) as partial, partial.open("wb") as file:
+            with whole(folder / f"record_{name}.npz") as partial, partial.open("wb") as file:
                 np.savez_compressed(file, **arrays)
 
 
@@ -118,9 +104,6 @@ def close_loop(
         reference: the desired motion.
         robot: the true system, which also gives the terms of the law ``"truth"``.
         settings: keyword arguments of :func:`close_loops`.
-
-    Raises:
-        TypeError, ValueError: as :func:`close_loops`, or if the model has no terms for the law.
     """
     learned = double_copy(getattr(run, "model", run))
     return close_loops({"learned": law(learned), "truth": law(robot)}, reference, robot, **settings)
@@ -155,12 +138,11 @@ def close_loops(
         samples_rate: samples per second of a continuous-time record, 1/s.
         q0, v0: initial states, ``(K, N)`` each; None starts on the reference.
         plant: the simulation of the robot at control instants; None solves its equation of motion.
-        actuator: limits of the input; None for no limits.
-        sensor: noise of the measurement; None for no noise.
+        actuator: limits of the input.
+        sensor: noise of the measurement.
         delay: dead time of the input, control instants.
-        settle_fraction: part of the step within which the error of a set point has settled.
-        settled_after: time from which the error of a set point is measured, s; None leaves it out.
-        progress: true shows a progress bar on a terminal.
+        settle_fraction, settled_after: see :func:`closed_loop_metrics`.
+        progress: show a progress bar on a terminal.
 
     Raises:
         ValueError: if the reference leaves the limits or the domain of the robot, sizes do not
@@ -169,21 +151,13 @@ def close_loops(
     start = reference(0.0)
     if q0 is None or v0 is None:
         q0, v0 = (x.double().reshape(-1, reference.num_coordinates) for x in (start.q, start.v))
-    check_reference(reference, robot, q0, duration)
-    at_rest = _is_set_point(reference, q0, duration)
-    if at_rest and settled_after is not None and settled_after > duration:
-        raise ValueError(
-            f"settled_after is {settled_after} s, expected at most duration, {duration} s"
-        )
+    _check_reference(reference, robot, q0, duration)
     if rate is None and (delay or sensor is not None):
-        raise ValueError(
-            "rate is null, a law in continuous time, which has neither delay nor sensor noise: "
-            "give a rate, or set them to 0"
-        )
-    records = {}
+        raise ValueError("a law in continuous time has no delay and no sensor noise: give a rate")
+    records, metrics = {}, {}
     for name, law in laws.items():
-        bar = f"closing the loop: {name}" if progress else None
-        common: dict[str, Any] = {"duration": duration, "actuator": actuator, "progress": bar}
+        common: dict[str, Any] = {"duration": duration, "actuator": actuator}
+        common["progress"] = f"closing the loop: {name}" if progress else None
         if rate is None:
             records[name] = close_loop_continuous(
                 robot, law, reference, q0, v0, samples_rate=samples_rate, **common
@@ -193,32 +167,23 @@ def close_loops(
             records[name] = close_sampled_loop(
                 plant, law, reference, q0, v0, rate=rate, sensor=sensor, delay=delay, **common
             )
-    metrics = {
-        name: closed_loop_metrics(
-            record,
+        metrics[name] = closed_loop_metrics(
+            records[name],
             settle_fraction=settle_fraction,
-            settled_after=settled_after if at_rest else None,
+            settled_after=settled_after,
             u_low=None if actuator is None else actuator.low,
             u_high=None if actuator is None else actuator.high,
         )
-        for name, record in records.items()
-    }
     return ControlResult(records, metrics)
 
 
-def check_reference(
+def _check_reference(
     reference: Reference, robot: MechanicalSystem, q0: Tensor, duration: float
 ) -> None:
-    """Check that a reference fits a robot and stays within its limits and its domain.
-
-    Raises:
-        ValueError: if it does not.
-    """
+    """Check that a reference fits a robot and stays within its limits and its domain."""
     for name, size in (("the reference", reference.num_coordinates), ("q0", q0.shape[-1])):
         if size != robot.num_coordinates:
-            raise ValueError(
-                f"{name} has {size} coordinates, expected {robot.num_coordinates}, as the robot has"
-            )
+            raise ValueError(f"{name} has {size} coordinates, the robot {robot.num_coordinates}")
     if isinstance(robot, HasLimits):
         check_limits(reference, robot.q_low, robot.q_high, duration, robot.v_max)
     if isinstance(robot, HasDomain):
@@ -228,15 +193,5 @@ def check_reference(
         robot.check_domain(visited.min(0), visited.max(0))
 
 
-def _is_set_point(reference: Reference, q0: Tensor, duration: float) -> bool:
-    """Return true for a constant reference that no run starts at."""
-    first = reference(0.0).q
-    times = np.linspace(0.0, duration, _DOMAIN_SAMPLES)
-    constant = all(torch.equal(reference(float(t)).q, first) for t in times)
-    return constant and not bool((q0 == first).all(-1).any())
-
-
 def _concatenated(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
-    """Concatenate the tables of several laws."""
-    named = pd.concat(tables, names=["controller"]).reset_index("controller")
-    return named.reset_index(drop=True)
+    return pd.concat(tables, names=["controller"]).reset_index("controller").reset_index(drop=True)

@@ -34,7 +34,7 @@ def control_errors(record: ClosedLoopRecord) -> Tensor:
 
 
 def closed_loop_figure(
-    records: ClosedLoopRecord | Mapping[str, ClosedLoopRecord],
+    laws: Mapping[str, ClosedLoopRecord],
     run: int,
     *,
     title: str,
@@ -47,17 +47,13 @@ def closed_loop_figure(
     A dashed vertical line marks the time at which a run was stopped.
 
     Args:
-        records: K runs of one control law, or names of laws and K runs of each.
+        laws: names of laws and K runs of each.
         run: index of the run.
         title: title of the figure.
         labels: name and unit of each coordinate; None takes q1 ... qN.
         input_labels: name and unit of each input; None takes u1 ... uM.
         held: the input is constant between two control instants.
-
-    Raises:
-        ValueError: if the number of labels does not fit.
     """
-    laws = {"closed loop": records} if isinstance(records, ClosedLoopRecord) else dict(records)
     first = next(iter(laws.values()))
     labels = default_labels(labels, "q", first.q.shape[-1])
     input_labels = default_labels(input_labels, "u", first.u.shape[-1])
@@ -93,12 +89,10 @@ def closed_loop_figure(
 def controller_comparison_figure(
     records: Mapping[str, ClosedLoopRecord], *, title: str, label: str = ERROR
 ) -> Figure:
-    """Draw the error over time of each control law: mean over its runs and 10-90 % band.
-
-    Stopped runs are left out and counted in the legend.
+    """Draw the error over time of each law: mean and 10-90 % band of its complete runs.
 
     Args:
-        records: names of laws and their runs; the order of the names fixes their colors.
+        records: names of laws and their runs.
         title: title of the figure.
         label: name and unit of the error.
     """
@@ -114,8 +108,6 @@ def tip_path_figure(
     t: Tensor, paths: Mapping[str, Tensor], reference: Tensor, *, title: str
 ) -> Figure:
     """Draw the path of the end effector in space, and its distance to the reference over time.
-
-    The distance is to the reference position at the same time.
 
     Args:
         t: times, ``(T,)``, s.
@@ -153,9 +145,8 @@ def steady_state_figure(
 ) -> Figure:
     """Draw the steady-state error of each set point against its predicted bound, on log axes.
 
-    The bound holds below the diagonal. A set point above it is a cross in a warning color. The
-    title counts the bounds that hold, the set points without a finite bound, and the set points
-    with a finite bound but no finite error, whose bound does not hold.
+    The bound holds below the diagonal. The title counts the bounds that hold, and the set points
+    that are not drawn, without a finite bound or error.
 
     Args:
         bound: predicted bounds, ``(K,)``, in the units of q.

@@ -13,11 +13,8 @@ from torch import Tensor
 
 from pinn_dyn.control.record import ClosedLoopRecord
 
-SMALL_STEP = 0.05
-"""A coordinate whose step is smaller than this part of the largest step has no overshoot."""
-
-STEADY_PART = 0.1
-"""The steady state is the last tenth of a run."""
+# A coordinate whose step is below this part of the largest step has no overshoot.
+_SMALL_STEP = 0.05
 
 Limit = Tensor | Sequence[float] | float | None
 
@@ -27,8 +24,7 @@ class ClosedLoopMetrics(NamedTuple):
 
     Means are over the runs that were not stopped, and infinite if all were stopped. A worst or
     largest value is infinite if any run was stopped. RMS values are over times, runs and the N
-    coordinates; e is in the units of q. The input is constant between two control instants, so its
-    last sample has no effect and does not count.
+    coordinates. The input is held between instants, so its last sample does not count.
 
     The metrics marked with * exist only for set points: each reference is constant, and no run
     starts at its reference. The step is s = q_ref - q(0).
@@ -38,12 +34,11 @@ class ClosedLoopMetrics(NamedTuple):
 
             - ``runs``, ``stopped``: number of runs, and of stopped runs.
             - ``rms_error``, ``mean_error``, ``max_error``: sqrt(mean e_i^2), mean and largest
-              |e|_2.
-            - ``step_error_after_<T>_s_mean_percent``, ``..._worst_percent`` *: see
-              :func:`step_error_after`.
+              |e|_2, in the units of q.
+            - ``step_error_after_<T>_s_mean_percent``, ``..._worst_percent`` *: largest |e|_2 from
+              T on, relative to |s|_2.
             - ``settling_time_median_s``, ``settling_time_worst_s`` *: first time from which |e|_2
-              stays below ``settle_fraction`` |s|_2, and ``never_settled``, the number of runs that
-              never settle, stopped runs among them.
+              stays below ``settle_fraction`` |s|_2; ``never_settled``: number of runs without it.
             - ``overshoot_mean_percent``, ``overshoot_worst_percent`` *: largest distance beyond the
               set point, relative to the step of the coordinate.
             - ``steady_state_error``: mean |e|_2 over the last tenth of the runs, and
@@ -74,99 +69,93 @@ def closed_loop_metrics(
     Args:
         record: K runs of a control law, with at least two samples.
         settle_fraction: part of the step within which the error has settled.
-        settled_after: time from which the step error is taken, s; None leaves the step error out.
+        settled_after: time from which the step error is taken, s; None or a time after the end
+            leaves the step error out.
         u_low, u_high: limits of the inputs, one number or M; None for no limit.
-
-    Raises:
-        ValueError: if ``settled_after`` is given and there is no step or no sample after it.
     """
     t = record.t.double() - record.t[0].double()
     duration = float(t[-1])
     lost = stopped_runs(record)
+    counted = lost if lost.all() else ~lost
+
+    def marked(values: Tensor) -> Tensor:
+        """Return the values ``(K, ...)`` with infinity for the stopped runs."""
+        return torch.where(lost.view(-1, *[1] * (values.ndim - 1)), torch.inf, values)
+
+    def mean(values: Tensor) -> Tensor:
+        return marked(values)[counted].mean(dim=0)
+
+    def largest(values: Tensor) -> Tensor:
+        return marked(values)[counted].amax(dim=0)
+
     error = (record.reference.q - record.q).double()
     norm = error.norm(dim=-1)
     square = error.square().mean(dim=1)  # (K, N)
-    steady = norm[:, t >= (1 - STEADY_PART) * duration].mean(dim=1)
+    steady = norm[:, t >= 0.9 * duration].mean(dim=1)
     summary: dict[str, Any] = {
         "runs": len(lost),
         "stopped": int(lost.sum()),
-        "rms_error": _mean(square, lost).mean().sqrt(),
-        "mean_error": _mean(norm.mean(dim=1), lost),
-        "max_error": _marked(norm.amax(dim=1), lost).max(),
+        "rms_error": mean(square).mean().sqrt(),
+        "mean_error": mean(norm.mean(dim=1)),
+        "max_error": marked(norm.amax(dim=1)).max(),
     }
     coordinates = {
-        "rms_error": _mean(square, lost).sqrt(),
-        "max_error": _marked(error.abs().amax(dim=1), lost).amax(dim=0),
+        "rms_error": mean(square).sqrt(),
+        "max_error": marked(error.abs().amax(dim=1)).amax(dim=0),
     }
-    if settled_after is not None:
-        ratio = 100 * step_error_after(record, settled_after)
-        name = f"step_error_after_{settled_after:g}_s"
-        summary[f"{name}_mean_percent"] = _mean(ratio, lost)
-        summary[f"{name}_worst_percent"] = ratio.max()
     step = _step(record)
-    if step is not None:
-        settling = _marked(_settling_times(norm, t, settle_fraction * step.norm(dim=-1)), lost)
-        overshoot = _overshoot(error, step, lost)
-        complete = overshoot if lost.all() else overshoot[~lost]
+    if step is None:
+        summary["steady_state_error"] = mean(steady)
+    else:
+        size = step.norm(dim=-1)
+        after = t >= (math.inf if settled_after is None else settled_after) - 1e-9 * duration
+        if after.any():
+            ratio = 100 * marked(norm[:, after].amax(dim=1) / size)
+            name = f"step_error_after_{settled_after:g}_s"
+            summary[f"{name}_mean_percent"] = mean(ratio)
+            summary[f"{name}_worst_percent"] = ratio.max()
+        settling = marked(_settling_times(norm, t, settle_fraction * size))
+        beyond = (-error * step.sign()[:, None]).amax(dim=1).clamp(min=0)
+        steps = step.abs()
+        large = steps >= _SMALL_STEP * steps.amax(dim=1, keepdim=True)
+        overshoot = torch.where(large, marked(100 * beyond / steps), torch.nan)  # (K, N)
         summary |= {
             "settling_time_median_s": median(settling.tolist()),
             "settling_time_worst_s": settling.max(),
             "never_settled": int(settling.isinf().sum()),
-            "overshoot_mean_percent": complete.nanmean(),
+            "overshoot_mean_percent": overshoot[counted].nanmean(),
             "overshoot_worst_percent": _nanmax(_nanmax(overshoot)),
+            "steady_state_error": mean(steady),
+            "steady_state_error_percent": 100 * mean(steady / size),
         }
-        coordinates["overshoot_mean_percent"] = complete.nanmean(dim=0)
+        coordinates["overshoot_mean_percent"] = overshoot[counted].nanmean(dim=0)
         coordinates["overshoot_worst_percent"] = _nanmax(overshoot)
-    summary["steady_state_error"] = _mean(steady, lost)
-    if step is not None:
-        summary["steady_state_error_percent"] = 100 * _mean(steady / step.norm(dim=-1), lost)
 
     held = record.u[:, :-1].double()
     effort = (held.square() * t.diff()[:, None]).sum(dim=1)  # (K, M)
     summary |= {
-        "input_rms": (_mean(effort, lost).mean() / duration).sqrt(),
-        "input_peak": _largest(held.abs().amax(dim=(1, 2)), lost),
-        "input_square_integral": _mean(effort.sum(dim=-1), lost),
-        "input_variation_per_s": _mean(held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration, lost),
+        "input_rms": (mean(effort).mean() / duration).sqrt(),
+        "input_peak": largest(held.abs().amax(dim=(1, 2))),
+        "input_square_integral": mean(effort.sum(dim=-1)),
+        "input_variation_per_s": mean(held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration),
     }
     if u_low is not None or u_high is not None:
-        saturated = _saturated(held, u_low, u_high)
+        low = torch.as_tensor(-math.inf if u_low is None else u_low, dtype=held.dtype)
+        high = torch.as_tensor(math.inf if u_high is None else u_high, dtype=held.dtype)
+        saturated = int(((held <= low) | (held >= high)).any(dim=-1).sum())
         applied = int(torch.isfinite(held).all(dim=-1).sum())
         summary["saturated_samples"] = saturated
         summary["saturated_percent"] = 100 * saturated / max(applied, 1)
     inputs = {
-        "rms": (_mean(effort, lost) / duration).sqrt(),
-        "peak": _largest(held.abs().amax(dim=1), lost),
-        "square_integral": _mean(effort, lost),
+        "rms": (mean(effort) / duration).sqrt(),
+        "peak": largest(held.abs().amax(dim=1)),
+        "square_integral": mean(effort),
     }
     return ClosedLoopMetrics(
         {k: x.item() if isinstance(x, Tensor) else x for k, x in summary.items()},
         _numbered("coordinate", "q", coordinates),
         _numbered("input", "u", inputs),
     )
-
-
-def step_error_after(record: ClosedLoopRecord, seconds: float) -> Tensor:
-    """Return max over t >= seconds of |e(t)|_2 / |s|_2 with the step s = q_ref - q(0), ``(K,)``.
-
-    The result is infinite for a stopped run. The paper reports that its controller is below 0.0023
-    within one second (section on the two-segment soft manipulator).
-
-    Raises:
-        ValueError: if the references are no set points, or if the runs do not last that long.
-    """
-    step = _step(record)
-    if step is None:
-        raise ValueError(
-            "settled_after needs a step: references that are constant in time and differ from q(0) "
-            "in every run; leave settled_after out"
-        )
-    t = record.t.double() - record.t[0].double()
-    after = t >= seconds - 1e-9 * float(t[-1])
-    if not after.any():
-        raise ValueError(f"settled_after is {seconds} s, expected at most {float(t[-1]):g} s")
-    error = (record.reference.q - record.q).double()[:, after].norm(dim=-1).amax(dim=1)
-    return _marked(error / step.norm(dim=-1), stopped_runs(record))
 
 
 def stopped_runs(record: ClosedLoopRecord) -> Tensor:
@@ -177,8 +166,7 @@ def stopped_runs(record: ClosedLoopRecord) -> Tensor:
 
 def samples_before_stop(record: ClosedLoopRecord, run: int) -> int:
     """Return the number of samples of a run before its first q that is not finite."""
-    finite = torch.isfinite(record.q[run]).all(dim=-1)
-    return len(finite) if finite.all() else int((~finite).int().argmax())
+    return int(torch.isfinite(record.q[run]).all(dim=-1).int().cumprod(0).sum())
 
 
 def comparison_table(results: Mapping[str, ClosedLoopMetrics]) -> pd.DataFrame:
@@ -204,46 +192,13 @@ def _settling_times(norm: Tensor, t: Tensor, bound: Tensor) -> Tensor:
     return torch.cat([t, t.new_full((1,), math.inf)])[last + 1]
 
 
-def _overshoot(error: Tensor, step: Tensor, lost: Tensor) -> Tensor:
-    """Return the overshoot in % of the step, ``(K, N)``; NaN for a coordinate with a small step."""
-    size = step.abs()
-    beyond = (-error * step.sign()[:, None]).amax(dim=1).clamp(min=0)
-    counted = size >= SMALL_STEP * size.amax(dim=1, keepdim=True)
-    return torch.where(counted, _marked(100 * beyond / size, lost), torch.nan)
-
-
 def _nanmax(values: Tensor) -> Tensor:
     """Return the largest value over the first dimension; NaN only where all values are NaN."""
     largest = values.nan_to_num(-1.0, posinf=math.inf).amax(dim=0)
     return torch.where(values.isnan().all(dim=0), torch.nan, largest)
 
 
-def _saturated(held: Tensor, low: Limit, high: Limit) -> int:
-    """Return the number of instants at which any input reaches a limit."""
-    at_limit = torch.zeros_like(held, dtype=torch.bool)
-    for limit, sign in ((low, -1.0), (high, 1.0)):
-        if limit is not None:
-            at_limit |= sign * held >= sign * torch.as_tensor(limit, dtype=held.dtype)
-    return int(at_limit.any(dim=-1).sum())
-
-
-def _marked(values: Tensor, lost: Tensor) -> Tensor:
-    """Return the values ``(K, ...)`` with infinity for the stopped runs."""
-    return torch.where(lost.view(-1, *[1] * (values.ndim - 1)), torch.inf, values)
-
-
-def _mean(values: Tensor, lost: Tensor) -> Tensor:
-    """Return the mean over the complete runs; infinite without any."""
-    return _marked(values, lost).mean(dim=0) if lost.all() else values[~lost].mean(dim=0)
-
-
-def _largest(values: Tensor, lost: Tensor) -> Tensor:
-    """Return the largest value over the complete runs; infinite without any."""
-    return (_marked(values, lost) if lost.all() else values[~lost]).amax(dim=0)
-
-
 def _numbered(kind: str, letter: str, columns: Mapping[str, Tensor]) -> pd.DataFrame:
-    """Return a table with one numbered row per entry of the columns."""
-    count = len(next(iter(columns.values())))
-    table = {kind: [f"{letter}{i + 1}" for i in range(count)]}
-    return pd.DataFrame(table | {name: x.tolist() for name, x in columns.items()})
+    table = pd.DataFrame({name: x.tolist() for name, x in columns.items()})
+    table.insert(0, kind, [f"{letter}{i + 1}" for i in range(len(table))])
+    return table

@@ -103,36 +103,7 @@ def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
     np.testing.assert_allclose(circle(circle.duration).q, POSTURE, atol=1e-9)
 
 
-# Out of reach, and bad input.
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"pitch": 2.0}, r"at t = [\d.]+ s its tip should be at \[.*\] m.* are [\d.e-]+ m from it"),
-        (
-            {"radius": 0.3, "turns": 0.5, "rise_time": 1.0},
-            r"cannot follow the helix .*at t = .* take a smaller radius",
-        ),
-        (
-            {"posture": [0.1, -0.3, 0, -2.2, 0, 4.0, 0]},
-            r"t = 0 s joint 'panda_joint6' would be at 4",
-        ),
-        ({"rise_time": 7.0}, r"rise_time is 7 s, expected at most turns \* period = 6 s"),
-    ],
-)
-def test_what_cannot_be_followed_is_refused_with_what_to_change(arm, changes, message):
-    with pytest.raises(ValueError, match=message):
-        Helix(arm, **{"posture": POSTURE, **FAST, **changes})
-
-
-def test_a_joint_limit_on_the_way_is_named():
-    fingers = ("panda_finger_joint1", "panda_finger_joint2")
-    arm = BulletArm("franka_panda/panda.urdf", locked_joints=fingers)
-    short = FAST | {"turns": 0.5}
-    free = Helix(arm, POSTURE, **short, rise_time=1.0)
-    top = max(float(free(t).q[3]) for t in np.linspace(0, free.duration, 500))
-    arm.q_high[3] = limit = 0.5 * (POSTURE[3] + top)
-    message = rf"t = ([\d.]+) s joint 'panda_joint4' would be at -[\d.]+ rad, .* to {limit:.4g} rad"
-    with pytest.raises(ValueError, match=message):
-        Helix(arm, POSTURE, **short, rise_time=1.0)
+@pytest.mark.parametrize("changes", [{"pitch": 2.0}, {"radius": 0.3, "turns": 0.5}])
+def test_a_helix_out_of_reach_is_refused(arm, changes):
+    with pytest.raises(ValueError, match=r"the (arm cannot follow|tip misses) the helix"):
+        Helix(arm, POSTURE, **{**FAST, **changes})

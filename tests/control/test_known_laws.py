@@ -1,12 +1,10 @@
-"""Control laws on known mechanics: their formulas, the contract of controllers, and export."""
+"""Control laws on known mechanics: their formulas and the contract of controllers."""
 
 import pytest
 import torch
 from torch import nn
 
-from pinn_dyn.control.export import export_law, load_law
 from pinn_dyn.control.laws import ComputedTorque, ProportionalDerivative, Regulation, Tracking
-from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.testing import ControllerContract, assert_near
 from pinn_dyn.testing.controller import states
 from tests.support.known import known_model
@@ -64,41 +62,3 @@ def test_computed_torque_brings_the_acceleration_that_it_wants():
     with torch.no_grad():
         a = controller.model.forward_dynamics(q, v, u)
     assert_near(a, motion.a + KP * (motion.q - q) + KD * (motion.v - v), 1e-8)
-
-
-class Formula(nn.Module):
-    """The formula of a law as a module, which torch.export wants."""
-
-    def __init__(self, controller):
-        super().__init__()
-        self.model = controller.model
-        self.law = controller.law
-
-    def forward(self, *state):
-        return self.law(*state)
-
-
-# That of Regulation is a part of that of Tracking.
-@pytest.mark.parametrize("law", [Tracking, ComputedTorque], ids=lambda law: law.__name__)
-def test_the_law_is_one_graph(law):
-    """As torch.export sees it: no branch on data, and nothing that is computed in Python."""
-    controller = law_on_known(law)
-    q, v, motion = states(4)
-    with torch.no_grad():
-        program = torch.export.export(Formula(controller), (q[0], v[0], *(x[0] for x in motion)))
-        for k in range(len(q)):
-            at = (q[k], v[k], *(x[k] for x in motion))
-            assert_near(program.module()(*at), controller.law(*at), 1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
-def test_an_exported_law_on_known_mechanics_is_the_eager_one(tmp_path):
-    controller = law_on_known(Tracking)
-    loaded = load_law(export_law(controller, tmp_path / "law.pt2"))
-    q, v, motion = states(4)
-    assert loaded.info["num_coordinates"] == 4
-    for k in range(len(q)):
-        at = [x.contiguous() for x in (q[k], v[k], *(x[k] for x in motion))]
-        with torch.no_grad():
-            assert_near(loaded(*at), controller.law(*at), 1e-9)

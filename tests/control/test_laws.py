@@ -22,7 +22,6 @@ from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near
 from pinn_dyn.testing.controller import states
 from tests.models.builders import InverseOf, make_model, make_structured
 from tests.support.cart_pole import CartPole
-from tests.support.linear import unit_masses
 
 MODEL_BASED = [ProportionalDerivative, Regulation, Tracking, ComputedTorque]
 
@@ -113,19 +112,6 @@ def test_proportional_derivative_is_the_feedback_through_the_input_matrix():
     feedback = 3.0 * (motion.q - q) + 2.0 * (motion.v - v)
     expected = feedback.numpy() @ system.inputs.detach().numpy()
     assert_near(u, torch.from_numpy(expected), 1e-12)
-
-
-def test_proportional_derivative_is_the_formula():
-    q, v, motion = states(2)
-    u = ProportionalDerivative(unit_masses(2), [3.0, 5.0], 2.0)(0.0, q, v, motion)
-    expected = torch.stack(
-        [
-            3.0 * (motion.q - q)[:, 0] + 2.0 * (motion.v - v)[:, 0],
-            5.0 * (motion.q - q)[:, 1] + 2.0 * (motion.v - v)[:, 1],
-        ],
-        dim=-1,
-    )
-    assert_near(u, expected, 1e-12)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
@@ -241,22 +227,12 @@ def test_a_singular_input_matrix_is_a_fault_of_its_row_only():
     assert not any(mask.any() for mask in damped.faults().values())
 
 
-def test_an_infinite_limit_still_flags_a_matrix_that_is_nan():
-    q, v, motion = states(2)
-    q = q.clone()
-    q[3] = torch.nan
-    law = Regulation(HalfSingular(), 1.0, 1.0, max_condition=np.inf)
-    law(0.0, q, v, motion)
-    (mask,) = law.faults().values()
-    assert mask.nonzero().flatten().tolist() == [3]
-
-
 # Deployment.
 
 
 @pytest.mark.parametrize(
     ("law", "kind", "num_inputs"),
-    [*((law, "lnn", 2) for law in MODEL_BASED[1:]), (Regulation, "hnn", 1)],
+    [(Tracking, "lnn", 2), (ComputedTorque, "lnn", 2), (Regulation, "hnn", 1)],
 )
 def test_the_formula_can_be_exported(law, kind, num_inputs):
     """That of PD is a part of all the others."""
@@ -279,29 +255,10 @@ def test_the_formula_can_be_exported(law, kind, num_inputs):
 # Errors.
 
 
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (0.0, r"^position_gain is 0.0: expected one positive number or 2 of them"),
-        (-1.0, "positive"),
-        (float("nan"), "^position_gain is nan"),
-        ([1.0, float("inf")], r"\[1.0, inf\]"),
-        ([1.0, 0.0], r"\[1.0, 0.0\]"),
-        ([1.0], r"^position_gain has shape \(1,\): expected .* 2 of them"),
-        ([1.0, 2.0, 3.0], r"has shape \(3,\)"),
-        ([[1.0, 0.0], [0.0, 1.0]], r"has shape \(2, 2\)"),
-        ("high", "^position_gain is 'high'"),
-        (None, "^position_gain is None"),
-    ],
-)
-def test_a_bad_gain_is_named(value, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), [1.0, 0.0], [1.0, 2.0, 3.0]])
+def test_a_bad_gain_is_named(value):
+    with pytest.raises(ValueError, match=r"^position_gain is .*expected 1 or 2 positive numbers"):
         Regulation(CartPole(), value, 1.0)
-
-
-def test_the_velocity_gain_is_named_too():
-    with pytest.raises(ValueError, match=r"^velocity_gain is -2"):
-        ProportionalDerivative(unit_masses(2), 1.0, -2.0)
 
 
 def test_a_gain_is_one_number_or_one_for_each_coordinate():
@@ -310,11 +267,10 @@ def test_a_gain_is_one_number_or_one_for_each_coordinate():
     assert diagonal_gain("k", torch.tensor([1.0, 2.0]), 2).dtype == torch.float64
 
 
-@pytest.mark.parametrize("law", MODEL_BASED)
 @pytest.mark.parametrize("kind", ["next_state", "acceleration"])
-def test_a_black_box_has_no_terms_for_a_law(law, kind):
-    with pytest.raises(TypeError, match=r"MLP, expected .* no terms M, G and A .* model=lnn"):
-        law(make_model(kind), 1.0, 1.0)
+def test_a_black_box_has_no_terms_for_a_law(kind):
+    with pytest.raises(TypeError, match=r"MLP, expected .* terms M, G and A, such as model=lnn"):
+        Tracking(make_model(kind), 1.0, 1.0)
 
 
 # The contract.
@@ -323,10 +279,9 @@ def test_a_black_box_has_no_terms_for_a_law(law, kind):
 @pytest.mark.parametrize(
     ("law", "model", "damping"),
     [
-        *((law, model, 0.0) for law in MODEL_BASED for model in (CartPole, SoftArm)),
-        (Regulation, CartPole, 0.1),
+        *((law, CartPole, 0.0) for law in MODEL_BASED),
+        (Tracking, SoftArm, 0.0),
         (Regulation, partial(linear_system, 2, 4), 0.1),
-        (Tracking, partial(linear_system, 1, 1), 0.0),
         (Tracking, partial(make_structured, "lnn", 2, 4), 0.0),
         (ComputedTorque, partial(make_structured, "hnn"), 0.0),
     ],
@@ -335,9 +290,3 @@ class TestModelBasedLaw(ControllerContract):
     @pytest.fixture
     def controller(self, law, model, damping):
         return law(model(), 5.0, 1.0, inverse_damping=damping)
-
-
-class TestProportionalDerivative(ControllerContract):
-    @pytest.fixture
-    def controller(self):
-        return ProportionalDerivative(unit_masses(3), [1.0, 2.0, 3.0], 0.5)

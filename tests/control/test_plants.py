@@ -1,4 +1,4 @@
-"""The plants of a closed loop, against SciPy, matrix exponentials and Bullet's own roll-out."""
+"""The plants of a closed loop: the contract, SciPy, matrix exponentials, Bullet's roll-out."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.systems import SoftArm
-from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
+from pinn_dyn.testing import LinearSystem, PlantContract, damped_oscillators, exact_solution
 from tests.support.vanishing import Vanishing
 
 PANDA = "franka_panda/panda.urdf"
@@ -58,24 +58,6 @@ def test_linear_system_moves_as_its_matrix_exponential(duration):
         torch.testing.assert_close(states[k], expected, rtol=0, atol=2e-8)
 
 
-def test_energy_of_a_damped_arm_without_input_decays():
-    arm = SoftArm()
-    q0, v0 = random_arm_states(3)
-    states = run(SystemPlant(arm), q0, v0, [torch.zeros(3, 3, dtype=torch.float64)] * 20, 0.01)
-    energy = arm.total_energy(*states.chunk(2, dim=-1))
-    assert (energy.diff(dim=1) < 0).all()
-
-
-def test_a_copy_moves_alone_as_among_others():
-    q0, v0 = random_arm_states(3)
-    inputs = torch.randn(3, 3, 3, generator=torch.manual_seed(1), dtype=torch.float64)
-    together = run(SystemPlant(SoftArm()), q0, v0, inputs, 0.01)
-    for k in range(3):
-        one = slice(k, k + 1)
-        alone = run(SystemPlant(SoftArm()), q0[one], v0[one], inputs[:, one], 0.01)
-        torch.testing.assert_close(together[one], alone, rtol=1e-5, atol=1e-5)
-
-
 def test_copies_at_rest_do_not_hide_the_error_of_one_that_moves():
     system = LinearSystem([[1.0]], [[100.0]], [[0.0]], [[1.0]])
     q0 = torch.zeros(10_000, 1, dtype=torch.float64)
@@ -96,27 +78,6 @@ def test_a_copy_that_loses_its_mass_matrix_is_nan_and_the_others_go_on():
     torch.testing.assert_close(states[1, :4, 0], expected, rtol=0, atol=1e-5)
     others = run(SystemPlant(Vanishing()), q0[[0, 2]], v0[[0, 2]], [u[:2] for u in inputs], 0.05)
     torch.testing.assert_close(states[[0, 2]], others, rtol=0, atol=1e-6)
-
-
-def test_a_copy_with_an_input_that_is_not_finite_is_nan_and_stays_so():
-    q0, v0 = random_arm_states(3)
-    inputs = torch.zeros(3, 3, 3, dtype=torch.float64)
-    inputs[1, 2, 0] = torch.inf
-    states = run(SystemPlant(SoftArm()), q0, v0, inputs, 0.001)
-    assert states[:2].isfinite().all()
-    assert states[2, 0].isfinite().all()
-    assert states[2, 1:].isnan().all()
-
-
-def test_bad_arguments_are_named():
-    plant = SystemPlant(damped_oscillators())
-    q0 = double([[1.0, 0.0]])
-    with pytest.raises(ValueError, match=r"v0 has shape \(1, 3\)"):
-        plant.start(q0, torch.zeros(1, 3))
-    with pytest.raises(ValueError, match="q0 has 1 non-finite"):
-        plant.start(q0 * torch.tensor([torch.nan, 1.0]), q0)
-    with pytest.raises(ValueError, match=r"q0 has shape \(2,\)"):
-        plant.start(q0[0], q0[0])
 
 
 @pytest.fixture(scope="module")
@@ -144,21 +105,22 @@ def test_bullet_copies_move_as_in_a_roll_out_of_bullet(panda):
 
 
 @pytest.mark.panda
-def test_a_bullet_copy_outside_the_finite_numbers_is_nan_and_the_other_goes_on(panda):
-    q0, v0, inputs = panda_states(panda)
-    inputs = torch.from_numpy(inputs)
-    expected = run(SimulatorPlant(panda), q0, v0, inputs, 0.001)
-    inputs[2, 0, 3] = torch.nan
-    states = run(SimulatorPlant(panda), q0, v0, inputs, 0.001)
-    assert states[0, 2:].isnan().all()
-    torch.testing.assert_close(states[0, :2], expected[0, :2])
-    torch.testing.assert_close(states[1], expected[1])
-
-
-@pytest.mark.panda
 def test_bullet_refuses_a_time_between_its_steps(panda):
     q0, v0, inputs = panda_states(panda)
     plant = SimulatorPlant(panda, step=0.001)
     plant.start(q0, v0)
     with pytest.raises(ValueError, match="integer multiple"):
         plant.advance(torch.from_numpy(inputs[0]), 0.0025)
+
+
+class TestSystemPlant(PlantContract):
+    @pytest.fixture(params=[damped_oscillators, SoftArm], ids=["oscillators", "soft arm"])
+    def plant(self, request):
+        return SystemPlant(request.param())
+
+
+@pytest.mark.panda
+class TestSimulatorPlant(PlantContract):
+    @pytest.fixture
+    def plant(self, panda):
+        return SimulatorPlant(panda, step=0.001)

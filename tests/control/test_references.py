@@ -104,27 +104,20 @@ def test_sines_start_from_rest_and_become_the_closed_form():
 def test_limits_name_first_time_joint_and_value():
     reference = Sines([0.0, 0.0], [0.4, 1.0], 0.25)
     check_limits(reference, [-0.4, -1.0], [0.4, 1.0], duration=4.0, v_max=[0.63, 1.58])
+    check_limits(reference, [-np.inf, -1.0], [np.inf, 1.0], duration=4.0, v_max=np.zeros(2))
     # sin(2 pi t / 4) = 0.5 at t = 1/3.
-    with pytest.raises(ValueError, match=r"t = 0\.334 s: q\[1\] is 0\.5\d* rad, .* -1 to 0\.5 rad"):
+    with pytest.raises(ValueError, match=r"t = 0\.334 s: q\[1\] is 0\.5\d*, expected -1 to 0\.5"):
         check_limits(reference, [-0.4, -1.0], [0.4, 0.5], duration=4.0)
-    with pytest.raises(ValueError, match=r"t = 0 s: v\[1\] is 1\.571 rad/s, allowed are -1\.5"):
+    with pytest.raises(ValueError, match=r"t = 0 s: v\[1\] is 1\.571, expected -1\.5"):
         check_limits(reference, [-1, -1], [1, 1], duration=4.0, v_max=[1.0, 1.5])
     # cos = -1/1.571 first at t = (pi/2 + asin(1/1.571)) 2 / pi: downwards.
     slow = Sines([0.0, 0.0], [0.4, 1.0], 0.25, phase=math.pi / 2)
-    with pytest.raises(ValueError, match=r"t = 0\.44 s: v\[1\] is -1\.00\d* rad/s"):
+    with pytest.raises(ValueError, match=r"t = 0\.44 s: v\[1\] is -1\.00\d*"):
         check_limits(slow, [-1, -1], [1, 1], duration=4.0, v_max=[1.0, 1.0])
 
 
-def test_limits_of_zero_speed_and_infinite_limits_bind_nothing():
-    reference = Sines([0.0, 0.0], 1.0, 5.0)
-    infinite = np.full(2, np.inf)
-    check_limits(reference, -infinite, infinite, duration=1.0, v_max=np.zeros(2))
-    with pytest.raises(ValueError, match=r"t = 0\.017 s: q\[0\] is 0\.509 rad"):
-        check_limits(reference, [-0.5, -2], [0.5, 2], duration=1.0)
-
-
 def test_limits_name_the_configuration_among_many_and_refuse_a_nan():
-    with pytest.raises(ValueError, match=r"t = 0 s: q\[2\] of configuration 1 is -1 rad"):
+    with pytest.raises(ValueError, match=r"t = 0 s: q\[2\] of run 1 is -1,"):
         check_limits(SetPoint(PAIR), [-0.5] * 3, [1.0] * 3, duration=1.0)
 
     class Broken(Reference):
@@ -133,31 +126,5 @@ def test_limits_name_the_configuration_among_many_and_refuse_a_nan():
         def __call__(self, t):
             return Motion(*(torch.tensor([math.nan]) for _ in range(3)))
 
-    with pytest.raises(ValueError, match=r"q\[0\] is nan rad"):
+    with pytest.raises(ValueError, match=r"q\[0\] is nan"):
         check_limits(Broken(), [-1.0], [1.0], duration=1.0)
-
-
-def test_limits_of_another_robot_are_refused():
-    with pytest.raises(ValueError, match=r"reference has 3 coordinates, but q_low has the shape"):
-        check_limits(SetPoint(PAIR), np.zeros(2), np.ones(3), duration=1.0)
-    with pytest.raises(ValueError, match=r"but v_max has the shape \(4,\)"):
-        check_limits(SetPoint(PAIR), -np.ones(3), np.ones(3), duration=1.0, v_max=np.ones(4))
-
-
-# Bad input.
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: SetPoint([]), r"q has the shape \(0,\), expected \(N,\) or \(K, N\)"),
-        (lambda: SetPoint([[[0.0]]]), r"q has the shape \(1, 1, 1\)"),
-        (lambda: RandomSetPoints([0.0], [1.0, 2.0], 3, 0), r"q_low has 1 coordinates and q_high"),
-        (lambda: RandomSetPoints([0.0, 3.0], [1.0, 2.0], 3, 0), r"q_low\[1\] = 3 lies above"),
-        (lambda: PointToPoint([0.0], [1.0, 2.0], 1.0), r"q_start has 1 coordinates and q_end has"),
-        (lambda: Sines([0.0] * 3, [1.0, 2.0], 1.0), r"amplitude has the shape \(2,\), but centre"),
-    ],
-)
-def test_bad_input_is_refused_with_what_was_expected(build, message):
-    with pytest.raises(ValueError, match=message):
-        build()

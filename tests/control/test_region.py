@@ -11,7 +11,6 @@ from pinn_dyn.control.laws import ProportionalDerivative, Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.testing import ControllerContract, LinearSystem
 from pinn_dyn.testing.controller import states
-from tests.support.cart_pole import CartPole
 from tests.support.linear import unit_masses
 
 LOGGER = "pinn_dyn.control.region"
@@ -101,13 +100,6 @@ def test_an_angle_may_wind_and_another_coordinate_may_not():
     assert bool((region.distance(q[:, ::50] + turn.flip(0), v[:, ::50]) > 2).all())
 
 
-def test_a_small_angle_counts_as_the_angle_itself():
-    q, v = loops(10, seed=1)
-    plain, wound = DataRegion(0.01 * q, v), DataRegion(0.01 * q, v, angles=[0, 1])
-    at = 0.01 * loops(3, seed=2)[0][:, ::50], loops(3, seed=2)[1][:, ::50]
-    assert wound.distance(*at) == pytest.approx(plain.distance(*at), rel=1e-2, abs=1e-3)
-
-
 def test_a_state_that_is_nan_has_no_distance():
     region = DataRegion(*comb())
     distance = region.distance(tensor([[1.0], [np.nan]]), tensor([[0.0], [0.0]]))
@@ -116,14 +108,10 @@ def test_a_state_that_is_nan_has_no_distance():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda q, v: ([0 * x for x in q], v), "the same states, expected different ones"),
-        (lambda q, v: ([q[0][:1]], [v[0][:1]]), "one trajectory, expected two"),
-    ],
+    "change", [lambda q, v: ([0 * x for x in q], v), lambda q, v: ([q[0][:1]], [v[0][:1]])]
 )
-def test_bad_data_are_named(change, message):
-    with pytest.raises(ValueError, match=message):
+def test_bad_data_are_refused(change):
+    with pytest.raises(ValueError, match="a region needs two different trajectories"):
         DataRegion(*change(*comb()))
 
 
@@ -161,14 +149,6 @@ def test_the_fallback_takes_the_states_outside_and_no_others():
     assert found["input_condition"].tolist() == [1, 1, 1, 1]
 
 
-def test_a_state_that_comes_back_is_given_back_to_the_law():
-    guarded = guard(active=True)
-    for q in (MIXED[1], MIXED[0]):
-        u = guarded(0.0, q, 0 * q, REST)
-    assert float(u) == pytest.approx(float(law_and_pd(MIXED[0])[0]))
-    assert float(guarded.diagnostics()["fallback"]) == 0
-
-
 @pytest.mark.parametrize("active", [True, False])
 def test_one_warning_in_each_run(active, caplog):
     guarded = guard(active)
@@ -180,12 +160,8 @@ def test_one_warning_in_each_run(active, caplog):
             for t in (0.25, 0.5, 0.75):
                 guarded(t, MIXED, 0 * MIXED, REST)
             assert len(caplog.messages) == run
-    message = caplog.messages[-1]
-    assert "t = 0.25 s: 2 of 4 states outside" in message
-    assert "(index 3) at distance 9," in message
-    assert "2 the limit" in message
-    assert ("the fallback law takes over" in message) == active
-    assert ("the law goes on" in message) != active
+    assert "t = 0.25 s: 2 of 4 states are outside" in caplog.messages[-1]
+    assert "up to 9 (" in caplog.messages[-1]
 
 
 class Faulty(Controller):
@@ -214,12 +190,6 @@ def test_faults_are_those_of_who_is_in_charge():
         guarded(0.0, MIXED, 0 * MIXED, REST)
         found = {reason: mask.int().tolist() for reason, mask in guarded.faults().items()}
         assert found == expected
-
-
-def test_a_guard_of_another_robot_is_refused():
-    region = DataRegion(*comb())
-    with pytest.raises(ValueError, match=r"region has 1 coordinates, expected .* the law, 2"):
-        Guarded(Regulation(CartPole(), 1.0, 1.0), None, region)
 
 
 @pytest.mark.parametrize("threshold", [0.01, 1.0, 1e3], ids=["outside", "both", "inside"])

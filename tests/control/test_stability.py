@@ -9,7 +9,7 @@ from scipy.optimize import fsolve
 
 from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.control.stability import certify, factor_bounds
-from pinn_dyn.control.stability_report import model_report, stability_report
+from pinn_dyn.control.stability_report import stability_report
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
@@ -265,19 +265,9 @@ def test_the_report_counts_measured_errors_above_the_bound():
     assert "| 0.01 | 3 | 7 |" in text
 
 
-def test_a_model_without_truth_gets_a_shorter_report():
-    q = draw(9, 3, 2)
-    text = model_report(Arm(), q, region="the log")
-    A = Arm().input_matrix(q)
-    assert "N = 2 and M = 2, as Proposition 1 needs" in text
-    assert f"| condition number of A_L | {torch.linalg.cond(A).median():.3g} |" in text
-    assert "at 3 of 3" in text
-    assert "Proposition 1 says nothing" in model_report(CartPole(), q, region="the log")
-
-
 def test_systems_without_the_proposition_are_refused():
     q = draw(10, 3, 2)
-    with pytest.raises(ValueError, match=r"truth has N = 2 coordinates and M = 1"):
+    with pytest.raises(ValueError, match=r"Proposition 1 needs N = M inputs, the robot has M = 1"):
         certify(CartPole(), CartPole(), q, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"model has \(N, M\) = \(3, 3\), truth \(2, 2\)"):
         certify(SoftArm(), Arm(), q, 1.0, 1.0)

@@ -103,22 +103,6 @@ def test_a_copy_beyond_its_bound_is_stopped(undisturbed):
             assert (q[kept][:-1].abs() <= bound).all()
 
 
-def test_the_loop_ends_when_all_copies_have_stopped():
-    class Counted(SystemPlant):
-        advanced = 0
-
-        def advance(self, u, duration):
-            self.advanced += 1
-            return super().advance(u, duration)
-
-    plant = Counted(spring())
-    record = sampled(plant, PD(bad=lambda t, q: torch.tensor([t > 0.03, t > 0.05, t > 0.07])))
-    assert plant.advanced == 4
-    assert [reason[-4:] for reason in record.stopped] == ["04 s", "06 s", "08 s"]
-    assert record.t.shape == (21,)
-    assert record.q[:, 5:].isnan().all()
-
-
 def test_ctrl_c_keeps_the_record_so_far(undisturbed):
     class Interrupted(PD):
         def __call__(self, t, q, v, reference):

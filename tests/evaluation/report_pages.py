@@ -9,15 +9,15 @@ from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.data import Splits
 from pinn_dyn.evaluation import (
+    ControlResult,
     Entry,
     HoldPosition,
     closed_loop_figure,
     closed_loop_metrics,
-    comparison_table,
     controller_comparison_figure,
     evaluate_models,
 )
-from pinn_dyn.evaluation.report import Origin, StabilityResult, control_report
+from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.prediction_page import prediction_report
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory
 
@@ -166,28 +166,17 @@ def control_page(names=("learned", "pd"), title="a loop", animation=None):
     """Return the page, and the summary that it was made of."""
     laws = records(names)
     metrics = {name: closed_loop_metrics(item, settled_after=1.0) for name, item in laws.items()}
-    first = next(iter(metrics.values()))
-    points = pd.DataFrame(
-        {
-            "bound": [1e-3, 2e-3, 3e-3, float("inf")],
-            "holds": [True, True, True, False],
-            "measured_error": [5e-4, 1e-3, 4e-3, 1e-3],
-        }
-    )
-    summary = comparison_table(metrics)
+    result = ControlResult(laws, metrics)
     page = control_report(
         title=title,
-        summary=summary,
-        coordinates=first.coordinates,
-        inputs=first.inputs,
-        records=laws,
+        result=result,
         figures={
             "comparison": controller_comparison_figure(laws, title=title),
             "closed_loop": closed_loop_figure(laws, 2, title=title, labels=LABELS),
         },
         labels=LABELS,
         animation=animation,
-        stability=StabilityResult("# Stability\n\n| a | b |\n|---|---|\n| A_L | 2 |\n", points),
+        stability="# Stability\n\n| a | b |\n|---|---|\n| A_L | 2 |\n",
         origin=origin(names),
     )
-    return page, summary
+    return page, result.table

@@ -24,8 +24,6 @@ def test_a_wrong_model_has_a_larger_error_than_the_truth(tmp_path):
     errors = result.table.set_index("controller")["rms_error"]
     assert list(errors.index) == ["learned", "truth"]
     assert errors["learned"] > 10 * errors["truth"]
-    (motion,) = result.trajectories("learned")
-    np.testing.assert_array_equal(motion.q, result.records["learned"].q[0])
     result.save(tmp_path)
     assert pd.read_csv(tmp_path / "summary.csv")["rms_error"].tolist() == pytest.approx([*errors])
     assert len(pd.read_csv(tmp_path / "coordinates.csv")) == 6
@@ -47,10 +45,9 @@ def test_limits_and_initial_states_reach_the_loop(rate):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rate": None, "delay": 1}, "neither delay nor sensor noise"),
-        ({"rate": None, "sensor": Sensor(0.1)}, "neither delay nor sensor noise"),
-        ({"settled_after": 3.0}, "settled_after is 3.0 s, expected at most duration, 0.1 s"),
-        ({"reference": SetPoint([0.1, 0.2])}, "reference has 2 coordinates, expected 3"),
+        ({"rate": None, "delay": 1}, "no delay and no sensor noise"),
+        ({"rate": None, "sensor": Sensor(0.1)}, "no delay and no sensor noise"),
+        ({"reference": SetPoint([0.1, 0.2])}, "reference has 2 coordinates, the robot 3"),
         ({"reference": SetPoint([0.0, 0.0, -0.3])}, "segment 1 of rest length 0.2 m shortens"),
     ],
 )

@@ -151,14 +151,14 @@ def test_a_closed_loop_shows_states_references_errors_and_inputs():
 def test_a_stop_is_marked_and_a_runaway_does_not_set_the_range():
     lost = record(2)
     lost.q[2, 39:], lost.u[2, 39:] = 1e3, -1e5
-    figure = closed_loop_figure(stop(lost, 2, 41), 2, title="t")
+    figure = closed_loop_figure({"law": stop(lost, 2, 41)}, 2, title="t")
     assert "stopped: 0.80 s: too fast" in figure.get_suptitle()
     for name, ax in panels(figure).items():
         assert any(np.allclose(line.get_xdata(), 0.8) for line in ax.lines)
         assert name.startswith("‖") or np.abs(ax.get_ylim()).max() < 2 * 7.2
     at_once = stop(record(2), 0, 1)
     at_once.u[0, 0] = torch.nan
-    closed_loop_figure(at_once, 0, title="t").draw_without_rendering()
+    closed_loop_figure({"law": at_once}, 0, title="t").draw_without_rendering()
 
 
 def test_control_laws_are_compared_by_their_mean_errors():

@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 from pinn_dyn.evaluation.identification import COLUMNS
-from pinn_dyn.evaluation.report import measured_model_report
 from pinn_dyn.evaluation.report.browser import trajectory_browser
 from pinn_dyn.evaluation.report.page import table
 from tests.evaluation.report_pages import (
@@ -20,7 +19,6 @@ from tests.evaluation.report_pages import (
     Page,
     control_page,
     evaluation,
-    origin,
     prediction_page,
 )
 
@@ -84,15 +82,12 @@ def test_control_laws_are_listed_with_the_reason_of_a_stop(control):
     assert [row["law"] for row in page.table("RMS error")] == ["learned", "pd"]
     (stop,) = page.table("reason")
     assert stop == {"law": "pd", "run": "2", "reason": "1.20 s: A is singular"}
-    assert "holds at 3 of 4 set points" in page.text
-    assert "2 of 3 measured steady-state errors" in page.text
 
 
 def test_odd_names_stay_text():
     pages = [
         prediction_page(names=(ODD, "lnn"))[0],
         control_page(names=(ODD, "lnn"), title=ODD)[0],
-        measured_model_report(title="m", report=f"# {ODD}\n\ntext", origin=origin([ODD])),
     ]
     for text in pages:
         page = Page(text)
