@@ -22,7 +22,7 @@ Arrays = Mapping[str, np.ndarray]
 
 def cache_key(description: object) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of a JSON-serializable description."""
-    text = json.dumps(description, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    text = json.dumps(description, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -31,11 +31,9 @@ def load_or_make(
 ) -> Arrays:
     """Load the arrays of a description from the cache, or make and store them.
 
-    A file is ``<name>-<key>.npz``: plain arrays without pickle, with their description. It is
-    written under another name and moved into place, so that a reader never sees half a file. A lock
-    lets one process make the file while others wait. Reading compares the archive's checksums and
-    the description. A damaged file, or one of other data, is reported, kept as ``.damaged`` and
-    made again. A read-only folder is only read.
+    A file is ``<name>-<key>.npz``: plain arrays without pickle, with their description. A reader
+    never sees half a file. One process makes the file while others wait. A damaged file is reported
+    and made again. A read-only folder is only read.
 
     Args:
         folder: the cache folder, made if missing.
@@ -46,46 +44,24 @@ def load_or_make(
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{cache_key(description)}.npz"
     if path.exists() and not os.access(folder, os.W_OK):
-        return _read(path, description)
+        return _read(path)
     with FileLock(f"{path}.lock"):
         if path.exists():
             try:
-                return _read(path, description)
+                return _read(path)
             except Exception as error:  # a damaged archive raises nearly anything
-                aside = path.with_suffix(".damaged")
-                os.replace(path, aside)
-                log.warning(
-                    "cache file %s is damaged (%s); kept as %s and made again",
-                    path,
-                    error,
-                    aside.name,
-                )
+                log.warning("cache file %s is damaged (%s): it is made again", path, error)
         # The holder of the lock is the only writer; other files are of killed processes.
         for partial in folder.glob(f"{glob.escape(path.name)}.*.partial"):
             partial.unlink(missing_ok=True)
         arrays = make()
-        _write(path, arrays, description)
+        text = np.array(json.dumps(description))
+        with whole(path) as partial, partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, description=text, names=list(arrays), **arrays)
     return arrays
 
 
-def _read(path: Path, description: object) -> Arrays:
+def _read(path: Path) -> Arrays:
     # numpy reads each member to its end, where zipfile compares the checksum.
     with np.load(path, allow_pickle=False) as archive:
-        written = json.loads(str(archive["description"]))
-        if cache_key(written) != cache_key(description):
-            raise ValueError(
-                f"it holds the data of another description, {json.dumps(written)[:200]}, expected "
-                f"{json.dumps(description)[:200]}"
-            )
         return {str(name): archive[str(name)] for name in archive["names"]}
-
-
-def _write(path: Path, arrays: Arrays, description: object) -> None:
-    with whole(path) as partial, partial.open("wb") as file:
-        # The names tell a reader what must be there, should the archive's directory be damaged.
-        members = {
-            "description": np.array(json.dumps(description)),
-            "names": np.array(list(arrays)),
-            **arrays,
-        }
-        np.savez(file, allow_pickle=False, **members)

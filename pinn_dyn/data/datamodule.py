@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from dataclasses import KW_ONLY, dataclass
 from typing import Annotated, Literal
 
 import lightning as L
@@ -12,75 +14,50 @@ from torch.utils.data import DataLoader, Sampler
 
 from pinn_dyn.data.lengths import seconds_of
 from pinn_dyn.data.source import DataSource, Splits
-from pinn_dyn.data.windows import (
-    BatchSampler,
-    WindowLoader,
-    Windows,
-    draw_windows,
-)
+from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows, draw_windows
 from pinn_dyn.mechanics import Trajectory, samples_of, stack_until
 from pinn_dyn.models.statistics import Statistics
 
 
+@dataclass(eq=False)
 class DynamicsData(L.LightningDataModule):
     """Training pairs from a data source, drawn from its training trajectories alone.
 
     Args:
-        source: where the trajectories come from.
+        source: the source of the trajectories.
         pairs: number of training windows, or ``"all"`` windows of the trajectories.
         steps: steps H of a window; 1 gives the paper's transition pairs.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
         batch_size: windows in a batch.
-        batches_per_epoch: batches in what the trainer counts as an epoch.
+        batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
         coverage: evenness of the windows over the configurations, 0 to 1; see
             :func:`~pinn_dyn.data.windows.draw_windows`.
         history: time before a window over which the input is kept, for models of a delay, s.
-
-    Raises:
-        ValueError: on a batch larger than the number of pairs.
     """
 
-    def __init__(
-        self,
-        source: DataSource,
-        *,
-        pairs: PositiveInt | Literal["all"] = 8000,
-        steps: PositiveInt = 1,
-        stride: PositiveInt | str = 10,
-        batch_size: PositiveInt = 256,
-        batches_per_epoch: PositiveInt,
-        seed: NonNegativeInt,
-        coverage: Annotated[float, Field(ge=0, le=1)] = 0.0,
-        history: NonNegativeFloat = 0.0,
-    ):
+    source: DataSource
+    _: KW_ONLY
+    pairs: PositiveInt | Literal["all"] = 8000
+    steps: PositiveInt = 1
+    stride: PositiveInt | str = 10
+    batch_size: PositiveInt = 256
+    batches_per_epoch: PositiveInt
+    seed: NonNegativeInt
+    coverage: Annotated[float, Field(ge=0, le=1)] = 0.0
+    history: NonNegativeFloat = 0.0
+
+    def __post_init__(self) -> None:
         super().__init__()
-        if pairs != "all" and batch_size > pairs:
-            raise ValueError(
-                f"batch_size is {batch_size}, expected at most the number of pairs, {pairs}"
-            )
-        self.source = source
-        self.pairs = pairs
-        self.steps = steps
-        self.stride = stride
-        self.batch_size = batch_size
-        self.batches_per_epoch = batches_per_epoch
-        self.seed = seed
-        self.coverage = coverage
-        self.history = history
-        self._splits: Splits | None = None
-        self._windows: Windows | None = None
 
     def prepare_data(self) -> None:
         """Simulate or convert the data once, before other processes read them."""
         self.splits  # noqa: B018
 
-    @property
+    @functools.cached_property
     def splits(self) -> Splits:
         """Trajectories of all splits."""
-        if self._splits is None:
-            self._splits = self.source.load()
-        return self._splits
+        return self.source.load()
 
     @property
     def step(self) -> float:
@@ -95,25 +72,28 @@ class DynamicsData(L.LightningDataModule):
             return samples_of("stride", length, self.splits.train[0].t)
         return self.stride
 
-    @property
+    @functools.cached_property
     def windows(self) -> Windows:
-        """Training windows."""
-        if self._windows is None:
-            self._windows = draw_windows(
-                self.splits.train,
-                count=None if self.pairs == "all" else self.pairs,
-                steps=self.steps,
-                stride=self._samples(),
-                seed=self.seed,
-                coverage=self.coverage,
-                history=self.history,
+        """Training windows.
+
+        Raises:
+            ValueError: on a batch larger than the number of windows.
+        """
+        windows = draw_windows(
+            self.splits.train,
+            count=None if self.pairs == "all" else self.pairs,
+            steps=self.steps,
+            stride=self._samples(),
+            seed=self.seed,
+            coverage=self.coverage,
+            history=self.history,
+        )
+        if self.batch_size > len(windows):
+            raise ValueError(
+                f"batch_size is {self.batch_size}, expected at most the number of pairs, "
+                f"{len(windows)}"
             )
-            if self.batch_size > len(self._windows):
-                raise ValueError(
-                    f"batch_size is {self.batch_size}, expected at most the number of pairs, "
-                    f"{len(self._windows)}"
-                )
-        return self._windows
+        return windows
 
     @property
     def statistics(self) -> Statistics:

@@ -44,11 +44,7 @@ class Drawn:
 class Joined:
     """Signals of several draws as one: signal k is number ``row[k]`` of ``signals[which[k]]``.
 
-    Args:
-        signals: draws with the same number of inputs; only the rows of a :class:`Drawn` that are
-            needed are computed.
-        which: index of the draw, ``(count,)``.
-        row: index of the signal within its draw, ``(count,)``.
+    Only the rows of a :class:`Drawn` that are needed are computed.
     """
 
     def __init__(self, signals: Sequence[Signal], which: np.ndarray, row: np.ndarray):
@@ -66,7 +62,7 @@ class Joined:
         return np.concatenate([part(t) for part in self._parts])[self._pick]
 
     def rows(self, index: np.ndarray) -> Signal:
-        """Select some of the signals; the other signals are not computed."""
+        """Select some of the signals."""
         return Joined(self._signals, self._which[index], self._row[index])
 
 
@@ -93,15 +89,8 @@ class _Bounded(Excitation):
     offset: Annotated[Sequence[float], Field(min_length=1)]
     amplitude: Annotated[Sequence[NonNegativeFloat], Field(min_length=1)]
 
-    def __post_init__(self) -> None:
-        if len(self.offset) != len(self.amplitude):
-            raise ValueError(
-                f"{type(self).__name__}: offset has {len(self.offset)} entries and amplitude "
-                f"{len(self.amplitude)}, expected one of each per input"
-            )
-
     def _scaled(self, shape: np.ndarray, peak: np.ndarray) -> np.ndarray:
-        """offset + peak * shape, for a shape ``(count, T, M)`` within [-1, 1]."""
+        """Return offset + peak * shape, for a shape ``(count, T, M)`` within [-1, 1]."""
         return np.asarray(self.offset) + peak[:, None, :] * shape
 
     def _peaks(self, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -116,7 +105,7 @@ class MultiSine(_Bounded):
     Args:
         offset: mean of each input, ``(M,)``.
         amplitude: largest peak of each input, ``(M,)``.
-        frequency: [low, high] in Hz; each f_ih is drawn from it, uniform in its logarithm.
+        frequency: [low, high] in Hz; f_ih is uniform in its logarithm.
         harmonics: number of sines; 1 gives a plain sine.
     """
 
@@ -131,19 +120,12 @@ class MultiSine(_Bounded):
         frequency = np.exp(rng.uniform(low, high, shape))
         phase = rng.uniform(0, 2 * np.pi, shape)
         weight = rng.dirichlet(np.ones(self.harmonics), peak.shape)
-
         return Drawn(self._signal, (peak, frequency, phase, weight))
 
-    def _signal(
-        self,
-        t: np.ndarray,
-        peak: np.ndarray,
-        frequency: np.ndarray,
-        phase: np.ndarray,
-        weight: np.ndarray,
-    ) -> np.ndarray:
-        angle = 2 * np.pi * frequency[:, None] * t[:, None, None] + phase[:, None]
-        return self._scaled((weight[:, None] * np.sin(angle)).sum(-1), peak)
+    def _signal(self, t: np.ndarray, peak: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+        frequency, phase, weight = (array[:, None] for array in arrays)
+        angle = 2 * np.pi * frequency * t[:, None, None] + phase
+        return self._scaled((weight * np.sin(angle)).sum(-1), peak)
 
 
 @dataclass(frozen=True)
@@ -165,20 +147,13 @@ class Chirp(_Bounded):
         down = rng.random(peak.shape) < 0.5
         start = np.where(down, self.frequency[1], self.frequency[0])
         rate = np.where(down, -1, 1) * (self.frequency[1] - self.frequency[0]) / duration
-
         return Drawn(self._signal, (peak, phase, start, rate))
 
-    def _signal(
-        self,
-        t: np.ndarray,
-        peak: np.ndarray,
-        phase: np.ndarray,
-        start: np.ndarray,
-        rate: np.ndarray,
-    ) -> np.ndarray:
+    def _signal(self, t: np.ndarray, peak: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+        phase, start, rate = (array[:, None] for array in arrays)
         time = t[:, None]
-        cycles = start[:, None] * time + 0.5 * rate[:, None] * time**2
-        return self._scaled(np.sin(phase[:, None] + 2 * np.pi * cycles), peak)
+        cycles = start * time + 0.5 * rate * time**2
+        return self._scaled(np.sin(phase + 2 * np.pi * cycles), peak)
 
 
 @dataclass(frozen=True)
@@ -188,19 +163,17 @@ class Steps(_Bounded):
     Args:
         offset: mean of each input, ``(M,)``.
         amplitude: largest peak of each input, ``(M,)``.
-        hold: [low, high] in s; each level lasts a time drawn from it, ramp included.
-        rise_time: length of a ramp in s, at most ``hold[0]``; a jump would fall between samples.
+        hold: [low, high] in s of the time that a level lasts, ramp included.
+        rise_time: length of a ramp in s, at most ``hold[0]``.
     """
 
     hold: Bounds = (0.5, 2.0)
     rise_time: PositiveFloat = 0.1
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.rise_time > self.hold[0]:
             raise ValueError(
-                f"Steps: rise_time is {self.rise_time} s, expected at most the shortest hold, "
-                f"{self.hold[0]} s"
+                f"Steps: rise_time is {self.rise_time} s, expected at most hold[0] = {self.hold[0]}"
             )
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
@@ -212,9 +185,8 @@ class Steps(_Bounded):
         start = np.cumsum(rng.uniform(self.hold[0], self.hold[1], shape), axis=-1)
         return Drawn(self._signal, (peak, level, start))
 
-    def _signal(
-        self, t: np.ndarray, peak: np.ndarray, level: np.ndarray, start: np.ndarray
-    ) -> np.ndarray:
+    def _signal(self, t: np.ndarray, peak: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
+        level, start = arrays
         rows, _, columns = np.ix_(range(len(peak)), range(1), range(peak.shape[1]))
         # A ramp ends before the next begins: only the last one begun is under way.
         begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)

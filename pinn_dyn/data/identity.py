@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from pinn_dyn.data.source import SPLITS, DataSource
 from pinn_dyn.mechanics import Trajectory
 
-# Samples of each trajectory at which p = M(q) v is compared: it follows from q and v.
-_MOMENTA = 8
 # Largest difference of moments that rounding explains, in standard deviations.
 _ROUNDING = 1e-6
 
@@ -21,39 +18,22 @@ _ROUNDING = 1e-6
 def data_identity(source: DataSource) -> dict[str, dict[str, Any]]:
     """Return what identifies the data of a source, for a checkpoint.
 
-    Each split has the ``names``, ``lengths`` and ``hashes`` of its K trajectories, their
-    ``moments`` ``(K, 2, 2N + M)``, mean and standard deviation of q, v and u, and their
-    ``momenta`` ``(K, 2, N)``, those of p, empty where p is unknown.
+    Each split has the ``names``, ``lengths`` and ``hashes`` of its K trajectories, and their
+    ``moments`` ``(K, 2, 2N + M)``: mean and standard deviation of q, v and u.
     """
     splits, names = source.load(), source.names()
-    return {split: _identity(names[split], getattr(splits, split)) for split in SPLITS}
-
-
-def _identity(names: list[str], trajectories: list[Trajectory]) -> dict[str, Any]:
-    return {
-        "names": list(names),
-        "lengths": [len(item.t) for item in trajectories],
-        "hashes": [_hash(item) for item in trajectories],
-        "moments": _stacked([_moments(_signals(item)) for item in trajectories]),
-        "momenta": _stacked([_moments(_momenta(item)) for item in trajectories if item.momentum]),
-    }
-
-
-def _signals(item: Trajectory) -> Tensor:
-    return torch.cat([item.q, item.v, item.u], dim=-1).double()
-
-
-def _momenta(item: Trajectory) -> Tensor:
-    samples = slice(None, None, max(len(item.t) // _MOMENTA, 1))
-    return item.states("qp", samples)[:, item.q.shape[-1] :].double()
-
-
-def _moments(x: Tensor) -> Tensor:
-    return torch.stack([x.mean(0), x.std(0, correction=0)])
-
-
-def _stacked(values: list[Tensor]) -> Tensor:
-    return torch.stack(values) if values else torch.zeros(0)
+    identity = {}
+    for split in SPLITS:
+        trajectories: list[Trajectory] = getattr(splits, split)
+        signals = [torch.cat([x.q, x.v, x.u], dim=-1).double() for x in trajectories]
+        moments = [torch.stack([x.mean(0), x.std(0, correction=0)]) for x in signals]
+        identity[split] = {
+            "names": list(names[split]),
+            "lengths": [len(x) for x in signals],
+            "hashes": [_hash(x) for x in trajectories],
+            "moments": torch.stack(moments) if moments else torch.zeros(0),
+        }
+    return identity
 
 
 def _hash(item: Trajectory) -> str:
@@ -69,47 +49,29 @@ def data_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
     Data that differ by rounding alone, as those of another machine do, are the same.
     """
     earlier, present = _by_name(before), _by_name(now)
-    changes = [f"{name} is no longer in {earlier[name].split}" for name in earlier.keys() - present]
-    changes += [f"{name} is new in {present[name].split}" for name in present.keys() - earlier]
+    changes = [f"{name} is no longer in {earlier[name][0]}" for name in earlier.keys() - present]
+    changes += [f"{name} is new in {present[name][0]}" for name in present.keys() - earlier]
     for name in earlier.keys() & present:
-        changes += _difference(name, earlier[name], present[name])
+        old_split, old_length, old_hash, old_moments = earlier[name]
+        split, length, content, moments = present[name]
+        if split != old_split:
+            changes.append(f"{name} moved from {old_split} to {split}")
+        elif length != old_length:
+            changes.append(f"{name} in {split} has {length} samples, it had {old_length}")
+        elif content != old_hash:
+            same = moments.shape == old_moments.shape and bool(
+                ((old_moments - moments).abs() <= _ROUNDING * moments[1] + 1e-12).all()
+            )
+            changes += [] if same else [f"{name} in {split} has other values"]
     return sorted(changes)
 
 
-class _Entry(NamedTuple):
-    split: str
-    length: int
-    content: str
-    moments: Tensor
-    momenta: Tensor
-
-
-def _by_name(identity: Mapping[str, Any]) -> dict[str, _Entry]:
-    entries: dict[str, _Entry] = {}
+def _by_name(identity: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+    """Return split, length, hash and moments of each trajectory."""
+    entries: dict[str, tuple[Any, ...]] = {}
     for split, part in identity.items():
-        for k, name in enumerate(part["names"]):
-            momenta = part["momenta"][k] if len(part["momenta"]) else part["momenta"]
+        columns = (part[key] for key in ("names", "lengths", "hashes", "moments"))
+        for name, *values in zip(*columns, strict=True):
             unique = name if name not in entries else f"{name}, in {split}"
-            entries[unique] = _Entry(
-                split, part["lengths"][k], part["hashes"][k], part["moments"][k], momenta
-            )
+            entries[unique] = (split, *values)
     return entries
-
-
-def _difference(name: str, before: _Entry, now: _Entry) -> list[str]:
-    if before.split != now.split:
-        return [f"{name} moved from {before.split} to {now.split}"]
-    if before.length != now.length:
-        return [f"{name} in {now.split} has {now.length} samples, it had {before.length}"]
-    if before.content != now.content and not _equal(before.moments, now.moments):
-        return [f"{name} in {now.split} has other values"]
-    if len(before.momenta) and len(now.momenta) and not _equal(before.momenta, now.momenta):
-        return [f"{name} in {now.split} has other momenta p"]
-    return []
-
-
-def _equal(before: Tensor, now: Tensor) -> bool:
-    """Check whether moments ``(2, C)`` agree up to rounding."""
-    if before.shape != now.shape:
-        return False
-    return bool(((before - now).abs() <= _ROUNDING * now[1] + 1e-12).all())

@@ -16,9 +16,6 @@ class InitialStates:
     Args:
         q_low, q_high: bounds of the configuration, ``(N,)``.
         v_max: bound of the speed of each coordinate, ``(N,)``.
-
-    Raises:
-        ValueError: if the lengths differ, or a lower bound exceeds the upper bound.
     """
 
     q_low: Sequence[float]
@@ -26,16 +23,8 @@ class InitialStates:
     v_max: Sequence[NonNegativeFloat]
 
     def __post_init__(self) -> None:
-        if not len(self.q_low) == len(self.q_high) == len(self.v_max):
-            raise ValueError(
-                f"InitialStates: q_low, q_high and v_max have {len(self.q_low)}, "
-                f"{len(self.q_high)} and {len(self.v_max)} entries, expected the same number"
-            )
-        if any(low > high for low, high in zip(self.q_low, self.q_high, strict=True)):
-            raise ValueError(
-                f"InitialStates: q_low = {list(self.q_low)}, q_high = {list(self.q_high)}, "
-                "expected q_low <= q_high"
-            )
+        if (np.subtract(self.q_high, self.q_low) < 0).any():
+            raise ValueError(f"q_low = {self.q_low} exceeds q_high = {self.q_high}")
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw ``count`` initial configurations and velocities, both ``(count, N)``."""

@@ -128,7 +128,7 @@ class RobotSource(DataSource):
         """
         t = np.arange(round(self.duration / self.step) + 2) * self.step
         tasks = [
-            (index, k) for index, split in enumerate(SPLITS) for k in range(getattr(self, split))
+            (index, k) for index, name in enumerate(SPLITS) for k in range(getattr(self, name))
         ]
         # One generator per trajectory: more trajectories do not change the others.
         rngs = [np.random.default_rng([self.seed, *task]) for task in tasks]
@@ -148,9 +148,9 @@ class RobotSource(DataSource):
                     f"the reach, speed or amplitude of {type(excitation).__name__}"
                 )
         arrays = {"t": t}
-        for index, split in enumerate(SPLITS):
+        for index, name in enumerate(SPLITS):
             chosen = [task[0] == index for task in tasks]
-            arrays |= {f"{split}_{key}": x[chosen] for key, x in zip("qvu", (q, v, u), strict=True)}
+            arrays |= {f"{name}_{key}": x[chosen] for key, x in zip("qvu", (q, v, u), strict=True)}
         return arrays
 
     def _record(self, plan: Plan, t: np.ndarray) -> np.ndarray:

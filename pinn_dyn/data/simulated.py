@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +17,6 @@ from pinn_dyn.data.excitation import Excitation, Joined
 from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
-from pinn_dyn.data.limits import Limits
 from pinn_dyn.data.simulation import SimulationError, momentum, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
@@ -31,13 +29,21 @@ _DRAWS = 40
 _AT_ONCE = 3
 
 
+class _Draw(NamedTuple):
+    """Initial states ``(K, N)`` and inputs of K motions."""
+
+    q0: np.ndarray
+    v0: np.ndarray
+    signal: InputSignal
+
+
+@dataclass(kw_only=True, eq=False)
 class SimulatedSource(DataSource):
     """Trajectories of a known system, simulated once and cached on disk.
 
-    Training trajectories combine every initial state with every input, or pair them one to one;
-    validation and test trajectories each have an initial state and an input of their own, which
-    no training trajectory has. A motion that leaves ``q_limits`` is drawn anew, both its initial
-    state and its input: the k-th motion of a split is the first within them of a sequence of draws.
+    Validation and test trajectories each have an initial state and an input that no training
+    trajectory has. A motion that leaves ``q_limits`` is drawn anew, both its initial state and its
+    input: the k-th motion of a split is the first within them of a sequence of draws.
 
     Args:
         name: short name of the data set.
@@ -51,11 +57,10 @@ class SimulatedSource(DataSource):
         train_initial_states: number of initial states for training.
         train_inputs: number of inputs for training.
         pairing: ``"product"`` trains on every combination of these, ``"matched"`` gives each
-            initial state an input of its own.
+            initial state its own input.
         q_limits: lower and upper limits of the configuration, ``(2, N)``, which no motion leaves;
-            they take ``pairing="matched"``. None: no limits.
-        validation: number of validation trajectories.
-        test: number of test trajectories.
+            they need ``pairing="matched"``. None: no limits.
+        validation, test: number of trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
         compile: compile the equation of motion for the simulation.
@@ -69,95 +74,68 @@ class SimulatedSource(DataSource):
             domain of the system's equation.
     """
 
-    def __init__(
-        self,
-        *,
-        name: str,
-        system: MechanicalSystem,
-        excitation: Excitation,
-        initial_states: InitialStates,
-        duration: PositiveFloat,
-        test_duration: PositiveFloat | None = None,
-        step: PositiveFloat,
-        keep_every: PositiveInt = 1,
-        train_initial_states: PositiveInt,
-        train_inputs: PositiveInt,
-        pairing: Literal["product", "matched"] = "product",
-        q_limits: Sequence[Sequence[float]] | None = None,
-        validation: PositiveInt,
-        test: PositiveInt,
-        seed: NonNegativeInt = 0,
-        rtol: PositiveFloat = 1e-8,
-        atol: PositiveFloat = 1e-9,
-        compile: bool = False,
-        cache: str = "~/.cache/pinn_dyn",
-        labels: Sequence[str],
-        input_labels: Sequence[str],
-        configurations: Mapping[str, Sequence[float]] = MappingProxyType({}),
-    ):
-        self.test_duration = duration if test_duration is None else test_duration
-        if not keep_every * step <= self.test_duration <= duration:
+    name: str
+    system: MechanicalSystem
+    excitation: Excitation
+    initial_states: InitialStates
+    duration: PositiveFloat
+    test_duration: PositiveFloat | None = None
+    step: PositiveFloat
+    keep_every: PositiveInt = 1
+    train_initial_states: PositiveInt
+    train_inputs: PositiveInt
+    pairing: Literal["product", "matched"] = "product"
+    q_limits: Sequence[Sequence[float]] | None = None
+    validation: PositiveInt
+    test: PositiveInt
+    seed: NonNegativeInt = 0
+    rtol: PositiveFloat = 1e-8
+    atol: PositiveFloat = 1e-9
+    compile: bool = False
+    cache: str = "~/.cache/pinn_dyn"
+    labels: Sequence[str]  # type: ignore[assignment]
+    input_labels: Sequence[str]  # type: ignore[assignment]
+    configurations: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.test_duration = self.test_duration or self.duration
+        if not self.keep_every * self.step <= self.test_duration <= self.duration:
             raise ValueError(
-                f"{name}: test_duration is {self.test_duration} s, expected from keep_every * step "
-                f"= {keep_every * step:g} to duration = {duration} s"
+                f"{self.name}: test_duration is {self.test_duration} s, expected from keep_every * "
+                f"step = {self.keep_every * self.step:g} to duration = {self.duration} s"
             )
-        if pairing == "matched" and train_initial_states != train_inputs:
+        if self.pairing == "matched" and self.train_initial_states != self.train_inputs:
             raise ValueError(
-                f"{name}: pairing is 'matched' with {train_initial_states} initial states and "
-                f"{train_inputs} inputs for training, expected as many of each"
+                f"{self.name}: pairing is 'matched' with {self.train_initial_states} initial "
+                f"states and {self.train_inputs} inputs for training, expected as many of each"
             )
-        for key, size, expected in (
-            ("initial_states", len(initial_states.q_low), system.num_coordinates),
-            ("labels", len(labels), system.num_coordinates),
-            ("input_labels", len(input_labels), system.num_inputs),
-            *(
-                (f"configurations.{key}", len(q), system.num_coordinates)
-                for key, q in configurations.items()
-            ),
+        if self.q_limits is not None and self.pairing != "matched":
+            raise ValueError(
+                f"{self.name}: q_limits draw motions anew, which breaks the combinations of "
+                "pairing = 'product': set pairing = 'matched'"
+            )
+        states, size = self.initial_states, self.system.num_coordinates
+        for key, values, expected in (
+            ("initial_states", states.q_low, size),
+            ("labels", self.labels, size),
+            ("input_labels", self.input_labels, self.system.num_inputs),
+            *((f"configurations.{key}", q, size) for key, q in self.configurations.items()),
         ):
-            if size != expected:
-                raise ValueError(f"{name}: {key} has {size} entries, the system needs {expected}")
-        ranges = {"initial_states": (initial_states.q_low, initial_states.q_high)}
-        self.limits = None
-        if q_limits is not None:
-            if pairing != "matched":
+            if len(values) != expected:
                 raise ValueError(
-                    f"{name}: q_limits with pairing = {pairing!r}: a motion that leaves them is "
-                    "drawn anew, which would break the combinations; expected 'matched'"
+                    f"{self.name}: {key} has {len(values)} entries, the system needs {expected}"
                 )
-            self.limits = Limits(f"{name}: q_limits", q_limits, around=ranges["initial_states"])
-            ranges["q_limits"] = (q_limits[0], q_limits[1])
-        if isinstance(system, HasDomain):
-            for key, (low, high) in ranges.items():
-                try:
-                    system.check_domain(np.asarray(low), np.asarray(high))
-                except ValueError as error:
-                    raise ValueError(f"{name}: {key}: {error}") from error
-        self.name = name
-        self.system: MechanicalSystem = system
-        self.angles = tuple(getattr(system, "angles", ()))
-        self.configurations = {key: list(q) for key, q in configurations.items()}
-        self.excitation = excitation
-        self.initial_states = initial_states
-        self.duration = duration
-        self.step = step
-        self.keep_every = keep_every
-        self.pairing = pairing
-        self.compile = compile
-        self.counts = {
-            "train": (train_initial_states, train_inputs),
-            "validation": (validation, validation),
-            "test": (test, test),
-        }
-        self.seed = seed
-        self.rtol = rtol
-        self.atol = atol
-        self.cache = Path(cache).expanduser()
-        self.labels = list(labels)
-        self.input_labels = list(input_labels)
+        low, high = np.array(self.q_limits or [states.q_low, states.q_high], dtype=float)
+        if (low > states.q_low).any() or (high < states.q_high).any():
+            raise ValueError(f"{self.name}: q_limits do not hold all initial states")
+        if isinstance(self.system, HasDomain):
+            self.system.check_domain(low, high)
+        self.angles = tuple(getattr(self.system, "angles", ()))
+        self.labels, self.input_labels = list(self.labels), list(self.input_labels)
 
     def load(self) -> Splits:
-        arrays = load_or_make(self.cache, self.name, self.describe(), self.simulate)
+        folder = Path(self.cache).expanduser()
+        arrays = load_or_make(folder, self.name, self.describe(), self.simulate)
         t = torch.from_numpy(arrays["t"][:: self.keep_every])
         splits: dict[str, list[Trajectory]] = {}
         for split in SPLITS:
@@ -165,35 +143,26 @@ class SimulatedSource(DataSource):
                 torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
             )
             splits[split] = [
-                Trajectory(
-                    q[k],
-                    v[k],
-                    Signal(t[: q.shape[1]], u[k]),
-                    momentum=partial(momentum, self.system),
-                )
-                for k in range(q.shape[0])
+                Trajectory(a, b, Signal(t[: len(c)], c), momentum=partial(momentum, self.system))
+                for a, b, c in zip(q, v, u, strict=True)
             ]
         return Splits(**splits)
 
+    @property
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Number of initial states and of inputs of each split."""
+        return {
+            "train": (self.train_initial_states, self.train_inputs),
+            "validation": (self.validation, self.validation),
+            "test": (self.test, self.test),
+        }
+
     def describe(self) -> dict[str, object]:
         """Return the settings that the simulation depends on: the key of the cache."""
-        parts = {
-            key: describe(getattr(self, key)) for key in ("system", "excitation", "initial_states")
-        }
-        limits = {} if self.limits is None else {"q_limits": describe(self.limits.bounds)}
-        return {
-            "version": _VERSION,
-            **parts,
-            **limits,
-            "duration": self.duration,
-            "test_duration": self.test_duration,
-            "step": self.step,
-            "counts": self.counts,
-            "pairing": self.pairing,
-            "seed": self.seed,
-            "rtol": self.rtol,
-            "atol": self.atol,
-        }
+        keys = "system excitation initial_states duration test_duration step counts pairing seed"
+        keys += " rtol atol" if self.q_limits is None else " rtol atol q_limits"
+        settings = {key: describe(getattr(self, key)) for key in keys.split()}
+        return {"version": _VERSION, **settings}
 
     def simulate(self) -> Arrays:
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
@@ -201,9 +170,9 @@ class SimulatedSource(DataSource):
         if self.test_duration == self.duration:
             return self._simulate(SPLITS, self.duration, 0)
         # Two batches of one size: the compiled equation of motion serves both.
-        size = max(self._size("train"), self._size("validation") + self._size("test"))
+        size = max(len(self._pairs("train")), self.validation + self.test)
         return {
-            **self._simulate(SPLITS[1:], self.test_duration, size),
+            **self._simulate(SPLITS[1:], self.test_duration or self.duration, size),
             **self._simulate(SPLITS[:1], self.duration, size),  # the longer times, "t", last
         }
 
@@ -211,55 +180,44 @@ class SimulatedSource(DataSource):
         """Simulate the trajectories of some splits in one batch, padded with copies to ``size``."""
         t = np.arange(round(duration / self.step) + 1) * self.step
         # One generator per split: more test trajectories do not change the training set.
-        rngs = [np.random.default_rng([self.seed, SPLITS.index(split)]) for split in splits]
-        first = self._draw(splits, rngs)
-        count = len(first.q0)
+        rngs = {s: np.random.default_rng([self.seed, SPLITS.index(s)]) for s in splits}
+        draw = self._draw(rngs)
+        count = len(draw.q0)
         rows = np.arange(max(count, size)) % count
-        q, v, u = (x[:count] for x in self._move([first], rows, t, count))
-        if self.limits is not None:
-            self._replace(self.limits, (q, v, u), splits, rngs, t)
+        motions = [x[:count] for x in self._move([draw], rows, t)]
+        if self.q_limits is not None:
+            self._replace(motions, rngs, t)
         elif isinstance(self.system, HasDomain):
-            for low, high in zip(q.min(1), q.max(1), strict=True):
-                try:
-                    self.system.check_domain(low, high)
-                except ValueError as error:
-                    raise SimulationError(
-                        f"{self.name}: in a motion {error}; set q_limits, within which motions "
-                        "are drawn anew, or reduce the excitation"
-                    ) from error
-        ends = np.cumsum([0, *(self._size(split) for split in splits)])
+            for q in motions[0]:
+                self.system.check_domain(q.min(0), q.max(0))
         arrays = {"t": t}
-        for index, split in enumerate(splits):
-            for key, values in (("q", q), ("v", v), ("u", u)):
-                arrays[f"{split}_{key}"] = values[ends[index] : ends[index + 1]]
+        ends = np.cumsum([len(self._pairs(split)) for split in splits])[:-1]
+        for key, values in zip("qvu", motions, strict=True):
+            parts = zip(splits, np.split(values, ends), strict=True)
+            arrays |= {f"{split}_{key}": part for split, part in parts}
         return arrays
 
-    def _size(self, split: str) -> int:
+    def _pairs(self, split: str) -> np.ndarray:
+        """Return the numbers of the initial state and the input of each motion, ``(K, 2)``."""
         states, inputs = self.counts[split]
-        product = split == "train" and self.pairing == "product"
-        return states * inputs if product else states
+        if split == "train" and self.pairing == "product":
+            return np.indices((states, inputs)).reshape(2, -1).T
+        return np.tile(np.arange(states)[:, None], 2)
 
-    def _draw(self, splits: Sequence[str], rngs: Sequence[np.random.Generator]) -> _Draw:
+    def _draw(self, rngs: Mapping[str, np.random.Generator]) -> _Draw:
         """Draw an initial state and an input for each motion of some splits."""
-        starts, signals, pick = [], [], []
-        for split, rng in zip(splits, rngs, strict=True):
+        starts, signals, rows = [], [], []
+        for index, (split, rng) in enumerate(rngs.items()):
             states, inputs = self.counts[split]
-            starts.append(self.initial_states.draw(states, rng))
+            pairs = self._pairs(split)
+            starts.append(np.stack(self.initial_states.draw(states, rng))[:, pairs[:, 0]])
             signals.append(self.excitation.draw(inputs, self.duration, rng))
-            if split == "train" and self.pairing == "product":
-                pick.append(np.array([(a, b) for a in range(states) for b in range(inputs)]))
-            else:
-                pick.append(np.array([(a, a) for a in range(states)]))
-
-        q0, v0 = (
-            np.concatenate([s[k][p[:, 0]] for s, p in zip(starts, pick, strict=True)])
-            for k in range(2)
-        )
-        which = np.repeat(np.arange(len(pick)), [len(p) for p in pick])
-        return _Draw(q0, v0, Joined(signals, which, np.concatenate(pick)[:, 1]))
+            rows += [(index, number) for number in pairs[:, 1]]
+        q0, v0 = np.concatenate(starts, axis=1)
+        return _Draw(q0, v0, Joined(signals, *np.array(rows).T))
 
     def _move(
-        self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray, count: int
+        self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Simulate q, v and u of some motions: ``rows`` of the concatenated draws."""
         size = len(draws[0].q0)
@@ -273,47 +231,39 @@ class SimulatedSource(DataSource):
             rtol=self.rtol,
             atol=self.atol,
             compile=self.compile,
-            q_limits=None if self.limits is None else self.limits.bounds,
-            progress=f"simulating {count} trajectories of {self.name}",
+            q_limits=None if self.q_limits is None else np.array(self.q_limits, dtype=float),
+            progress=f"simulating {len(rows)} trajectories of {self.name}",
         )
         return q, v, signal(t)
 
     def _replace(
         self,
-        limits: Limits,
-        motions: tuple[np.ndarray, np.ndarray, np.ndarray],
-        splits: Sequence[str],
-        rngs: Sequence[np.random.Generator],
+        motions: Sequence[np.ndarray],
+        rngs: Mapping[str, np.random.Generator],
         t: np.ndarray,
     ) -> None:
-        """Replace the motions that leave the limits by new draws that stay within them.
+        """Replace the motions that leave the limits by new draws that stay within them."""
+        low, high = np.array(self.q_limits, dtype=float)
 
-        Raises:
-            SimulationError: if some leave them in every draw.
-        """
+        def stays(q: np.ndarray) -> np.ndarray:
+            return ((q >= low) & (q <= high)).all((1, 2))
+
         q, drawn = motions[0], 1
-        while (left := np.flatnonzero(limits.left_by(q))).size:
+        while (left := np.flatnonzero(~stays(q))).size:
             if drawn >= _DRAWS:
+                passed = ((q[left] < low) | (q[left] > high)).any((0, 1))
+                names = [label for label, beyond in zip(self.labels, passed, strict=True) if beyond]
                 raise SimulationError(
-                    f"{self.name}: {left.size} of {len(q)} motions leave q_limits in each of "
-                    f"{drawn} draws: {limits.passed(q[left], self.labels)}; reduce the amplitude "
-                    "of the excitation or the initial states, or widen q_limits"
+                    f"{self.name}: {left.size} of {len(q)} motions leave q_limits of "
+                    f"{', '.join(names)} in each of {drawn} draws: reduce the amplitude of the "
+                    "excitation or the initial states, or widen q_limits"
                 )
-            draws = [self._draw(splits, rngs) for _ in range(_AT_ONCE)]
+            draws = [self._draw(rngs) for _ in range(_AT_ONCE)]
             drawn += _AT_ONCE
             rows = np.concatenate([left + k * len(q) for k in range(_AT_ONCE)])
-            new = self._move(draws, rows, t, left.size)
-            stays = ~limits.left_by(new[0]).reshape(_AT_ONCE, left.size)
-            replaced = stays.any(0)
-            first = (stays.argmax(0) * left.size + np.arange(left.size))[replaced]
+            new = self._move(draws, rows, t)
+            inside = stays(new[0]).reshape(_AT_ONCE, left.size)
+            replaced = inside.any(0)
+            first = (inside.argmax(0) * left.size + np.arange(left.size))[replaced]
             for old, values in zip(motions, new, strict=True):
                 old[left[replaced]] = values[first]
-
-
-@dataclass(frozen=True)
-class _Draw:
-    """Initial states ``(K, N)`` and inputs of K motions."""
-
-    q0: np.ndarray
-    v0: np.ndarray
-    signal: InputSignal

@@ -14,11 +14,7 @@ SPLITS = ("train", "validation", "test")
 
 @dataclass(frozen=True)
 class Splits:
-    """Trajectories for training, validation and test; no trajectory is in two of them.
-
-    Attributes:
-        train, validation, test: the trajectories.
-    """
+    """Trajectories for training, validation and test; no trajectory is in two of them."""
 
     train: list[Trajectory]
     validation: list[Trajectory]
@@ -26,16 +22,13 @@ class Splits:
 
 
 class DataSource(abc.ABC):
-    """Where trajectories come from: a simulation, a log, or a class of your own.
-
-    A source of your own sets the attributes and gives :meth:`load`; the rest has defaults.
+    """Source of trajectories: a simulation, a log, or a class of your own with :meth:`load`.
 
     Attributes:
         name: short name, for tables and titles.
         labels: name and unit of each coordinate, N.
         input_labels: name and unit of each input, M.
-        angles: numbers of the coordinates that are angles of joints: the robot is the same after a
-            whole turn.
+        angles: indices of the coordinates that repeat after a whole turn.
         system: the truth, or None for measured data.
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
     """
@@ -49,13 +42,10 @@ class DataSource(abc.ABC):
 
     @abc.abstractmethod
     def load(self) -> Splits:
-        """The trajectories; a second call, or a second process, reads them from the cache."""
+        """Return the trajectories; a second call reads them from the cache."""
 
     def names(self) -> dict[str, list[str]]:
-        """Return the names of the trajectories of each split, for messages.
-
-        A log gives the names of its runs; the default numbers the trajectories.
-        """
+        """Return the names of the trajectories of each split; the default numbers them."""
         splits = self.load()
         return {
             split: [f"{split} trajectory {k}" for k in range(len(getattr(splits, split)))]

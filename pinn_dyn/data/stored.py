@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,38 +14,42 @@ import torch
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.data.whole import whole
 from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.mechanics.signal import Interpolation
 
 
+@dataclass(eq=False)
 class StoredSource(DataSource):
-    """Trajectories that another data source left in a file, see :func:`store`.
-
-    They have no momenta and no true system, since a file holds no code.
+    """Trajectories that :func:`store` wrote to a file, without momenta and true system.
 
     Args:
-        path: the file, as written by :func:`store`.
-        name, labels, input_labels, angles: as in the other source.
+        path: the file.
+        name, labels, input_labels, angles: as in the stored source.
 
     Raises:
         ValueError: if the file is missing or damaged, when it is read.
     """
 
-    def __init__(
-        self,
-        path: str,
-        name: str,
-        labels: Sequence[str],
-        input_labels: Sequence[str],
-        angles: Sequence[int] = (),
-    ):
-        self.path = Path(path).expanduser()
-        self.name = name
-        self.labels = list(labels)
-        self.input_labels = list(input_labels)
-        self.angles = tuple(angles)
+    path: str
+    name: str
+    labels: list[str]
+    input_labels: list[str]
+    angles: Sequence[int] = ()
 
     def load(self) -> Splits:
         arrays = self._read()
-        return Splits(**{split: _unpack(split, arrays) for split in SPLITS})
+
+        def unpack(split: str, k: int, interpolation: Interpolation) -> Trajectory:
+            keys = {key: f"{split}_{k}_{key}" for key in ("t", "q", "v", "u", "past")}
+            item = {k: torch.from_numpy(arrays[name]) for k, name in keys.items() if name in arrays}
+            signal = Signal(item["t"], item["u"], interpolation)
+            return Trajectory(item["q"], item["v"], signal, past=item.get("past"))
+
+        return Splits(
+            **{
+                split: [unpack(split, k, kind) for k, kind in enumerate(arrays[split].tolist())]
+                for split in SPLITS
+            }
+        )
 
     def names(self) -> dict[str, list[str]]:
         arrays = self._read()
@@ -52,7 +57,7 @@ class StoredSource(DataSource):
 
     def _read(self) -> dict[str, np.ndarray]:
         try:
-            with np.load(self.path, allow_pickle=False) as file:
+            with np.load(Path(self.path).expanduser(), allow_pickle=False) as file:
                 return dict(file)
         except (OSError, ValueError, zipfile.BadZipFile) as error:
             raise ValueError(
@@ -75,19 +80,3 @@ def store(source: DataSource, path: Path) -> None:
                     arrays[f"{split}_{k}_{key}"] = value.numpy()
     with whole(path) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)
-
-
-def _unpack(split: str, arrays: dict[str, np.ndarray]) -> list[Trajectory]:
-    trajectories = []
-    for k, interpolation in enumerate(arrays[split].tolist()):
-        q, v, u, t = (torch.from_numpy(arrays[f"{split}_{k}_{key}"]) for key in "qvut")
-        past = arrays.get(f"{split}_{k}_past")
-        trajectories.append(
-            Trajectory(
-                q,
-                v,
-                Signal(t, u, interpolation),
-                past=None if past is None else torch.from_numpy(past),
-            )
-        )
-    return trajectories

@@ -12,14 +12,8 @@ from pathlib import Path
 def whole(path: Path) -> Iterator[Path]:
     """Replace a file only by a complete one, even if the writer is killed or fails.
 
-    Args:
-        path: the file; its folder exists.
-
     Yields:
         Path of ``<name>.<process>.partial`` to write to; it is moved into place afterwards.
-
-    Raises:
-        OSError: if it cannot be written, as on a full disk; names the file.
     """
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import islice, repeat
 from typing import Any
 
@@ -30,8 +30,7 @@ class Windows:
         t: times of the steps from the window's start, ``(H + 1,)``, s.
         q, v: state at the start, ``(B, N)``.
         p: momentum at the start, ``(B, N)``; empty ``(B, 0)`` where there is none.
-        dq, dv, dp: increments from the start to each step, ``(B, H, N)``; taken in double
-            precision, as they are far smaller than the states.
+        dq, dv, dp: increments from the start to each step, ``(B, H, N)``, of double precision.
         input: u, with samples ``(B, past + H * stride + 1, M)``.
         past: samples of the input before the start, for models of a delay.
     """
@@ -107,27 +106,26 @@ class Windows:
 
     def statistics(self) -> Statistics:
         """Return means, standard deviations and ranges over the windows."""
-        ones = torch.ones_like(self.q[0])
 
         def spread(values: Tensor) -> Tensor:
             std = values.std(0, correction=0)
             return torch.where(std > 1e-12, std, torch.ones_like(std))
 
-        has_momentum = self.p.shape[-1] > 0
         qv_std = spread(self.increments("qv"))
+        p_std, qp_std = torch.ones_like(self.q[0]), torch.ones_like(qv_std)
+        if self.p.shape[-1] > 0:
+            p_std, qp_std = spread(self.p), spread(self.increments("qp"))
         return Statistics(
             q_mean=self.q.mean(0),
             q_std=spread(self.q),
             q_low=self.q.amin(0),
             q_high=self.q.amax(0),
             v_std=spread(self.v),
-            p_std=spread(self.p) if has_momentum else ones,
+            p_std=p_std,
             u_mean=self.u.mean((0, 1)),
             u_std=spread(self.u.flatten(0, 1)),
             qv_increment_std=qv_std,
-            qp_increment_std=spread(self.increments("qp"))
-            if has_momentum
-            else torch.ones_like(qv_std),
+            qp_increment_std=qp_std,
             step=float(self.t[1]),
         )
 
@@ -144,12 +142,11 @@ def draw_windows(
 ) -> Windows:
     """Draw windows at random starts, over all starts of all trajectories.
 
-    With ``coverage`` c = 0 all starts are equally likely, so most windows lie where the robot was
-    most of the time. With c > 0 the starts are drawn from candidates (the larger of 400,000 and ten
-    times ``count``) with probabilities ~ (d_k)^(c N), where d_k is the distance from a candidate's
-    q, ``(N,)`` in units of its spread, to its tenth nearest neighbor: as 1/d_k^N estimates the
-    density (Loftsgaarden and Quesenberry 1965), c = 1 spreads the windows evenly over all
-    configurations that were visited.
+    With ``coverage`` c = 0 all starts are equally likely. With c > 0 the starts are drawn from
+    candidates (the larger of 400,000 and ten times ``count``) with probabilities ~ (d_k)^(c N),
+    where d_k is the distance from a candidate's q, ``(N,)`` in units of its spread, to its tenth
+    nearest neighbor: as 1/d_k^N estimates the density (Loftsgaarden and Quesenberry 1965), c = 1
+    spreads the windows evenly over all configurations that were visited.
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
@@ -175,21 +172,18 @@ def draw_windows(
             )
     if history and trajectories[0].input.interpolation == "hold":
         raise ValueError(
-            f"history is {history} s, for a learned delay, but the input is held between its "
-            "samples, and has no slope to learn by: set dataset.interpolation=linear, or find the "
-            "delay by check.py, shift the input by the step InputDelay and take ~model/delay"
+            "a delay cannot be learned from an input that is held between its samples: set "
+            "dataset.interpolation=linear, or measure the delay by check.py and shift the input"
         )
     past = math.ceil(history / sample - 1e-6)
     starts = torch.tensor([max(item.t.shape[0] - span - past, 0) for item in trajectories])
     total = int(starts.sum())
-    if count is None:
-        count = max(total, 1)
+    count = max(total, 1) if count is None else count
     if total < count:
-        before = f", and of {past} before them for the delay," if past else ""
         raise ValueError(
-            f"{count} windows of {span} samples ({span * sample:g} s){before} were asked for, but "
-            f"the {len(trajectories)} training trajectories have only {total} starts for them: ask "
-            "for fewer pairs, a shorter window or more data"
+            f"{count} windows of {span + past} samples ({(span + past) * sample:g} s) were asked "
+            f"for, but the {len(trajectories)} training trajectories have only {total} starts for "
+            "them: ask for fewer pairs, a shorter window or more data"
         )
     generator = torch.Generator().manual_seed(seed)
     if coverage > 0:
@@ -206,9 +200,9 @@ def draw_windows(
     knots = torch.arange(steps + 1) * stride
     q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(number, offset, strict=True)])
     v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(number, offset, strict=True)])
-    inputs = [item.input for item in trajectories]
     inputs = [
-        inputs[i].part(slice(k - past, k + span + 1)) for i, k in zip(number, offset, strict=True)
+        trajectories[i].input.part(slice(k - past, k + span + 1))
+        for i, k in zip(number, offset, strict=True)
     ]
     t = torch.arange(-past, span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
@@ -250,19 +244,20 @@ PICKED = 16_384
 """Approximate number of windows that are picked at once."""
 
 
+@dataclass(eq=False)
 class WindowLoader:
-    """Windows in the memory of a device; batches are picked there by tensors of positions.
+    """Loader of batches from windows in the memory of a device.
 
     Many small batches are picked by one operation, of which each is a view.
 
-    Args:
+    Attributes:
         windows: all windows, on the device that trains.
-        sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble.
+        sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble;
+            the trainer tells it the epoch.
     """
 
-    def __init__(self, windows: Windows, sampler: Sampler[Tensor]):
-        self.windows = windows
-        self.sampler = sampler  # the trainer looks for it here, to tell it the epoch
+    windows: Windows
+    sampler: Sampler[Tensor]
 
     def __len__(self) -> int:
         return len(self.sampler)  # type: ignore[arg-type]
@@ -276,41 +271,32 @@ class WindowLoader:
             yield from self.windows[index].unbind()
 
 
+@dataclass(eq=False)
 class BatchSampler(Sampler[Tensor]):
-    """Batches of an epoch: ``batches`` of them, from as many shuffled passes as they need.
+    """Batches of an epoch, from as many shuffled passes as they need.
 
-    The order depends on the seed and the epoch alone, so a resumed training sees the batches that
-    an uninterrupted one would have seen.
+    The order depends on the seed and the epoch alone, so a resumed training sees the batches of an
+    uninterrupted one.
 
-    Args:
+    Attributes:
         size: number of windows.
         batch_size: windows in a batch.
         batches: batches in an epoch.
         seed: seed of the order.
-        rank, processes: of several processes that train together, each yields its own share of
-            every batch, so that all of them see what one alone would have seen.
+        rank, processes: each of several processes yields its own share of every batch.
     """
 
-    def __init__(
-        self,
-        size: int,
-        *,
-        batch_size: int,
-        batches: int,
-        seed: int,
-        rank: int = 0,
-        processes: int = 1,
-    ):
-        self.size = size
-        self.batch_size = batch_size
-        self.batches = batches
-        self.seed = seed
-        self.rank = rank
-        self.processes = processes
-        self.epoch = 0
+    size: int
+    _: KW_ONLY
+    batch_size: int
+    batches: int
+    seed: int
+    rank: int = 0
+    processes: int = 1
+    epoch: int = field(default=0, init=False)
 
     def set_epoch(self, epoch: int) -> None:
-        """Called by the trainer at the start of each epoch."""
+        """Set the epoch; the trainer calls it at the start of each one."""
         self.epoch = epoch
 
     def __len__(self) -> int:

@@ -101,7 +101,7 @@ class SimulatedArm(RigidChain, abc.ABC):
     def motor_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return M a + C v + G + D v, ``(*batch, N)``, Nm."""
         with torch.inference_mode():
-            force = self.rigid_force(*map(torch.from_numpy, (q, v, a)))
+            force = self.rigid_force(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(a))
         return force.numpy() + self.friction * v
 
     @property

@@ -23,22 +23,11 @@ def test_batches_depend_on_the_seed_and_the_epoch_alone():
     assert torch.equal(last, batches(epoch=3))
 
 
-def test_a_pass_covers_every_window_once():
-    order = batches(number=12).reshape(3, 64)
-    for one_pass in order:
-        assert torch.equal(one_pass.sort().values, torch.arange(64))
-    assert not torch.equal(order[0], order[1])
-
-
 def test_no_window_comes_twice_in_a_pass_that_does_not_divide_evenly():
     order = batches(size=70, number=8)
     assert order.shape == (8, 16)
     for one_pass in order.reshape(2, 64):
         assert len(set(one_pass.tolist())) == 64
-
-
-def test_the_sampler_tells_its_length():
-    assert len(BatchSampler(64, batch_size=16, batches=7, seed=0)) == 7
 
 
 def test_the_shares_of_several_processes_are_the_batch_of_one():

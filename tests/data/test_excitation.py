@@ -34,26 +34,13 @@ def test_signals_move_within_their_amplitude_about_the_offset(kind):
     assert (excursion > 0.6 * AMPLITUDE).all()
 
 
-def test_peaks_of_a_sine_lie_between_a_third_and_the_whole_amplitude():
-    u = samples(KINDS["sine"], count=200)
-    peak = np.abs(u - OFFSET).max(axis=1) / AMPLITUDE
-    assert peak.min() > 0.33
-    assert peak.min() < 0.4
-    assert peak.max() > 0.95
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_seed_gives_the_same_signals_again_and_another_seed_gives_others(kind):
     first, again, other = (samples(KINDS[kind], seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (np.abs(first - other).max(axis=(1, 2)) > 1e-3).all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_signals_drawn_together_differ(kind):
-    u = samples(KINDS[kind], count=6).reshape(6, -1)
-    distance = np.abs(u[:, None] - u[None]).max(-1)
-    assert (distance[~np.eye(6, dtype=bool)] > 1e-3).all()
+    # Signals that are drawn together differ, too.
+    assert len(np.unique(first.reshape(len(first), -1), axis=0)) == len(first)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -152,10 +139,3 @@ def test_frequencies_of_a_sine_lie_in_its_band():
     assert (turns >= 1.0 * 20 - 0.5).all()
     assert (turns <= 2.0 * 20 + 0.5).all()
     assert np.ptp(turns) > 5
-
-
-def test_arguments_that_contradict_each_other_are_refused():
-    with pytest.raises(ValueError, match="MultiSine: offset has 1 entries and amplitude 2"):
-        MultiSine([0.0], [1.0, 2.0])
-    with pytest.raises(ValueError, match=r"Steps: rise_time is 0\.2 s, expected at most"):
-        Steps([0.0], [1.0], hold=[0.1, 1.0], rise_time=0.2)

@@ -18,13 +18,6 @@ def test_initial_states_fill_their_box():
     assert (np.ptp(v, axis=0) > 0.95 * 2 * v_max).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(v_max=[1.0]), "v_max have 3, 3 and 1 entries"),
-        (dict(q_low=[2.0, -1.0, 0.1]), "q_low <= q_high"),
-    ],
-)
-def test_a_bad_box_of_initial_states_is_refused(change, message):
-    with pytest.raises(ValueError, match=f"InitialStates: .*{message}"):
-        InitialStates(**{**BOX, **change})
+def test_bounds_in_the_wrong_order_are_refused():
+    with pytest.raises(ValueError, match="exceeds q_high"):
+        InitialStates(**{**BOX, "q_low": [2.0, -1.0, 0.1]})

@@ -6,10 +6,9 @@ import torch
 from scipy.integrate import cumulative_simpson, solve_ivp
 
 from pinn_dyn.data import Mixture, MultiSine, SimulationError, Steps, simulate
-from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import SoftArm
-from pinn_dyn.testing import damped_oscillators, exact_solution
+from pinn_dyn.testing import damped_oscillators
 from tests.support.linear import exact_solution_under_sine
 
 ARM_INPUTS = Mixture(
@@ -39,17 +38,8 @@ def arm_run():
     return signal, q, v
 
 
-def test_a_damped_linear_system_under_a_constant_input_follows_the_matrix_exponential(linear):
-    x0 = np.array([[0.5, -0.3, 0.2, 0.8], [1.0, 1.0, 0.0, 0.0]])
-    t = np.linspace(0, 4, 41)
-    q, v = simulate(linear, x0[:, :2], x0[:, 2:], constant([0.7], 2), t)
-    u = torch.full((41, 1), 0.7, dtype=torch.float64)
-    for k in range(2):
-        exact = exact_solution(linear, torch.from_numpy(x0[k]), torch.from_numpy(t), u, "hold")
-        np.testing.assert_allclose(np.hstack([q[k], v[k]]), exact.numpy(), rtol=0, atol=1e-7)
-
-
-def test_a_damped_linear_system_under_a_sine_follows_the_matrix_exponential(linear):
+@pytest.mark.parametrize(("tolerance", "error"), [(1e-8, 1e-7), (1e-11, 1e-9)])
+def test_a_damped_linear_system_follows_the_matrix_exponential(linear, tolerance, error):
     x0 = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
     t = np.linspace(0, 4, 41)
     q, v = simulate(
@@ -58,18 +48,11 @@ def test_a_damped_linear_system_under_a_sine_follows_the_matrix_exponential(line
         x0[None, 2:].numpy(),
         lambda s: np.sin(3 * s)[None, :, None],
         t,
+        rtol=tolerance,
+        atol=tolerance,
     )
     exact = exact_solution_under_sine(linear, x0, torch.from_numpy(t), 3.0)
-    np.testing.assert_allclose(np.hstack([q[0], v[0]]), exact.numpy(), rtol=0, atol=1e-7)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
-def test_a_compiled_simulation_is_the_same(linear):
-    q0, v0, t = np.ones((2, 2)), np.zeros((2, 2)), np.linspace(0, 1, 5)
-    plain = simulate(linear, q0, v0, constant([1.0], 2), t)
-    compiled = simulate(linear, q0, v0, constant([1.0], 2), t, compile=True)
-    np.testing.assert_allclose(compiled, plain, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.hstack([q[0], v[0]]), exact.numpy(), rtol=0, atol=error)
 
 
 def test_without_a_compiler_the_simulation_runs_and_says_so(linear, monkeypatch, caplog):
@@ -80,26 +63,6 @@ def test_without_a_compiler_the_simulation_runs_and_says_so(linear, monkeypatch,
         simulate(linear, q0, v0, constant([1.0], 2), t, compile=True), plain
     )
     assert "no C++ compiler" in caplog.text
-
-
-def test_looser_tolerances_give_larger_errors(linear):
-    """The tolerances reach the solver."""
-    x0 = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
-    t = np.linspace(0, 4, 41)
-    exact = exact_solution_under_sine(linear, x0, torch.from_numpy(t), 3.0).numpy()
-    errors = []
-    for tolerance in (1e-4, 1e-11):
-        q, v = simulate(
-            linear,
-            x0[None, :2].numpy(),
-            x0[None, 2:].numpy(),
-            lambda s: np.sin(3 * s)[None, :, None],
-            t,
-            rtol=tolerance,
-            atol=tolerance,
-        )
-        errors.append(np.abs(np.hstack([q[0], v[0]]) - exact).max())
-    assert errors[1] < 1e-9 < 1e-7 < errors[0]
 
 
 def test_the_soft_arm_agrees_with_a_tighter_solve_of_one_trajectory(arm_run):
@@ -140,13 +103,6 @@ def test_a_batch_equals_single_trajectories(arm_run):
         np.testing.assert_allclose(alone_v[0], v[k, :126], rtol=0, atol=1e-5)
 
 
-def test_samples_start_at_the_initial_states(arm_run):
-    _, q, v = arm_run
-    assert q.shape == v.shape == (3, 501, 3)
-    np.testing.assert_array_equal(q[:, 0], ARM_Q)
-    np.testing.assert_array_equal(v[:, 0], ARM_V)
-
-
 def test_the_energy_of_the_soft_arm_changes_by_the_power_that_enters_and_is_lost(arm_run):
     signal, q, v = arm_run
     arm = SoftArm()
@@ -156,21 +112,6 @@ def test_the_energy_of_the_soft_arm_changes_by_the_power_that_enters_and_is_lost
     change = energy - energy[:, :1]
     np.testing.assert_allclose(change, work, rtol=0, atol=2e-6)
     assert np.abs(change).max() > 0.05
-
-
-def test_the_velocity_is_the_rate_of_the_configuration(arm_run):
-    _, q, v = arm_run
-    h = ARM_T[1]
-    rate = (8 * (q[:, 3:-1] - q[:, 1:-3]) - (q[:, 4:] - q[:, :-4])) / (12 * h)
-    np.testing.assert_allclose(rate, v[:, 2:-2], rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_non_finite_initial_state_is_refused_with_its_number(linear, bad):
-    q0 = np.zeros((3, 2))
-    q0[1, 0] = bad
-    with pytest.raises(ValueError, match="initial state 1"):
-        simulate(linear, q0, np.zeros((3, 2)), constant([0.0], 3), np.linspace(0, 1, 11))
 
 
 class LosesMass(MechanicalSystem):
@@ -208,13 +149,6 @@ def push(mass, q0):
 
 def time_of(error):
     return float(str(error).split("t = ")[1].split(" s")[0])
-
-
-def test_a_mass_that_vanishes_ends_the_simulation_and_says_when():
-    """By conservation of energy p^2/(2 m) = q, so q = 1 is reached after pi/sqrt(8) s."""
-    with pytest.raises(SimulationError) as caught:
-        push(vanishing, 0.0)
-    assert time_of(caught.value) == pytest.approx(np.pi / np.sqrt(8), abs=2e-3)
 
 
 def test_a_mass_matrix_that_is_not_positive_ends_the_simulation_and_says_when():

@@ -76,34 +76,11 @@ def test_inputs_beyond_the_range_exceed_it(beyond):
     assert np.abs(u[..., :2]).max() <= 2.6
 
 
-def test_no_start_or_input_is_shared_between_the_sets(wide, beyond):
-    parts = [drawn(wide, split, 20) for split in ("train", "validation", "test")]
-    parts.append(drawn(beyond, "test", 20))
-    q = np.concatenate([q for q, _ in parts])
-    u = np.concatenate([u for _, u in parts])
-    assert len(np.unique(q[:, 0])) == len(q)
-    assert len({tuple(x.ravel()) for x in u}) == len(u)
-
-
-def test_limits_take_an_arm_of_five_centimetres_to_nearly_four_metres(wide, beyond):
-    low, high = wide.limits.bounds
-    np.testing.assert_allclose(wide.system.length + np.array([low[2], high[2]]), [0.05, 3.9])
-    np.testing.assert_allclose(beyond.limits.bounds[:, :2], 1.3 * wide.limits.bounds[:, :2])
-    assert beyond.limits.bounds[1, 2] == pytest.approx(1.3 * high[2], rel=0.01)
-
-
-@pytest.mark.parametrize("elongation", [-0.2, -0.5])
-def test_a_range_in_which_the_arm_has_no_length_is_refused(elongation):
-    limits = f"dataset.q_limits=[[-2.5,-2.5,{elongation}],[2.5,2.5,3.7]]"
-    with pytest.raises(ValueError, match=r"soft_arm_1_wide: q_limits: .*keep q\[2\] above -0.2"):
-        build("soft_arm_1_wide", limits)
-
-
 @pytest.mark.slow
 def test_motions_cover_the_range_and_stay_within_it(tmp_path):
     source = build("soft_arm_1_wide", "dataset.step=0.005", f"+dataset.cache={tmp_path}")
     splits = source.load()
-    low, high = torch.from_numpy(source.limits.bounds)
+    low, high = torch.tensor(source.q_limits)
     for name in ("train", "validation", "test"):
         for x in getattr(splits, name):
             assert ((x.q >= low) & (x.q <= high)).all()

@@ -98,21 +98,8 @@ def test_windows_are_distinct_slices_of_their_trajectories(
             assert torch.equal(part.u[row], item.u[k : k + length * stride + 1])
 
 
-def test_all_starts_are_drawn_before_any_comes_twice(trajectories):
-    """40 + 25 + 40 samples, less 6 each, are 87 starts: 87 windows are all of them."""
-    windows = draw(trajectories, count=87)
-    expected = [(n, k) for n, item in enumerate(trajectories) for k in range(len(item.t) - 6)]
-    assert sorted(origin(trajectories, windows)) == expected
-
-
 def with_momenta(trajectories, system):
     return [dataclasses.replace(item, momentum=system.momentum) for item in trajectories]
-
-
-def test_a_seed_gives_the_same_windows_again_and_another_seed_gives_others(trajectories):
-    first, again, other = (draw(trajectories, seed=seed) for seed in (0, 0, 1))
-    assert torch.equal(first.q, again.q)
-    assert origin(trajectories, first) != origin(trajectories, other)
 
 
 def test_momenta_come_from_the_mass_matrix_at_the_start_and_at_every_step(trajectories):
@@ -261,20 +248,6 @@ def test_validation_is_one_batch_of_whole_trajectories():
     assert batch.q.shape == (2, 40, 2)
 
 
-def test_the_source_is_asked_once():
-    data = make_data()
-    data.prepare_data()
-    list(data.train_dataloader())
-    list(data.val_dataloader())
-    assert data.statistics.step == pytest.approx(3 * STEP)
-    assert data.source.loads == 1
-
-
-def test_a_batch_of_more_windows_than_there_are_is_refused():
-    with pytest.raises(ValueError, match=r"batch_size is 91, expected at most .* 90"):
-        make_data(batch_size=91)
-
-
 def test_all_pairs_are_all_starts_once():
     data = make_data(pairs="all")
     assert len(data.windows) == 102
@@ -320,19 +293,6 @@ def test_coverage_counts_the_coordinates():
     )
     for value in windows.q.T.numpy():
         assert kstest(value, "uniform", args=(-1, 2)).statistic < 0.06
-
-
-def test_coverage_counts_coordinates_in_units_of_their_spread(trajectories):
-    scaled = [
-        dataclasses.replace(item, q=item.q * torch.tensor([1.0, 1000.0], dtype=torch.float64))
-        for item in trajectories
-    ]
-    for a, b in zip(
-        origin(trajectories, draw(trajectories, coverage=1.0)),
-        origin(scaled, draw(scaled, coverage=1.0)),
-        strict=True,
-    ):
-        assert a == b
 
 
 def test_coverage_of_a_robot_at_rest_draws_what_is_there():
