@@ -25,7 +25,7 @@ def main(draws: int, first: int) -> None:
         ways = {"its own": [input_delays([one], rigid=rigid) for one in logs]}
         if kind != "pendulum":
             ways["common"] = [input_delays([one], common=True, rigid=rigid) for one in logs]
-            ways["agreed"] = [agreed_delays([one], rigid=rigid)[0] for one in logs]
+            ways["agreed"] = [agreed_delays([one], rigid=rigid) for one in logs]
         for way, found in ways.items():
             print(f"{kind}, {way}: {_words(found, delays)}", flush=True)
 

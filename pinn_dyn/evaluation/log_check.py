@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from pinn_dyn.data.logs import (
     Butterworth,
     Cleaned,
     DelayCurve,
-    LogError,
     LogSource,
     Measurement,
     MovingAverage,
@@ -29,29 +28,32 @@ from pinn_dyn.evaluation.log_numbers import (
     bandwidth,
     distance_from,
     explained_share,
-    independent_share,
-    regressor_columns,
-    share_at_rest,
+    independent_shares,
     white_noise,
 )
 from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_excitation
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.known import Structure
 
-# A training makes no sense beyond these limits.
-_LEAST_SAMPLES = 200
-_LEAST_EXPLAINED = 0.1
-_MOST_REST = 0.98
-_STILL = 0.25  # noise of q as a share of its range
-# A warning.
-_NOISE = 0.02
-_CONDITION = 1e3
-_INDEPENDENT = 0.01
-_FAR = 3.0
-_OUTSIDE = 0.05
-_ROWS = 20  # lines of a table in the terminal
-
+_EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
+_NOISE = 0.02  # noise of q as a share of its range
+_STILL = 0.25  # the same of a joint at rest
+_FAR = 3.0  # distance of a test sample from the training
+_OUTSIDE = 0.05  # share of the test
+_ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
+# Column of the table of coordinates, its limit, and the text beyond it.
+_LIMITS = (
+    ("noise / range", "below", _NOISE, "its noise is {:.2g} % of its range"),
+    (
+        *("independent share of a", "at least", 0.01),
+        "its q, v and the accelerations of the other coordinates explain its acceleration but for "
+        "{:.2g} %, so its inertia cannot be told from stiffness, damping or the inertia of another "
+        "joint; excite it with more frequencies",
+    ),
+    ("test outside", "below", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
+)
+_judged = functools.partial(judged, section="bags_and_other_logs.md#is-the-log-good-enough")
 
 
 @dataclass(frozen=True)
@@ -61,15 +63,12 @@ class LogCheck:
     Attributes:
         source: the log.
         measurements: the measurements, each with its verdict.
-        runs: one row per stretch: split, duration, rows, sample time, jitter, longest gap.
-        coordinates: one row per coordinate: range, noise, share of the acceleration that
-            identifies its inertia.
-        inputs: one row per input: range, delay and its spread, or why there is no delay.
+        runs, coordinates, inputs: tables of stretches, coordinates and inputs.
         delays: delay curve of each input.
         distance: distance of the test samples from the nearest training sample, ``(S,)``; 1 is the
             distance between tenths of the training.
+        steps: lines for the YAML of the data set: filter cutoff and delay, if needed.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
-        steps: cleaning steps for the YAML of the data set that follow from measurements.
     """
 
     source: LogSource
@@ -79,8 +78,8 @@ class LogCheck:
     inputs: pd.DataFrame
     delays: list[DelayCurve]
     distance: np.ndarray
+    steps: list[str]
     rigid: RigidExcitation | None = None
-    steps: list[str] = field(default_factory=list)
 
     @property
     def problems(self) -> list[str]:
@@ -94,30 +93,27 @@ class LogCheck:
 
     def table(self) -> pd.DataFrame:
         """Return one row per measurement, stops and warnings first."""
-        rows = sorted(self.measurements, key=lambda x: _RANK[x.verdict])
-        return pd.DataFrame(
-            [[x.verdict, x.name, x.place, x.value, x.expected, x.text, x.section] for x in rows],
-            columns=["verdict", "measurement", "of", "value", "expected", "explanation", "docs"],
+        frame = pd.DataFrame(self.measurements).rename(
+            columns={"name": "measurement", "place": "of", "text": "explanation", "section": "docs"}
         )
+        frame.insert(0, "verdict", frame.pop("verdict"))
+        return frame.sort_values("verdict", key=lambda x: x.map(_RANK), kind="stable")
 
     def __str__(self) -> str:
-        table = self.table()
-        many = len(self.runs) > _ROWS
-        parts = {
-            "Runs": self.runs.head(_ROWS),
-            f"{len(self.runs) - _ROWS} more runs are in the page" if many else "": None,
+        tables = {
+            "Runs": self.runs,
             "Coordinates": self.coordinates,
             "Inputs": self.inputs,
-            **({} if self.rigid is None else {"Rigid bodies": self.rigid.joints}),
-            "Measurements": table[["verdict", "measurement", "of", "value", "expected"]].head(50),
+            "Measurements": self.table()[["verdict", "measurement", "of", "value", "expected"]],
         }
-        lines = [f"{self.source.name}: check of the log"]
-        for title, frame in parts.items():
-            lines += ["", title] if title else []
-            if frame is not None:
-                lines.append(frame.to_string(index=False, na_rep="", float_format="{:.3g}".format))
         if self.rigid is not None:
-            lines.append(f"not determined: {self.rigid.summary(_ROWS)}")
+            tables[f"Rigid bodies, not determined: {self.rigid.summary}"] = self.rigid.joints
+        lines = [f"{self.source.name}: check of the log"]
+        for title, frame in tables.items():
+            more = f" (the first {_ROWS} of {len(frame)})" if len(frame) > _ROWS else ""
+            number = "{:.3g}".format
+            text = frame.head(_ROWS).to_string(index=False, na_rep="", float_format=number)
+            lines += ["", title + more, text]
         for x in self.measurements:
             if x.verdict != "ok":
                 lines += ["", f"{x.verdict}: {x.text} (docs/{x.section})"]
@@ -168,18 +164,18 @@ def check(
         for item in part.clean
     ]
     step = float(np.median(np.diff(training[0].t)))
-    rigid = None if structure is None else functools.partial(_regressor, structure)
-    delays, common = agreed_delays(training, longest=longest_delay, rigid=rigid)
-    coordinates, condition = _coordinates(source, training, splits.test, step)
+    rigid = None
+    if structure is not None:
+        rigid = lambda *motion: structure.regressor(*map(torch.from_numpy, motion)).numpy()  # noqa: E731
+    delays = agreed_delays(training, longest=longest_delay, rigid=rigid)
+    coordinates = _coordinates(source, training, splits.test, step)
     noise = coordinates["noise of q"].to_numpy()
     highest = bandwidth(training, step, noise)
     distance = distance_from(training, splits.test)
     measurements = [
         *source.measurements,
-        *_amount(training, explained_share(training, delays, step)),
-        *_motion(coordinates, condition),
-        *_coverage(coordinates, distance),
-        *_delay_measurements(source, delays, step),
+        *_measured(coordinates, distance, explained_share(training, delays, step)),
+        *(_lateness(name, x, step) for name, x in zip(source.u.columns, delays, strict=True)),
     ]
     excitation = None
     if structure is not None:
@@ -187,31 +183,27 @@ def check(
         # At least three periods of the cutoff are in the longest motion.
         cutoff = min(max(4 * highest, 1.0, 3.01 / longest), 0.4 / step)
         still = (coordinates["noise / range"] > _STILL).tolist()
-        try:
-            excitation = rigid_excitation(structure, splits.train, cutoff=cutoff, still=still)
-        except ValueError as error:
-            raise LogError(f"the rigid-body regressor: {error}") from error
+        excitation = rigid_excitation(structure, splits.train, cutoff=cutoff, still=still)
         measurements.append(_excitation(excitation))
     u = np.vstack([item.u for item in training])
+    table = {
+        "input": source.input_labels[:inputs],
+        "min": u.min(axis=0),
+        "max": u.max(axis=0),
+        "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
+        "spread [ms]": [np.nan if x.delay is None else 1e3 * x.spread for x in delays],
+        "method": [x.reason or x.form for x in delays],
+    }
     return LogCheck(
         source,
         measurements,
         pd.DataFrame([_run(part) for part in source.cleaned]),
         coordinates,
-        pd.DataFrame(
-            {
-                "input": source.input_labels[:inputs],
-                "min": u.min(axis=0),
-                "max": u.max(axis=0),
-                "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
-                "spread [ms]": [np.nan if x.delay is None else 1e3 * x.spread for x in delays],
-                "method": [x.reason or f"{x.form}{', common' * common}" for x in delays],
-            }
-        ),
+        pd.DataFrame(table),
         delays,
         distance,
-        excitation,
         [*_filter(source, training, step, noise, highest), *_delay(delays, step)],
+        excitation,
     )
 
 
@@ -231,19 +223,14 @@ def _run(part: Cleaned) -> dict[str, object]:
 
 def _coordinates(
     source: LogSource, training: list[Recording], test: Sequence[Trajectory], step: float
-) -> tuple[pd.DataFrame, float]:
-    """Return one row per coordinate, and the condition number of (1, q, v, a)."""
+) -> pd.DataFrame:
     q = np.vstack([item.q for item in training])
     v = np.vstack([item.v for item in training if item.v is not None])
     raw = [x.raw for x in source.cleaned if x.split == "train" and len(x.raw) > 10]
     noise = np.median([white_noise(item.q) for item in raw], axis=0)
-    # The noise of a derived velocity is not white.
-    noise_of_v = [white_noise(item.v) for item in raw if item.v is not None]
     tested = np.vstack([item.q.numpy() for item in test])
     low, high = q.min(axis=0), q.max(axis=0)
-    regressor = regressor_columns(training, step)
-    size = q.shape[1]
-    frame = pd.DataFrame(
+    return pd.DataFrame(
         {
             "coordinate": source.labels,
             "min": low,
@@ -251,105 +238,46 @@ def _coordinates(
             "fastest [/s]": np.abs(v).max(axis=0),
             "noise of q": noise,
             "noise / range": noise / np.ptp(q, axis=0).clip(min=1e-300),
-            **({"noise of v": np.median(noise_of_v, axis=0)} if noise_of_v else {}),
             "test outside": ((tested < low) | (tested > high)).mean(axis=0),
-            "independent share of a": [independent_share(regressor, k, size) for k in range(size)],
+            "independent share of a": independent_shares(training, step),
         }
     )
-    scaled = regressor / np.linalg.norm(regressor, axis=0).clip(min=1e-300)
-    return frame, float(np.linalg.cond(scaled))
 
 
-def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
-    """Return Y ``(R, N, 10 N)`` of the bodies at q, v, a ``(R, N)``."""
-    return structure.regressor(*map(torch.from_numpy, motion)).numpy()
-
-
-_judged = functools.partial(judged, section="bags_and_other_logs.md#is-the-log-good-enough")
-
-
-def _amount(training: list[Recording], explained: float) -> list[Measurement]:
-    """Measure whether the training has enough samples, motion and input."""
-    samples = sum(len(item) for item in training)
-    at_rest = share_at_rest(training)
-    stop = functools.partial(_judged, verdict="stop")
-    text = f"the training has {samples} samples, expected at least {_LEAST_SAMPLES}"
-    few = samples < _LEAST_SAMPLES
-    results = [stop("samples", "training", samples, f"at least {_LEAST_SAMPLES}", few, text)]
-    text = "the robot rests for nearly the whole training: cut the rest out"
-    rests = at_rest > _MOST_REST
-    results.append(stop("share at rest", "training", at_rest, f"below {_MOST_REST}", rests, text))
-    text = (
-        f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these the "
-        "inputs of this robot, on the same clock?"
-    )
-    name = "share of the motion that inputs add to (1, q, v)"
-    bad = explained < _LEAST_EXPLAINED
-    results.append(stop(name, "inputs", explained, f"at least {_LEAST_EXPLAINED}", bad, text))
-    return results
-
-
-def _motion(coordinates: pd.DataFrame, condition: float) -> list[Measurement]:
-    """Measure noise, and the identifiability of inertias from the linear regressor."""
+def _measured(
+    coordinates: pd.DataFrame, distance: np.ndarray, explained: float
+) -> list[Measurement]:
+    """Measure noise, excitation, coverage of the test, and whether inputs explain the motion."""
     results = []
-    for row in coordinates.to_dict("records"):
-        name, noise, share = (
-            row[key] for key in ("coordinate", "noise / range", "independent share of a")
-        )
-        text = f"{name}: its noise is {100 * noise:.2g} % of its range"
-        bad = noise > _NOISE
-        results.append(_judged("noise of q / range", name, noise, f"below {_NOISE}", bad, text))
-        text = (
-            f"{name}: its q, v and the accelerations of the other coordinates explain its "
-            f"acceleration but for {100 * share:.2g} %, so its inertia cannot be told from "
-            "stiffness, damping or the inertia of another joint; excite it with more frequencies"
-        )
-        bad, expected = share < _INDEPENDENT, f"at least {_INDEPENDENT}"
-        results.append(_judged("independent share of a", name, share, expected, bad, text))
-    text = (
-        "the regressor (1, q, v, a) of all joints is ill-conditioned: their motions share few "
-        "frequencies, so choose a model of few parameters (known mechanics), or excite more"
-    )
-    bad, expected = condition > _CONDITION, f"below {_CONDITION:g}"
-    name = "condition number of (1, q, v, a)"
-    results.append(_judged(name, "training", condition, expected, bad, text))
-    if (coordinates["noise / range"] > _STILL).all():
-        text = "no coordinate moves by more than its noise"
-        results.append(_judged("motion", "training", 0.0, "", True, text, verdict="stop"))
-    return results
-
-
-def _coverage(coordinates: pd.DataFrame, distance: np.ndarray) -> list[Measurement]:
-    """Measure how far the test is from the training."""
-    results = []
-    expected = f"below {_OUTSIDE}"
-    for name, share in zip(coordinates["coordinate"], coordinates["test outside"], strict=True):
-        text = f"{name}: {100 * share:.0f} % of the test is outside the range of the training"
-        title = "share of the test outside the range"
-        results.append(_judged(title, name, share, expected, share > _OUTSIDE, text))
+    for name, limit, bound, text in _LIMITS:
+        for label, value in zip(coordinates["coordinate"], coordinates[name], strict=True):
+            bad = value > bound if limit == "below" else value < bound
+            message = f"{label}: {text.format(100 * value)}"
+            results.append(_judged(name, label, value, f"{limit} {bound}", bad, message))
     far = float((distance > _FAR).mean())
     text = (
         f"{100 * far:.0f} % of the test is {_FAR:g} times further from the training than tenths of "
         "it are from each other"
     )
-    results.append(_judged("share of the test far away", "", far, expected, far > _OUTSIDE, text))
-    return results
+    measured = ("share of the test far away", "", far, f"below {_OUTSIDE}", far > _OUTSIDE)
+    results.append(_judged(*measured, text))
+    text = (
+        f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these the "
+        "inputs of this robot, on the same clock?"
+    )
+    name, expected = "share of the motion that inputs add to (1, q, v)", f"at least {_EXPLAINED}"
+    bad = explained < _EXPLAINED
+    return [*results, _judged(name, "inputs", explained, expected, bad, text, "stop")]
 
 
-def _delay_measurements(
-    source: LogSource, delays: Sequence[DelayCurve], step: float
-) -> list[Measurement]:
-    """Return the delay of each input; a delay of a sample or more is a warning."""
-    results = []
-    for name, curve in zip(source.u.columns, delays, strict=True):
-        delay = np.nan if curve.delay is None else 1e3 * curve.delay
-        late = delay > 750 * step
-        text = (
-            f"input {name!r} acts {delay:.0f} ms after it is logged: add the InputDelay step "
-            "below, or learn the delay with the model (model/delay=learned)"
-        )
-        results.append(_judged("delay [ms]", name, delay, "below a sample", late, text))
-    return results
+def _lateness(name: str, curve: DelayCurve, step: float) -> Measurement:
+    """Return the delay of an input; a delay of a sample or more is a warning."""
+    delay = np.nan if curve.delay is None else 1e3 * curve.delay
+    text = (
+        f"input {name!r} acts {delay:.0f} ms after it is logged: add the InputDelay step below, or "
+        "learn the delay with the model (model/delay=learned)"
+    )
+    return _judged("delay [ms]", name, delay, "below a sample", delay > 750 * step, text)
 
 
 def _excitation(excitation: RigidExcitation) -> Measurement:
@@ -373,7 +301,7 @@ def _filter(
     v = np.vstack([np.diff(item.q, axis=0) / step for item in training])
     share = float((2**0.5 * noise / step / v.std(axis=0).clip(min=1e-300)).max())
     cutoff = float(f"{max(4 * highest, 1.0):.2g}")
-    if share < _NOISE or not 0 < cutoff < 0.4 / step:
+    if share < _NOISE or not cutoff < 0.4 / step:
         return []
     return [
         f"filter: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
@@ -387,7 +315,4 @@ def _delay(delays: Sequence[DelayCurve], step: float) -> list[str]:
     if not any(shifts):
         return []
     value = shifts[0] if len(set(shifts)) == 1 else shifts
-    return [
-        f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s, the delay of "
-        "the inputs"
-    ]
+    return [f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"]

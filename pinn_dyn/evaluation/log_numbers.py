@@ -13,45 +13,45 @@ from pinn_dyn.data.logs import DelayCurve, Recording
 from pinn_dyn.mechanics import Trajectory
 
 _SMOOTH = 0.03  # width of the kernel before a derivative, s
-_POINTS = 4000  # of a figure or a search among neighbours
-_STILL = 0.01  # of the fastest, a speed below which the robot rests
-_NEAR = 0.05  # of the spread
+_POINTS = 4000  # largest number of samples in a search among neighbors
+_NEAR = 0.05  # distance that always counts as near, as a share of the spread
 
 
 def white_noise(x: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of white noise, from third differences.
-
-    A smooth motion has next to no third difference.
-    """
-    third = np.diff(x, n=3, axis=0)
-    return 1.4826 * np.median(np.abs(third), axis=0) / np.sqrt(20)
+    """Return the standard deviation of white noise on smooth motions, from third differences."""
+    return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
 
 
-def regressor_columns(training: list[Recording], step: float) -> np.ndarray:
-    """Return columns 1, q, v, a, averaged by a Gaussian kernel and of unit spread."""
+def _smooth_motion(item: Recording, width: float) -> list[np.ndarray]:
+    """Return q, v, a averaged by a Gaussian kernel of a width in samples; v, a per sample."""
+    return [gaussian_filter1d(item.q, width, axis=0, order=k) for k in range(3)]
+
+
+def independent_shares(training: Sequence[Recording], step: float) -> np.ndarray:
+    """Return the share of each a_k that 1, q_k, v_k and the other a do not explain, ``(N,)``."""
     width = max(_SMOOTH / step, 1.5)
-    thin = max(1, int(width / 2))
-    parts = []
-    for item in training:
-        if len(item) > 10 * width:
-            smooth = [gaussian_filter1d(item.q, width, axis=0, order=k) for k in range(3)]
-            inner = slice(int(4 * width), -int(4 * width), thin)
-            parts.append(np.hstack([x[inner] for x in smooth]))
-    x = np.vstack(parts) if parts else np.zeros((1, 3 * training[0].q.shape[1]))
+    inner = slice(int(4 * width), -int(4 * width), max(1, int(width / 2)))
+    size = training[0].q.shape[1]
+    motion = [
+        np.hstack([x[inner] for x in _smooth_motion(item, width)])
+        for item in training
+        if len(item) > 10 * width
+    ]
+    x = np.vstack([*motion, np.zeros((1, 3 * size))]) if not motion else np.vstack(motion)
     x = (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
-    return np.hstack([np.ones((len(x), 1)), x])
+    shares = []
+    for k in range(size):
+        a = x[:, 2 * size + k]
+        known = np.delete(x[:, 2 * size :], k, axis=1)
+        known = np.column_stack([np.ones(len(x)), x[:, k], x[:, size + k], known])
+        remainder = a - known @ np.linalg.lstsq(known, a, rcond=None)[0]
+        shares.append(remainder.var() / max(a.var(), 1e-300))
+    return np.array(shares)
 
 
-def independent_share(x: np.ndarray, k: int, size: int) -> float:
-    """Return the share of a_k that 1, q_k, v_k and the other accelerations do not explain."""
-    accelerations = np.arange(1 + 2 * size, 1 + 3 * size)
-    column = accelerations[k]
-    known = x[:, [0, 1 + k, 1 + size + k, *accelerations[accelerations != column]]]
-    remainder = x[:, column] - known @ np.linalg.lstsq(known, x[:, column], rcond=None)[0]
-    return float(remainder.var() / max(x[:, column].var(), 1e-300))
-
-
-def explained_share(training: list[Recording], delays: Sequence[DelayCurve], step: float) -> float:
+def explained_share(
+    training: Sequence[Recording], delays: Sequence[DelayCurve], step: float
+) -> float:
     """Return the largest share that delayed inputs add to the explanation of v and of a.
 
     Without inputs, v and a are explained by (1, q, v). The shares are corrected for the number of
@@ -62,26 +62,21 @@ def explained_share(training: list[Recording], delays: Sequence[DelayCurve], ste
     lags = [round((curve.delay or 0.0) / step) for curve in delays]
     parts = []
     for item in training:
-        first = edge + max(lags)
-        # At this distance their averages are independent.
-        rows = np.arange(first, len(item) - edge, max(1, int(3.5 * width)))
-        if not len(rows):
-            continue
-        motion = [gaussian_filter1d(item.q, width, axis=0, order=k)[rows] for k in range(3)]
+        # At this distance the averages of two rows are independent.
+        rows = np.arange(edge + max(lags), len(item) - edge, max(1, int(3.5 * width)))
         smooth = gaussian_filter1d(item.u, width, axis=0)
         acting = np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)])
-        parts.append([*motion, acting])
-    if sum(len(q) for q, *_ in parts) < 6 * (3 * training[0].q.shape[1] + len(delays)):
+        parts.append([*(x[rows] for x in _smooth_motion(item, width)), acting])
+    q, v, a, u = map(np.vstack, zip(*parts, strict=True))
+    if len(q) < 6 * (3 * q.shape[1] + len(lags)):
         return 1.0
-    position, speed, acceleration, inputs = map(np.vstack, zip(*parts, strict=True))
-    known = np.hstack([np.ones((len(position), 1)), position, np.sin(position), np.cos(position)])
-    gains = [
-        _unexplained(y, x) - _unexplained(y, np.hstack([x, inputs]))
-        for y, x in ((speed, known), (acceleration, np.hstack([known, speed])))
-    ]
-    # The acceleration of a controlled robot may follow from q and v; its torque then does too.
-    gains.append(1 - _unexplained(inputs, np.hstack([known, speed, acceleration])))
-    return max(gains)
+    known = np.hstack([np.ones((len(q), 1)), q, np.sin(q), np.cos(q)])
+    return max(
+        _unexplained(v, known) - _unexplained(v, np.hstack([known, u])),
+        _unexplained(a, np.hstack([known, v])) - _unexplained(a, np.hstack([known, v, u])),
+        # The acceleration of a controlled robot may follow from q and v; its torque then does too.
+        1 - _unexplained(u, np.hstack([known, v, a])),
+    )
 
 
 def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
@@ -90,43 +85,30 @@ def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
     moving = spread > 1e-12 * np.abs(y).max(axis=0)  # a constant has the spread of rounding
     if not moving.any():
         return 1.0
-    left = len(x) - x.shape[1]
     y = (y[:, moving] - y[:, moving].mean(axis=0)) / spread[moving]
     x = x / np.abs(x).max(axis=0).clip(min=1e-300)
     remainder = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-    return float((remainder**2).mean()) * len(x) / left
-
-
-def share_at_rest(training: list[Recording]) -> float:
-    """Return the share of samples in which no coordinate has a hundredth of its top speed."""
-    speeds = np.vstack([np.abs(np.diff(item.q, axis=0)) for item in training])
-    return float((speeds < _STILL * speeds.max(axis=0).clip(min=1e-300)).all(axis=1).mean())
+    return float((remainder**2).mean()) * len(x) / (len(x) - x.shape[1])
 
 
 def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> float:
     """Return the frequency in Hz below which 99 % of the power of v is, above the noise of q."""
-    highest = 0.0
     size = min(round(8 / step), min(len(item) for item in training))
-    for k in range(training[0].q.shape[1]):
-        powers = [welch(item.q[:, k], 1 / step, nperseg=size)[1] for item in training]
-        f = np.fft.rfftfreq(size, step)
-        density = np.mean(powers, axis=0)
-        # White noise has 2 s² h per Hz; single bad samples have the density of the highest
-        # frequencies. Four times that is no noise.
-        level = max(2 * noise[k] ** 2 * step, float(np.median(density[len(f) // 2 :])))
-        power = np.where(density > 4 * level, density, 0.0) * f**2
-        if power.any():
-            share = np.cumsum(power) / power.sum()
-            highest = max(highest, float(f[int(np.searchsorted(share, 0.99))]))
-    return highest
+    spectra = [welch(item.q, 1 / step, nperseg=size, axis=0) for item in training]
+    f, density = spectra[0][0], np.mean([power for _, power in spectra], axis=0)
+    # White noise has 2 s² h per Hz; single bad samples have the density of the highest
+    # frequencies. Power up to four times this level counts as noise.
+    level = np.maximum(2 * noise**2 * step, np.median(density[len(f) // 2 :], axis=0))
+    power = np.where(density > 4 * level, density, 0.0) * f[:, None] ** 2
+    share = np.cumsum(power, axis=0) / power.sum(axis=0).clip(min=1e-300)
+    return max((float(f[np.searchsorted(x, 0.99)]) for x in share.T if x[-1] > 0), default=0.0)
 
 
-def distance_from(training: list[Recording], test: Sequence[Trajectory]) -> np.ndarray:
-    """Return the distance of each test sample (q, v) from the nearest of the training, ``(S,)``.
+def distance_from(training: Sequence[Recording], test: Sequence[Trajectory]) -> np.ndarray:
+    """Return the distance of test samples (q, v) from the nearest training sample, ``(S,)``.
 
     The unit is the distance between a tenth of the training and the nine others, so that it does
-    not depend on the number of coordinates; at least a twentieth of the spread in each of them,
-    which is near also where the training repeats one motion.
+    not depend on N. It is at least a twentieth of the spread, for trainings that repeat one motion.
     """
     known = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
     samples = np.vstack([np.hstack([item.q.numpy(), item.v.numpy()]) for item in test])

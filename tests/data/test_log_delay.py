@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pinn_dyn.data.logs import InputDelay, agreed_delays, input_delays
-from pinn_dyn.data.logs import delay as finding
+from pinn_dyn.data.logs import delay as delay_module
 from tests.support.delayed_robots import log, seven_regressor
 
 
@@ -14,14 +14,14 @@ from tests.support.delayed_robots import log, seven_regressor
 @pytest.mark.parametrize(("seed", "delay"), [(0, 0.0), (1, 0.043), (2, 0.1)])
 def test_a_known_delay_is_found_within_a_sample(kind, seed, delay):
     for curve in input_delays([log(kind, seed, delay)]):
-        assert curve.delay == pytest.approx(delay, abs=0.01), str(curve)
+        assert curve.delay == pytest.approx(delay, abs=0.01)
 
 
 @pytest.mark.parametrize(("seed", "delay"), [(0, 0.0), (1, 0.043), (2, 0.1)])
 def test_seven_joints_whose_kinematics_are_known(seed, delay):
     curves = input_delays([log("seven joints", seed, delay)], rigid=seven_regressor)
     for curve in curves:
-        assert curve.delay == pytest.approx(delay, abs=0.01), str(curve)
+        assert curve.delay == pytest.approx(delay, abs=0.01)
     assert sum(curve.form == "rigid bodies" for curve in curves) >= 5
 
 
@@ -66,25 +66,25 @@ def test_given_delays_shift_each_input():
 
 def both(first, second):
     """The arm with the torque of each joint late by its own time."""
-    one, other = log("arm", 3, first), log("arm", 3, second)
-    return replace(one, u=np.column_stack([one.u[:, 0], other.u[:, 1]]))
+    slow, slower = log("arm", 3, first), log("arm", 3, second)
+    return replace(slow, u=np.column_stack([slow.u[:, 0], slower.u[:, 1]]))
 
 
-def test_inputs_with_delays_of_their_own_keep_them():
-    found, common = agreed_delays([both(0.02, 0.06)])
-    assert not common
-    assert [curve.delay for curve in found] == pytest.approx([0.02, 0.06], abs=0.005)
+def test_inputs_with_different_delays_keep_them():
+    curves = agreed_delays([both(0.02, 0.06)])
+    assert [curve.delay for curve in curves] == pytest.approx([0.02, 0.06], abs=0.005)
 
 
 def test_an_input_without_an_answer_takes_that_of_all(monkeypatch):
     item = log("arm", 3, 0.03)
-    own = input_delays([item])
-    lost = [own[0], replace(own[1], delay=None, reason="the residual is all but the same")]
-    every = input_delays([item], common=True)
-    answers = {False: lost, True: every}
-    monkeypatch.setattr(finding, "input_delays", lambda *_, common=False, **__: answers[common])
-    found, common = agreed_delays([item])
-    assert common
-    assert [curve.delay for curve in found] == pytest.approx([0.03, 0.03], abs=0.005)
-    lost[1] = replace(lost[1], reason=finding._AFTER)
-    assert agreed_delays([item])[0] == lost
+    single = input_delays([item])
+    lost = [single[0], replace(single[1], delay=None, reason="the residual is all but the same")]
+    answers = {False: lost, True: input_delays([item], common=True)}
+    monkeypatch.setattr(
+        delay_module, "input_delays", lambda *_, common=False, **__: answers[common]
+    )
+    curves = agreed_delays([item])
+    assert [curve.form for curve in curves] == ["inverse dynamics, common"] * 2
+    assert [curve.delay for curve in curves] == pytest.approx([0.03, 0.03], abs=0.005)
+    lost[1] = replace(lost[1], reason=delay_module._AFTER)
+    assert agreed_delays([item]) == lost

@@ -72,8 +72,6 @@ def test_the_condition_number_of_a_pendulum_is_that_of_its_six_columns():
     columns = np.stack([x[moves] / np.linalg.norm(x[moves]) for x in columns], axis=1)
     assert excitation.count == 6
     assert excitation.condition == pytest.approx(np.linalg.cond(columns), rel=0.02)
-    shares = 1 / np.diag(np.linalg.inv(columns.T @ columns))
-    assert excitation.joints["its own share"].item() == pytest.approx(shares.min(), rel=0.05)
     assert excitation.undetermined == []
 
 
@@ -82,7 +80,7 @@ def test_motions_of_all_joints_leave_nothing_open():
     excitation = rigid_excitation(chain, [motion(4, seconds=60.0)], cutoff=10.0)
     assert excitation.condition < 100
     assert excitation.open_joints == []
-    assert excitation.summary(5) == "none"
+    assert excitation.summary == "none"
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-5])

@@ -1,19 +1,17 @@
 """Delay between an input and its motion, estimated from the equation of motion.
 
 A correlation of q with u includes the lag of the robot itself. Here a candidate d is judged by the
-share that the equation of motion leaves unexplained. Three forms of it are tried, and a fourth for
-rigid robots:
+share that an equation of motion leaves unexplained:
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
-    increments          v = f(q) + B(u(t - d)),         overdamped robots
-    acceleration        a = f(q, v) + B(u(t - d))
-    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if the kinematics are known
-                                                                      and no other form answers
+    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if f has no answer
+    increments          v = f(q) + B(u(t - d)),         overdamped robots with more inputs
+    acceleration        a = f(q, v) + B(u(t - d)),      robots with more inputs
 
 f and B are linear in their parameters (least squares). All signals are averaged by one Gaussian
-kernel g of width s, whose slopes give the derivatives: g * a = g'' * q. A linear equation then
-stays true, the delay included, without a derivative of noise. The form and width count whose
-estimate varies least when tenths of the data are left out in turn (jackknife).
+kernel g, whose slopes give the derivatives: g * a = g'' * q. A linear equation then stays true, the
+delay included, without a derivative of noise. The form and width count whose estimate varies least
+when tenths of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
@@ -26,8 +24,9 @@ import numpy as np
 from pinn_dyn.data.logs.delay_regression import (
     BLOCKS,
     Regressor,
-    Remainder,
     Smoothed,
+    input_shares,
+    motion_shares,
     rigid_shares,
     terms,
 )
@@ -35,14 +34,11 @@ from pinn_dyn.data.logs.recording import Recording
 
 _WIDTHS = (0.005, 0.01, 0.02, 0.04, 0.08)  # of the kernel, s
 _CANDIDATES = 60  # at most: a parabola finds what is between them
-# The residual must fall to this share of its usual value, and the spread of the estimate stay below
-# this share of a sample, or of 10 ms.
-_DEPTH = 0.9
-_SPREAD = 0.6
-_UNEXPLAINED = 0.4
-_AS_WELL = 1.1  # factor between residuals up to which a common delay explains as well
+_DEPTH = 0.9  # largest residual as a share of its median
+_SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
+_UNEXPLAINED = 0.4  # largest residual
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
-_RIGID = "rigid bodies"
+_INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
 
 
@@ -66,16 +62,6 @@ class DelayCurve:
     form: str
     reason: str = ""
 
-    def __str__(self) -> str:
-        if self.delay is None:
-            return f"no delay: {self.reason}"
-        best = int(np.argmin(self.residual))
-        return (
-            f"{1e3 * self.delay:.1f} ± {1e3 * self.spread:.1f} ms ({self.form}: "
-            f"{100 * self.residual[best]:.2g} % unexplained, "
-            f"{100 * np.interp(0.0, self.candidates, self.residual):.2g} % without a delay)"
-        )
-
 
 def input_delays(
     recordings: Sequence[Recording],
@@ -86,15 +72,13 @@ def input_delays(
 ) -> list[DelayCurve]:
     """Estimate the delay of each input, or one for all, from uniformly sampled stretches.
 
+    With more inputs than coordinates it is one for all.
+
     Args:
-        recordings: stretches of one sample time, q and u in them.
+        recordings: stretches of one sample time.
         longest: longest delay that is tried, s.
         common: estimate one delay for all inputs.
-        rigid: regressor Y of a rigid robot with one input per joint, or None. Without it, seven
-            joints have more terms than minutes of data determine.
-
-    Returns:
-        A curve per input; the same curve for all if ``common``.
+        rigid: regressor Y of a rigid robot with one input per joint, or None.
 
     Raises:
         LogError: if a clock is not uniform.
@@ -103,123 +87,82 @@ def input_delays(
     inputs = recordings[0].u.shape[1]
     stride = max(1, round(longest / step / _CANDIDATES))
     lags = stride * np.arange(-2, max(round(longest / step / stride), 3) + 1)
-    widths = sorted({max(width, 1.5 * step) for width in _WIDTHS})
     forms: dict[str, list[list[DelayCurve]]] = {}
-    for width in widths:
+    for width in sorted({max(width, 1.5 * step) for width in _WIDTHS}):
         data = Smoothed.average(recordings, step, width, lags)
-        if data is not None:
-            for form, trial in _trials(data, lags * step, inputs, common, rigid).items():
-                forms.setdefault(form, []).append(trial)
+        for form, shares in _shares(data, inputs, rigid).items() if data else ():
+            if common:
+                shares = shares.mean(axis=-1, keepdims=True)
+            curves = [_curve(lags * step, x, form) for x in np.moveaxis(shares, -1, 0)]
+            forms.setdefault(form, []).append(curves * (inputs // len(curves)))
     if not forms:
         short = "the stretches are too short"
         return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
     best = {
-        form: [min((trial[i] for trial in trials), key=_rank) for i in range(inputs)]
+        form: [min(curves, key=_rank) for curves in zip(*trials, strict=True)]
         for form, trials in forms.items()
     }
     bodies = best.pop(_RIGID, None)
     curves = min(best.values(), key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
     if bodies is not None:  # its friction is simpler than in the other forms, so it comes last
         curves = [
-            of_bodies if of_bodies.delay is not None and _is_open(curve) else curve
+            of_bodies if curve.reason not in ("", _AFTER) and not of_bodies.reason else curve
             for curve, of_bodies in zip(curves, bodies, strict=True)
         ]
-    lines = [_is_one_line([item.u[:, i] for item in recordings]) for i in range(inputs)]
-    if all(lines) or (any(lines) and not common):
-        reason = "the input is a single sine, whose delay looks like damping"
-        curves = [
-            replace(curve, delay=None, reason=reason) if line or common else curve
-            for curve, line in zip(curves, lines, strict=True)
-        ]
-    return curves
+    sines = [all(_is_sine(item.u[:, i]) for item in recordings) for i in range(inputs)]
+    if common:
+        sines = [all(sines)] * inputs
+    reason = "the input is a single sine, whose delay looks like damping"
+    return [
+        replace(curve, delay=None, reason=reason) if sine else curve
+        for curve, sine in zip(curves, sines, strict=True)
+    ]
 
 
 def agreed_delays(
     recordings: Sequence[Recording], *, longest: float = 0.3, rigid: Regressor | None = None
-) -> tuple[list[DelayCurve], bool]:
-    """Estimate the delay of each input, or one for all where single answers are not good.
+) -> list[DelayCurve]:
+    """Estimate the delay of each input, or one for all where an input has no answer of its own.
 
-    Most delays are those of a bus or a filter that all inputs share, and a common estimate uses the
-    data of all inputs. If an input has no answer, or two answers differ by more than a sample, a
-    common delay is tried, unless an input is logged after the motion. It counts if it lies within
-    a sample of the range of the single answers and explains the motion about as well.
-
-    Arguments and errors are those of :func:`input_delays`.
-
-    Returns:
-        A curve per input, and true if they are the common curve.
+    The common delay counts if it lies within a sample of the range of the single answers, and no
+    input is logged after the motion; its form then ends with "common". Arguments and errors are
+    those of :func:`input_delays`.
     """
     single = input_delays(recordings, longest=longest, rigid=rigid)
     delays = [curve.delay for curve in single if curve.delay is not None]
-    complete = len(delays) == len(single)
-    step = recordings[0].sample_time("a delay")
     after = any(curve.reason == _AFTER for curve in single)
-    agree = complete and max(delays) - min(delays) <= step
-    if len(single) == 1 or not delays or after or agree:
-        return single, False
+    if after or len(delays) in (0, len(single)):
+        return single
+    step = recordings[0].sample_time("a delay")
     common = input_delays(recordings, longest=longest, common=True, rigid=rigid)
-    left, left_in_common = (np.mean([c.residual.min() for c in x]) for x in (single, common))
-    among = common[0].delay is not None and (
-        min(delays) - step <= common[0].delay <= max(delays) + step
-    )
-    if not among or (complete and left_in_common > _AS_WELL * left):
-        return single, False
-    return common, True
+    delay = common[0].delay
+    if delay is None or not min(delays) - step <= delay <= max(delays) + step:
+        return single
+    return [replace(curve, form=f"{curve.form}, common") for curve in common]
 
 
 def _rank(curve: DelayCurve) -> tuple[bool, float]:
     return curve.delay is None, min(curve.spread, 1.0)
 
 
-def _is_open(curve: DelayCurve) -> bool:
-    """Tell whether there is no answer, not even that the input comes after the motion."""
-    return curve.delay is None and curve.reason != _AFTER
+def _is_sine(x: np.ndarray) -> bool:
+    """Tell whether nearly all power of a signal is in one spectral line."""
+    power = np.abs(np.fft.rfft((x - x.mean()) * np.hanning(len(x)))) ** 2
+    peak = int(power.argmax())
+    return bool(power[max(peak - 2, 0) : peak + 3].sum() >= _ONE_LINE * power.sum())
 
 
-def _is_one_line(signals: Sequence[np.ndarray]) -> bool:
-    """Tell whether nearly all power of every stretch of a signal is in one spectral line."""
-    for x in signals:
-        power = np.abs(np.fft.rfft((x - x.mean()) * np.hanning(len(x)))) ** 2
-        peak = int(power.argmax())
-        if power[max(peak - 2, 0) : peak + 3].sum() < _ONE_LINE * power.sum():
-            return False
-    return True
-
-
-def _trials(
-    data: Smoothed,
-    candidates: np.ndarray,
-    inputs: int,
-    common: bool,
-    rigid: Regressor | None,
-) -> dict[str, list[DelayCurve]]:
-    """Return a curve per input for every form of the equation, at one width."""
-    results = {}
-    torques = {}
-    if inputs <= data.q.shape[1]:
-        known = terms(data, inverse=True)
-        torques["inverse dynamics"] = Remainder.fit(known, data, data.a[:, :0]).of_targets()
+def _shares(data: Smoothed, inputs: int, rigid: Regressor | None) -> dict[str, np.ndarray]:
+    """Return the unexplained shares by form, ``(B + 1, D, M)``, or ``(B + 1, D, 1)`` of all."""
+    if inputs > data.q.shape[1]:
+        return {
+            "increments": motion_shares(terms(data, "increments"), data, data.v),
+            "acceleration": motion_shares(terms(data, "acceleration"), data, data.a),
+        }
+    shares = {_INVERSE: input_shares(terms(data, _INVERSE), data, slice(inputs))}
     if rigid is not None and inputs == data.q.shape[1]:
-        torques[_RIGID] = rigid_shares(data, rigid)
-    for form, shares in torques.items():
-        if common:
-            shares = np.repeat(shares[..., :inputs].mean(axis=-1, keepdims=True), inputs, axis=-1)
-        results[form] = [_curve(candidates, shares[..., i], form) for i in range(inputs)]
-    for form, target in (("increments", data.v), ("acceleration", data.a)):
-        known = terms(data, inverse=False, first_order=form == "increments")
-        remainder = Remainder.fit(known, data, target)
-        lag = np.zeros(data.u.shape[2], dtype=int)
-        shares = remainder.of_inputs(lag, range(len(lag)))
-        curves = [_curve(candidates, shares, form)] * inputs
-        lag[:] = shares[0].argmin()
-        for _ in range(0 if common or inputs == 1 else 2):
-            for i in range(inputs):
-                columns = [k for k, p in enumerate(data.powers) if p[i] == sum(p)]
-                shares = remainder.of_inputs(lag, columns)
-                lag[columns] = shares[0].argmin()
-                curves[i] = _curve(candidates, shares, form)
-        results[form] = curves
-    return results
+        shares[_RIGID] = rigid_shares(data, rigid)
+    return shares
 
 
 def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:

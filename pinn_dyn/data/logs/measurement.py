@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,21 +10,21 @@ Verdict = Literal["ok", "warning", "stop"]
 
 @dataclass(frozen=True)
 class Measurement:
-    """A number that a check measured, and what it means for a training.
+    """A number that a check measured, and its meaning for a training.
 
     Attributes:
         name: measured quantity.
         place: run, column or input.
-        value: the number; NaN where there is none.
+        value: the number; NaN without a number.
         expected: range of a good log, in words.
-        verdict: ``"ok"``, ``"warning"``, or ``"stop"`` where a training makes no sense.
+        verdict: ``"stop"`` if a training makes no sense.
         text: explanation of a warning or a stop, a full sentence.
         section: section of the documentation.
     """
 
     name: str
     place: str = ""
-    value: float = math.nan
+    value: float = float("nan")
     expected: str = ""
     verdict: Verdict = "ok"
     text: str = ""
@@ -39,11 +38,9 @@ def judged(
     expected: str,
     bad: bool,
     text: str,
-    *,
     verdict: Verdict = "warning",
     section: str = Measurement.section,
 ) -> Measurement:
     """Return a measurement with a verdict and a text if it is bad, else ``"ok"``."""
-    if not bad:
-        return Measurement(name, place, float(value), expected, section=section)
+    verdict, text = (verdict, text) if bad else ("ok", "")
     return Measurement(name, place, float(value), expected, verdict, text, section)

@@ -2,151 +2,85 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+import pandas as pd
+from scipy.integrate import cumulative_trapezoid
 
 from pinn_dyn.data.logs.checks import BURSTS, burst_share
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.measurement import Measurement, judged
+from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 
-# Factor between dq/dt and v without a warning, and the correlation that determines it.
-_FACTORS = (0.8, 1.25)
-_CLEAR = 0.8
-# The same factor of a single run, which noise in its v makes smaller.
-_FACTORS_OF_A_RUN = (0.5, 2.0)
-# Share of the samples in which a robot may rest without a warning.
-_AT_REST = 0.9
-# A coordinate that moves less, m or rad, does not move.
-_STILL = 1e-12
-# A partial correlation of force and acceleration below this value is clear.
-_REVERSED = -0.5
-# All columns of a signal are larger in one run: motions do not do that, degrees (57) or mm do.
-_OTHER_UNITS = 40.0
+_FACTORS = (0.8, 1.25)  # range of dq/dt over v without a warning
+_FACTORS_OF_A_RUN = (0.5, 2.0)  # the same beside most runs; noise in v makes the factor smaller
+_CLEAR = 0.8  # correlation from which the factor is determined
+_AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and of a stop
+_STILL = 1e-12  # range of a coordinate that does not move, m or rad
+_REVERSED = -0.5  # partial correlation of force and acceleration
 _MOST_ROWS = 50_000
 
 
 def check_stamps(recordings: list[Recording], repairs: Collection[str]) -> list[Measurement]:
     """Measure whether stamps come in bursts, as of a logger that empties a buffer."""
-    shares = [burst_share(item.t) for item in recordings]
-    worst = int(np.argmax(shares))
-    bad = shares[worst] > BURSTS and "bursts" not in repairs
-    run = recordings[worst].run
+    share, run = max((burst_share(item.t), item.run) for item in recordings)
     text = (
         f"{run}: stamps come in bursts, most rows follow the row before within a fifth of the mean "
         "sample time: if no row is missing, take the time from the row number, by the step "
         "examples.cleaning_steps.RowClock"
     )
-    return [judged("share of rows in bursts", run, shares[worst], f"below {BURSTS}", bad, text)]
+    bad = share > BURSTS and "bursts" not in repairs
+    return [judged("share of rows in bursts", run, share, f"below {BURSTS}", bad, text)]
 
 
 def check_inputs(training: list[Recording], u: Columns) -> list[Measurement]:
-    """Measure the range of each input in the training.
-
-    Raises:
-        LogError: if no input ever changes.
-    """
-    sizes = np.ptp(np.vstack([item.u[:, : len(u.columns)] for item in training]), axis=0)
-    if not sizes.any():
-        raise LogError(
-            f"u: every input ({', '.join(u.columns)}) is constant in the training runs: are these "
-            "the right columns?"
-        )
-    results = []
-    for name, size in zip(u.columns, sizes, strict=True):
-        text = f"input {name!r} is constant in the training runs: its effect cannot be learned"
-        results.append(judged("range of the input", name, size, "above 0", size == 0, text))
-    return results
+    """Measure the range of each input in the training."""
+    ranges = np.ptp(np.vstack([item.u[:, : len(u.columns)] for item in training]), axis=0)
+    text = "input {!r} is constant in the training runs: its effect cannot be learned"
+    return [
+        judged("range of the input", name, size, "above 0", size == 0, text.format(name))
+        for name, size in zip(u.columns, ranges, strict=True)
+    ]
 
 
 def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
     """Measure the largest angles; an angle beyond 4 pi rad is probably in degrees."""
     results = []
-    for k, name in enumerate(q.columns):
-        if q.units[k] != "rad":
-            continue
-        largest = [float(np.abs(item.q[:, k]).max()) for item in recordings]
-        run, value = recordings[int(np.argmax(largest))].run, max(largest)
+    for k in (k for k, unit in enumerate(q.units) if unit == "rad"):
+        angle, run = max((float(np.abs(item.q[:, k]).max()), item.run) for item in recordings)
         text = (
-            f"{run}, column {name!r}: an angle of {value:.4g} rad is more than two turns: is it in "
-            f"degrees? Its unit is configured as {q.unit[k]!r}"
+            f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two turns: "
+            f"is it in degrees? Its unit is configured as {q.unit[k]!r}"
         )
-        results.append(
-            judged(
-                "largest angle [rad]",
-                name,
-                value,
-                "below 4 pi",
-                value > 4 * math.pi,
-                text,
-                section="csv_logs.md#columns",
-            )
-        )
-    return results
-
-
-def check_units_of_runs(
-    recordings: list[Recording], signals: Mapping[str, Columns]
-) -> list[Measurement]:
-    """Warn of runs, of three or more, in which all columns of a signal spread far too much."""
-    results = []
-    for signal in signals if len(recordings) >= 3 else ():
-        spreads = np.array([getattr(item, signal).std(axis=0) for item in recordings])
-        usual = np.sort(spreads, axis=0)[(len(spreads) - 1) // 2]
-        for item, spread in zip(recordings, spreads, strict=True):
-            if (usual > 0).all() and (spread > _OTHER_UNITS * usual).all():
-                ratio = (spread / usual).min()
-                text = (
-                    f"{item.run}: {signal} spreads {ratio:.3g} times as far as in most runs: has "
-                    "this run other units?"
-                )
-                name = f"spread of {signal} beside most runs"
-                results.append(judged(name, item.run, ratio, f"below {_OTHER_UNITS:g}", True, text))
+        bad, section = angle > 4 * math.pi, "csv_logs.md#columns"
+        measured = ("largest angle [rad]", q.columns[k], angle, "below 4 pi")
+        results.append(judged(*measured, bad, text, section=section))
     return results
 
 
 def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
-    """Measure the motion of each coordinate, and the share of the training at rest.
-
-    Raises:
-        LogError: if no coordinate ever moves.
-    """
-    positions = np.vstack([item.q for item in training])
-    still = np.ptp(positions, axis=0) <= _STILL
-    if still.all():
-        raise LogError(
-            f"q: no coordinate ({', '.join(q.columns)}) moves in the training runs: there is no "
-            "motion to learn from; are these the right columns?"
-        )
+    """Measure the motion of each coordinate, and the share of the training at rest."""
     results = []
     for k, name in enumerate(q.columns):
-        spread = positions[:, k].std()
-        text = ""
-        if still[k]:
-            text = f"column {name!r} (q): never moves in the training runs"
-        elif not moves(training, k):
-            text = (
-                f"column {name!r} (q): moves no more than its noise in the training runs, "
-                f"{spread:.3g} {q.units[k]}"
-            )
-        results.append(
-            judged("spread of q in the training", name, spread, "above noise", bool(text), text)
+        spread = np.concatenate([item.q[:, k] for item in training]).std()
+        text = (
+            f"column {name!r} (q): moves no more than its noise in the training runs, "
+            f"{spread:.3g} {q.units[k]}"
         )
+        measured = ("spread of q in the training", name, spread, "above noise")
+        results.append(judged(*measured, not moves(training, k), text))
     steps = np.vstack([np.abs(np.diff(item.q, axis=0)) for item in training])
-    slow = (x < 0.01 * max(x.max(), 1e-300) for x in steps.T)
-    share = float(functools.reduce(np.logical_and, slow).mean())
+    share = (steps < 0.01 * steps.max(axis=0).clip(min=1e-300)).all(axis=1).mean()
     text = (
         f"the robot is at rest for {100 * share:.0f} % of the training samples: windows drawn "
         "there teach little; use data.coverage, or cut the rest out"
     )
-    results.append(
-        judged("share at rest", "training", share, f"below {_AT_REST}", share > _AT_REST, text)
-    )
-    return results
+    bad = share > _AT_REST
+    verdict: Verdict = "stop" if share > _ALL_AT_REST else "warning"
+    name, expected = "share at rest", f"below {_AT_REST}"
+    return [*results, judged(name, "training", share, expected, bad, text, verdict)]
 
 
 def check_velocities(
@@ -156,14 +90,10 @@ def check_velocities(
 
     Δq_j = k ∫ v dt over stretches of 10, 100 and 1000 samples, by least squares; integrals are less
     noisy than derivatives. The stretches count over which the two agree best.
-
-    Args:
-        parts: the stretches of training, validation and test.
-        q, v: their columns.
-        step: the sample time, s.
     """
     training = parts["train"]
     correlations, factors = _agreement(training, step)
+    runs = _factors_of_runs(parts, step)
     low, high = _FACTORS
     results = []
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
@@ -184,38 +114,32 @@ def check_velocities(
         )
         expected = f"{low} to {high}"
         results.append(judged("dq/dt over v", f"{a}, {b}", factor, expected, bool(cause), text))
-    return results + _velocities_of_runs(parts, q, v, step)
+        usual = runs[k].median() or np.nan
+        low_of_run, high_of_run = _FACTORS_OF_A_RUN
+        for run, factor in runs[k].items():
+            text = (
+                f"{run}, columns {a!r} and {b!r}: the derivative of q is {factor:.4g} times v (0: "
+                f"v is zero), and {usual:.4g} times in most runs: has it other units or signs?"
+            )
+            if factor / usual < low_of_run or factor / usual > high_of_run:
+                measured = ("dq/dt over v", f"{run}, {a}, {b}", factor, f"{usual:.3g}")
+                results.append(judged(*measured, True, text))
+    return results
 
 
-def _velocities_of_runs(
-    parts: Mapping[str, list[Recording]], q: Columns, v: Columns, step: float
-) -> list[Measurement]:
-    """Warn of single runs whose v has another unit or sign than that of most runs."""
+def _factors_of_runs(parts: Mapping[str, list[Recording]], step: float) -> pd.DataFrame:
+    """Return a row of N factors per run, NaN where v does not determine a factor."""
     runs: dict[str, list[Recording]] = {}
     for split, stretches in parts.items():
         for item in stretches:
             runs.setdefault(f"{item.run} ({split})", []).append(item)
     rows = []
     for stretches in runs.values():
-        correlations, values = _agreement(stretches, step)
-        clear = np.diag(correlations) >= _CLEAR
-        for k in range(len(values)):
-            zero = not any(x.v[:, k].any() for x in stretches if x.v is not None)
-            clear[k] |= zero and moves(stretches, k)
-        rows.append(np.where(clear, values, np.nan))
-    low, high = _FACTORS_OF_A_RUN
-    results = []
-    for a, b, factors in zip(q.columns, v.columns, np.transpose(rows), strict=True):
-        usual = float(np.median(factors[~np.isnan(factors)])) if not np.isnan(factors).all() else 0
-        for run, factor in zip(runs, factors, strict=True):
-            if not np.isnan(factor) and not low * usual**2 <= factor * usual <= high * usual**2:
-                place = f"{run}, columns {a!r} and {b!r}"
-                text = (
-                    f"{place}: the derivative of q is {factor:.4g} times v in this run (0: v is "
-                    f"zero), and {usual:.4g} times in most: has it other units or signs?"
-                )
-                results.append(judged("dq/dt over v", place, factor, f"{usual:.3g}", True, text))
-    return results
+        correlations, factors = _agreement(stretches, step)
+        v = np.vstack([x.v for x in stretches if x.v is not None])
+        dead = [not x.any() and moves(stretches, k) for k, x in enumerate(v.T)]
+        rows.append(np.where((np.diag(correlations) >= _CLEAR) | dead, factors, np.nan))
+    return pd.DataFrame(rows, index=list(runs))
 
 
 def moves(recordings: Sequence[Recording], k: int) -> bool:
@@ -225,34 +149,23 @@ def moves(recordings: Sequence[Recording], k: int) -> bool:
     """
     q = np.concatenate([item.q[:, k] for item in recordings])
     steps = np.concatenate([np.diff(item.q[:, k]) for item in recordings])
-    return bool(np.ptp(q) > 0 and (steps**2).mean() <= q.var())
+    return bool(np.ptp(q) > _STILL and (steps**2).mean() <= q.var())
 
 
 def _agreement(recordings: list[Recording], step: float) -> tuple[np.ndarray, np.ndarray]:
     """Return correlations of Δq_i with ∫ v_k dt, ``(N, N)``, and the factor of each v_i."""
-    results = [_agreement_over(recordings, step, samples) for samples in (10, 100, 1000)]
-    correlations, factors = (np.array(values) for values in zip(*results, strict=True))
-    diagonal = correlations.diagonal(axis1=1, axis2=2)
-    return correlations.max(axis=0), factors[diagonal.argmax(axis=0), range(diagonal.shape[1])]
-
-
-def _agreement_over(
-    recordings: list[Recording], step: float, samples: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same over stretches of so many samples."""
-    size = recordings[0].q.shape[1]
-    dq, dv = [np.zeros((0, size))], [np.zeros((0, size))]
-    for item in recordings:
-        assert item.v is not None
-        integral = np.cumsum(0.5 * step * (item.v[1:] + item.v[:-1]), axis=0)
-        dq.append(np.diff(item.q[1::samples], axis=0))
-        dv.append(np.diff(integral[::samples], axis=0))
-    moved, integrated = np.vstack(dq), np.vstack(dv)
-    squares = (integrated**2).sum(axis=0)
-    norms = np.sqrt(np.outer((moved**2).sum(axis=0), squares))
-    product = moved.T @ integrated * (len(moved) >= 5)  # fewer are too few to tell
-    correlations = np.abs(product) / np.where(norms > 0, norms, np.inf)
-    return correlations, np.diag(product) / np.where(squares > 0, squares, np.inf)
+    correlations, factors = [], []
+    for samples in (10, 100, 1000):
+        dq = np.vstack([np.diff(item.q[1::samples], axis=0) for item in recordings])
+        integrals = [cumulative_trapezoid(item.v, dx=step, axis=0) for item in recordings]
+        dv = np.vstack([np.diff(x[::samples], axis=0) for x in integrals])
+        squares = (dv**2).sum(axis=0).clip(min=1e-300)
+        product = dq.T @ dv * (len(dq) >= 5)  # fewer are too few to tell
+        norms = np.sqrt(np.outer((dq**2).sum(axis=0), squares)).clip(min=1e-300)
+        correlations.append(np.abs(product) / norms)
+        factors.append(np.diag(product) / squares)
+    clearest = np.diagonal(correlations, axis1=1, axis2=2).argmax(axis=0)
+    return np.max(correlations, axis=0), np.array(factors)[clearest, range(len(clearest))]
 
 
 def check_force_signs(training: list[Recording], u: Columns, step: float) -> list[Measurement]:
@@ -264,21 +177,16 @@ def check_force_signs(training: list[Recording], u: Columns, step: float) -> lis
     size = len(u.columns)
     if training[0].q.shape[1] != size or not set(u.units) <= {"Nm", "N"}:
         return []
-    # A sample tells, and all of a long log would take gigabytes.
     thin = slice(None, None, max(1, sum(map(len, training)) // _MOST_ROWS))
-    q = np.vstack([item.q[thin] for item in training])
-    v = np.vstack([item.v[thin] for item in training if item.v is not None])
-    forces = np.vstack([item.u[thin, :size] for item in training])  # without rates of the inputs
-    acceleration = np.vstack(
-        [np.gradient(item.v, step, axis=0)[thin] for item in training if item.v is not None]
-    )
-    ones = np.ones((len(q), 1))
+    signals = [x.values()[:, : 3 * size] for x in training]
+    rows = [np.hstack([x, np.gradient(x[:, size : 2 * size], step, axis=0)]) for x in signals]
+    q, v, forces, a = np.hsplit(np.vstack([x[thin] for x in rows]), 4)
+    known = np.hstack([np.ones((len(q), 1)), q, q**2, np.sin(q), np.cos(q), v])
     results = []
     for k, name in enumerate(u.columns):
-        inputs = np.delete(forces, k, axis=1)
-        known = np.hstack([ones, q, q**2, np.sin(q), np.cos(q), v, inputs])
-        both = np.column_stack([acceleration[:, k], forces[:, k]])
-        remainders = both - known @ np.linalg.lstsq(known, both, rcond=None)[0]
+        x = np.hstack([known, np.delete(forces, k, axis=1)])
+        y = np.column_stack([a[:, k], forces[:, k]])
+        remainders = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
         norm = np.linalg.norm(remainders, axis=0).prod()
         correlation = float(remainders[:, 0] @ remainders[:, 1]) / norm if norm > 0 else 0.0
         text = (
@@ -286,14 +194,7 @@ def check_force_signs(training: list[Recording], u: Columns, step: float) -> lis
             f"coordinate {k + 1} by {correlation:.2f} once position, velocity and other inputs "
             "are accounted for: is its sign reversed?"
         )
-        results.append(
-            judged(
-                "correlation of force and acceleration",
-                name,
-                correlation,
-                f"above {_REVERSED}",
-                correlation < _REVERSED,
-                text,
-            )
-        )
+        title, expected = "correlation of force and acceleration", f"above {_REVERSED}"
+        bad = correlation < _REVERSED
+        results.append(judged(title, name, correlation, expected, bad, text))
     return results

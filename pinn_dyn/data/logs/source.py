@@ -13,7 +13,7 @@ import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from pinn_dyn.data.logs import plausibility
-from pinn_dyn.data.logs.checks import check_clock, check_rows, check_second_clock
+from pinn_dyn.data.logs.checks import check_clock, check_rows
 from pinn_dyn.data.logs.columns import Columns, described
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
@@ -48,7 +48,7 @@ class LogSource(DataSource):
         files: names or glob patterns in the folder ``root``; or a data frame in memory, or data
             frames by the name of their run. Messages name the rows of a frame by its index.
         root: folder of the files.
-        time: column of the time; a second column is a clock that must agree with the first.
+        time: column of the time.
         q: columns of the configuration, N.
         u: columns of the input, M.
         v: columns of the velocity, N, or None.
@@ -144,6 +144,8 @@ class LogSource(DataSource):
     def _check_columns(self) -> None:
         """Check the units of the signals, and that no column holds two of them."""
         self.time.check_units("time", ["s"])
+        if len(self.time.columns) > 1:
+            raise LogError(f"time has the columns {self.time.columns}, expected one")
         self.q.check_units("q", ["rad", "m", "1"])
         self.u.check_units("u", sorted({unit for unit, _ in UNITS.values()} - {"s"}))
         if self.v is not None and self.v.units != [f"{unit}/s" for unit in self.q.units]:
@@ -238,10 +240,8 @@ class LogSource(DataSource):
         measurements: list[Measurement] = []
         self._measurements = measurements
         recordings = self._read(report, measurements)
-        measured = {key: x for key, x in self._signals.items() if key != "time"}
         measurements += plausibility.check_stamps(recordings, self._repairs())
         measurements += plausibility.check_angles(recordings, self.q)
-        measurements += plausibility.check_units_of_runs(recordings, measured)
         if self.test is None:
             times = {item.run: item.t for item in recordings}
             self.validation, self.test, self.guard = default_split(times, self.seed)
@@ -329,15 +329,13 @@ class LogSource(DataSource):
             for signal, columns in self._signals.items()
         }
         repairs = self._repairs()
-        clock, *clocks = self.time.columns
+        (clock,) = self.time.columns
         recordings = []
         for run, rows in runs.items():
             part = table.select(rows)
             times, remark = since_start(values["time"][rows])
-            t, *second_clocks = times.T
+            (t,) = times.T
             check_clock(t, part, clock, repairs)
-            for name, second in zip(clocks, second_clocks, strict=True):
-                check_second_clock(t, second, part, (clock, name))
             signals = {key: x[rows] for key, x in values.items() if key != "time"}
             for signal, x in signals.items():
                 columns = self._signals[signal]

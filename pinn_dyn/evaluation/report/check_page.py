@@ -6,7 +6,6 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from pinn_dyn.data.logs import LogSource
 from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.report.page import (
@@ -19,7 +18,6 @@ from pinn_dyn.evaluation.report.page import (
     preformatted,
     table,
 )
-from pinn_dyn.evaluation.rigid_excitation import MOST
 
 
 def check_report(check: LogCheck, *, command: str) -> str:
@@ -35,20 +33,30 @@ def check_report(check: LogCheck, *, command: str) -> str:
     if check.steps:
         text = "Steps that follow from the measured delay and noise, for the YAML of the data set:"
         verdict += [paragraph(text), preformatted("\n".join(["steps:", *check.steps]))]
+    coordinates = (
+        "The noise is estimated from third differences. The independent share of an acceleration "
+        "is the share that 1, q and v of the same coordinate and the other accelerations do not "
+        "explain."
+    )
+    inputs = (
+        "The curve shows the share of the equation of motion, fitted by least squares, that stays "
+        "unexplained if an input is shifted by a delay. The delay is at its minimum."
+    )
+    cleaning = cleaning_figure(
+        source.cleaned[0],
+        title=source.name,
+        labels=source.labels,
+        input_labels=source.input_labels,
+    )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
     sections = [
         Section("Verdict", verdict),
         Section("Measurements", [table(measurements)]),
-        Section("Clock", [table(check.runs), drawing(_clock(source), "time between rows")]),
+        Section("Clock", [table(check.runs), drawing(_clock(check), "time between rows")]),
         Section(
             "Coordinates",
             [
-                paragraph(
-                    "The noise is estimated from third differences. The independent share of an "
-                    "acceleration is the share that 1, q and v of the same coordinate and the "
-                    "other accelerations do not explain: below a hundredth its inertia cannot be "
-                    "identified."
-                ),
+                paragraph(coordinates),
                 table(check.coordinates),
                 drawing(_coverage(check), "coverage of the test by the training"),
             ],
@@ -57,11 +65,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
         Section(
             "Inputs and their delays",
             [
-                paragraph(
-                    "The curve shows the share of the equation of motion, fitted by least squares, "
-                    "that stays unexplained if an input is shifted by a delay. The delay is at its "
-                    "minimum."
-                ),
+                paragraph(inputs),
                 table(check.inputs),
                 drawing(_delays(check), "unexplained share over the delay"),
             ],
@@ -69,15 +73,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
         Section(
             "Cleaning",
             [
-                drawing(
-                    cleaning_figure(
-                        source.cleaned[0],
-                        title=source.name,
-                        labels=source.labels,
-                        input_labels=source.input_labels,
-                    ),
-                    "raw and cleaned signals",
-                ),
+                drawing(cleaning, "raw and cleaned signals"),
                 details("Notes of each step", from_markdown(source.report)),
             ],
         ),
@@ -90,19 +86,19 @@ def _rigid(check: LogCheck) -> list[Markup]:
     if check.rigid is None:
         return []
     text = (
-        f"The torques of rigid bodies and their drives are linear in {check.rigid.count} base "
-        "parameters. The regressor of the training motions, each column of unit norm, has the "
-        f"condition number {check.rigid.condition:.3g}; below {MOST:g} a motion is well "
-        "conditioned. Directions with less than a hundredth of the largest singular value are not "
-        f"determined: {check.rigid.summary(len(check.rigid.undetermined))}."
+        f"The torques are linear in {check.rigid.count} base parameters of bodies and drives. The "
+        "regressor of the training motions, each column of unit norm, has the condition number "
+        f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. Directions with "
+        "less than a hundredth of the largest singular value are not determined: "
+        f"{check.rigid.summary}."
     )
     return [paragraph(text), table(check.rigid.joints)]
 
 
-def _clock(source: LogSource) -> Figure:
+def _clock(check: LogCheck) -> Figure:
     figure = Figure(figsize=(9, 2.6), layout="constrained")
     ax = figure.subplots()
-    for part in source.cleaned[:6]:
+    for part in check.source.cleaned[:6]:
         ax.plot(part.raw.t[1:], 1e3 * np.diff(part.raw.t), ".", markersize=2)
     ax.set(xlabel="time (s)", ylabel="time between rows (ms)")
     return figure
@@ -111,11 +107,10 @@ def _clock(source: LogSource) -> Figure:
 def _delays(check: LogCheck) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     ax = figure.subplots()
-    for index, (name, curve) in enumerate(zip(check.inputs["input"], check.delays, strict=True)):
-        color = f"C{index}"
-        ax.plot(1e3 * curve.candidates, 100 * curve.residual, color=color, label=name)
+    for k, (name, curve) in enumerate(zip(check.inputs["input"], check.delays, strict=True)):
+        ax.plot(1e3 * curve.candidates, 100 * curve.residual, color=f"C{k}", label=name)
         if curve.delay is not None:
-            ax.axvline(1e3 * curve.delay, color=color, linewidth=0.8, linestyle="--")
+            ax.axvline(1e3 * curve.delay, color=f"C{k}", linewidth=0.8, linestyle="--")
     ax.set(xlabel="delay (ms)", ylabel="unexplained (%)", yscale="log")
     ax.legend(fontsize="small")
     return figure
@@ -124,15 +119,12 @@ def _delays(check: LogCheck) -> Figure:
 def _coverage(check: LogCheck) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    source = check.source
-    splits = source.load()
-    several = len(source.labels) > 1
+    splits, label = check.source.load(), check.source.labels[0]
     for name, color, items in (("training", "0.7", splits.train), ("test", "C0", splits.test)):
-        x = np.concatenate([item.q[:, 0].numpy() for item in items])
-        y = np.concatenate([(item.q[:, 1] if several else item.v[:, 0]).numpy() for item in items])
+        x, y = (np.concatenate([getattr(item, key)[:, 0] for item in items]) for key in "qv")
         thin = slice(None, None, max(1, len(x) // 4000))
         left.plot(x[thin], y[thin], ".", color=color, markersize=2, label=name)
-    left.set(xlabel=source.labels[0], ylabel=source.labels[1] if several else "its velocity")
+    left.set(xlabel=label, ylabel=f"velocity of {label}")
     left.legend(fontsize="small")
     right.hist(check.distance, bins=40)
     right.set(xlabel="distance of a test sample from the training", ylabel="samples")
