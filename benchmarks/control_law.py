@@ -3,13 +3,13 @@
     python benchmarks/control_law.py
     python benchmarks/control_law.py --run runs/panda/lnn-seed0/<date>
 
-The law is the paper's tracking law on a Lagrangian network of the size of experiment=panda/lnn,
-untrained: its weights do not change its time. `--run` takes a trained one. Beside the compiled law
-(pinn_dyn.control.export_law) and the eager one stand PyBullet's and Pinocchio's inverse dynamics of
-the same arm, where they are installed. All take turns, in one thread, over the same random states,
-and every call is timed by itself. Compiled and eager law are compared in all these states. On a
-busy machine the 99th percentile is that of the scheduler: `--real-time` takes the priority that a
-control loop would have.
+The law is the paper's tracking law on a Lagrangian network of the size of experiment=panda.
+The network is untrained, since the weights do not change the time; `--run` takes a trained network.
+The rivals of the compiled law (pinn_dyn.control.export_law) are the eager law and the inverse
+dynamics of the same arm in PyBullet and Pinocchio, if installed. All take turns in one thread over
+the same random states. The script also compares the outputs of compiled and eager law. On a busy
+machine the scheduler determines the 99th percentile; `--real-time` uses the priority of a control
+loop.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ Call = tuple[Callable[..., Any], list[Any]]
 
 
 def untrained() -> MechanicalSystem:
-    """A network of the size of the Panda experiment, its scales all one."""
+    """Return an untrained network of the size of the Panda experiment, with unit scales."""
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = plain(compose("train", overrides=["experiment=panda/lnn", "model_name=lnn"]))
+        config = plain(compose("train", overrides=["experiment=panda", "model_name=lnn"]))
     one, increment = torch.ones(JOINTS), torch.ones(1, 2 * JOINTS)
     torch.manual_seed(0)
     statistics = Statistics(
@@ -66,14 +66,17 @@ def untrained() -> MechanicalSystem:
 
 
 def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
-    """Inverse dynamics of the true arm at (q_ref, v_ref, a_ref), by what is installed."""
+    """Return the inverse dynamics of the true arm at (q_ref, v_ref, a_ref) by each library."""
     try:
         arm = BulletArm(PANDA, locked_joints=FINGERS)
     except ImportError as error:
         print(error)
         return {}
     client = connect()
-    body = client.loadURDF(str(arm.path), flags=client.URDF_USE_INERTIA_FROM_FILE)
+    body = client.loadURDF(
+        str(arm.path), useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE
+    )
+    client.setGravity(0, 0, -9.81)
     fingers = [0.0] * len(FINGERS)
 
     def bullet(q: list[float], v: list[float], a: list[float]) -> Any:
@@ -102,7 +105,7 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
 
 
 def percentiles(call: Call, calls: int) -> tuple[float, float]:
-    """Median and 99th percentile of the time of one call, us."""
+    """Return median and 99th percentile of the time of a call, us."""
     function, values = call
     seconds = np.empty(calls)
     for i in range(WARM_UP):

@@ -1,9 +1,10 @@
 """Time of a training step of known mechanics, beside that of the Lagrangian network for one robot.
 
-A step is: one RK4 step of a batch, the increment loss, its gradient; no optimizer. The models are
-those of experiment=panda/known, panda/known_and_network and panda/lnn, N = 7, eager and compiled as
-compile=true does it in a training of 5,000 steps (the state derivative), or of 20,000 (the whole).
-They take turns, round by round; the clock is the processor time of this process, on one thread.
+A step is one RK4 step of a batch, the increment loss and its gradient; no optimizer. The models are
+the Lagrangian network of experiment=panda, the rigid chain of the Panda and their sum (N = 7). They
+run eager and compiled, as compile=true does in a training of 5,000 steps (the state derivative) or
+of 20,000 steps (the whole step). The models take turns, round by round. Times are processor times
+of this process on one thread.
 
     python benchmarks/known_step.py                       # the table of README.md
     python benchmarks/known_step.py --ways eager --rounds 2 --output /dev/null   # a smoke run
@@ -31,13 +32,25 @@ from pinn_dyn.training.gradients import Compiled, Eager
 
 SIZE = 7
 RESULT = Path(__file__).parent / "results" / "known_step.csv"
-MODELS = ("lnn", "known", "known_and_network")
+PANDA = ["dataset=panda", "name=benchmark", "model_name=benchmark"]
+CHAIN = "structure.urdf=franka_panda/panda.urdf"
+FINGERS = "structure.locked_joints=[panda_finger_joint1,panda_finger_joint2]"
+MODELS = {
+    "lnn": ["experiment=panda", "loss=increment"],
+    "known": ["model=known", "~model/friction", f"model.{CHAIN}", f"model.{FINGERS}"],
+    "known_and_network": [
+        "model=known_and_network",
+        "~model/friction@model.known.friction",
+        f"model.known.{CHAIN}",
+        f"model.known.{FINGERS}",
+    ],
+}
 WAYS = {"eager": None, "derivative": 0, "whole": STEPS_FOR_PROGRAM}
-"""How it is compiled, and the steps of a training that does so."""
+"""Compilation, and the number of training steps that selects it."""
 
 
 def scales() -> Statistics:
-    """Of standard normal data."""
+    """Return the scales of standard normal data."""
     one = torch.ones(SIZE, dtype=torch.float64)
     increment = torch.cat([STEP * one, STEP * one])[None]
     return Statistics(
@@ -46,10 +59,9 @@ def scales() -> Statistics:
 
 
 def step_of(name: str, compiled: str, batch: int) -> Callable[[], float]:
-    """Loss and gradient of the model of an experiment on one batch."""
+    """Return a function for loss and gradient of a model on one batch."""
     torch.manual_seed(0)
-    words = [f"experiment=panda/{name}", "name=benchmark", f"model_name={name}"]
-    model = build_model(composed("train", words), scales()).train()
+    model = build_model(composed("train", [*MODELS[name], *PANDA]), scales()).train()
     loss, vector = IncrementLoss(scales(), model), ParameterVector(model.parameters())
     windows = make_windows(SIZE, batch, torch.float32)
     steps = WAYS[compiled]
@@ -58,7 +70,7 @@ def step_of(name: str, compiled: str, batch: int) -> Callable[[], float]:
 
 
 def seconds_of(step: Callable[[], float], count: int) -> float:
-    """Processor time of a step among its like."""
+    """Return the processor time of a step, s."""
     step()
     start = time.process_time()
     for _ in range(count):

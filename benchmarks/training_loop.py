@@ -93,7 +93,7 @@ def configuration(
 ) -> dict[str, Any]:
     """That of a long training, of which the first epochs are run, up to no validation."""
     words = [
-        f"trainer={device}",
+        f"trainer.accelerator={device}",
         "model=lnn",
         "model_name=lnn",
         f"loss={loss}",

@@ -1,6 +1,6 @@
-"""Learn a robot from a log in a data frame, and compare with a robot that keeps its velocity.
+"""Learn a robot from a log in a data frame and compare it with the constant-velocity baseline.
 
-python examples/own_log.py [--steps 300]    leaves a run folder, runs/own_log
+python examples/own_log.py [--steps 300]    writes the run folder runs/own_log
 """
 
 import argparse
@@ -12,7 +12,7 @@ import pandas as pd
 import pinn_dyn
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--steps", type=int, default=1000, help="steps of the optimizer")
+parser.add_argument("--steps", type=int, default=1000, help="optimizer steps")
 parser.add_argument("--folder", default="runs/own_log", help="run folder")
 args = parser.parse_args()
 
@@ -31,8 +31,8 @@ columns = model.source.q.columns
 for name, run in log[log.run.isin(model.source.test.names)].groupby("run"):
     predicted = model.predict(run)
     start = predicted.iloc[0].to_numpy()
-    floor = start[:3] + start[3:] * (run.t.to_numpy() - run.t.iloc[0])[:, None]
+    baseline = start[:3] + start[3:] * (run.t.to_numpy() - run.t.iloc[0])[:, None]
     errors = [
-        np.abs(x - run[columns]).mean().round(1).to_dict() for x in (predicted[columns], floor)
+        np.abs(x - run[columns]).mean().round(1).to_dict() for x in (predicted[columns], baseline)
     ]
-    print(f"{name}: mean error {errors[0]}, of one that keeps its velocity {errors[1]}")
+    print(f"{name}: mean error {errors[0]}, of constant velocity {errors[1]}")

@@ -55,7 +55,7 @@ RUN = "runs/own_log"
 
 
 def test_own_log(own_log, home):
-    errors = [line for line in own_log.splitlines() if "of one that keeps its velocity" in line]
+    errors = [line for line in own_log.splitlines() if "of constant velocity" in line]
     assert len(errors) == 2  # of two test runs
     assert all(re.search(r"'bend_x': \d+", line) for line in errors)
     assert (home / RUN / "metrics.json").is_file()
