@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pinn_dyn.mechanics import Trajectory as Trajectory
     from pinn_dyn.systems import SoftArm as SoftArm
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 _MODULES = {
     "DataSource": "pinn_dyn.data",

@@ -1,6 +1,5 @@
-"""Whether what a command line names exists: scripts, targets, extras, choices of Hydra's."""
+"""Check of command lines: scripts, modules, make targets, and the choices of Hydra exist."""
 
-import importlib.metadata
 import importlib.util
 import re
 
@@ -17,64 +16,40 @@ from tests.docs.blocks import ROOT
 
 PROGRAMS = ("train", "evaluate", "control", "gather", "check")
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-# Of the shell, or of the system: there is nothing of ours in them to check.
-SHELL = {"source", "export", "cd", "git"}
 
 
 def check_command(words, folder):
-    while re.fullmatch(r"[A-Z_]+=.*", words[0]):  # variables of the environment
+    while re.fullmatch(r"[A-Z_]+=.*", words[0]):  # environment variables
         words = words[1:]
-    program, *rest = words
-    if program == "eval":
-        inner = re.fullmatch(r"\$\((.*)\)", rest[0])
-        assert inner, rest
-        check_command(inner[1].split(), folder)
-    elif program in ("python", "python3"):
-        check_python(rest, folder)
+    program, *arguments = words
+    if program in ("python", "python3"):
+        check_python(arguments, folder)
     elif program == "make":
-        for word in rest:
-            assert "=" in word or word in TARGETS, f"make has no target {word}"
-    elif program == "pip":
-        for extras in re.findall(r"\[([\w,-]+)\]", " ".join(rest)):
-            assert set(extras.split(",")) <= EXTRAS.keys(), f"no such extra: {extras}"
-    elif program.startswith("pinn-dyn-"):
+        assert all("=" in word or word in TARGETS for word in arguments), words
+    else:
         assert program in SCRIPTS, f"no such command: {program}"
-        check_overrides(program.removeprefix("pinn-dyn-"), rest, folder)
-    elif program not in SHELL:
-        known = importlib.metadata.entry_points(group="console_scripts").names
-        assert program in known, (
-            f"{program} is no command of the environment: put <!-- not run: why --> before it"
-        )
+        check_overrides(program.removeprefix("pinn-dyn-"), arguments, folder)
 
 
 def check_python(words, folder):
     script = words[0]
     if script == "-m":
         assert importlib.util.find_spec(words[1]), f"no such module: {words[1]}"
-        return
-    name = script.removesuffix(".py")
-    if name in PROGRAMS:
-        check_overrides(name, words[1:], folder)
-        return
-    path = next((p for p in (ROOT / script, folder / script) if p.is_file()), None)
-    assert path, f"no such script: {script}"
-    for word in words[1:]:
-        if word.startswith("--"):
-            assert f'"{word.split("=")[0]}"' in path.read_text(), f"{script} has no {word}"
+    elif script.removesuffix(".py") in PROGRAMS:
+        check_overrides(script.removesuffix(".py"), words[1:], folder)
+    else:
+        path = next((p for p in (ROOT / script, folder / script) if p.is_file()), None)
+        assert path, f"no such script: {script}"
+        options = [word.split("=")[0] for word in words[1:] if word.startswith("--")]
+        assert all(f'"{option}"' in path.read_text() for option in options), words
 
 
-# What fits every configuration of train.py. A sweep over experiments of nothing else composes the
-# first: tests/app/test_configurations.py trains them all.
-PLAIN = re.compile(r"(experiment|seed|hydra\.(run|sweep)\.dir)=")
-FLAGS = {"-m", "--multirun", "--help", "--hydra-help", "--resolve", "--info", "-sc", "--cfg", "job"}
+FLAGS = {"-m", "--multirun", "--help", "--hydra-help", "--resolve", "--info", "--cfg", "job"}
 
 
 def check_overrides(program, words, folder):
-    """Every choice of a command line composes, one change at a time if it is a sweep."""
-    if "-sc" in words:
-        return
+    """Compose every choice of a command line, one change at a time in a sweep."""
     overrides = []
     for word in words:
         if word.startswith("--config-dir="):
@@ -84,35 +59,28 @@ def check_overrides(program, words, folder):
             assert "=" in word or word.startswith("~"), f"{word} is neither a flag nor an override"
             overrides.append(word)
     choices = [_choices(word) for word in overrides]
-    if program == "train" and all(map(PLAIN.match, overrides)):
-        for option in (option for options in choices for option in options[1:]):
-            key, _, value = option.partition("=")
-            path = config_folder(program) / key / f"{value}.yaml"
-            assert key != "experiment" or path.is_file(), f"no {option}"
-        choices = [options[:1] for options in choices]
     first = [options[0] for options in choices]
-    for index, options in enumerate(choices):
+    for index, options in enumerate(choices or [[None]]):
         for option in options if index == 0 else options[1:]:
-            compose(program, [*first[:index], option, *first[index + 1 :]], folder)
-    if not choices:
-        compose(program, [], folder)
+            words = [*first[:index], option, *first[index + 1 :]] if choices else []
+            compose(program, words, folder)
 
 
 def _choices(word):
-    """What a sweep over one override tries, itself for one that is no sweep."""
+    """Return the values that a sweep over one override tries."""
     (parsed,) = OverridesParser.create().parse_overrides([word])
     if not parsed.is_sweep_override():
         return [word]
     if parsed.is_interval_sweep():
         return [f"{word.split('=')[0]}={parsed.value().start}"]
-    return [f"{word.split('=')[0]}={value}" for value in parsed.sweep_string_iterator()]
+    values = list(parsed.sweep_string_iterator())
+    if word.startswith(("seed=", "search.draw=")):
+        values = values[:1]
+    return [f"{word.split('=')[0]}={value}" for value in values]
 
 
 def compose(program, overrides, folder):
-    """The configuration of a command line, with the configuration folders below a folder.
-
-    Types and ranges are checked too, unless a value is missing, which no command of ours gives.
-    """
+    """Compose and check a command line, with the configuration folders below a folder."""
     candidates = [folder, *sorted(path for path in folder.glob("*conf") if path.is_dir())]
     paths = [f"file://{path}" for path in candidates if any(path.glob("*/*.yaml"))]
     words = [word for word in overrides if not word.startswith("hydra.searchpath")]
@@ -124,17 +92,17 @@ def compose(program, overrides, folder):
         if re.search(r"hydra/(launcher|sweeper)", str(error)):
             pytest.skip(f"needs a plugin of Hydra: {error}")
         raise
-    except ConfigCompositionException:  # a key that stands in no YAML, or does not exist
+    except ConfigCompositionException:  # a key that is in no YAML, or does not exist
         cfg = _composed(program, completed(program, words))
     HydraConfig.instance().set_config(cfg)
     with open_dict(cfg):
         del cfg["hydra"]
-    if not OmegaConf.missing_keys(cfg):
-        with pytest.MonkeyPatch.context() as patch:
-            for place in (folder, folder.parent):  # classes of the page itself
-                patch.syspath_prepend(str(place))
-            return checked(program, cfg)
-    return OmegaConf.to_container(cfg, resolve=False)
+    if OmegaConf.missing_keys(cfg):
+        return OmegaConf.to_container(cfg, resolve=False)
+    with pytest.MonkeyPatch.context() as patch:
+        for path in (folder, folder.parent):  # classes of the page
+            patch.syspath_prepend(str(path))
+        return checked(program, cfg)
 
 
 def _composed(program, words):

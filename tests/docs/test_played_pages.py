@@ -1,4 +1,4 @@
-"""Pages that run from start to end, in the order of their blocks, on data that take no time."""
+"""Pages that run from start to end on small data."""
 
 import re
 import sys
@@ -11,7 +11,7 @@ import pytest
 from tests.app.entry import NO_FIGURES, ROOT, TINY_DATA, TINY_TRAINING, run_script
 from tests.docs.blocks import PLAYED, blocks
 
-# What makes each page small: added to the commands of train.py.
+# Overrides that make the commands of a page small.
 SMALL_DATA = {
     "docs/tutorial.md": [*TINY_DATA, "data.stride=5"],
     "docs/your_log.md": [],
@@ -26,14 +26,9 @@ SMALL_DATA = {
 SMALL = {
     "train.py": [*TINY_TRAINING, NO_FIGURES],
     "evaluate.py": ["horizon=0.1", "windows=[0.1]"],
-    "control.py": [  # an untrained model takes only soft gains
-        "runs=2",
-        "rate=200",
-        "duration=0.05",
-        "settled_after=0.02",
-        "gains.position=5",
-        "gains.velocity=0.5",
-        "animate=false",
+    "control.py": [
+        *("runs=2", "rate=200", "duration=0.05", "settled_after=0.02", "animate=false"),
+        *("gains.position=5", "gains.velocity=0.5"),  # soft gains for an untrained model
     ],
 }
 
