@@ -9,7 +9,7 @@ _MOMENTS = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
 
 
 def pseudo_inertia_basis() -> Tensor:
-    """E ``(10, 4, 4)``, float64, with J = sum over a of pi_a E_a: J is linear in the parameters.
+    """Return E ``(10, 4, 4)``, float64, with J = sum over a of pi_a E_a.
 
     J = [[S, h], [h^T, m]] with h = m c and S the second moments of the mass about the origin,
     S = tr(I) / 2 - I. J is positive definite for every body of positive density, and only then
@@ -30,12 +30,12 @@ def pseudo_inertia_basis() -> Tensor:
 
 
 def pseudo_inertia(parameters: Tensor) -> Tensor:
-    """J ``(*batch, 4, 4)`` of ten parameters ``(*batch, 10)``."""
+    """Return J ``(*batch, 4, 4)`` of ten parameters ``(*batch, 10)``."""
     return torch.einsum("...a,aij->...ij", parameters, pseudo_inertia_basis().to(parameters))
 
 
 def inertial_parameters(pseudo: Tensor) -> Tensor:
-    """The ten parameters ``(*batch, 10)`` of J ``(*batch, 4, 4)``: I = tr(S) - S."""
+    """Return the ten parameters ``(*batch, 10)`` of J ``(*batch, 4, 4)``: I = tr(S) - S."""
     second = pseudo[..., :3, :3]
     trace = second.diagonal(dim1=-2, dim2=-1).sum(-1)
     moments = trace[..., None, None] * torch.eye(3).to(pseudo) - second
@@ -45,7 +45,7 @@ def inertial_parameters(pseudo: Tensor) -> Tensor:
 
 
 def rod(start: Tensor, end: Tensor, *, radius: float, density: float) -> Tensor:
-    """J of a homogeneous cylinder from ``start`` to ``end``, ``(3,)`` each in m: a plausible link.
+    """Return J of a homogeneous cylinder from ``start`` to ``end``, ``(3,)`` each in m.
 
     With l its length and d its direction, S = m (c c^T + l^2 d d^T / 12 + r^2 (1 - d d^T) / 4).
     """

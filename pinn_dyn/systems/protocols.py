@@ -1,4 +1,4 @@
-"""What a robot may offer beyond its equation of motion; a class of your own just has the methods.
+"""Protocols of what a robot may offer beyond its equation of motion.
 
 References, plants, limits and animations ask for these and for no class.
 """
@@ -18,19 +18,12 @@ class HasTip(Protocol):
     num_coordinates: int
 
     def tip_position(self, q: Tensor) -> Tensor:
-        """Position of the tip in the frame of the base, ``(*batch, 3)``, m; differentiable."""
+        """Return the tip in the frame of the base, ``(*batch, 3)``, m; differentiable."""
 
 
 @runtime_checkable
 class HasLimits(Protocol):
-    """A robot with limits.
-
-    Attributes:
-        joint_names: names of the coordinates, N.
-        q_low, q_high: limits of the configuration, ``(N,)``, rad or m.
-        v_max: limits of the speeds, ``(N,)``.
-        u_max: limits of the inputs, ``(M,)``.
-    """
+    """A robot with limits of the configuration, of the speeds ``(N,)`` and inputs ``(M,)``."""
 
     joint_names: list[str]
     q_low: np.ndarray
@@ -49,27 +42,23 @@ class HasDomain(Protocol):
 
 @runtime_checkable
 class Stepped(Protocol):
-    """A robot whose simulator moves it in steps of its own."""
+    """A robot that a simulator moves in time steps."""
 
     num_coordinates: int
     num_inputs: int
 
     def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
-        """Put it into a state, ``(N,)`` each, from which :meth:`step` moves it."""
+        """Put the robot into a state, ``(N,)`` each, from which :meth:`step` moves it."""
 
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """q and v, ``(N,)`` each, after a step of ``step`` s under an input ``(M,)``."""
+        """Return q and v, ``(N,)`` each, after ``step`` s under an input ``(M,)``."""
 
 
 @runtime_checkable
 class Drawable(Protocol):
-    """A robot that is drawn as lines, from its base to its tip.
-
-    Attributes:
-        z_is_down: whether z points downwards.
-    """
+    """A robot that is drawn as lines, from its base to its tip."""
 
     z_is_down: bool
 
     def lines(self, q: Tensor) -> Tensor:
-        """S lines of P points each, ``(*batch, S, P, 3)``, m; the last point is the tip."""
+        """Return S lines of P points, ``(*batch, S, P, 3)``, m; the last point is the tip."""

@@ -43,11 +43,9 @@ class RigidChain(MechanicalSystem):
         tau_j = <xi_j, sum over k >= j of (Xi'_k + Xi_k^2 - Gamma) J_k>
 
     where Gamma holds gravity in its last column: the recursive Newton-Euler algorithm. The sums
-    over the tree are products with one constant matrix, so all bodies are computed at once and only
-    the poses need a loop over the chain; there is no automatic differentiation in it, and no
-    branch on data. As J enters linearly, so do the ten inertial parameters of each body
-    (:meth:`regressor`). Every function takes another ``inertia`` than the URDF's: that is what a
-    model learns.
+    over the tree are products with one constant matrix, so only the poses need a loop over the
+    chain. J enters linearly, and so do the ten inertial parameters of each body
+    (:meth:`regressor`). Functions take another ``inertia`` than the URDF's, which a model learns.
 
     Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; the 4 x 4 matrices are
     those of Legnani et al. 1996, "A homogeneous matrix approach to 3D kinematics and dynamics".
@@ -58,20 +56,19 @@ class RigidChain(MechanicalSystem):
         locked_joints: names of joints that are held at zero.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
         gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
-        tip: link at the end of the arm, which carries the payload; None for the last one of the
+        tip: link at the end of the arm, which carries the payload; None for the last link of the
             file without a joint behind it.
         mass_scale: factor of all masses and inertias.
         payload: point mass at the origin of the tip's frame, kg, which is not scaled.
 
     Attributes:
         joint_names, body_names: N names each; a body is a link with everything fixed to it.
-        turning: true for a joint that turns, false for one that slides.
+        turning: true for a joint that turns, false for a joint that slides.
         inertia: pseudo-inertias of the URDF, ``(N, 4, 4)``, in the frames of the joints.
 
     Raises:
         FileNotFoundError: if there is no such URDF.
-        ValueError: on a URDF that is no such robot (:func:`~pinn_dyn.systems.urdf.read_urdf`), or
-            a damping of another length.
+        ValueError: on a URDF that is no such robot (:func:`~pinn_dyn.systems.urdf.read_urdf`).
     """
 
     z_is_down = False
@@ -103,13 +100,6 @@ class RigidChain(MechanicalSystem):
         size = len(tree.joints)
         super().__init__(num_coordinates=size, num_inputs=size)
         double = torch.float64
-        acceleration = torch.tensor(list(gravity), dtype=double)
-        resistance = torch.as_tensor(damping, dtype=double)
-        if resistance.shape not in ((), (size,)):
-            raise ValueError(
-                f"damping has {resistance.numel()} entries, expected one number or {size}, one for "
-                f"each of the joints {', '.join(tree.joints)}"
-            )
         self.joint_names, self.body_names = tree.joints, tree.bodies
         self.turning = tree.turning
         self.parents = tuple(tree.parents)
@@ -128,17 +118,22 @@ class RigidChain(MechanicalSystem):
         for k, parent in enumerate(tree.parents):
             if parent >= 0:
                 moved[:, k] += moved[:, parent]
-        self.register_buffer("inertia", tree.inertia)
-        self.register_buffer("_gravity", acceleration)
-        self.register_buffer("_placements", placements, persistent=False)
-        self.register_buffer("_axes", tree.axes, persistent=False)
-        self.register_buffer("_turning", turning.to(double)[:, None], persistent=False)
-        self.register_buffer("_moved", moved, persistent=False)
-        self.register_buffer("_damping", resistance.expand(size).clone())
-        self.register_buffer("_screws", _screw_basis(), persistent=False)
-        self.register_buffer("_basis", pseudo_inertia_basis(), persistent=False)
+        buffers = {
+            "inertia": tree.inertia,
+            "_gravity": torch.tensor(list(gravity), dtype=double),
+            "_damping": torch.as_tensor(damping, dtype=double).expand(size).clone(),
+            "_placements": placements,
+            "_axes": tree.axes,
+            "_turning": turning.to(double)[:, None],
+            "_moved": moved,
+            "_screws": _screw_basis(),
+            "_basis": pseudo_inertia_basis(),
+            "_tip_pose": tree.tip_pose,
+        }
+        for name, value in buffers.items():
+            constant = name in ("inertia", "_gravity", "_damping")
+            self.register_buffer(name, value, persistent=constant)
         self._tip_body = tree.tip_body
-        self.register_buffer("_tip_pose", tree.tip_pose, persistent=False)
         smallest = float(torch.linalg.eigvalsh(self.mass_matrix(torch.zeros(size).double()))[0])
         if not smallest > 0:
             raise ValueError(
@@ -146,10 +141,8 @@ class RigidChain(MechanicalSystem):
                 "give the moving links mass and inertia"
             )
 
-    # The algorithms.
-
     def kinematics(self, q: Tensor) -> Kinematics:
-        """Poses and twists at q ``(*batch, N)``."""
+        """Return poses and twists at q ``(*batch, N)``."""
         turning = self._turning.squeeze(-1)
         first = turning * torch.sin(q) + (1 - turning) * q
         second = turning * (1 - torch.cos(q))
@@ -168,10 +161,7 @@ class RigidChain(MechanicalSystem):
     def mass_and_bias(
         self, q: Tensor, v: Tensor, inertia: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """M(q) and C(q, v) v + G(q) with the bodies ``inertia`` ``(N, 4, 4)``, the URDF's if None.
-
-        One pass over the chain for both: what forward dynamics needs.
-        """
+        """Return M and C v + G with the bodies ``inertia`` ``(N, 4, 4)``, the URDF's if None."""
         at = self.kinematics(q)
         bodies = self._in_world(at, inertia)
         bias = self._force(at, self._accelerations(at, v, None, self._gravity), bodies)
@@ -180,13 +170,13 @@ class RigidChain(MechanicalSystem):
     def rigid_force(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None, gravity: bool = True
     ) -> Tensor:
-        """tau = M a + C v + G, ``(*batch, N)``; without G if ``gravity`` is false."""
+        """Return M a + C v + G, ``(*batch, N)``; without G if ``gravity`` is false."""
         at = self.kinematics(q)
         pull = self._gravity if gravity else torch.zeros_like(self._gravity)
         return self._force(at, self._accelerations(at, v, a, pull), self._in_world(at, inertia))
 
     def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Y ``(*batch, N, 10 N)`` with M a + C v + G = Y pi.
+        """Return Y ``(*batch, N, 10 N)`` with M a + C v + G = Y pi.
 
         pi ``(10 N,)`` are ten parameters of each body, body after body, in the order of Pinocchio:
         m in kg, m c in kg m, and Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the frame's origin in kg m^2.
@@ -200,7 +190,7 @@ class RigidChain(MechanicalSystem):
     def force_slopes(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """dtau/dq and dtau/dv of tau = M a + C v + G at fixed a, ``(*batch, N, N)`` each.
+        """Return dtau/dq and dtau/dv of tau = M a + C v + G at fixed a, ``(*batch, N, N)`` each.
 
         Seen from the bodies behind joint i, a change of q_i turns what lies before it, gravity
         included, and nothing else. With p the body before joint i, m the later of the joints i and
@@ -216,14 +206,14 @@ class RigidChain(MechanicalSystem):
         """
         at = self.kinematics(q)
         twists, bodies = at.twists, self._in_world(at, inertia)
-        own = twists * v[..., None, None]
-        velocity = self._tree_sum(self._moved.mT, own)
-        before = velocity - own
+        joint_velocity = twists * v[..., None, None]
+        velocity = self._tree_sum(self._moved.mT, joint_velocity)
+        before = velocity - joint_velocity
         turned = _bracket(before, twists)
-        own_change = turned * v[..., None, None] + twists * a[..., None, None]
-        change = self._tree_sum(self._moved.mT, own_change)
+        joint_change = turned * v[..., None, None] + twists * a[..., None, None]
+        change = self._tree_sum(self._moved.mT, joint_change)
         gravity = torch.nn.functional.pad(self._gravity.unsqueeze(-1), (3, 0, 0, 1))
-        shifted = _bracket(change - own_change, twists) - _bracket(turned, before)
+        shifted = _bracket(change - joint_change, twists) - _bracket(turned, before)
         shifted = shifted + twists @ gravity
         accelerations = change + velocity @ velocity - gravity
         momentum, force, composite = (
@@ -242,23 +232,22 @@ class RigidChain(MechanicalSystem):
         return by_q, 2 * (former * driving + later * slowing)
 
     def parameters_of(self, inertia: Tensor | None = None) -> Tensor:
-        """Ten inertial parameters of each body, ``(N, 10)``: kg, kg m, kg m^2."""
+        """Return the ten inertial parameters of each body, ``(N, 10)``: kg, kg m, kg m^2."""
         return inertial_parameters(self.inertia if inertia is None else inertia)
 
     def generic_inertia(self, density: float = 1000.0) -> Tensor:
-        """Pseudo-inertias ``(N, 4, 4)`` from the kinematics alone: a rod for each body.
+        """Return pseudo-inertias ``(N, 4, 4)`` from the kinematics alone: a rod for each body.
 
-        It goes from the body's joint to its farthest next one, or, at the end of the chain and
-        where that is nearer than half the mean distance, along the joint's axis by the mean
-        distance (0.1 m if there is none). Its radius is a sixth of that mean: a housing is no
-        lighter where its joints' frames happen to coincide.
+        A rod leads to the farthest next joint, or, at the end of the chain and where that is nearer
+        than half the mean distance, along the joint's axis by the mean distance (0.1 m if there is
+        none). Its radius is a sixth of that mean.
         """
         starts = self._placements[0, :, :3, 3].double()
-        ends: list[Tensor | None] = []
-        for k in range(self.num_coordinates):
-            behind = [starts[j] for j, parent in enumerate(self.parents) if parent == k]
-            farthest = max(behind, key=lambda p: float(p.norm()), default=None)
-            ends.append(farthest)
+        behind = [
+            [starts[j] for j, parent in enumerate(self.parents) if parent == k]
+            for k in range(self.num_coordinates)
+        ]
+        ends = [max(points, key=lambda p: float(p.norm()), default=None) for points in behind]
         lengths = [float(end.norm()) for end in ends if end is not None and end.norm() > 0.02]
         usual = sum(lengths) / len(lengths) if lengths else 0.1
         bodies = []
@@ -283,8 +272,6 @@ class RigidChain(MechanicalSystem):
         starts = [parent + 1 for parent in (*self.parents, self._tip_body)]
         return torch.stack([points[..., starts, :], points[..., 1:, :]], dim=-2)
 
-    # The contract of a mechanical system.
-
     def mass_matrix(self, q: Tensor, inertia: Tensor | None = None) -> Tensor:
         """M(q), ``(*batch, N, N)``, with the bodies ``inertia``, the URDF's if None."""
         self._check(q=q)
@@ -292,7 +279,7 @@ class RigidChain(MechanicalSystem):
         return self._mass(at, self._in_world(at, inertia))
 
     def potential_energy(self, q: Tensor, inertia: Tensor | None = None) -> Tensor:
-        """V(q) = -sum over k of g^T h_k, ``(*batch,)``, J, with h_k = m_k c_k in the world."""
+        """Return V = -sum over k of g^T h_k, ``(*batch,)``, J, with h_k = m_k c_k in the world."""
         self._check(q=q)
         bodies = self._in_world(self.kinematics(q), inertia)
         return -matvec(bodies[..., :3, 3], self._gravity).sum(-1)
@@ -329,9 +316,9 @@ class RigidChain(MechanicalSystem):
 
     def _accelerations(self, at: Kinematics, v: Tensor, a: Tensor | None, pull: Tensor) -> Tensor:
         """Xi' + Xi^2 - Gamma of every body, ``(*batch, N, 4, 4)``."""
-        own = at.twists * v[..., None, None]
-        velocity = self._tree_sum(self._moved.mT, own)
-        change = velocity @ own - own @ velocity
+        joint_velocity = at.twists * v[..., None, None]
+        velocity = self._tree_sum(self._moved.mT, joint_velocity)
+        change = _bracket(velocity, joint_velocity)
         if a is not None:
             change = change + at.twists * a[..., None, None]
         gravity = torch.nn.functional.pad(pull.unsqueeze(-1), (3, 0, 0, 1))

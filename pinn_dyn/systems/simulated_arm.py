@@ -21,15 +21,14 @@ class SimulatedArm(RigidChain, abc.ABC):
     """A rigid chain with joint limits that a simulator moves in time steps of its own.
 
     A subclass gives :meth:`set_state` and :meth:`step`. The simulator loads :meth:`to_urdf`, which
-    holds exactly the bodies and joints of the chain, so locked joints, payload and mass scale are
-    in it. Simulators must not add joint motors, damping, friction, joint limits or contacts.
+    holds the bodies and joints of the chain, payload and mass scale included. It must not add joint
+    motors, damping, friction, joint limits or contacts.
 
     Args:
         urdf, locked_joints, gravity, tip, mass_scale, payload: arguments of :class:`RigidChain`.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
 
     Attributes:
-        path: file of the URDF.
         text: the URDF that the simulator loads.
         gravity: gravitational acceleration, m/s^2, 3 numbers.
         q_low, q_high: joint limits, ``(N,)``, rad or m; -pi and pi for a continuous joint.
@@ -64,22 +63,20 @@ class SimulatedArm(RigidChain, abc.ABC):
             payload=payload,
         )
         tree = read_urdf(urdf, locked_joints=locked_joints, tip=tip)
-        for name, (low, high, *_) in zip(tree.joints, tree.limits, strict=True):
-            if not low < high:
-                raise ValueError(
-                    f"{tree.path}: joint {name!r} has limits lower = {low} and upper = {high}, "
-                    "expected lower < upper: set them, lock the joint, or make it continuous"
-                )
-        for name, body in zip(tree.bodies, self.inertia, strict=True):
-            if not body[3, 3] > 0:
-                raise ValueError(
-                    f"{tree.path}: link {name!r} moves and has no mass: expected <inertial> with a "
-                    "positive mass, in it or in a link fixed to it"
-                )
-        self.path = tree.path
+        self.q_low, self.q_high, self.v_max, self.u_max = tree.limits.T.copy()
+        if not (self.q_low < self.q_high).all():
+            raise ValueError(
+                f"{tree.path}: the limits of the joints {', '.join(tree.joints)} are "
+                f"{self.q_low.tolist()} to {self.q_high.tolist()}, expected lower < upper: set "
+                "them, lock the joint, or make it continuous"
+            )
+        if not (self.inertia[:, 3, 3] > 0).all():
+            raise ValueError(
+                f"{tree.path}: the masses of {', '.join(tree.bodies)} are "
+                f"{self.inertia[:, 3, 3].tolist()} kg, expected positive masses of links that move"
+            )
         self.gravity = tuple(float(g) for g in gravity)
         self.text = self.to_urdf()
-        self.q_low, self.q_high, self.v_max, self.u_max = tree.limits.T.copy()
         self.angles = tuple(k for k, turns in enumerate(tree.turning) if turns)
 
     def import_simulator(self) -> None:

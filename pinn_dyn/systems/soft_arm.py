@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,13 +13,6 @@ from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, spd_solve
 from pinn_dyn.systems.segment_frames import Tip, in_world, tip_rotation, turning_bias
 from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
-
-
-class _Points(NamedTuple):
-    """Backbone points of all segments in the world frame: S = segments * nodes of them."""
-
-    jacobian: Tensor  # (*batch, S, 3, N), dr/dq
-    bias: Tensor | None  # (*batch, S, 3), (dJ/dt) v
 
 
 class SoftArm(MechanicalSystem):
@@ -51,18 +43,12 @@ class SoftArm(MechanicalSystem):
 
     Args:
         segments: n, number of segments; N = M = 3 n.
-        mass: mass of each segment, kg; one for all, or n of them. A segment without mass leaves
-            M singular in its coordinates.
+        mass: mass of each segment, kg; one number or n. A segment without mass leaves M singular.
         length: rest length of each segment, m.
         gravity: gravitational acceleration along +z, m/s^2.
-        stiffness: elastic stiffness, Nm/rad for bending, N/m for elongation; one for all
-            coordinates, or N of them.
-        damping: viscous damping likewise, Nms/rad and Ns/m.
+        stiffness: elastic stiffness, Nm/rad for bending, N/m for elongation; one number or N.
+        damping: viscous damping, Nms/rad and Ns/m; one number or N.
         nodes: Gauss-Legendre nodes per segment; 10 are exact to 1e-12 for theta <= 3.
-
-    Raises:
-        ValueError: on masses that are all zero, or constants that are negative or neither one nor
-            as many as expected.
     """
 
     z_is_down = True
@@ -92,10 +78,9 @@ class SoftArm(MechanicalSystem):
             "stiffness": ["Nm/rad", "Nm/rad", "N/m"] * segments,
             "damping": ["Nms/rad", "Nms/rad", "Ns/m"] * segments,
         }
-        for name, given in (("mass", mass), ("stiffness", stiffness), ("damping", damping)):
-            self.register_buffer(name, _entries(name, given, len(self.constants[name])))
-        if not self.mass.any():
-            raise ValueError(f"SoftArm: mass is {mass}, expected a positive number")
+        for name, values in (("mass", mass), ("stiffness", stiffness), ("damping", damping)):
+            constants = torch.as_tensor(values, dtype=torch.float64)
+            self.register_buffer(name, constants.expand(len(self.constants[name])).clone())
         points, weights = np.polynomial.legendre.leggauss(nodes)
         # Not persistent: a checkpoint in single precision would round them.
         for name, value in (("_s", (points + 1) / 2), ("_weights", weights / 2)):
@@ -108,25 +93,19 @@ class SoftArm(MechanicalSystem):
             ValueError: if a segment has no length there, or bends by a whole turn.
         """
         low, high = (np.asarray(q, dtype=float).reshape(-1, 3) for q in (q_low, q_high))
-        for k in range(self.segments):
-            shortest = self.length + low[k, 2]
-            if not shortest > 0:
+        bends = np.hypot(*np.maximum(np.abs(low), np.abs(high))[:, :2].T)
+        for k, (shortest, bend) in enumerate(zip(self.length + low[:, 2], bends, strict=True)):
+            if not (shortest > 0 and bend < 2 * np.pi):
                 raise ValueError(
-                    f"segment {k + 1} of rest length {self.length:g} m shortens by "
-                    f"{-low[k, 2]:g} m, to {shortest:.3g} m; keep q[{3 * k + 2}] above "
-                    f"{-self.length:g}"
-                )
-            bend = float(np.hypot(*np.maximum(np.abs(low[k, :2]), np.abs(high[k, :2]))))
-            if not bend < 2 * np.pi:
-                raise ValueError(
-                    f"segment {k + 1} bends by up to {bend:.3g} rad, where the equation holds "
-                    f"below 2 pi; lower q[{3 * k}] and q[{3 * k + 1}]"
+                    f"segment {k + 1} shortens to {shortest:.3g} m and bends by up to {bend:.3g} "
+                    f"rad, where the equation of motion does not hold: keep q[{3 * k + 2}] above "
+                    f"{-self.length:g} and the bending below 2 pi"
                 )
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q) = sum_i mass_i int J^T J ds, ``(*batch, N, N)``."""
-        points, _ = self._chain(q)
-        return self._gram(points.jacobian)
+        jacobian, _, _ = self._chain(q)
+        return self._gram(jacobian)
 
     def potential_energy(self, q: Tensor) -> Tensor:
         """V(q) = stiffness^T q^2 / 2 - sum_i mass_i gravity int z ds, ``(*batch,)``."""
@@ -140,69 +119,67 @@ class SoftArm(MechanicalSystem):
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """A(q) = [A_1 ... A_n], ``(*batch, N, 3 n)``."""
-        _, tips = self._chain(q, nodes=self._s[:0])
+        _, _, tips = self._chain(q, nodes=self._s[:0])
         columns = []
         for tip in tips:
-            angular = tip.rotation.transpose(-1, -2) @ tip.angular
-            linear = tip.rotation.transpose(-1, -2) @ tip.linear
-            rows = torch.stack([-angular[..., 0, :], -angular[..., 1, :], linear[..., 2, :]], -1)
-            columns.append(rows)
-        return torch.cat(columns, dim=-1)
+            angular, linear = tip.rotation.mT @ tip.angular, tip.rotation.mT @ tip.linear
+            columns += [-angular[..., 0, :], -angular[..., 1, :], linear[..., 2, :]]
+        return torch.stack(columns, dim=-1)
 
     def tip_positions(self, q: Tensor) -> Tensor:
-        """World position of each segment's tip, ``(*batch, n, 3)``, m."""
+        """Return the world position of each segment's tip, ``(*batch, n, 3)``, m."""
         return self.backbone(q, q.new_ones(1)).squeeze(-2)
 
     def tip_position(self, q: Tensor) -> Tensor:
-        """World position of the arm's tip, ``(*batch, 3)``, m."""
+        """Return the world position of the arm's tip, ``(*batch, 3)``, m."""
         return self.tip_positions(q)[..., -1, :]
 
     def lines(self, q: Tensor) -> Tensor:
-        """The backbone as a line of 21 points for each segment, ``(*batch, n, 21, 3)``, m."""
+        """Return the backbone, a line of 21 points per segment, ``(*batch, n, 21, 3)``, m."""
         return self.backbone(q, torch.linspace(0, 1, 21, dtype=q.dtype, device=q.device))
 
     def backbone(self, q: Tensor, s: Tensor) -> Tensor:
-        """World position of the backbone, ``(*batch, n, S, 3)``, m.
-
-        Each segment is taken at the fractions s in [0, 1] of its length, ``(S,)``.
-        """
+        """Return points at the fractions s ``(S,)`` of all segments, ``(*batch, n, S, 3)``, m."""
         position = q.new_zeros((*q.shape[:-1], 3))
         rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
         segments = []
-        for index in range(self.segments):
-            local = self._local_points(q[..., 3 * index : 3 * index + 3], s.to(q))
-            segments.append(position.unsqueeze(-2) + local @ rotation.transpose(-1, -2))
-            position, rotation = self._tip_frame(q, index, position, rotation)
+        for block in q.split(3, dim=-1):
+            local = self._local_points(block, s.to(q))
+            segments.append(position.unsqueeze(-2) + local @ rotation.mT)
+            tip = self._local_points(block, q.new_ones(1)).squeeze(-2)
+            position = position + matvec(rotation, tip)
+            turn, _ = tip_rotation(block, stumpff((block[..., :2] ** 2).sum(-1, keepdim=True)))
+            rotation = rotation @ turn
         return torch.stack(segments, dim=-3)
 
     # Closed formulas in place of automatic differentiation: for point masses
     # C(q, v) v = sum m J^T (dJ/dt) v, which needs no derivative of M.
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        points, _ = self._chain(q)
-        return self._potential_force_of(q, points.jacobian)
+        jacobian, _, _ = self._chain(q)
+        return self._potential_force_of(q, jacobian)
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        points, _ = self._chain(q, v)
-        return matvec(self._gram(points.jacobian), a) + self._coriolis_force_of(points)
+        jacobian, bias, _ = self._chain(q, v)
+        return matvec(self._gram(jacobian), a) + self._coriolis_force_of(jacobian, bias)
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        points, _ = self._chain(q, v)
-        bias = self._coriolis_force_of(points) + self._potential_force_of(q, points.jacobian)
-        return spd_solve(self._gram(points.jacobian), force - bias)
+        jacobian, bias, _ = self._chain(q, v)
+        conservative = self._coriolis_force_of(jacobian, bias) + self._potential_force_of(
+            q, jacobian
+        )
+        return spd_solve(self._gram(jacobian), force - conservative)
 
     def _point_masses(self, like: Tensor) -> Tensor:
         return torch.outer(self.mass.to(like), self._weights.to(like)).flatten()
 
     def _gram(self, jacobian: Tensor) -> Tensor:
         weighted = jacobian * self._point_masses(jacobian)[:, None, None]
-        rows = jacobian.flatten(-3, -2)
-        return rows.transpose(-1, -2) @ weighted.flatten(-3, -2)
+        return jacobian.flatten(-3, -2).mT @ weighted.flatten(-3, -2)
 
-    def _coriolis_force_of(self, points: _Points) -> Tensor:
-        assert points.bias is not None
-        force = points.bias * self._point_masses(points.bias)[:, None]
-        return matvec(points.jacobian.flatten(-3, -2).transpose(-1, -2), force.flatten(-2))
+    def _coriolis_force_of(self, jacobian: Tensor, bias: Tensor) -> Tensor:
+        force = bias * self._point_masses(bias)[:, None]
+        return matvec(jacobian.flatten(-3, -2).mT, force.flatten(-2))
 
     def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
         lift = (jacobian[..., 2, :] * self._point_masses(q)[:, None]).sum(-2)
@@ -212,8 +189,12 @@ class SoftArm(MechanicalSystem):
 
     def _chain(
         self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None
-    ) -> tuple[_Points, list[Tip]]:
-        """Points at the nodes and tip frames of all segments; bias terms only where v is given."""
+    ) -> tuple[Tensor, Tensor, list[Tip]]:
+        """Return the kinematics of the S = segments * nodes points of the chain.
+
+        These are dr/dq ``(*batch, S, 3, N)``, (d/dt dr/dq) v ``(*batch, S, 3)``, zero without v,
+        and the tip frames.
+        """
         batch, size = q.shape[:-1], self.num_coordinates
         s = (self._s if nodes is None else nodes).to(q)
         ends = torch.cat([s, s.new_ones(1)])
@@ -237,15 +218,14 @@ class SoftArm(MechanicalSystem):
             biases.append(bias[..., :-1, :])
             base = Tip(r[..., -1, :], turn, jac[..., -1, :, :], spin, bias[..., -1, :], spin_bias)
             tips.append(base)
-        points = _Points(torch.cat(jacobians, -3), None if v is None else torch.cat(biases, -2))
-        return points, tips
+        return torch.cat(jacobians, -3), torch.cat(biases, -2), tips
 
     def _segment(
         self, q: Tensor, v: Tensor | None, s: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """One segment in the frame of its base.
+        """Return the kinematics of one segment in the frame of its base.
 
-        Returns r ``(*batch, S, 3)``, its Jacobian ``(*batch, S, 3, 3)`` and bias (dJ/dt) v
+        These are r ``(*batch, S, 3)``, its Jacobian ``(*batch, S, 3, 3)`` and bias (dJ/dt) v
         ``(*batch, S, 3)`` at the points ``s`` (the last one is the tip); the tip's rotation
         ``(*batch, 3, 3)``, Jacobian of the angular velocity ``(*batch, 3, 3)`` and its bias.
         """
@@ -296,23 +276,3 @@ class SoftArm(MechanicalSystem):
         c = stumpff((dx * dx + dy * dy) * s * s)
         shape = torch.stack([dx * s * s * c[2], dy * s * s * c[2], s * c[1]], dim=-1)
         return (self.length + dl).unsqueeze(-1) * shape
-
-    def _tip_frame(
-        self, q: Tensor, index: int, position: Tensor, rotation: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        block = q[..., 3 * index : 3 * index + 3]
-        end = self._local_points(block, q.new_ones(1)).squeeze(-2)
-        square = (block[..., :2] ** 2).sum(-1, keepdim=True)
-        turn, _ = tip_rotation(block, stumpff(square))
-        return position + matvec(rotation, end), rotation @ turn
-
-
-def _entries(name: str, value: float | Sequence[float], count: int) -> Tensor:
-    values = [float(value)] * count if isinstance(value, (int, float)) else list(value)
-    if len(values) != count:
-        raise ValueError(
-            f"SoftArm: {name} has {len(values)} entries, expected one number or {count}"
-        )
-    if not all(x >= 0 for x in values):
-        raise ValueError(f"SoftArm: {name} is {value}, expected zero or positive numbers")
-    return torch.tensor(values, dtype=torch.float64)

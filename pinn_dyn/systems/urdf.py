@@ -15,7 +15,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.systems.inertia import pseudo_inertia
 
 _TURNING = ("revolute", "continuous")
@@ -31,7 +30,7 @@ class Tree(NamedTuple):
         parents: index of the joint before each joint, -1 at the base; parents come first.
         placements: pose of each joint's frame at q = 0 in its parent's frame, ``(N, 4, 4)``.
         axes: unit axis of each joint in its own frame, ``(N, 3)``.
-        turning: true for a joint that turns, false for one that slides.
+        turning: true for a joint that turns, false for a joint that slides.
         inertia: pseudo-inertia of each body in its joint's frame, ``(N, 4, 4)``; kg, kg m, kg m^2.
         limits: lower and upper position, speed and effort of each joint, ``(N, 4)``; zero where
             the URDF has none, a position of -pi to pi for a continuous joint.
@@ -60,7 +59,7 @@ def read_urdf(
     mass_scale: float = 1.0,
     payload: float = 0.0,
 ) -> Tree:
-    """Read a URDF: a file, one that ships with PyBullet, or the text itself.
+    """Read a URDF: a file, a file that ships with PyBullet, or the text itself.
 
     Args:
         urdf: path or text.
@@ -76,12 +75,17 @@ def read_urdf(
             joint that moves, or a mass or inertia that no body has.
     """
     file = _UrdfFile(*_open(urdf))
-    for name in locked_joints:
-        if name not in file.joints:
-            raise ValueError(
-                f"{file.path} has no joint {name!r} to lock: its joints are {list(file.joints)}"
-            )
-    tip = file.tip(tip)
+    if unknown := set(locked_joints) - file.joints.keys():
+        raise ValueError(
+            f"{file.path} has no joints {sorted(unknown)} to lock: its joints are "
+            f"{list(file.joints)}"
+        )
+    children = [_end(joint, "child") for joint in file.joints.values()]
+    if tip is None:
+        inner = {_end(joint, "parent") for joint in file.joints.values()}
+        tip = [name for name in children if name not in inner][-1]
+    if tip not in children:
+        raise ValueError(f"{file.path}: tip is {tip!r}, expected a link behind a joint: {children}")
     joints: list[str] = []
     parents: list[int] = []
     placements: list[np.ndarray] = []
@@ -111,8 +115,7 @@ def read_urdf(
     visit(file.root, -1, np.eye(4))
     if unreached := file.links.keys() - visited.keys():
         raise ValueError(
-            f"{file.path}: the links {', '.join(sorted(unreached))} are parents of each other in "
-            "a circle, expected a tree that starts at one root"
+            f"{file.path}: no joints lead from the base {file.root!r} to {sorted(unreached)}"
         )
     if not joints:
         raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked_joints)})")
@@ -140,43 +143,16 @@ class _UrdfFile:
             robot = ET.fromstring(content)
         except (ET.ParseError, LookupError, ValueError) as error:  # also unknown encodings
             raise ValueError(f"{path} is not valid XML for a URDF: {error}") from error
-        if robot.tag != "robot" or robot.find("joint") is None:
-            raise ValueError(f"{path} is <{robot.tag}>, expected the <robot> of a URDF with joints")
-        self.links = self._by_name(robot, "link")
-        self.joints = self._by_name(robot, "joint")
+        self.links, self.joints = (self._by_name(robot, kind) for kind in ("link", "joint"))
         children = Counter(_end(joint, "child") for joint in self.joints.values())
-        for name, joint in self.joints.items():
-            for end in ("parent", "child"):
-                if (link := _end(joint, end)) not in self.links:
-                    raise ValueError(
-                        f"{path}: joint {name!r} has the {end} {link!r}, which is no link: "
-                        f"expected one of {', '.join(self.links)}"
-                    )
-            if children[link] > 1:
-                raise ValueError(
-                    f"{path}: link {link!r} is the child of {children[link]} joints, expected one: "
-                    "a closed loop is not a URDF"
-                )
         roots = [name for name in self.links if name not in children]
-        if len(roots) != 1:
+        shared = [name for name, count in children.items() if count > 1]
+        if len(roots) != 1 or not children or shared:
             raise ValueError(
-                f"{path} has {len(roots)} links that no joint moves ({', '.join(roots[:5])}), "
-                "expected one root, the base: join the others to it, or remove them"
+                f"{path}: expected a <robot> with joints and one base link; links without a parent "
+                f"are {roots[:5]}, links of several parents {shared}"
             )
         self.root = roots[0]
-
-    def tip(self, tip: str | None) -> str:
-        """Return the link at the end of the robot."""
-        children = [_end(joint, "child") for joint in self.joints.values()]
-        if tip is None:
-            parents = {_end(joint, "parent") for joint in self.joints.values()}
-            return [name for name in children if name not in parents][-1]
-        if tip not in children:
-            raise ValueError(
-                f"{self.path}: tip is {tip!r}, expected a link behind a joint: "
-                f"{', '.join(children)}"
-            )
-        return tip
 
     def axis(self, name: str) -> np.ndarray:
         """Return the unit axis of a joint that moves."""
@@ -188,19 +164,10 @@ class _UrdfFile:
                 "expected revolute, continuous, prismatic or fixed: add it to locked_joints"
             )
         axis = self._numbers(joint, "axis", "xyz", 3, "1 0 0")
-        length = np.linalg.norm(axis)
-        if length < _TOLERANCE:
-            raise ValueError(
-                f"{self.path}: joint {name!r} has the axis {axis.tolist()} of length 0, expected a "
-                "direction such as '0 0 1'"
-            )
-        return axis / length
+        return axis / np.linalg.norm(axis)
 
     def limits(self, name: str) -> list[float]:
-        """Return lower and upper position, speed and effort of a joint; zero where there is none.
-
-        A continuous joint turns without end; -pi to pi is the range that is explored.
-        """
+        """Return lower and upper position, speed and effort of a joint; see :class:`Tree`."""
         joint = self.joints[name]
         keys = ("lower", "upper", "velocity", "effort")
         low, high, *limits = (self._numbers(joint, "limit", key, 1, "0")[0] for key in keys)
@@ -217,23 +184,21 @@ class _UrdfFile:
         return pose
 
     def pseudo_inertia(self, link: str) -> np.ndarray:
-        """Return J of a link in its own frame, ``(4, 4)``; zero for a mere frame."""
+        """Return J of a link in its frame, ``(4, 4)``; zero for a mere frame."""
         inertial = self.links[link].find("inertial")
         if inertial is None:
             return np.zeros((4, 4))
-        missing = None if inertial.find("mass") is not None else "0"
-        mass = self._numbers(inertial, "mass", "value", 1, missing)[0]
-        missing = None if inertial.find("inertia") is not None else "0"
+        mass = self._numbers(inertial, "mass", "value", 1)[0]
         keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-        values = [self._numbers(inertial, "inertia", key, 1, missing)[0] for key in keys]
+        values = [self._numbers(inertial, "inertia", key, 1)[0] for key in keys]
         xx, xy, yy, xz, yz, zz = values
         moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         slack = _TOLERANCE * np.abs(moments).max()
         if mass < 0 or moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
             raise ValueError(
                 f"{self.path}: link {link!r} has mass {mass:g} kg and the principal moments of "
-                f"inertia {', '.join(f'{x:.3g}' for x in moments)} kg m^2, expected none negative "
-                "and no moment larger than the sum of the other two"
+                f"inertia {moments.tolist()} kg m^2, expected no negative values and no moment "
+                "larger than the sum of the other two"
             )
         pose = self.pose(inertial)
         parameters = torch.tensor([mass, 0.0, 0.0, 0.0, *values], dtype=torch.float64)
@@ -241,32 +206,25 @@ class _UrdfFile:
 
     def _by_name(self, robot: ET.Element, kind: str) -> dict[str, ET.Element]:
         elements = robot.findall(kind)
-        names = Counter(element.get("name", "") for element in elements)
-        for name, count in names.items():
-            if count > 1 or not name:
-                raise ValueError(
-                    f"{self.path} has {count} {kind}s named {name!r}, expected a name for each "
-                    f"{kind}, and each name once"
-                )
-        return dict(zip(names, elements, strict=True))
+        by_name = {element.get("name", ""): element for element in elements}
+        if len(by_name) != len(elements):
+            raise ValueError(f"{self.path} has several {kind}s of the same name")
+        return by_name
 
     def _numbers(
-        self, owner: ET.Element, tag: str, key: str, count: int, default: str | None
+        self, owner: ET.Element, tag: str, key: str, count: int, default: str = ""
     ) -> np.ndarray:
         """Return the numbers of an attribute, ``(count,)``, or the default."""
         element = owner.find(tag)
         text = default if element is None else element.get(key, default)
         try:
-            values = np.array([float(number) for number in (text or "").split()])
+            values = np.array(text.split(), dtype=float)
         except ValueError:
             values = np.empty(0)
         if len(values) != count or not np.isfinite(values).all():
-            name = owner.get("name") or next(
-                name for name, link in self.links.items() if owner in link
-            )
             raise ValueError(
-                f"{self.path}: {name!r} has <{tag} {key}={(text or '')[:80]!r}>, expected {count} "
-                f"finite number{'s' if count > 1 else ''}"
+                f"{self.path}: <{tag} {key}={text!r}> of {owner.get('name', 'an <inertial>')}, "
+                f"expected {count} finite numbers"
             )
         return values
 
@@ -281,15 +239,9 @@ def _open(urdf: str) -> tuple[Path, bytes]:
     if urdf.lstrip().startswith("<"):
         return Path("URDF text"), urdf.encode()
     path = Path(urdf).expanduser()
-    folders = [Path()]
     package = importlib.util.find_spec("pybullet_data")
-    if package is not None and package.origin:
-        folders.append(Path(package.origin).parent)
-    for folder in folders:
-        if (folder / path).is_file():
-            file = (folder / path).resolve()
-            return file, file.read_bytes()
-    near = [str(file) for file in path.parent.glob("*.urdf")]
-    near += [str(file.relative_to(folders[-1])) for file in folders[-1].glob("*/*.urdf")]
-    hint = did_you_mean(urdf, near) or ": give the path of a URDF"
-    raise FileNotFoundError(f"URDF {urdf!r} not found from {Path.cwd()}{hint}")
+    shipped = Path(package.origin).parent if package is not None and package.origin else Path()
+    for file in (path, shipped / path):
+        if file.is_file():
+            return file.resolve(), file.read_bytes()
+    raise FileNotFoundError(f"URDF {urdf!r} not found from {Path.cwd()}")
