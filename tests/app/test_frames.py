@@ -81,7 +81,7 @@ def test_rows_that_the_cleaning_drops_or_moves_are_predicted_all_the_same():
 
 
 def test_a_step_that_no_frame_can_take_is_named():
-    with pytest.raises(ValueError, match=r"steps.own leaves 3 stretches"):
+    with pytest.raises(ValueError, match=r"the steps leave 3 stretches"):
         predicted(motion(1), steps={"own": PolynomialFit(degree=3, segment=1.0)})
 
 

@@ -11,7 +11,6 @@ from examples.cleaning_steps import RowClock
 from pinn_dyn.data.logs import (
     Deduplicate,
     LogError,
-    MovingAverage,
     RemoveJumps,
     Resample,
     SplitGaps,
@@ -310,16 +309,6 @@ def test_a_motion_that_repeats_a_training_motion(tmp_path, run, split):
     text = warned_of_runs(tmp_path, {run: again})
     assert f"{split}: 4 of the motions of {run} repeat one of a" in text
     assert warned_of_runs(tmp_path, {run: motion(4.0, phase=1.3)}) == ""
-
-
-def test_steps_that_destroy_the_data(tmp_path):
-    text = warned(tmp_path, motion(), steps=dict(smooth=MovingAverage(900)))
-    assert "smooth: MovingAverage(window=900" in text
-    assert "% of its spread left" in text
-    table = motion()
-    table["q1"] += 1e-3 * NOISE[0]
-    steps = dict(jumps=RemoveJumps(threshold=1e-4, window=5))
-    assert "threshold is below the noise" in warned(tmp_path, table, steps=steps)
 
 
 @pytest.mark.parametrize("apart", [0.0, 2e-5])

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-import scipy.io
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -92,7 +91,7 @@ def test_missing_velocity_is_derived(folder):
     derived = source(folder, v=None)
     (train,) = derived.load().train
     np.testing.assert_allclose(train.v, motion()[["v1", "v2"]][:601], atol=2e-3)
-    assert "velocity: SavitzkyGolayVelocity(window=11, order=3, causal=False)" in derived.report
+    assert "velocity: SavitzkyGolayVelocity(" in derived.report
 
 
 def test_borders_are_cut_before_filters_see_them(folder):
@@ -175,7 +174,7 @@ def test_named_runs_and_the_end_of_the_others(runs):
         == names(parts, "train")
         == {f"run_{k}" for k in range(8)} - {"run_3"}
     )
-    assert "1 s are left over and dropped" in mixed.report
+    assert "1 s are dropped" in mixed.report
 
 
 def test_a_column_tells_runs_apart(tmp_path):
@@ -191,25 +190,6 @@ def test_a_column_tells_runs_apart(tmp_path):
     np.testing.assert_allclose(splits.validation[0].q, tables[1][["q1", "q2"]], atol=1e-11)
     np.testing.assert_allclose(splits.test[0].u, tables[3][["u1", "u2"]], atol=1e-11)
     assert len(splits.train) == 2
-
-
-def test_matlab_matrices_and_structs(tmp_path):
-    table = motion()
-    log = {"q": table[["q1", "q2"]].to_numpy(), "v": table[["v1", "v2"]].to_numpy().T}
-    content = {"time": table["t"].to_numpy(), "log": log, "u": table[["u1", "u2"]].to_numpy()}
-    scipy.io.savemat(tmp_path / "run.mat", content | {"gain": 3.0})
-    matlab = source(
-        tmp_path,
-        files="run.mat",
-        time=dict(columns="time", unit="s"),
-        q=dict(columns=["log.q_1", "log.q_2"], unit="rad"),
-        v=dict(columns=["log.v_1", "log.v_2"], unit="rad/s"),
-        u=dict(columns=["u_1", "u_2"], unit="Nm"),
-    )
-    (train,) = matlab.load().train
-    for signal in "qvu":
-        wanted = table[[f"{signal}1", f"{signal}2"]].to_numpy()
-        np.testing.assert_allclose(getattr(train, signal), wanted[:601], atol=1e-12)
 
 
 def test_semicolons_and_a_byte_order_mark(tmp_path):
@@ -230,47 +210,25 @@ def test_short_stretches_are_dropped_and_named(folder):
     assert "2 gaps, after 2.99 s, 3.44 s" in split.report
 
 
-def test_the_figure_holds_raw_and_cleaned_values(folder):
-    filtered = source(folder, v=None, steps={"filter": Butterworth(cutoff=5.0)})
-    part = filtered.cleaned[0]
-    figure = cleaning_figure(
-        part,
-        title="oscillator",
-        labels=filtered.labels,
-        input_labels=filtered.input_labels,
-    )
-    panels = {ax.get_ylabel(): ax for ax in figure.axes}
-    assert set(panels) == {
-        *filtered.labels,
-        "d/dt q1 [rad/s]",
-        "d/dt q2 [rad/s]",
-        "u1 [Nm]",
-        "u2 [Nm]",
-    }
-    raw, clean = panels["q2 [rad]"].get_lines()
-    np.testing.assert_array_equal(raw.get_ydata(), part.raw.q[:, 1])
-    np.testing.assert_array_equal(clean.get_ydata(), part.clean[0].q[:, 1])
-    assert len(panels["d/dt q1 [rad/s]"].get_lines()) == 1
-    assert "oscillator: run, train" in figure.get_suptitle()
-    with pytest.raises(ValueError, match="1 labels for q, expected 2"):
-        cleaning_figure(part, title="", labels=["q"], input_labels=["u1", "u2"])
-
-
 def test_rates_of_the_inputs_arrive_named_and_drawn(folder):
     table = motion()
     table["u1"] = table["q1"]  # an input whose rate is known: v1
     write(folder, table)
-    with_rates = source(folder, steps={"rates": InputRates(window=5)})
-    (train,) = with_rates.load().train
-    assert train.u.shape == (601, 4)
+    log = source(folder, v=None, steps={"rates": InputRates(window=5)})
+    (train,) = log.load().train
     np.testing.assert_allclose(train.u[5:-5, 2], table["v1"][5:596], atol=1e-5)
     labels = ["u1 [Nm]", "u2 [Nm]", "d/dt u1 [Nm/s]", "d/dt u2 [Nm/s]"]
-    assert with_rates.input_labels == labels
-    figure = cleaning_figure(
-        with_rates.cleaned[0], title="", labels=with_rates.labels, input_labels=labels
-    )
-    lines = {ax.get_ylabel(): len(ax.get_lines()) for ax in figure.axes}
-    assert (lines["u2 [Nm]"], lines["d/dt u1 [Nm/s]"]) == (2, 1)
+    assert log.input_labels == labels
+    part = log.cleaned[0]
+    figure = cleaning_figure(part, title="", labels=log.labels, input_labels=labels)
+    panels = {ax.get_ylabel(): ax.get_lines() for ax in figure.axes if ax.get_lines()}
+    assert {key: len(lines) for key, lines in panels.items()} == {
+        **dict.fromkeys(["q1 [rad]", "q2 [rad]", "u1 [Nm]", "u2 [Nm]"], 2),
+        **dict.fromkeys(["d/dt q1 [rad/s]", "d/dt q2 [rad/s]", *labels[2:]], 1),
+    }
+    raw, clean = panels["q2 [rad]"]
+    np.testing.assert_array_equal(raw.get_ydata(), part.raw.q[:, 1])
+    np.testing.assert_array_equal(clean.get_ydata(), part.clean[0].q[:, 1])
 
 
 @pytest.mark.parametrize(
@@ -282,17 +240,12 @@ def test_rates_of_the_inputs_arrive_named_and_drawn(folder):
         (dict(q=dict(columns=["q1", "q2"], unit=["rad"] * 3)), r"q: unit has 3 entries"),
         (dict(q=dict(columns=["q1", "q2"], unit="rad", sign=2)), r"q.sign.*1 or -1"),
         (dict(q=dict(columns=["q1"], unit="Nm"), v=None), "q has the column 'q1' in Nm"),
-        (dict(q=dict(columns=["u1"], unit="rad"), v=None), "'u1' is in q and in u"),
-        (dict(u=dict(columns=["u1"], unit="ms")), "u has the column 'u1' in s"),
+        (dict(q=dict(columns=["u1"], unit="rad"), v=None), "'u1' is in two of q, v and u"),
         (dict(v=dict(columns=["v1", "v2"], unit="m/s")), r"v has the units .*m/s.*per second"),
-        (dict(time=dict(columns="t", unit="m")), r"time has the column 't' in m"),
         (dict(test=dict(piece=1.0)), r"test: runs is None and seconds is None"),
-        (dict(test=dict(seconds=1.0, runs=1, piece=1.0)), r"expected one of them"),
         (dict(test=dict(seconds=1.0, piece=2.0)), r"piece is 2.0 s.*at most seconds"),
         (dict(test=dict(run=1, piece=2.0)), r"test.run: Unexpected"),
-        (dict(test=dict(runs=1, piece="all")), r"test.piece: .*'whole'"),
         (dict(test=None), r"both validation and test"),
-        (dict(labels=["a"]), r"labels has 1 entries, expected 2"),
         (dict(angles=[2]), r"angles is \[2\], expected numbers of angles"),
     ],
 )
@@ -346,5 +299,5 @@ def test_frames_in_memory_are_read_as_files(tmp_path, runs):
 def test_messages_name_the_rows_of_a_frame_by_its_index(tmp_path):
     table = motion().set_index(pd.Index([f"row {k}" for k in range(1001)]))
     table.loc["row 40", "q1"] = np.nan
-    with pytest.raises(LogError, match=r"the frame, row row 40, column 'q1' \(q\): .*NaN"):
+    with pytest.raises(LogError, match=r"frame, row row 40, column 'q1' \(q\): .*NaN"):
         source(tmp_path, files=table).load()

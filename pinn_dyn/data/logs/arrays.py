@@ -6,6 +6,7 @@ and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,10 @@ from scipy.io import loadmat
 
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.readers import Request, optional
-from pinn_dyn.data.logs.table import Table
 from pinn_dyn.spelling import did_you_mean
 
 
-def read_mat(path: Path, request: Request) -> Table:
+def read_mat(path: Path, request: Request) -> pd.DataFrame:
     """Read a MATLAB file; version 7.3, which is HDF5, by pymatreader."""
     try:
         content = loadmat(path, squeeze_me=False, struct_as_record=True)
@@ -44,17 +44,13 @@ def _flatten(name: str, value: Any, variables: dict[str, Any]) -> None:
         variables[name] = value
 
 
-def read_hdf5(path: Path, request: Request) -> Table:
+def read_hdf5(path: Path, request: Request) -> pd.DataFrame:
     """Read an HDF5 file. Data sets that lie in other files are not opened."""
     h5py = optional("h5py", path)
     variables: dict[str, Any] = {}
 
     def visit(name: str, item: Any) -> None:
-        if not isinstance(item, h5py.Dataset):
-            variables[name] = f"is a group that holds {listed(item) or 'nothing'}"
-        elif item.external or item.is_virtual:
-            variables[name] = "lies in another file, which is not opened"
-        else:
+        if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
             variables[name] = item[()]
 
     with h5py.File(path, "r") as file:
@@ -62,33 +58,25 @@ def read_hdf5(path: Path, request: Request) -> Table:
     return _table(path, request.time, variables)
 
 
-def read_npz(path: Path, request: Request) -> Table:
-    """Read an NPZ file; Python objects are never unpickled."""
+def read_npz(path: Path, request: Request) -> pd.DataFrame:
+    """Read an NPZ file; Python objects are left out and never unpickled."""
     variables: dict[str, Any] = {}
     with np.load(path, allow_pickle=False) as file:
         for name in file.files:
-            try:
+            with contextlib.suppress(ValueError):
                 variables[name] = file[name]
-            except ValueError:
-                variables[name] = "holds Python objects, which are never unpickled"
     return _table(path, request.time, variables)
 
 
-def _table(path: Path, time: str, variables: Mapping[str, Any]) -> Table:
-    """Return the real vectors and matrices that have as many rows as the time.
+def _table(path: Path, time: str, variables: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the real vectors and matrices that have as many rows or columns as the time.
 
     Raises:
         LogError: if there is no such time.
     """
-    unusable = {name: value for name, value in variables.items() if isinstance(value, str)}
-    arrays: dict[str, np.ndarray] = {}
-    for name in variables.keys() - unusable.keys():
-        value = variables[name]
-        value = np.asarray(value, dtype=object if isinstance(value, list) else None)
-        if value.dtype.kind not in "fiub" or value.ndim not in (1, 2):
-            kind = "a cell array" if value.dtype == object else f"of the type {value.dtype}"
-            unusable[name] = f"is {kind} with {value.ndim} dimensions"
-        else:
+    arrays = {}
+    for name, value in variables.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
             arrays[name] = value if value.ndim == 2 else value[:, None]
     if time not in arrays:
         hint = did_you_mean(time, arrays) or "."
@@ -96,15 +84,11 @@ def _table(path: Path, time: str, variables: Mapping[str, Any]) -> Table:
         raise LogError(f"{path}: no variable {time!r} for the time{hint} The file has {sizes}")
     samples = arrays[time].size
     columns: dict[str, np.ndarray] = {}
-    for name in [key for key in variables if key in arrays]:
-        value = arrays[name]
+    for name, value in arrays.items():
         rows = value if value.shape[0] == samples else value.T
         if rows.shape[0] != samples:  # parameters and the like
-            size = " by ".join(map(str, value.shape))
-            unusable[name] = f"is {size}, and the time has {samples} samples"
-        elif rows.shape[1] == 1:
-            columns[name] = rows[:, 0]
-        else:
-            columns |= {f"{name}_{k + 1}": rows[:, k] for k in range(rows.shape[1])}
-    frame = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
-    return Table(frame, str(path), unusable=unusable)
+            continue
+        width = rows.shape[1]
+        names = [name] if width == 1 else [f"{name}_{k + 1}" for k in range(width)]
+        columns |= dict(zip(names, rows.T, strict=True))
+    return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))

@@ -11,7 +11,6 @@ not later than it, and not older than ``max_age``; rows without such a message a
 
 from __future__ import annotations
 
-import json
 import os
 from array import array
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ _NAMES = ("name", "joint_names")
 def read_bag(path: Path, request: Request) -> Table:
     """Read columns of a bag, one row per message of the topic of the time.
 
-    The decoded messages are kept as Parquet files in the cache, since decoding takes 20 µs each.
+    The rows are kept as a Parquet file in the cache, since decoding takes 20 µs a message.
 
     Raises:
         LogError: on topics, fields or joints that the bag does not have, and on topics whose
@@ -44,24 +43,16 @@ def read_bag(path: Path, request: Request) -> Table:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys([request.time, *request.columns]))
-    key = cache_key([str(path.absolute()), stats, fields])
+    key = cache_key([str(path.absolute()), stats, fields, request.max_age])
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
-    index = folder / f"bag-{key}.json"
-    if index.is_file():
-        topics = {
-            topic: pd.read_parquet(folder / file)
-            for topic, file in json.loads(index.read_text()).items()
-        }
-    else:
-        topics = _decode(path, fields)
+    cached = folder / f"bag-{key}.parquet"
+    if not cached.is_file():
+        frame = _merge(path, _decode(path, fields), request)
         folder.mkdir(parents=True, exist_ok=True)
-        names = {topic: f"bag-{key}-{k}.parquet" for k, topic in enumerate(topics)}
-        for topic, name in names.items():
-            with whole(folder / name) as partial:
-                topics[topic].to_parquet(partial)
-        with whole(index) as partial:
-            partial.write_text(json.dumps(names))
-    return _merge(path, topics, request)
+        with whole(cached) as partial:
+            frame.to_parquet(partial)
+    frame = pd.read_parquet(cached)
+    return Table(frame, str(path), "message", notes=frame.attrs["notes"])
 
 
 def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
@@ -86,11 +77,10 @@ def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
     topics = {}
     for topic, names in fields.items():
         values = np.frombuffer(numbers[topic]).reshape(-1, 1 + len(names))
-        frame = pd.DataFrame(values[:, 1:], index=values[:, 0], columns=list(names))
-        if (empty := frame.isna().all()).any():
-            field = names[empty.idxmax()]
-            raise LogError(f"{path}, topic {topic}: no message has a value of {field!r}")
-        topics[topic] = frame
+        topics[topic] = pd.DataFrame(values[:, 1:], index=values[:, 0], columns=list(names))
+        for column in topics[topic]:
+            if topics[topic][column].isna().all():
+                raise LogError(f"{path}: no message has a value of {column!r}")
     return topics
 
 
@@ -116,11 +106,7 @@ def _time(message: Any, received: int) -> float:
 
 
 def _number(message: Any, field: str, place: str) -> float:
-    """Return the number at a path such as ``position/joint1``; NaN for an entry that is missing.
-
-    Raises:
-        LogError: if the message has no such field, or it is no number.
-    """
+    """Return the number at a path such as ``position/joint1``; NaN for a missing entry."""
     node = message
     for step in field.split("/"):
         if hasattr(node, "__len__") and not isinstance(node, str):
@@ -132,9 +118,8 @@ def _number(message: Any, field: str, place: str) -> float:
         elif hasattr(node, step):
             node = getattr(node, step)
         else:
-            raise LogError(
-                f"{place}: its messages have no {field!r}: their fields are {_fields(message)}"
-            )
+            names = [name for name in message.__dataclass_fields__ if not name.startswith("__")]
+            raise LogError(f"{place}: no {field!r} in its messages, which have {listed(names)}")
     if not isinstance(node, (int, float, np.number, np.bool_)):
         raise LogError(
             f"{place}: {field!r} is a {type(node).__name__}, expected a number: name an entry of "
@@ -143,37 +128,24 @@ def _number(message: Any, field: str, place: str) -> float:
     return float(node)
 
 
-def _fields(message: Any) -> str:
-    return ", ".join(name for name in message.__dataclass_fields__ if not name.startswith("__"))
-
-
-def _merge(path: Path, topics: dict[str, pd.DataFrame], request: Request) -> Table:
+def _merge(path: Path, topics: dict[str, pd.DataFrame], request: Request) -> pd.DataFrame:
     """Return all columns at the times of the topic that has the time."""
-    clock_topic = next(topic for topic, frame in topics.items() if request.time in frame)
-    frame = topics[clock_topic].copy()
-    usable = frame.notna().all(axis=1).to_numpy()
-    notes = []
-    if not usable.all():
-        notes.append(f"{int((~usable).sum())} messages of {clock_topic} lack an entry")
-    t = frame[request.time].to_numpy()
+    clock = next(topic for topic, frame in topics.items() if request.time in frame)
+    frame = topics.pop(clock)
+    times = frame[request.time].to_numpy()
     frame.index = pd.RangeIndex(1, len(frame) + 1)
-    for topic, messages in topics.items():
-        if topic == clock_topic:
-            continue
+    for messages in topics.values():
         messages = messages.dropna().sort_index(kind="stable")
-        stamps = messages.index.to_numpy()
-        last = np.searchsorted(stamps, t, side="right") - 1
-        fresh = (last >= 0) & (t - stamps[last.clip(min=0)] <= request.max_age)
-        if not fresh.all():
-            notes.append(
-                f"{int((~fresh).sum())} messages of {clock_topic} have none of {topic} in the "
-                f"{request.max_age:g} s before them"
-            )
-        usable = usable & fresh
-        for column in messages:
-            frame[column] = messages[column].to_numpy()[last.clip(min=0)]
-    if not usable.any():
-        raise LogError(f"{path}: no row is left: {'; '.join(notes)}")
-    dropped = int((~usable).sum())
-    notes = [f"{dropped} rows are dropped: {note}" for note in notes]
-    return Table(frame[usable], str(path), "message", notes=notes)
+        messages = messages[~messages.index.duplicated(keep="last")]
+        latest = messages.reindex(times, method="ffill", tolerance=request.max_age)
+        frame[messages.columns] = latest.to_numpy()
+    rows = frame.dropna()
+    dropped = (
+        f"{len(frame) - len(rows)} of {len(frame)} messages of {clock} are dropped: they lack an "
+        f"entry, or have none of {listed(topics) or 'another topic'} in the {request.max_age:g} s "
+        "before them"
+    )
+    if not len(rows):
+        raise LogError(f"{path}: no row is left: {dropped}")
+    rows.attrs["notes"] = [dropped] if len(rows) < len(frame) else []
+    return rows

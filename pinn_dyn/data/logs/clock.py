@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
-from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.recording import SIGNALS, Recording
 from pinn_dyn.data.logs.step import Step
 
 
@@ -39,10 +39,9 @@ class Deduplicate(Step):
             if end - first > self.longest:
                 stale[first:end] = False
         drop = same_time | stale
-        share = 100 * drop.mean()
         text = (
-            f"dropped {drop.sum()} of {len(drop)} rows ({share:.2g} %): {same_time.sum()} with the "
-            f"time of the row before, {(stale & ~same_time).sum()} with its values"
+            f"dropped {drop.sum()} of {len(drop)} rows ({100 * drop.mean():.2g} %), "
+            f"{same_time.sum()} with the time of the row before"
         )
         return [recording.rows(~drop)], text
 
@@ -67,12 +66,8 @@ class SplitGaps(Step):
         edges = [0, *gaps.tolist(), len(recording)]
         parts = [recording.rows(slice(a, b)) for a, b in itertools.pairwise(edges)]
         stretches = [part for part in parts if len(part) > 1]
-        times = ", ".join(f"{recording.t[k - 1]:.6g} s" for k in gaps[:5])
-        more = " ..." if len(gaps) > 5 else ""
-        text = f"{len(gaps)} gaps" + (f", after {times}{more}" if len(gaps) else "")
-        if len(stretches) < len(parts):
-            text += f"; dropped {len(parts) - len(stretches)} stretches of a single row"
-        return stretches, text
+        times = listed(f"{recording.t[k - 1]:.6g} s" for k in gaps)
+        return stretches, f"{len(gaps)} gaps" + (f", after {times}" if times else "")
 
 
 @dataclass(frozen=True)
@@ -94,7 +89,7 @@ class Resample(Step):
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         t = recording.t
         spacing = np.diff(t)
-        if len(t) < 2 or not (spacing > 0).all():
+        if not (spacing > 0).all():
             raise LogError(
                 f"{recording.place}: Resample needs times that increase: put Deduplicate before it"
             )
@@ -112,10 +107,8 @@ class Resample(Step):
         def at(values: np.ndarray) -> np.ndarray:
             return np.column_stack([np.interp(clock, t, column) for column in values.T])
 
-        v = None if recording.v is None else at(recording.v)
-        resampled = Recording(recording.run, clock, at(recording.q), v, at(recording.u))
         text = (
             f"{len(t)} rows, {1e3 * spacing.min():.3g} to {1e3 * spacing.max():.3g} ms apart, to "
             f"{count} samples at {self.rate:g} Hz"
         )
-        return [resampled], text
+        return [replace(recording.change(SIGNALS, at), t=clock)], text

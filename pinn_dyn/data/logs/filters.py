@@ -12,12 +12,9 @@ from pydantic import PositiveFloat, PositiveInt
 from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
 from pinn_dyn.data.lengths import Length
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.recording import SIGNALS, Recording
 from pinn_dyn.data.logs.step import Signals, Step, window_samples
-
-# Share of the rows that may be jumps; more are noise or motion.
-_MOST_JUMPS = 0.05
 
 
 @dataclass(frozen=True)
@@ -26,11 +23,9 @@ class MovingAverage(Step):
 
         x̄_k = mean(x_{k-b}, ..., x_{k+f}),   b = ⌊w/2⌋,   f = ⌈w/2⌉ - 1
 
-    An even window looks one sample further back than ahead.
-
     Args:
         window: number of samples w, or a time, such as ``"0.1 s"``.
-        signals: signals that are averaged.
+        signals: averaged signals.
     """
 
     window: Length = 50
@@ -58,7 +53,7 @@ class Butterworth(Step):
     Args:
         cutoff: cut-off frequency f_c, Hz; the two passes together halve the amplitude at f_c.
         order: order n of one pass.
-        signals: signals that are filtered.
+        signals: filtered signals.
     """
 
     cutoff: PositiveFloat
@@ -81,15 +76,13 @@ class RemoveJumps(Step):
     """Replace samples far from the median of their neighbors, such as jumps of a marker.
 
     A sample is a jump where |x_k - median(x_{k-h}, ..., x_{k+h})| > threshold, h = (window - 1)/2.
-    The straight line between the good samples around it replaces it, and the report lists time and
-    distance. A jump that lasts longer than h samples is not detected. The first and last h samples
-    are not judged, as a one-sided median lags behind a motion.
+    The straight line between the good samples around it replaces it. A jump that lasts longer than
+    h samples is not detected. The first and last h samples are not judged.
 
     Args:
-        threshold: largest distance from the median that is no jump, SI units; one value, or one
-            per column.
+        threshold: largest distance that is no jump, SI units; one value, or one per column.
         window: number of samples, odd, or a time, such as ``"0.25 s"``.
-        signals: signals that are repaired.
+        signals: repaired signals.
     """
 
     threshold: PositiveFloat | Sequence[PositiveFloat]
@@ -113,26 +106,8 @@ class RemoveJumps(Step):
             return frame.mask(bad).interpolate(limit_direction="both").to_numpy()
 
         repaired = recording.change(self.signals, repair)
-        if not jumps:
-            return [repaired], "no jumps"
-        more = " ..." if len(jumps) > 20 else ""
-        text = f"{len(jumps)} samples replaced, at (distance): {', '.join(jumps[:20])}{more}"
-        return [repaired], text
-
-    def losses(self, before: list[Recording], after: list[Recording]) -> list[str]:
-        changes = [
-            (getattr(old, name) != getattr(new, name)).any(axis=1)
-            for old, new in zip(before, after, strict=True)
-            for name in self.signals
-            if getattr(old, name) is not None
-        ]
-        warnings = super().losses(before, after)
-        if (replaced := np.concatenate(changes).mean()) > _MOST_JUMPS:
-            warnings.append(
-                f"{100 * (1 - replaced):.0f} % of the rows are left as they were: the threshold is "
-                "below the noise, or below the motion within a window"
-            )
-        return warnings
+        text = f"{len(jumps)} of {len(recording)} samples replaced"
+        return [repaired], f"{text}, at (distance): {listed(jumps)}" if jumps else text
 
 
 @dataclass(frozen=True)
@@ -155,13 +130,10 @@ class _SavitzkyGolaySlope(Step):
 class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
     """Derive the velocity as the slope of a polynomial through ``window`` samples of q.
 
-    Within half a window of an end the polynomial of the outermost full window is used.
-
-    The velocity of a sample then depends on q up to half a window later, and so does a prediction
-    that starts there: a model can read the first half window of its errors from v. With ``causal``
-    the polynomial goes through the sample and the ``window`` - 1 samples before it, which a
-    controller has too; only the first ``window`` - 1 samples of a run share one polynomial. It
-    carries more noise, so a shorter window and a lower order suit it.
+    v_k depends on q up to half a window later, and so does a prediction that starts there. With
+    ``causal`` the polynomial goes through the sample and the ``window`` - 1 samples before it,
+    except for the first ``window`` - 1 samples. It carries more noise, so a shorter window and a
+    lower order suit it.
 
     Args:
         window: number of samples, odd, or a time, such as ``"50 ms"``.
@@ -180,25 +152,22 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
         past = ", from the past alone" if self.causal else ""
         return [replace(recording, v=v)], f"v from q in windows of {window * step:.3g} s{past}"
 
-    def _causal_slope(self, values: np.ndarray, window: int, step: float) -> np.ndarray:
-        def weights(position: int) -> np.ndarray:
-            return savgol_coeffs(window, self.order, deriv=1, delta=step, pos=position, use="dot")
-
-        last = window - 1
-        start = [weights(k) @ values[:window] for k in range(last)]
-        windows = sliding_window_view(values, window, axis=0)
-        return np.vstack([*start, windows @ weights(last)])
+    def _causal_slope(self, q: np.ndarray, window: int, step: float) -> np.ndarray:
+        weights = [
+            savgol_coeffs(window, self.order, deriv=1, delta=step, pos=k, use="dot")
+            for k in range(window)
+        ]
+        start = [w @ q[:window] for w in weights[:-1]]
+        return np.vstack([*start, sliding_window_view(q, window, axis=0) @ weights[-1]])
 
 
 @dataclass(frozen=True)
 class InputRates(_SavitzkyGolaySlope):
     """Append the rates of the inputs: u becomes (u, du/dt), 2 M columns.
 
-    For inputs that are positions, such as motor angles of tendons. A tendon that pulls like a
-    spring and a damper side by side has the force k (u - q) + c (du/dt - dq/dt), so it needs
-    A(q) (u, du/dt), and a drive that holds its place by friction moves with du/dt alone. The rate
-    is the slope of the polynomial through ``window`` samples of u around each sample, as in
-    :class:`SavitzkyGolayVelocity`, so it looks half a window ahead.
+    For inputs that are positions: a tendon that pulls like a spring and a damper has the force
+    k (u - q) + c (du/dt - dq/dt). The rate is the slope of the polynomial through ``window``
+    samples of u around each sample, so it looks half a window ahead.
 
     Args:
         window: number of samples, odd, or a time, such as ``"50 ms"``.

@@ -13,8 +13,7 @@ from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
-# Inputs before a piece that are kept for models of a delay, s.
-PAST = 0.5
+_PAST = 0.5  # s before a piece whose inputs are kept for models of a delay
 
 
 @dataclass(frozen=True)
@@ -32,13 +31,8 @@ class Cleaned:
     clean: list[Recording]
 
 
-def one_sample_time(cleaned: Sequence[Cleaned]) -> float:
-    """Return the sample time that all stretches share, s.
-
-    Raises:
-        LogError: if a stretch has another.
-    """
-    items = [item for part in cleaned for item in part.clean]
+def one_sample_time(items: Sequence[Recording]) -> float:
+    """Return the sample time that all stretches share, s."""
     times = [item.sample_time("a data set") for item in items]
     shared = float(np.median(times))
     for item, step in zip(items, times, strict=True):
@@ -52,26 +46,15 @@ def one_sample_time(cleaned: Sequence[Cleaned]) -> float:
 
 
 def pieces_of(
-    name: str, part: Part, cleaned: Sequence[Cleaned], step: float
+    name: str, part: Part, stretches: Sequence[Recording], step: float
 ) -> tuple[list[Recording], str]:
-    """Cut the stretches of a split into roll-outs of one length, or return them whole.
+    """Cut the cleaned stretches of a split into roll-outs; return them and a note.
 
-    A stretch of T samples that lasts one sample less than n pieces still has n of them, of which
-    neighbors share a sample, or two.
-
-    Args:
-        name: name of the split, such as test.
-        part: its description.
-        cleaned: all stretches.
-        step: their sample time, s.
-
-    Returns:
-        The pieces, and a note for the report.
+    A stretch that lasts one sample less than n pieces still has n of them, which overlap.
 
     Raises:
         LogError: if a piece is no multiple of the sample time, or longer than every stretch.
     """
-    stretches = [item for part in cleaned if part.split == name for item in part.clean]
     if part.piece == "whole":
         pieces = [replace(item, past=item.u[:0]) for item in stretches]
         return pieces, f"{summary(pieces, step)}, each one roll-out"
@@ -83,37 +66,31 @@ def pieces_of(
     pieces = [
         replace(
             item.rows(slice(first, first + span + 1)),
-            past=item.u[max(first - round(PAST / step), 0) : first],
+            past=item.u[max(first - round(_PAST / step), 0) : first],
         )
         for item in stretches
         for first in _starts(len(item), span)
     ]
     if not pieces:
         raise LogError(f"{name}: no stretch is as long as a piece of {part.piece} s")
-    unused = sum(item.duration for item in stretches) - len(pieces) * span * step
-    note = f"{summary(pieces, step)}, each one roll-out; {max(unused, 0):.4g} s are left over"
-    return pieces, f"{note} and dropped"
-
-
-def trajectory(recording: Recording, step: float, interpolation: Interpolation) -> Trajectory:
-    """Return a recording as tensors, from t = 0 on."""
-    q, v, u = (
-        torch.from_numpy(np.ascontiguousarray(values))
-        for values in (recording.q, recording.v, recording.u)
-    )
-    t = torch.arange(len(recording), dtype=torch.float64) * step
-    past = None if recording.past is None else torch.from_numpy(recording.past.copy())
-    return Trajectory(q, v, Signal(t, u, interpolation), past=past)
+    unused = max(sum(item.duration for item in stretches) - len(pieces) * span * step, 0)
+    return pieces, f"{summary(pieces, step)}, each one roll-out; {unused:.4g} s are dropped"
 
 
 def _starts(samples: int, span: int) -> list[int]:
     """Return the first samples of the pieces of ``span`` + 1 samples of a stretch."""
-    number = samples // span
-    if number * span < samples:
-        return [k * span for k in range(number)]
-    # One sample is missing: two neighbors overlap by it.
-    last = samples - 1 - span
-    return [round(k * last / (number - 1)) for k in range(number)] if number > 1 < span else []
+    last, count = samples - 1 - span, samples // span
+    stride = min(span, last / max(count - 1, 1))
+    return [round(k * stride) for k in range(count)] if last >= 0 else []
+
+
+def trajectory(recording: Recording, step: float, interpolation: Interpolation) -> Trajectory:
+    """Return a recording as tensors, from t = 0 on."""
+    assert recording.v is not None
+    q, v, u = (torch.from_numpy(x.copy()) for x in (recording.q, recording.v, recording.u))
+    t = torch.arange(len(recording), dtype=torch.float64) * step
+    past = None if recording.past is None else torch.from_numpy(recording.past.copy())
+    return Trajectory(q, v, Signal(t, u, interpolation), past=past)
 
 
 def summary(recordings: Sequence[Recording], step: float) -> str:

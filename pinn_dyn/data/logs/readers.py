@@ -31,7 +31,7 @@ class Request:
 
     Attributes:
         time: column of the time.
-        columns: columns of all signals, the time among them. A reader may return more.
+        columns: all columns, the time among them. A reader may return more.
         max_age: oldest message of another topic of a bag that a row may use, s.
     """
 
@@ -41,22 +41,16 @@ class Request:
 
 
 Reader = Callable[[Path, Request], pd.DataFrame | Table]
-"""Reads a file. One row per sample; the index names a row in messages."""
+"""Function that reads a file. One row per sample; the index names a row in messages."""
 
 
 def optional(name: str, path: Path) -> Any:
-    """Import a module of the extra ``logs``.
-
-    Raises:
-        LogError: if it is not installed.
-    """
+    """Import a module of the extra ``logs``."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise LogError(
-            f"{path}: reading it needs the package {name.split('.')[0]}: "
-            "pip install 'pinn_dyn[logs]'"
-        ) from error
+        package = name.split(".")[0]
+        raise LogError(f"{path} needs {package}: pip install 'pinn_dyn[logs]'") from error
 
 
 def read_csv(path: Path, request: Request) -> Table:
@@ -84,8 +78,6 @@ def read_csv(path: Path, request: Request) -> Table:
 
 
 def _lazy(module: str, function: str) -> Reader:
-    """Return a reader whose module is imported at its first use."""
-
     def read(path: Path, request: Request) -> pd.DataFrame | Table:
         reader: Reader = getattr(importlib.import_module(f"{__package__}.{module}"), function)
         return reader(path, request)
@@ -104,8 +96,8 @@ READERS: dict[str, Reader] = {
 """Reader of each suffix; the folder of a ROS 2 bag is read as ``.db3``."""
 
 
-def is_bag_folder(path: Path) -> bool:
-    """Tell whether a path is the folder of a ROS 2 bag."""
+def _is_bag(path: Path) -> bool:
+    """Return True for the folder of a ROS 2 bag."""
     return (path / "metadata.yaml").is_file()
 
 
@@ -115,7 +107,7 @@ def read_table(path: Path, request: Request) -> Table:
     Raises:
         LogError: if no reader knows its format, or it is damaged or empty.
     """
-    suffix = ".db3" if is_bag_folder(path) else path.suffix.lower()
+    suffix = ".db3" if _is_bag(path) else path.suffix.lower()
     if suffix not in READERS:
         raise LogError(
             f"{path}: no reader for {suffix!r}, expected one of {', '.join(READERS)}: convert it "
@@ -151,18 +143,12 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
         )
     files: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        paths = list(folder.glob(pattern))
-        matches = [path for path in paths if path.is_file() or is_bag_folder(path)]
+        matches = [path for path in folder.glob(pattern) if path.is_file() or _is_bag(path)]
         if not matches:
-            names = sorted(
-                path.relative_to(folder).as_posix()
-                for parent in [folder, *paths]
-                for path in parent.glob("*")
-                if not path.name.startswith(".")
-            )
+            names = listed(sorted(path.name for path in folder.iterdir()))
             raise LogError(
                 f"files: nothing matches {pattern!r} in the folder {folder.absolute()}, which has "
-                f"{listed(names) or 'no files'}: correct dataset.files or dataset.root"
+                f"{names or 'no files'}: correct dataset.files or dataset.root"
             )
         files.update(matches)
     return sorted(files)

@@ -9,12 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.measurement import Measurement
 
 SIGNALS: tuple[Literal["q", "v", "u"], ...] = ("q", "v", "u")
-_SINCE_1970 = 1e8  # s, three years: later times count from 1970
-# A clock counts as uniform if every sample is within this share of a sample of its place: files
-# round their times.
-_CLOCK_TOLERANCE = 0.02
+_SINCE_1970 = 1e8  # s; later times count from 1970
+_CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
 @dataclass(frozen=True)
@@ -22,12 +21,12 @@ class Recording:
     """A stretch of one run of a log.
 
     Attributes:
-        run: name of the run: its file without suffix, its trajectory id, or both.
-        t: times of the log, ``(T,)``, s; of stamps since 1970, from the first of the run.
+        run: name of the run.
+        t: times, ``(T,)``, s.
         q: configuration, ``(T, N)``.
         v: velocity, ``(T, N)``, or None while there is none.
         u: input, ``(T, M)``.
-        past: u of the samples right before, ``(K, M)``, of a stretch cut out of a longer one.
+        past: u of the samples right before, ``(K, M)``, or None.
     """
 
     run: str
@@ -63,18 +62,12 @@ class Recording:
         self, signals: Sequence[str], function: Callable[[np.ndarray], np.ndarray]
     ) -> Recording:
         """Return the recording with a function applied to signals, ``(T, K) -> (T, K)``."""
-        changed: dict[str, Any] = {
-            name: function(getattr(self, name))
-            for name in signals
-            if getattr(self, name) is not None
-        }
+        values = {name: getattr(self, name) for name in signals}
+        changed: Any = {name: function(x) for name, x in values.items() if x is not None}
         return replace(self, **changed)
 
     def sample_time(self, user: str) -> float:
-        """Return the sample time of a uniform clock, s.
-
-        Args:
-            user: name of the step that needs it, for the message.
+        """Return the sample time of a uniform clock, s, for a ``user`` that messages name.
 
         Raises:
             LogError: if there are fewer than two samples, or the clock is not uniform.
@@ -84,48 +77,53 @@ class Recording:
             raise LogError(f"{self.run}: {user} needs at least 2 samples, got {len(t)}")
         step = float(t[-1] - t[0]) / (len(t) - 1)
         error = np.abs(t - t[0] - step * np.arange(len(t)))
-        if not step > 0 or error.max() > _CLOCK_TOLERANCE * step:
-            k = int(error.argmax())
+        k = int(error.argmax())
+        if not step > 0 or error[k] > _CLOCK_TOLERANCE * step:
             raise LogError(
                 f"{self.place}: {user} needs a uniform clock, but near t = {t[k]:.6g} s the time "
                 f"is {error[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it, "
-                f"as {{_target_: pinn_dyn.data.logs.Resample, rate: {float(f'{1 / step:.3g}')}, "
-                f"max_gap: {max(float(np.diff(t).max()), step):.2g}}}"
+                f"with rate={1 / step:.3g} and max_gap={max(float(np.diff(t).max()), step):.2g}"
             )
         return step
 
 
-def since_start(times: np.ndarray) -> tuple[np.ndarray, str]:
-    """Count clocks of a run, ``(T, C)`` in s, from its start if they are stamps since 1970.
-
-    Returns:
-        The times, and a remark for the report, "" if the times are unchanged.
-    """
-    stamps = times[0] > _SINCE_1970
-    remark = f"; t from the stamp {times[0, 0]:.6f} s" if stamps[0] else ""
-    return times - np.where(stamps, times[0], 0.0), remark
+def since_start(t: np.ndarray) -> tuple[np.ndarray, str]:
+    """Count stamps since 1970 from the first; return the times, s, and a remark or ""."""
+    if t[0] < _SINCE_1970:
+        return t, ""
+    return t - t[0], f"; t from the stamp {t[0]:.6f} s"
 
 
 @dataclass
 class Report:
-    """Notes on what each step did to each run, as Markdown."""
+    """Measurements of the checks, and notes on what each step did to each run."""
 
     name: str
+    measurements: list[Measurement] = field(default_factory=list)
     sections: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
     def add(self, section: str, place: str, text: str) -> None:
         """Add a note on one run to a section."""
         self.sections.setdefault(section, {}).setdefault(text, []).append(place)
 
-    def markdown(self, warnings: Sequence[str]) -> str:
+    def warn(self, name: str, text: str) -> None:
+        """Add a warning."""
+        self.measurements.append(Measurement(name, verdict="warning", text=text))
+
+    @property
+    def warnings(self) -> list[str]:
+        """Texts of the measurements that are warnings."""
+        return list(dict.fromkeys(x.text for x in self.measurements if x.verdict != "ok"))
+
+    def markdown(self) -> str:
         """Return the report with the warnings first."""
         lines = [f"# {self.name}: what was done to the log", "", "## Warnings", ""]
-        lines += [f"- {text}" for text in warnings] or ["- none"]
+        lines += [f"- {text}" for text in self.warnings] or ["- none"]
         for section, texts in self.sections.items():
             lines += ["", f"## {section}", ""]
             for text, places in texts.items():
-                # Notes that are the same for many runs are one line.
-                many = len(places) > 3
-                summary = f"{len(places)} stretches, {places[0]} ... {places[-1]}" if many else ""
-                lines.append(f"- {summary or ', '.join(places)}: {text}")
+                names = ", ".join(places)
+                if len(places) > 3:
+                    names = f"{len(places)} stretches, {places[0]} ... {places[-1]}"
+                lines.append(f"- {names}: {text}")
         return "\n".join(lines) + "\n"

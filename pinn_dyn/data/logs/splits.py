@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -15,10 +16,10 @@ from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.source import SPLITS
 from pinn_dyn.spelling import did_you_mean
 
-_WHOLE_RUNS = 5  # from this number of runs on, the default split keeps some of them whole
+# The default split: from this number of runs on it keeps runs whole.
+_WHOLE_RUNS = 5
 _SHARE = 0.15  # of the runs, or of each run, for the test, and again for the validation
-_PIECE = 5.0  # s, longest piece of the default split
-_GUARD = 0.5  # s, longest guard of the default split
+_PIECE, _GUARD = 5.0, 0.5  # s, at most
 
 
 @dataclass(config=STRICT)
@@ -27,12 +28,10 @@ class Part:
 
     Args:
         piece: length of the roll-outs that it is cut into, s; ``"whole"``: each stretch is one
-            roll-out, and an evaluation takes the roll-outs that last as long as its horizon.
+            roll-out.
         runs: number of runs, drawn by the seed, or the names of the runs.
-        seconds: the last so many seconds of every run that is not named elsewhere.
-
-    Raises:
-        LogError: unless exactly one of ``runs`` and ``seconds`` is given.
+        seconds: duration at the end of every run that is not selected as a whole, s. Expects
+            either this or ``runs``.
     """
 
     piece: PositiveFloat | Literal["whole"]
@@ -54,40 +53,28 @@ class Part:
 
 
 def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part, float]:
-    """Choose validation, test and guard of a log for which the user chose none.
+    """Choose validation, test and guard (s) of a log from the times of its runs, s.
 
-    Of five runs or more, 15 % are the test and as many the validation: whole runs, drawn among
-    the runs of at least the median length. Of fewer runs, the last 15 % of each are the test and
-    the 15 % before them the validation. Both are cut into pieces of at most 5 s.
-
-    Args:
-        runs: times of each run, s.
-        seed: seed of the choice of runs.
-
-    Returns:
-        Validation, test, and the guard between the parts of one run, s.
+    Of five runs or more, 15 % are the test and as many the validation: whole runs, drawn by the
+    seed among the runs of at least the median length. Of fewer runs, the last 15 % of each are the
+    test and the 15 % before them the validation. Both are cut into pieces of at most 5 s.
     """
     spacing = np.concatenate([np.diff(t) for t in runs.values()])
-    step = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
+    step = float(np.median(spacing[spacing > 0]))
     lengths = {name: float(np.ptp(t)) for name, t in runs.items()}
-
-    def piece(longest: float) -> float:
-        """Return the longest piece that is a multiple of the sample time."""
-        return round(max(int(min(_PIECE, longest) / step + 1e-6), 1) * step, 9)
-
-    if len(runs) >= _WHOLE_RUNS:
-        median = float(np.median([*lengths.values()]))
+    whole_runs = len(runs) >= _WHOLE_RUNS
+    median, shortest = float(np.median([*lengths.values()])), min(lengths.values())
+    longest = min(_PIECE, median if whole_runs else _SHARE * shortest)
+    # A multiple of the sample time.
+    piece = round(max(int(longest / step + 1e-6), 1) * step, 9)
+    if whole_runs:
         long = [name for name, length in lengths.items() if length >= median - 0.5 * step]
         count = max(round(_SHARE * len(runs)), 1)
         drawn = [long[k] for k in np.random.default_rng(seed).permutation(len(long))]
         test, validation = sorted(drawn[:count]), sorted(drawn[count : 2 * count])
-        size = piece(median)
-        return Part(size, runs=validation), Part(size, runs=test), _GUARD
-    shortest = min(lengths.values())
-    size = piece(_SHARE * shortest)
-    seconds = max(_SHARE * shortest, size)
-    guard = min(_GUARD, 0.02 * shortest)
-    return Part(size, seconds=seconds), Part(size, seconds=seconds), guard
+        return Part(piece, runs=validation), Part(piece, runs=test), _GUARD
+    part = Part(piece, seconds=max(_SHARE * shortest, piece))
+    return part, part, min(_GUARD, 0.02 * shortest)
 
 
 def split(
@@ -100,7 +87,7 @@ def split(
     Raises:
         LogError: on unknown or doubly used runs, or too few or too short ones.
     """
-    names = [recording.run for recording in recordings]
+    names = list(dict.fromkeys(recording.run for recording in recordings))
     splits: dict[str, str] = {}
     for name, part in (("validation", validation), ("test", test)):
         for run in part.names:
@@ -110,21 +97,19 @@ def split(
             if run in splits:
                 raise LogError(f"run {run!r} is in {splits[run]} and in {name}, expected in one")
             splits[run] = name
+    free = [run for run in names if run not in splits]
     counts = {
-        name: part.runs
+        name: part.runs if isinstance(part.runs, int) else 0
         for name, part in (("test", test), ("validation", validation))
-        if isinstance(part.runs, int)
     }
-    free = [run for run in dict.fromkeys(names) if run not in splits]
     if sum(counts.values()) >= len(free):
         raise LogError(
             f"{len(free)} runs to choose from, expected more than {sum(counts.values())}, so that "
             "one is left for training; with a single run, split by 'seconds'"
         )
-    order = np.random.default_rng(seed).permutation(len(free))
+    drawn = iter(np.random.default_rng(seed).permutation(len(free)))
     for name, count in counts.items():
-        splits |= {free[k]: name for k in order[:count]}
-        order = order[count:]
+        splits |= {free[k]: name for k in itertools.islice(drawn, count)}
 
     parts: dict[str, list[Recording]] = {name: [] for name in SPLITS}
     for recording in recordings:
@@ -140,23 +125,21 @@ def _cut(
     recording: Recording, validation: Part, test: Part, guard: float
 ) -> list[tuple[str, Recording]]:
     """Return training, validation and test stretches of one run."""
-    if validation.seconds is None and test.seconds is None:
-        return [("train", recording)]
-    t = recording.t
-    if not (np.diff(t) >= 0).all():
-        raise LogError(f"{recording.run}: the time goes backwards: split by 'runs'")
-    stretches = []
+    t, stretches = recording.t, []
     end, last = t[-1], len(t)
-    for name, part in (("test", test), ("validation", validation)):
-        if part.seconds is None:
+    parts = {"test": test.seconds, "validation": validation.seconds}
+    for name, seconds in parts.items():
+        if seconds is None:
             continue
+        if not (np.diff(t) >= 0).all():
+            raise LogError(f"{recording.run}: the time goes backwards: split by 'runs'")
         # From the row at or before the border, so that the stretch is not a row too short.
-        first = int(np.searchsorted(t, end - part.seconds, side="right")) - 1
-        border = end - part.seconds - guard
-        left = int(np.searchsorted(t, border, side="right")) + 1
-        if first < 0 or left < 2 or border <= t[0]:
-            raise LogError(f"{recording.place}: too short to keep {part.seconds} s for {name}")
+        first = int(np.searchsorted(t, end - seconds, side="right")) - 1
+        border = end - seconds - guard
+        if border <= t[0]:
+            raise LogError(f"{recording.place}: too short to keep {seconds} s for {name}")
         stretches.append((name, recording.rows(slice(first, last))))
-        end, last = border, min(left, first)
+        end, last = border, min(int(np.searchsorted(t, border, side="right")) + 1, first)
     # The row after the border only completes a stretch that is measured from its end.
-    return [*stretches, ("train", recording.rows(slice(0, max(last - 1, 1))))]
+    train = recording.rows(slice(0, max(last - 1, 1))) if stretches else recording
+    return [*stretches, ("train", train)]
