@@ -57,7 +57,6 @@ def traced(monkeypatch):
 @pytest.fixture
 def undrawn(monkeypatch):
     """No pictures and no pages of the programs: they take longer than all else."""
-    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})
     monkeypatch.setattr("pinn_dyn.app.control_results.control_report", lambda **_: "")
     evaluation = "pinn_dyn.evaluation"

@@ -20,9 +20,6 @@ from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
 from pinn_dyn.models import Statistics
 
-# Arguments that say where a logger or a callback writes.
-_DESTINATIONS = ("name", "version", "filename", "dirpath", "save_dir")
-
 
 def build_source(config: dict[str, Any]) -> DataSource:
     """Build the data source of ``config["dataset"]``; a simulated one gets the cache folder."""
@@ -51,19 +48,8 @@ def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
     return build_predictor(model_builder(config), statistics, config["seed"])
 
 
-def training_arguments(
-    config: dict[str, Any], folder: Path, *, resumed: bool = False
-) -> dict[str, Any]:
-    """Build the arguments of :func:`~pinn_dyn.train` from the configuration of train.py.
-
-    Loggers and callbacks of a resumed training write to the run folder, whatever the file says.
-    """
-
-    def writers(group: str) -> dict[str, dict[str, Any]]:
-        parts = {name: part for name, part in config[group].items() if part is not None}
-        ignored = _DESTINATIONS if resumed else ()
-        return {n: {k: x for k, x in p.items() if k not in ignored} for n, p in parts.items()}
-
+def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Build the arguments of :func:`~pinn_dyn.train` from the configuration of train.py."""
     optimizer = config["optimizer"]
     settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
     builders = ("data", "loss", "scheduler", "validator")
@@ -75,8 +61,12 @@ def training_arguments(
         "steps": settings.pop("steps"),
         "validations": settings.pop("validations"),
         "trainer": settings,
-        "callbacks": [build_part(f"callbacks.{k}", x) for k, x in writers("callbacks").items()],
-        "loggers": [_logger(name, part, folder) for name, part in writers("logger").items()],
+        "callbacks": [
+            build_part(f"callbacks.{name}", part)
+            for name, part in config["callbacks"].items()
+            if part is not None
+        ],
+        "loggers": [_logger(name, part, folder) for name, part in config["logger"].items()],
         **{name: config[name] for name in ("seed", "ensemble", "compile", "threads")},
     }
 

@@ -76,10 +76,7 @@ def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
 def composed(command: str, words: list[str], config_dir: str | None = None) -> dict[str, Any]:
     """Compose and check the configuration of a command; of a sweep the first value counts.
 
-    Args:
-        command: name of the program.
-        words: overrides, as on its command line.
-        config_dir: folder with further options of groups, as ``--config-dir``.
+    ``words`` are overrides, ``config_dir`` is a folder with further options of groups.
 
     Raises:
         ConfigError: as :func:`check`, or with the message of Hydra.
@@ -131,14 +128,9 @@ def explained(error: HydraException | OmegaConfBaseException) -> str:
 def build_part(
     name: str, config: dict[str, Any], /, *arguments: Any, partial_: bool = False, **extra: Any
 ) -> Any:
-    """Build the object that a part of the configuration describes.
+    """Build the object that a part of the configuration describes; ``name`` is its path.
 
-    Args:
-        name: path of the part, for messages.
-        config: its ``_target_`` and arguments.
-        arguments: positional arguments that the program adds.
-        partial_: return a factory that takes further arguments.
-        extra: keyword arguments that the program adds.
+    The program adds ``arguments`` and ``extra``, or takes a factory with ``partial_``.
 
     Raises:
         ConfigError: if an argument does not fit, or with the message of the constructor.

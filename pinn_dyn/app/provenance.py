@@ -49,14 +49,9 @@ def write_provenance(
     beside: dict[str, Any],
     folder: Path,
 ) -> Origin:
-    """Write ``provenance.json``, and return its content as the last section of a report.
+    """Write ``provenance.json`` with the contents ``config`` and ``beside``, and return an origin.
 
-    Args:
-        runs: the runs by their names in the tables.
-        source: the data of the test.
-        config: the resolved configuration of this program.
-        beside: further content of the file.
-        folder: folder of the file.
+    The runs go by their names in the tables; ``source`` has the data of the test.
     """
     record = {"command": command_line(), "data_hash": data_hash(data_identity(source))}
     record |= provenance()

@@ -79,9 +79,8 @@ class Run:
         members = f"{self.model.size} members, " if isinstance(self.model, Ensemble) else ""
         error = self.metrics.get("validation", {}).get(VALIDATION_ERROR, math.nan)
         return (
-            f"Run({name} of {data}: {members}"
-            f"q = ({', '.join(self.labels)}), u = ({', '.join(self.input_labels)}), "
-            f"predicts {' and '.join(self.model.state)}, validation error {error:.3g})"
+            f"Run({name} of {data}: {members}q = ({', '.join(self.labels)}), "
+            f"u = ({', '.join(self.input_labels)}), validation error {error:.3g})"
         )
 
     @cached_property
@@ -136,17 +135,11 @@ class Run:
         return None if self.covariance is None else posterior_draws(self.model, self.covariance)
 
     def save(self, folder: str | Path) -> None:
-        """Copy the run folder, with the data of a source that was made in Python.
-
-        Raises:
-            FileExistsError: if the folder exists.
-        """
+        """Copy the run folder to a new one, with the data of a source that was made in Python."""
         target = Path(folder).expanduser()
         shutil.copytree(self.folder, target, ignore=shutil.ignore_patterns(".lock"))
         if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
             store(self._made_in_python, target / TRAJECTORIES)
-
-    # Predictions.
 
     @overload
     def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...
@@ -212,7 +205,6 @@ class Run:
 
         Raises:
             TypeError: if the model is a single network, which has no spread.
-            ValueError: as :meth:`predict`.
         """
         if (ensemble := self.ensemble) is None:
             raise TypeError(
@@ -258,15 +250,9 @@ class Run:
         signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
         return x0.expand(*batch, -1), times, signal
 
-    # Terms of the equation of motion.
-
     @property
     def system(self) -> MechanicalSystem:
-        """The model as a mechanical system, on tensors.
-
-        Raises:
-            TypeError: if the model is a black box or an ensemble.
-        """
+        """The model as a mechanical system; TypeError for black boxes and ensembles."""
         if not isinstance(self.model, MechanicalSystem):
             kind = "an ensemble" if isinstance(self.model, Ensemble) else "a black box"
             raise TypeError(
@@ -276,16 +262,12 @@ class Run:
         return self.model
 
     def terms(self, q: Values) -> TermArrays:
-        """Return M, D ``(*batch, N, N)``, G ``(*batch, N)`` and A ``(*batch, N, M)`` at q.
-
-        Raises:
-            TypeError: if the model is a black box or an ensemble.
-        """
+        """Return M, D ``(*batch, N, N)``, G ``(*batch, N)`` and A ``(*batch, N, M)`` at q."""
         terms = self.system.terms(self._coordinates("q", q))
         return TermArrays(*(term.numpy() for term in terms))
 
     def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
-        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``, from q, v, a ``(*batch, N)``."""
+        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``."""
         values = [self._coordinates(name, x) for name, x in (("q", q), ("v", v), ("a", a))]
         return self.system.inverse_dynamics(*torch.broadcast_tensors(*values)).numpy()
 
@@ -301,7 +283,6 @@ class Run:
         return self._array(name, value, self.model.num_coordinates, "N")
 
     def _array(self, name: str, value: Values, size: int, symbol: str) -> Tensor:
-        """Return a float64 tensor ``(*batch, size)`` of finite numbers."""
         tensor = _tensor(name, value)
         if tensor.ndim == 0 or tensor.shape[-1] != size:
             labels: Sequence[str] = self.input_labels if symbol == "M" else self.labels

@@ -171,13 +171,10 @@ def finish(folder: Path, record: dict[str, Any]) -> None:
 
 
 def check_data(run: Run, source: DataSource) -> None:
-    """Refuse data that are not those that a run was trained on.
-
-    An added or edited file moves runs between training, validation and test, so that the training
-    may have seen a test motion.
+    """Refuse data that have changed since a run was trained on them: test motions may have moved.
 
     Raises:
-        ConfigError: with what has changed since.
+        ConfigError: with what has changed.
     """
     require_same_data(run.folder, run.data, source.name, data_identity(source))
 

@@ -16,9 +16,9 @@ Activation = Literal["softplus", "silu", "tanh"]
 class EqualSearch:
     """One draw of the settings that matter, the same for all models.
 
-    Draw k is point k of a scrambled Sobol sequence (:class:`scipy.stats.qmc.Sobol`), which covers
-    the ranges evenly. Draw 0 leaves the configuration as it is. ``hidden`` and ``activation`` are
-    set in every network of a model, ``substeps`` in its integrator.
+    Draw k is point k of a scrambled Sobol sequence (:class:`scipy.stats.qmc.Sobol`). Draw 0 leaves
+    the configuration as it is. ``hidden`` and ``activation`` are set in every network of a model,
+    ``substeps`` in its integrator.
 
     Args:
         draw: number of the draw.
@@ -39,7 +39,7 @@ class EqualSearch:
     substeps: Sequence[PositiveInt] = (1, 2, 4)
 
     def applied(self, config: dict[str, Any]) -> dict[str, Any]:
-        """Return the configuration with the settings of the draw; of the search it keeps the draw.
+        """Return the configuration with the settings of the draw.
 
         A fit by least squares has none of these settings, so that all draws are the same.
         """

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from pinn_dyn.app import training
 from pinn_dyn.app.build import training_arguments
 from pinn_dyn.app.config import ConfigError, build_part, check, checked
-from pinn_dyn.app.run import VALIDATION_ERROR, Run
+from pinn_dyn.app.run import VALIDATION_ERROR
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
     flattened,
@@ -41,8 +41,7 @@ def train(cfg: DictConfig) -> float:
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     trust = packages(cfg.get("trust"))
-    resumed = cfg.get("resume") is not None
-    if resumed:
+    if cfg.get("resume") is not None:
         folder = Path(cfg.resume)
         config = _recorded(folder, trust)
     else:
@@ -51,10 +50,11 @@ def train(cfg: DictConfig) -> float:
         check_name("dataset.name", config["dataset"].get("name", "data"))
         if config.get("search"):
             config = build_part("search", config["search"]).applied(config)
+    start = config.get("start_from")
     try:
         run = training.train(
-            **training_arguments(config, folder, resumed=resumed),
-            start_from=_start(config.get("start_from"), trust),
+            **training_arguments(config, folder),
+            start_from=None if start is None else load_run(Path(start), "best", trust),
             folder=folder,
             config=config,
             settings=_settings(config),
@@ -82,13 +82,6 @@ def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:
     require_trusted(config, str(path), trust)
     check("train", config)
     return config
-
-
-def _start(folder: str | None, trust: tuple[str, ...]) -> Run | None:
-    try:
-        return None if folder is None else load_run(Path(folder), "best", trust)
-    except ConfigError as error:
-        raise ConfigError(f"start_from: {error}") from error
 
 
 def _settings(config: dict[str, Any]) -> dict[str, Any]:

@@ -146,12 +146,7 @@ def build_trainer(
 ) -> L.Trainer:
     """Build the trainer with its callbacks and loggers, all writing to ``folder``.
 
-    Args:
-        folder: the run folder.
-        settings: arguments of :class:`lightning.Trainer`.
-        callbacks: callbacks beside the checkpoints and the progress.
-        loggers: loggers.
-        length: as returned by :func:`epochs`.
+    ``settings`` are arguments of :class:`lightning.Trainer`, ``length`` is that of :func:`epochs`.
 
     Raises:
         ConfigError: if an argument does not fit, or the strategy starts the program again on each

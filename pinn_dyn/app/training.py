@@ -58,8 +58,6 @@ from pinn_dyn.ensembles import Ensemble, EnsembleData
 from pinn_dyn.evaluation import (
     RolloutFigures,
     RolloutValidator,
-    cleaning_figure,
-    save,
 )
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import (
@@ -173,6 +171,9 @@ def train(
         model_name, model = model_name or model, MODELS[model]
     made_in_python = config is None
     if config is None:
+        parts = dict(
+            data=data, loss=loss, optimizer=optimizer, scheduler=scheduler, validator=validator
+        )
         factory = model.func if isinstance(model, partial) else model
         name = model_name or getattr(factory, "__name__", type(factory).__name__)
         config = {
@@ -184,12 +185,8 @@ def train(
             "threads": threads,
             **({} if start_from is None else {"start_from": str(start_from.folder)}),
             **_description(source),
-            "data": described(data),
             "model": None if isinstance(model, Predictor) else described(model),
-            "loss": described(loss),
-            "optimizer": described(optimizer),
-            "scheduler": described(scheduler),
-            "validator": described(validator),
+            **{name: described(part) for name, part in parts.items()},
             "trainer": {"steps": steps, "validations": validations, **trainer},
         }
     config = dict(config)
@@ -227,7 +224,7 @@ def train(
             loop.callbacks.insert(0, recorder)  # type: ignore[attr-defined]
             require_same_data(run_folder, saved.get(DATA, {}), source.name, recorder.identity)
             if isinstance(source, LogSource):
-                _write_report(source, run_folder)
+                write_whole(run_folder / "log_report.md", source.report)
             with naming("validator"):
                 rollouts = validator(training_step=statistics.step)
                 rollouts.check(stack_until(windows.splits.validation))
@@ -380,16 +377,3 @@ def _fit(
     record = recorder.record(trainer, learner.model, read_checkpoint(last)["global_step"])
     finish(folder, record)
     return record
-
-
-def _write_report(source: LogSource, folder: Path) -> None:
-    """Write a report and a figure of the cleaning of a log."""
-    write_whole(folder / "log_report.md", source.report)
-    figure = cleaning_figure(
-        source.cleaned[0],
-        title=f"{source.name}, raw and cleaned",
-        labels=source.labels,
-        input_labels=source.input_labels,
-    )
-    save(figure, folder / "log_cleaning.png")
-    log.info("the cleaning of the log is described in %s", folder / "log_report.md")

@@ -17,23 +17,11 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    NonNegativeFloat,
-    PlainValidator,
-    PositiveFloat,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-    WithJsonSchema,
-    WrapValidator,
-    create_model,
-)
+import pydantic
+from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
-_CONFIG = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+_CONFIG = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 _LISTS = (
     list,
     tuple,
@@ -46,9 +34,9 @@ _PLAIN = (bool, int, float, str, type(None), Any)
 _Share = Annotated[float, Field(ge=0, lt=1)]
 # The optimizers of PyTorch state no limits.
 _OPTIMIZER = {
-    "lr": PositiveFloat,
-    "weight_decay": NonNegativeFloat,
-    "eps": PositiveFloat,
+    "lr": pydantic.PositiveFloat,
+    "weight_decay": pydantic.NonNegativeFloat,
+    "eps": pydantic.PositiveFloat,
     "betas": tuple[_Share, _Share],
 }
 
@@ -136,11 +124,8 @@ def places(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 @functools.cache
-def arguments_model(target: Any, required: bool = False) -> type[BaseModel]:
-    """Make the pydantic model of the arguments of a class or function.
-
-    Arguments without a default are mandatory if ``required``; else the program may add them.
-    """
+def arguments_model(target: Any, required: bool = False) -> type[pydantic.BaseModel]:
+    """Make the model of the arguments of a class; all are optional unless ``required``."""
     target = STAND_INS.get(target, target)
     is_plain_class = isinstance(target, type) and not hasattr(target, "__dataclass_fields__")
     hints = _hints(target.__init__ if is_plain_class else target)
@@ -156,8 +141,10 @@ def arguments_model(target: Any, required: bool = False) -> type[BaseModel]:
             # The alias is the key: a field of its name could hide a method of the model.
             field = Field(default, alias=name)
             fields[f"{name}_"] = (_configurable(hints.get(name, Any)), field)
-    config = ConfigDict(**_CONFIG, extra=extra)
-    return create_model(getattr(target, "__name__", "arguments"), __config__=config, **fields)
+    config = pydantic.ConfigDict(**_CONFIG, extra=extra)
+    return pydantic.create_model(
+        getattr(target, "__name__", "arguments"), __config__=config, **fields
+    )
 
 
 def _hints(target: Any) -> dict[str, Any]:
@@ -175,7 +162,7 @@ def _configurable(hint: Any) -> Any:
     if origin in (Union, UnionType):
         return _union(inner)
     if origin is tuple and inner[-1:] != (Ellipsis,):
-        return Annotated[tuple[tuple(map(_configurable, inner))], Strict(False)]  # type: ignore[misc]
+        return Annotated[tuple[tuple(map(_configurable, inner))], pydantic.Strict(False)]  # type: ignore[misc]
     if (origin or hint) in _LISTS:
         return list[_configurable(inner[0] if inner else Any)]  # type: ignore[misc]
     if (origin or hint) in _MAPPINGS:
@@ -210,7 +197,7 @@ def _union(options: Sequence[Any]) -> Any:
     values += [_object(objects, short)] if objects else []
     union: Any = Union[tuple(values)]  # noqa: UP007
     if len(values) > 1:
-        union = Annotated[union, WrapValidator(_merge_alternatives)]
+        union = Annotated[union, pydantic.WrapValidator(_merge_alternatives)]
     return union | None if type(None) in options else union
 
 
@@ -259,7 +246,11 @@ def _object(hints: Sequence[Any], short: bool = False) -> Any:
         _validate_arguments(maker, arguments)
         return value
 
-    return Annotated[Any, PlainValidator(check), WithJsonSchema({"type": "object", "title": title})]
+    return Annotated[
+        Any,
+        pydantic.PlainValidator(check),
+        pydantic.WithJsonSchema({"type": "object", "title": title}),
+    ]
 
 
 def _maker(name: Any, kinds: Sequence[Any], title: str) -> Any:

@@ -38,9 +38,7 @@ def fit(frame=None, **changes):
 
 @pytest.fixture(scope="module")
 def model():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
-        return fit()
+    return fit()
 
 
 @pytest.fixture(scope="module")

@@ -104,8 +104,6 @@ SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200", "data.steps=2"]
 def test_every_experiment_trains(tmp_path, monkeypatch, experiment):
     monkeypatch.setenv("PINN_DYN_LOGS", str(LOGS))
     monkeypatch.chdir(ROOT)  # from where the example log is found
-    if experiment != "trunk":  # drawing takes longer than training
-        monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     folder = tmp_path / "run"
     run_script(
         "train.py",
@@ -180,7 +178,6 @@ HNN_ON_A_LOG = ["experiment=example_log", "model=hnn", "compile=false", *TINY_TR
 
 def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     folder = tmp_path / "run"
     choices = ["model.state=qv", NO_FIGURES, f"hydra.run.dir={folder}"]
     run_script("train.py", *HNN_ON_A_LOG, *choices)
@@ -189,7 +186,6 @@ def test_a_hamiltonian_network_on_velocities_trains_on_a_log(tmp_path, monkeypat
 
 def test_a_hamiltonian_network_on_momenta_is_told_how_to_do_without(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     error = fails("train.py", *HNN_ON_A_LOG, f"hydra.run.dir={tmp_path / 'run'}")
     assert "set model.state=qv" in said(error, capsys)
 

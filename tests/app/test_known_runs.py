@@ -32,7 +32,6 @@ SMALL = [*WINDOWS, "optimizer.rollouts=false"]
 def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PINN_DYN_LOGS", str(LOGS))
-        patch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
         yield
 
 

@@ -8,7 +8,6 @@ from functools import partial
 import pandas as pd
 import pytest
 import torch
-from matplotlib.image import imread
 
 import pinn_dyn
 from pinn_dyn.data import DynamicsData
@@ -64,15 +63,12 @@ def test_the_script_writes_the_example_log_again(tmp_path):
     assert (EXAMPLES / "example_log.csv").stat().st_size < 250_000
 
 
-def test_a_run_on_a_log_keeps_the_report_and_a_picture_of_the_cleaning(run):
+def test_a_run_on_a_log_keeps_the_report_of_the_cleaning(run):
     assert_trained(run)
     report = (run / "log_report.md").read_text()
     assert "from example_log.csv" in report
     assert "9 trajectories of 5 to 5 s" in report
     assert "## Warnings\n\n- none" in report
-    picture = imread(run / "log_cleaning.png")
-    assert min(picture.shape[:2]) > 200
-    assert picture[..., :3].std() > 0.01
 
 
 def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, capsys):
@@ -90,7 +86,6 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
 
 
 def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
-    monkeypatch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
     run_script(
         "train.py",
         *TINY,

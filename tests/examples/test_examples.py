@@ -27,8 +27,6 @@ def home(tmp_path_factory):
         patch.chdir(folder)
         patch.setenv("HOME", str(folder))
         patch.setenv("PINN_DYN_CACHE", str(folder / "cache"))
-        # The picture of the cleaning takes longer than the training.
-        patch.setattr("pinn_dyn.app.training._write_report", lambda source, folder: None)
         # One of the five seconds of each run: the examples predict whole runs.
         log = pd.read_csv(EXAMPLES / "example_log.csv")
         log[log.t <= 1.0].to_csv(folder / "example_log.csv", index=False)
