@@ -35,9 +35,8 @@ def check_known(model: Predictor, source: DataSource) -> None:
         ]
         if inputs:
             raise ConfigError(
-                f"the inputs are {', '.join(inputs)}, and model.drive_gain is 1: expected drive "
-                "gains, as model.drive_gain=10 model.gain_spread=0.5 (Nm or N per unit, known "
-                "within 50 %), or the unit of a force (dataset.u.unit) if the columns hold forces"
+                f"the inputs are {', '.join(inputs)}, no forces: set drive gains, as "
+                "model.drive_gain=10 model.gain_spread=0.5, or correct dataset.u.unit"
             )
 
 
@@ -60,9 +59,8 @@ def check_structure(path: str, structure: Structure, source: DataSource) -> None
         columns = list(units)
         if len(columns) != len(joints):
             raise ConfigError(
-                f"{key} has {len(columns)} columns, {', '.join(columns)}, and {path} has the "
-                f"joints {', '.join(joints)}: lock joints by {path}.locked_joints=[...], or leave "
-                "out columns"
+                f"{key} has the columns {', '.join(columns)}, and {path} the joints "
+                f"{', '.join(joints)}: leave out columns, or set {path}.locked_joints"
             )
         numbers = [_joint_of(column, joints) for column in columns]
         matches = [None if numbers.count(k) > 1 else k for k in numbers]
@@ -70,8 +68,7 @@ def check_structure(path: str, structure: Structure, source: DataSource) -> None
             order = [columns[matches.index(k)] if k in matches else "?" for k in range(len(joints))]
             raise ConfigError(
                 f"{key} has the order {', '.join(columns)}, and {path} has the joints "
-                f"{', '.join(joints)}: expected the order of the joints in q, v and u, "
-                f"{key}=[{','.join(order)}]"
+                f"{', '.join(joints)}: expected {key}=[{','.join(order)}]"
             )
         if None in matches:
             pairs = map(" -> ".join, zip(columns, joints, strict=True))

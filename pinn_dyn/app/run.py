@@ -175,10 +175,7 @@ class Run:
         """
         if isinstance(start, pd.DataFrame):
             if self.log is None:
-                raise ValueError(
-                    f"the model was trained on {self.config['dataset'].get('name')}, which has no "
-                    "columns of a log: use predict(start, u, t)"
-                )
+                raise ValueError("the training data have no columns of a log: give start, u and t")
             return predict_frame(self.model, self.log, start)
         x0, times, signal = self._motion(start, u, t)
         return self.model.predict(x0, times, signal).numpy()
@@ -207,10 +204,7 @@ class Run:
             TypeError: if the model is a single network, which has no spread.
         """
         if (ensemble := self.ensemble) is None:
-            raise TypeError(
-                f"model={self.config['model_name']} is a single network, whose prediction has no "
-                "spread: train an ensemble (ensemble=5), or model=known by least squares"
-            )
+            raise TypeError("a single network has no spread: train an ensemble (ensemble=5)")
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
             paths = double_copy(ensemble).member_increments(x0, times, signal)
@@ -231,19 +225,14 @@ class Run:
             times = signal.t if t is None else _tensor("t", t)
             first, last = float(signal.t[0]), float(signal.t[-1])
             if times.min() < first - 1e-9 or times.max() > last + 1e-9:
-                raise ValueError(
-                    f"t is from {float(times.min()):g} to {float(times.max()):g} s, outside the "
-                    f"input, which is known from {first:g} to {last:g} s"
-                )
+                raise ValueError(f"t leaves the times of the input, {first:g} to {last:g} s")
         elif u is None or t is None:
             raise TypeError("the input is missing: expected predict(start, u, t)")
         else:
             times, samples = _tensor("t", t), self._array("u", u, size, "M")
             if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
-                raise ValueError(
-                    f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}, expected "
-                    f"(*batch, T, {size}) and (T,): one input for each time"
-                )
+                shapes = f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}"
+                raise ValueError(f"{shapes}, expected (*batch, T, {size}) and (T,)")
             part = self.config.get("log") or self.config["dataset"]
             signal = Signal(times, samples, part.get("interpolation", "linear"))
         batch = torch.broadcast_shapes(x0.shape[:-1], signal.batch)
@@ -255,10 +244,7 @@ class Run:
         """The model as a mechanical system; TypeError for black boxes and ensembles."""
         if not isinstance(self.model, MechanicalSystem):
             kind = "an ensemble" if isinstance(self.model, Ensemble) else "a black box"
-            raise TypeError(
-                f"model={self.config['model_name']} is {kind} and has no terms M, D, G and A: use "
-                "a member, or train model=lnn or model=hnn"
-            )
+            raise TypeError(f"the model is {kind} and has no terms M, D, G and A")
         return self.model
 
     def terms(self, q: Values) -> TermArrays:

@@ -108,10 +108,7 @@ def _load_weights(model: Predictor, state: Mapping[str, torch.Tensor]) -> None:
     weights = {k.removeprefix("model."): x for k, x in state.items() if k.startswith("model.")}
     set_output_limits(model, weights)
     if broken := [key for key, value in weights.items() if not value.isfinite().all()]:
-        raise ConfigError(
-            f"the weights {broken[0]} are NaN or infinite, the training diverged: load another "
-            "checkpoint or train again with a lower optimizer.lr"
-        )
+        raise ConfigError(f"the weights {broken[0]} are NaN or infinite, the training diverged")
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
@@ -143,9 +140,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         config["dataset"].pop("cache", None)  # each user has their own
         saved["state_dict"].items()
     except Exception as error:  # a damaged archive or pickle raises nearly anything
-        raise ConfigError(
-            f"{path} cannot be read, it may be cut short: {in_one_line(error)}"
-        ) from error
+        text = f"{path} cannot be read, it may be cut short: {in_one_line(error)}"
+        raise ConfigError(text) from error
     return saved
 
 
@@ -186,10 +182,7 @@ def require_same_data(
     if changes := data_changes(before, now) if before else []:
         more = [f"and {len(changes) - 10} more"] if len(changes) > 10 else []
         text = "\n  ".join([*changes[:10], *more])
-        raise ConfigError(
-            f"{name} has changed since {folder} was trained:\n  {text}\n"
-            "Restore the data, or train again"
-        )
+        raise ConfigError(f"{name} has changed since {folder} was trained:\n  {text}")
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
@@ -235,10 +228,8 @@ def _require_same_config(folder: Path, before: dict[str, Any], now: dict[str, An
         if ours.get(key, "absent") != theirs.get(key, "absent")
     ]
     if differences:
-        raise ConfigError(
-            f"{folder} holds a training of another configuration: {', '.join(differences[:5])}; "
-            "choose another folder, or delete this one"
-        )
+        text = ", ".join(differences[:5])
+        raise ConfigError(f"{folder} holds a training of another configuration: {text}")
 
 
 def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

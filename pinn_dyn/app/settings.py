@@ -60,13 +60,11 @@ class TrainerArguments:
     validations: PositiveInt | None = None
     accelerator: Literal["cpu", "gpu", "cuda", "auto"] = "auto"
     devices: PositiveInt | Sequence[NonNegativeInt] | Literal["auto"] = "auto"
-    num_nodes: PositiveInt = 1
     strategy: str = "auto"
     precision: Literal["32-true", "32", 32, "bf16-mixed", "bf16"] | None = None
     gradient_clip_val: PositiveFloat | None = None
     gradient_clip_algorithm: Literal["norm", "value"] | None = None
     enable_progress_bar: bool = True
-    benchmark: bool | None = None
     deterministic: bool | Literal["warn"] = False
     detect_anomaly: bool = False
     profiler: Literal["simple", "advanced"] | None = None

@@ -96,9 +96,9 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
     """
     between, remainder = divmod(steps, validations)
     if remainder or not between:
+        multiple = max(between, 1) * validations
         raise ConfigError(
-            f"trainer.steps is {steps} and trainer.validations {validations}: expected a multiple, "
-            f"as trainer.steps={max(between, 1) * validations}"
+            f"trainer.steps is {steps}, expected a multiple of trainer.validations, as {multiple}"
         )
     fewest = -(-between // LONGEST_EPOCH)
     parts = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)
@@ -180,10 +180,7 @@ def build_trainer(
     with naming("trainer"):
         trainer = L.Trainer(**arguments)
     if isinstance(trainer.strategy.launcher, _SubprocessScriptLauncher):
-        raise ConfigError(
-            "trainer: this strategy starts the whole program again on each device: use "
-            "trainer.strategy=ddp_spawn_find_unused_parameters_true"
-        )
+        raise ConfigError("use trainer.strategy=ddp_spawn_find_unused_parameters_true")
     return trainer
 
 

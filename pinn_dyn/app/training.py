@@ -247,10 +247,7 @@ def train(
             )
             if isinstance(learner, LeastSquaresLearner) and start_from is not None:
                 if start_from.covariance is None:
-                    raise ConfigError(
-                        f"start_from: {start_from.folder} has no covariance of its constants: fit "
-                        "it by optimizer=least_squares, or leave start_from out"
-                    )
+                    raise ConfigError("start_from: the run has no covariance of its constants")
                 learner.covariance = start_from.covariance
             batches = EnsembleData(windows, ensemble) if ensemble > 1 else windows
             record = _fit(loop, learner, batches, checkpoint, run_folder, source, recorder)
@@ -298,9 +295,7 @@ def _statistics(windows: DynamicsData, devices: int) -> Statistics:
         if warning := too_long_for(windows.splits.train, windows.step, windows.source.labels):
             log.warning("%s: %s", windows.source.name, warning)
         if windows.batch_size % devices:
-            raise ValueError(
-                f"batch_size is {windows.batch_size}, no multiple of {devices} devices"
-            )
+            raise ValueError(f"batch_size {windows.batch_size} is no multiple of {devices} devices")
         return windows.statistics
 
 
@@ -323,13 +318,12 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
     """Refuse windows without the momenta or the past inputs that the model needs."""
     if model.state == "qp" and windows.windows.p.shape[-1] == 0:
         raise ValueError(
-            f"it learns from momenta p = M(q) v, and {windows.source.name} has none, as they "
-            "cannot be measured: set model.state=qv, which learns from (q, v), or use model=lnn"
+            f"{windows.source.name} has no momenta p: set model.state=qv, or use model=lnn"
         )
     if model.input_history > windows.history:
         raise ValueError(
-            f"it may look {model.input_history} s back (delay.longest), and data.history is "
-            f"{windows.history} s: set both to the same time"
+            f"delay.longest is {model.input_history} s, and data.history {windows.history} s: set "
+            "both to the same time"
         )
 
 
@@ -342,10 +336,8 @@ def _take_weights(model: Predictor, run: Run) -> None:
     try:
         model.load_state_dict(trained.state_dict())
     except RuntimeError as error:
-        raise ConfigError(
-            f"start_from: the run {run.folder} trained another model than this configuration has, "
-            f"expected the same classes and sizes: {in_one_line(error)}"
-        ) from error
+        text = f"start_from: {run.folder} is of another model: {in_one_line(error)}"
+        raise ConfigError(text) from error
     log.info("starting from the weights of %s", run.folder)
 
 

@@ -91,7 +91,7 @@ def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, 
         if key in part and part[key] not in allowed:
             raise ConfigError(
                 f"{path}.{key} is {part[key]!r}: a configuration from a run folder does not choose "
-                f"where something is written. If you trust it, add trust={target} to the command"
+                f"where something is written, unless you add trust={target}"
             )
     for key in ("name", "filename", "version"):
         if part.get(key) is not None:

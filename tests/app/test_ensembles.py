@@ -98,7 +98,7 @@ def test_an_interval_holds_the_predictions_of_the_members(ensemble_run, lnn_run)
     np.testing.assert_allclose(twice[1] - twice[0], 2 * (high - low))
     narrow = model.predict_interval(start, u, t, level=0.5)
     assert (narrow[1] - narrow[0] <= high - low).all()
-    with pytest.raises(TypeError, match="is a single network, whose prediction has no spread"):
+    with pytest.raises(TypeError, match="a single network has no spread"):
         pinn_dyn.load(lnn_run).predict_interval(start, u, t)
 
 

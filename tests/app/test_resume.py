@@ -214,7 +214,8 @@ def test_a_resumed_training_writes_to_its_own_folder(command, tmp_path):
     parts["config"]["callbacks"] = {"keep": {**keep, "filename": "stolen"}}
     change(command, hyper_parameters=parts)
     run_script("train.py", f"resume={command}")
-    assert list(tmp_path.iterdir()) == [command]
+    assert not list((tmp_path / "runs").rglob("*elsewhere*"))
+    assert list(command.rglob("metrics.csv"))
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ DAMAGE = {
         "another model.*extra",
     ),
     "other sizes": (weights(lambda x: torch.cat([x, x]) if x.ndim else x), "another model"),
-    "zero step": (statistics("step", 0.0), "statistics.step .* expected .* positive"),
+    "zero step": (statistics("step", 0.0), "statistics.step .* expected positive"),
     "NaN mean": (statistics("q_mean", [math.nan] * 3), "statistics.q_mean .* finite numbers"),
     "negative spread": (statistics("v_std", [-1.0] * 3), "statistics.v_std .*positive numbers"),
 }
