@@ -1,6 +1,5 @@
 """Delays found in simulated logs of known delay: python -m benchmarks.delays [draws] [first].
 
-Each input by itself (``input_delays``), one for all, and as check.py does (``agreed_delays``).
 The thresholds were set on the draws 0 to 5. Of the seven joints the kinematics are known.
 """
 
@@ -9,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pinn_dyn.data.logs import DelayCurve, agreed_delays, input_delays
+from pinn_dyn.data.logs import DelayCurve, input_delays
 from tests.support.delayed_robots import log, seven_regressor
 
 SAMPLE = 0.01
@@ -22,19 +21,15 @@ def main(draws: int, first: int) -> None:
         delays = [float(np.random.default_rng(1000 + k).uniform(0, 0.1)) for k in numbers]
         logs = [log(kind, k, d) for k, d in zip(numbers, delays, strict=True)]
         rigid = seven_regressor if kind == "seven joints" else None
-        ways = {"its own": [input_delays([one], rigid=rigid) for one in logs]}
-        if kind != "pendulum":
-            ways["common"] = [input_delays([one], common=True, rigid=rigid) for one in logs]
-            ways["agreed"] = [agreed_delays([one], rigid=rigid) for one in logs]
-        for way, found in ways.items():
-            print(f"{kind}, {way}: {_words(found, delays)}", flush=True)
+        curves = [input_delays([item], rigid=rigid) for item in logs]
+        print(f"{kind}: {_words(curves, delays)}", flush=True)
 
 
-def _words(found: Sequence[Sequence[DelayCurve]], delays: Sequence[float]) -> str:
+def _words(results: Sequence[Sequence[DelayCurve]], delays: Sequence[float]) -> str:
     errors = np.array(
         [
             [np.inf if c.delay is None else abs(c.delay - d) for c in curves]
-            for curves, d in zip(found, delays, strict=True)
+            for curves, d in zip(results, delays, strict=True)
         ]
     )
     within = int((errors <= SAMPLE).all(axis=1).sum())

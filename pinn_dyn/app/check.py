@@ -35,8 +35,8 @@ def check(cfg: DictConfig) -> None:
         structure = build_part("model.structure", part)
         if not isinstance(structure, Structure):
             raise ConfigError(
-                f"model.structure is a {type(structure).__name__}, expected rigid bodies: "
-                "model/structure=urdf model.structure.urdf=my_robot.urdf, or leave it out"
+                f"model.structure is a {type(structure).__name__}, expected rigid bodies, such as "
+                "model/structure=urdf model.structure.urdf=my_robot.urdf"
             )
         check_structure("model.structure", structure, source)
     try:
@@ -47,5 +47,4 @@ def check(cfg: DictConfig) -> None:
     page = report.save(folder, command_line())
     print(f"\n{report}\n\nthe page is {page}")
     if report.problems:
-        problems = "; ".join(report.problems)
-        raise ConfigError(f"{source.name}: a training makes no sense: {problems}")
+        raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,34 +12,17 @@ import pandas as pd
 import torch
 from pydantic import PositiveFloat
 
-from pinn_dyn.data.logs import (
-    Butterworth,
-    Cleaned,
-    DelayCurve,
-    LogSource,
-    Measurement,
-    MovingAverage,
-    Recording,
-    agreed_delays,
-)
-from pinn_dyn.data.logs.measurement import judged
+from pinn_dyn.data import logs
+from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.evaluation.log_numbers import (
-    bandwidth,
-    distance_from,
-    explained_share,
-    independent_shares,
-    white_noise,
-)
+from pinn_dyn.evaluation import log_numbers as numbers
 from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_excitation
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.known import Structure
 
 _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
-_NOISE = 0.02  # noise of q as a share of its range
-_STILL = 0.25  # the same of a joint at rest
-_FAR = 3.0  # distance of a test sample from the training
-_OUTSIDE = 0.05  # share of the test
+_NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
+_FAR, _OUTSIDE = 3.0, 0.05  # distance of a test sample from the training; share of the test
 _ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
 # Column of the table of coordinates, its limit, and the text beyond it.
@@ -53,7 +36,7 @@ _LIMITS = (
     ),
     ("test outside", "below", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
 )
-_judged = functools.partial(judged, section="bags_and_other_logs.md#is-the-log-good-enough")
+_judged = partial(judged, section="bags_and_other_logs.md#is-the-log-good-enough")
 
 
 @dataclass(frozen=True)
@@ -71,12 +54,12 @@ class LogCheck:
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
     """
 
-    source: LogSource
+    source: logs.LogSource
     measurements: list[Measurement]
     runs: pd.DataFrame
     coordinates: pd.DataFrame
     inputs: pd.DataFrame
-    delays: list[DelayCurve]
+    delays: list[logs.DelayCurve]
     distance: np.ndarray
     steps: list[str]
     rigid: RigidExcitation | None = None
@@ -110,25 +93,19 @@ class LogCheck:
             tables[f"Rigid bodies, not determined: {self.rigid.summary}"] = self.rigid.joints
         lines = [f"{self.source.name}: check of the log"]
         for title, frame in tables.items():
-            more = f" (the first {_ROWS} of {len(frame)})" if len(frame) > _ROWS else ""
-            number = "{:.3g}".format
-            text = frame.head(_ROWS).to_string(index=False, na_rep="", float_format=number)
-            lines += ["", title + more, text]
-        for x in self.measurements:
-            if x.verdict != "ok":
-                lines += ["", f"{x.verdict}: {x.text} (docs/{x.section})"]
+            text = frame.to_string(
+                index=False, na_rep="", float_format="{:.3g}".format, max_rows=_ROWS
+            )
+            lines += ["", title, text]
+        bad = [x for x in self.measurements if x.verdict != "ok"]
+        lines += [f"\n{x.verdict}: {x.text} (docs/{x.section})" for x in bad]
         if self.steps:
             lines += ["", "steps:", *(f"  {line}" for line in self.steps)]
         verdict = "no sense" if self.problems else "sense"
         return "\n".join([*lines, "", f"Verdict: a training makes {verdict}"])
 
     def save(self, folder: str | Path, command: str = "") -> Path:
-        """Write ``check.html``, ``measurements.csv`` and ``log_report.md``; return the page.
-
-        Args:
-            folder: the folder, made if missing.
-            command: command line, for the page.
-        """
+        """Write ``check.html``, ``measurements.csv`` and ``log_report.md``; return the page."""
         from pinn_dyn.evaluation.report.check_page import check_report
 
         folder = Path(folder)
@@ -140,7 +117,7 @@ class LogCheck:
 
 
 def check(
-    source: LogSource,
+    source: logs.LogSource,
     *,
     longest_delay: PositiveFloat = 0.3,
     structure: Structure | None = None,
@@ -157,26 +134,28 @@ def check(
     """
     splits = source.load()
     inputs = len(source.u.columns)
-    training = [
-        replace(item, u=item.u[:, :inputs])  # without rates of the inputs
-        for part in source.cleaned
-        if part.split == "train"
-        for item in part.clean
-    ]
+    training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
+    training = [replace(item, u=item.u[:, :inputs]) for item in training]  # no rates of inputs
     step = float(np.median(np.diff(training[0].t)))
-    rigid = None
-    if structure is not None:
-        rigid = lambda *motion: structure.regressor(*map(torch.from_numpy, motion)).numpy()  # noqa: E731
-    delays = agreed_delays(training, longest=longest_delay, rigid=rigid)
+    rigid = None if structure is None else partial(_regressor, structure)
+    delays = logs.input_delays(training, longest=longest_delay, rigid=rigid)
     coordinates = _coordinates(source, training, splits.test, step)
     noise = coordinates["noise of q"].to_numpy()
-    highest = bandwidth(training, step, noise)
-    distance = distance_from(training, splits.test)
+    highest = numbers.bandwidth(training, step, noise)
+    distance = numbers.distance_from(training, splits.test)
+    explained = numbers.explained_share(training, delays, step)
     measurements = [
         *source.measurements,
-        *_measured(coordinates, distance, explained_share(training, delays, step)),
-        *(_lateness(name, x, step) for name, x in zip(source.u.columns, delays, strict=True)),
+        *_measured(coordinates, distance, explained),
     ]
+    for name, curve in zip(source.u.columns, delays, strict=True):
+        delay = np.nan if curve.delay is None else 1e3 * curve.delay
+        text = (
+            f"input {name!r} acts {delay:.0f} ms after it is logged: add the InputDelay step below "
+            "or learn the delay with the model (model/delay=learned)"
+        )
+        bad = delay > 750 * step
+        measurements.append(_judged("delay [ms]", name, delay, "below a sample", bad, text))
     excitation = None
     if structure is not None:
         longest = max(item.duration for item in splits.train)
@@ -207,7 +186,7 @@ def check(
     )
 
 
-def _run(part: Cleaned) -> dict[str, object]:
+def _run(part: logs.Cleaned) -> dict[str, object]:
     spacing = np.diff(part.raw.t)
     usual = float(np.median(spacing))
     return {
@@ -222,26 +201,29 @@ def _run(part: Cleaned) -> dict[str, object]:
 
 
 def _coordinates(
-    source: LogSource, training: list[Recording], test: Sequence[Trajectory], step: float
+    source: logs.LogSource, training: list[logs.Recording], test: Sequence[Trajectory], step: float
 ) -> pd.DataFrame:
     q = np.vstack([item.q for item in training])
     v = np.vstack([item.v for item in training if item.v is not None])
-    raw = [x.raw for x in source.cleaned if x.split == "train" and len(x.raw) > 10]
-    noise = np.median([white_noise(item.q) for item in raw], axis=0)
+    raw = [x.raw.q for x in source.cleaned if x.split == "train" and len(x.raw) > 10]
+    noise = np.median([numbers.white_noise(x) for x in raw], axis=0)
     tested = np.vstack([item.q.numpy() for item in test])
     low, high = q.min(axis=0), q.max(axis=0)
-    return pd.DataFrame(
-        {
-            "coordinate": source.labels,
-            "min": low,
-            "max": high,
-            "fastest [/s]": np.abs(v).max(axis=0),
-            "noise of q": noise,
-            "noise / range": noise / np.ptp(q, axis=0).clip(min=1e-300),
-            "test outside": ((tested < low) | (tested > high)).mean(axis=0),
-            "independent share of a": independent_shares(training, step),
-        }
-    )
+    table = {
+        "coordinate": source.labels,
+        "min": low,
+        "max": high,
+        "fastest [/s]": np.abs(v).max(axis=0),
+        "noise of q": noise,
+        "noise / range": noise / (high - low).clip(min=1e-300),
+        "test outside": ((tested < low) | (tested > high)).mean(axis=0),
+        "independent share of a": numbers.independent_shares(training, step),
+    }
+    return pd.DataFrame(table)
+
+
+def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
+    return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
 
 def _measured(
@@ -259,29 +241,19 @@ def _measured(
         f"{100 * far:.0f} % of the test is {_FAR:g} times further from the training than tenths of "
         "it are from each other"
     )
-    measured = ("share of the test far away", "", far, f"below {_OUTSIDE}", far > _OUTSIDE)
-    results.append(_judged(*measured, text))
+    bad, expected = far > _OUTSIDE, f"below {_OUTSIDE}"
+    results.append(_judged("share of the test far away", "", far, expected, bad, text))
     text = (
         f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these the "
         "inputs of this robot, on the same clock?"
     )
-    name, expected = "share of the motion that inputs add to (1, q, v)", f"at least {_EXPLAINED}"
-    bad = explained < _EXPLAINED
+    bad, expected = explained < _EXPLAINED, f"at least {_EXPLAINED}"
+    name = "share of the motion that inputs add to (1, q, v)"
     return [*results, _judged(name, "inputs", explained, expected, bad, text, "stop")]
 
 
-def _lateness(name: str, curve: DelayCurve, step: float) -> Measurement:
-    """Return the delay of an input; a delay of a sample or more is a warning."""
-    delay = np.nan if curve.delay is None else 1e3 * curve.delay
-    text = (
-        f"input {name!r} acts {delay:.0f} ms after it is logged: add the InputDelay step below, or "
-        "learn the delay with the model (model/delay=learned)"
-    )
-    return _judged("delay [ms]", name, delay, "below a sample", delay > 750 * step, text)
-
-
 def _excitation(excitation: RigidExcitation) -> Measurement:
-    """Measure whether the motion determines the base parameters of a rigid robot."""
+    """Return the condition number of the base parameters of a rigid robot."""
     condition = excitation.condition
     text = (
         f"the rigid-body regressor has the condition number {condition:.3g}, expected less than "
@@ -293,15 +265,19 @@ def _excitation(excitation: RigidExcitation) -> Measurement:
 
 
 def _filter(
-    source: LogSource, training: list[Recording], step: float, noise: np.ndarray, highest: float
+    source: logs.LogSource,
+    training: list[logs.Recording],
+    step: float,
+    noise: np.ndarray,
+    highest: float,
 ) -> list[str]:
     """Return the low-pass between motion and noise, where noise matters and no step filters."""
-    if any(isinstance(x, (Butterworth, MovingAverage)) for x in source.steps.values()):
-        return []
     v = np.vstack([np.diff(item.q, axis=0) / step for item in training])
     share = float((2**0.5 * noise / step / v.std(axis=0).clip(min=1e-300)).max())
     cutoff = float(f"{max(4 * highest, 1.0):.2g}")
-    if share < _NOISE or not cutoff < 0.4 / step:
+    filters = (logs.Butterworth, logs.MovingAverage)
+    filtered = any(isinstance(x, filters) for x in source.steps.values())
+    if filtered or share < _NOISE or not cutoff < 0.4 / step:
         return []
     return [
         f"filter: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
@@ -309,10 +285,9 @@ def _filter(
     ]
 
 
-def _delay(delays: Sequence[DelayCurve], step: float) -> list[str]:
+def _delay(delays: Sequence[logs.DelayCurve], step: float) -> list[str]:
     """Return the step that shifts the inputs by their measured delays."""
     shifts = [round(round((curve.delay or 0.0) / step) * step, 6) for curve in delays]
-    if not any(shifts):
-        return []
     value = shifts[0] if len(set(shifts)) == 1 else shifts
-    return [f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"]
+    text = f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"
+    return [text] if any(shifts) else []

@@ -11,24 +11,14 @@ from pinn_dyn.evaluation.plots import COLORS, TRUTH, default_labels, legend_belo
 
 
 def cleaning_figure(
-    cleaned: Cleaned,
-    *,
-    title: str,
-    labels: list[str],
-    input_labels: list[str],
+    cleaned: Cleaned, *, title: str, labels: list[str], input_labels: list[str]
 ) -> Figure:
     """Draw raw samples as dots and cleaned signals as lines: a column each for q, v and u.
-
-    A velocity or an input rate that the log does not have has lines only.
 
     Args:
         cleaned: the stretch, one of ``LogSource.cleaned``.
         title: data set; the name of the run is appended.
-        labels: name and unit of each coordinate.
-        input_labels: name and unit of each input.
-
-    Raises:
-        ValueError: if the number of labels does not fit.
+        labels, input_labels: name and unit of each coordinate and input.
     """
     raw = cleaned.raw
     inputs = [raw, *cleaned.clean][-1].u.shape[1]

@@ -32,12 +32,10 @@ def independent_shares(training: Sequence[Recording], step: float) -> np.ndarray
     width = max(_SMOOTH / step, 1.5)
     inner = slice(int(4 * width), -int(4 * width), max(1, int(width / 2)))
     size = training[0].q.shape[1]
-    motion = [
-        np.hstack([x[inner] for x in _smooth_motion(item, width)])
-        for item in training
-        if len(item) > 10 * width
-    ]
-    x = np.vstack([*motion, np.zeros((1, 3 * size))]) if not motion else np.vstack(motion)
+    motion = [np.hstack([x[inner] for x in _smooth_motion(item, width)]) for item in training]
+    x = np.vstack(motion)
+    if not len(x):
+        return np.full(size, np.nan)
     x = (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
     shares = []
     for k in range(size):
@@ -52,10 +50,9 @@ def independent_shares(training: Sequence[Recording], step: float) -> np.ndarray
 def explained_share(
     training: Sequence[Recording], delays: Sequence[DelayCurve], step: float
 ) -> float:
-    """Return the largest share that delayed inputs add to the explanation of v and of a.
+    """Return the largest share of v and a that delayed inputs explain beside (1, q, v).
 
-    Without inputs, v and a are explained by (1, q, v). The shares are corrected for the number of
-    terms. The result is 1 where the rows are too few to tell.
+    The result is 1 where the rows are too few to tell.
     """
     width = max(_SMOOTH / step, 1.5)
     edge = int(4 * width) + 1
@@ -96,8 +93,7 @@ def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> 
     size = min(round(8 / step), min(len(item) for item in training))
     spectra = [welch(item.q, 1 / step, nperseg=size, axis=0) for item in training]
     f, density = spectra[0][0], np.mean([power for _, power in spectra], axis=0)
-    # White noise has 2 s² h per Hz; single bad samples have the density of the highest
-    # frequencies. Power up to four times this level counts as noise.
+    # White noise has 2 s² h per Hz. Power up to four times this level counts as noise.
     level = np.maximum(2 * noise**2 * step, np.median(density[len(f) // 2 :], axis=0))
     power = np.where(density > 4 * level, density, 0.0) * f[:, None] ** 2
     share = np.cumsum(power, axis=0) / power.sum(axis=0).clip(min=1e-300)
@@ -107,8 +103,8 @@ def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> 
 def distance_from(training: Sequence[Recording], test: Sequence[Trajectory]) -> np.ndarray:
     """Return the distance of test samples (q, v) from the nearest training sample, ``(S,)``.
 
-    The unit is the distance between a tenth of the training and the nine others, so that it does
-    not depend on N. It is at least a twentieth of the spread, for trainings that repeat one motion.
+    The unit is the distance between a tenth of the training and the nine others, at least a
+    twentieth of the spread.
     """
     known = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
     samples = np.vstack([np.hstack([item.q.numpy(), item.v.numpy()]) for item in test])

@@ -30,8 +30,7 @@ class RigidExcitation:
     Attributes:
         condition: condition number of the regressor; infinite if a column is zero.
         count: number of base parameters, with those of drives.
-        joints: one row per joint: base parameters of its body and drive, and how many of them the
-            motions do not determine.
+        joints: table of each joint: number of base parameters, and of undetermined ones.
         undetermined: directions that the motions do not determine, in words.
     """
 

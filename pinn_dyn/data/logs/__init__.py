@@ -2,7 +2,7 @@
 
 from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay import DelayCurve, agreed_delays, input_delays
+from pinn_dyn.data.logs.delay import DelayCurve, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
     Butterworth,
@@ -45,7 +45,6 @@ __all__ = [
     "SplitGaps",
     "Step",
     "Table",
-    "agreed_delays",
     "default_split",
     "input_delays",
     "window_samples",

@@ -16,7 +16,7 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.table import Table
 
-_SAMPLE_TIMES = (1e-5, 0.5)  # of logs of robots, s
+_SAMPLE_TIMES = (1e-5, 0.5)  # s
 _GAP_FACTOR = 3.0  # sample times from which a distance between rows is a gap
 BURSTS = 0.4
 """Share of rows right after the row before from which stamps come in bursts."""
@@ -35,17 +35,11 @@ def burst_share(t: np.ndarray) -> float:
 
 
 def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[str]) -> None:
-    """Check the times of one run.
-
-    Args:
-        t: the times, s.
-        table: rows of the run.
-        column: column of the time.
-        repairs: faults that a cleaning step repairs, see :attr:`Step.repairs`.
+    """Check the times of one run in s.
 
     Raises:
         LogError: on an implausible sample time, and on times that go back, repeat or jump unless a
-            step repairs this; names the row and the step.
+            step repairs this (:attr:`Step.repairs`); names the row and the step.
     """
     spacing = np.diff(t)
     if not (spacing > 0).any():

@@ -64,20 +64,13 @@ class DelayCurve:
 
 
 def input_delays(
-    recordings: Sequence[Recording],
-    *,
-    longest: float = 0.3,
-    common: bool = False,
-    rigid: Regressor | None = None,
+    recordings: Sequence[Recording], *, longest: float = 0.3, rigid: Regressor | None = None
 ) -> list[DelayCurve]:
-    """Estimate the delay of each input, or one for all, from uniformly sampled stretches.
-
-    With more inputs than coordinates it is one for all.
+    """Estimate the delay of each input, or one for all if there are more inputs than coordinates.
 
     Args:
-        recordings: stretches of one sample time.
+        recordings: stretches of one uniform sample time.
         longest: longest delay that is tried, s.
-        common: estimate one delay for all inputs.
         rigid: regressor Y of a rigid robot with one input per joint, or None.
 
     Raises:
@@ -91,8 +84,6 @@ def input_delays(
     for width in sorted({max(width, 1.5 * step) for width in _WIDTHS}):
         data = Smoothed.average(recordings, step, width, lags)
         for form, shares in _shares(data, inputs, rigid).items() if data else ():
-            if common:
-                shares = shares.mean(axis=-1, keepdims=True)
             curves = [_curve(lags * step, x, form) for x in np.moveaxis(shares, -1, 0)]
             forms.setdefault(form, []).append(curves * (inputs // len(curves)))
     if not forms:
@@ -109,36 +100,12 @@ def input_delays(
             of_bodies if curve.reason not in ("", _AFTER) and not of_bodies.reason else curve
             for curve, of_bodies in zip(curves, bodies, strict=True)
         ]
-    sines = [all(_is_sine(item.u[:, i]) for item in recordings) for i in range(inputs)]
-    if common:
-        sines = [all(sines)] * inputs
     reason = "the input is a single sine, whose delay looks like damping"
+    sines = [all(_is_sine(item.u[:, i]) for item in recordings) for i in range(inputs)]
     return [
         replace(curve, delay=None, reason=reason) if sine else curve
         for curve, sine in zip(curves, sines, strict=True)
     ]
-
-
-def agreed_delays(
-    recordings: Sequence[Recording], *, longest: float = 0.3, rigid: Regressor | None = None
-) -> list[DelayCurve]:
-    """Estimate the delay of each input, or one for all where an input has no answer of its own.
-
-    The common delay counts if it lies within a sample of the range of the single answers, and no
-    input is logged after the motion; its form then ends with "common". Arguments and errors are
-    those of :func:`input_delays`.
-    """
-    single = input_delays(recordings, longest=longest, rigid=rigid)
-    delays = [curve.delay for curve in single if curve.delay is not None]
-    after = any(curve.reason == _AFTER for curve in single)
-    if after or len(delays) in (0, len(single)):
-        return single
-    step = recordings[0].sample_time("a delay")
-    common = input_delays(recordings, longest=longest, common=True, rigid=rigid)
-    delay = common[0].delay
-    if delay is None or not min(delays) - step <= delay <= max(delays) + step:
-        return single
-    return [replace(curve, form=f"{curve.form}, common") for curve in common]
 
 
 def _rank(curve: DelayCurve) -> tuple[bool, float]:

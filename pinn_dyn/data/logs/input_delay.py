@@ -17,25 +17,19 @@ from pinn_dyn.data.logs.step import Step
 class InputDelay(Step):
     """Shift each input to the time at which it acts: u_i(t) becomes u_i(t - d_i).
 
-    ``check.py`` measures the delays, see :func:`~pinn_dyn.data.logs.input_delays`. The clock must
-    be uniform.
-
     Args:
-        delay: d, s, rounded to samples; one, or one per input.
+        delay: d, s, rounded to samples of a uniform clock; one, or one per input.
     """
 
     delay: NonNegativeFloat | Sequence[NonNegativeFloat]
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        inputs = recording.u.shape[1]
-        if np.size(self.delay) not in (1, inputs):
-            raise LogError(f"delay is {self.delay}, expected one, or {inputs}, one per input")
         step = recording.sample_time("InputDelay")
-        lags = np.broadcast_to(np.round(np.asarray(self.delay) / step).astype(int), inputs)
+        lags = np.round(np.asarray(self.delay) / step).astype(int)
+        lags = np.broadcast_to(lags, recording.u.shape[1])
         longest, samples = int(lags.max()), len(recording)
         if samples - longest < 2:
             raise LogError(f"{recording.place}: shorter than the input delay: drop the run")
         u = np.column_stack([recording.u[longest - k : samples - k, i] for i, k in enumerate(lags)])
-        shown = lags[:1] if len(set(lags)) == 1 else lags
-        text = ", ".join(f"{lag} samples ({lag * step:.4g} s)" for lag in shown)
+        text = ", ".join(f"{lag} samples ({lag * step:.4g} s)" for lag in dict.fromkeys(lags))
         return [replace(recording.rows(slice(longest, None)), u=u)], f"u delayed by {text}"

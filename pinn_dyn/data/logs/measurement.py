@@ -13,9 +13,7 @@ class Measurement:
     """A number that a check measured, and its meaning for a training.
 
     Attributes:
-        name: measured quantity.
-        place: run, column or input.
-        value: the number; NaN without a number.
+        name, place, value: measured quantity; its run, column or input; the number.
         expected: range of a good log, in words.
         verdict: ``"stop"`` if a training makes no sense.
         text: explanation of a warning or a stop, a full sentence.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.log_check import LogCheck
@@ -21,12 +20,7 @@ from pinn_dyn.evaluation.report.page import (
 
 
 def check_report(check: LogCheck, *, command: str) -> str:
-    """Return the HTML page: verdict, measurements, tables, delay curves, coverage, cleaning.
-
-    Args:
-        check: the measurements.
-        command: the command line.
-    """
+    """Return the HTML page of a check: verdict, measurements, delay curves, coverage, cleaning."""
     source = check.source
     verdict = [paragraph(text) for text in check.problems or ["A training makes sense."]]
     verdict += [paragraph(f"Warning: {text}") for text in check.warnings]
@@ -34,13 +28,12 @@ def check_report(check: LogCheck, *, command: str) -> str:
         text = "Steps that follow from the measured delay and noise, for the YAML of the data set:"
         verdict += [paragraph(text), preformatted("\n".join(["steps:", *check.steps]))]
     coordinates = (
-        "The noise is estimated from third differences. The independent share of an acceleration "
-        "is the share that 1, q and v of the same coordinate and the other accelerations do not "
-        "explain."
+        "The independent share of an acceleration is the share that 1, q and v of the same "
+        "coordinate and the other accelerations do not explain."
     )
     inputs = (
-        "The curve shows the share of the equation of motion, fitted by least squares, that stays "
-        "unexplained if an input is shifted by a delay. The delay is at its minimum."
+        "The curve shows the share of the equation of motion that stays unexplained if an input is "
+        "shifted by a delay. The delay is at its minimum."
     )
     cleaning = cleaning_figure(
         source.cleaned[0],
@@ -49,40 +42,22 @@ def check_report(check: LogCheck, *, command: str) -> str:
         input_labels=source.input_labels,
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
+    coverage = drawing(_coverage(check), "coverage of the test by the training")
+    curves = drawing(_delays(check), "unexplained share over the delay")
+    notes = details("Notes of each step", from_markdown(source.report))
     sections = [
         Section("Verdict", verdict),
         Section("Measurements", [table(measurements)]),
-        Section("Clock", [table(check.runs), drawing(_clock(check), "time between rows")]),
-        Section(
-            "Coordinates",
-            [
-                paragraph(coordinates),
-                table(check.coordinates),
-                drawing(_coverage(check), "coverage of the test by the training"),
-            ],
-        ),
-        Section("Rigid bodies", _rigid(check)),
-        Section(
-            "Inputs and their delays",
-            [
-                paragraph(inputs),
-                table(check.inputs),
-                drawing(_delays(check), "unexplained share over the delay"),
-            ],
-        ),
-        Section(
-            "Cleaning",
-            [
-                drawing(cleaning, "raw and cleaned signals"),
-                details("Notes of each step", from_markdown(source.report)),
-            ],
-        ),
+        Section("Clock", [table(check.runs)]),
+        Section("Coordinates", [paragraph(coordinates), table(check.coordinates), coverage]),
+        *_rigid(check),
+        Section("Inputs and their delays", [paragraph(inputs), table(check.inputs), curves]),
+        Section("Cleaning", [drawing(cleaning, "raw and cleaned signals"), notes]),
     ]
-    sections = [section for section in sections if section.parts]
     return page(f"{source.name}: check of the log", command, sections)
 
 
-def _rigid(check: LogCheck) -> list[Markup]:
+def _rigid(check: LogCheck) -> list[Section]:
     if check.rigid is None:
         return []
     text = (
@@ -92,16 +67,7 @@ def _rigid(check: LogCheck) -> list[Markup]:
         "less than a hundredth of the largest singular value are not determined: "
         f"{check.rigid.summary}."
     )
-    return [paragraph(text), table(check.rigid.joints)]
-
-
-def _clock(check: LogCheck) -> Figure:
-    figure = Figure(figsize=(9, 2.6), layout="constrained")
-    ax = figure.subplots()
-    for part in check.source.cleaned[:6]:
-        ax.plot(part.raw.t[1:], 1e3 * np.diff(part.raw.t), ".", markersize=2)
-    ax.set(xlabel="time (s)", ylabel="time between rows (ms)")
-    return figure
+    return [Section("Rigid bodies", [paragraph(text), table(check.rigid.joints)])]
 
 
 def _delays(check: LogCheck) -> Figure:
