@@ -63,24 +63,22 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
             "pinn_dyn.control.export_law writes a law on the model for your own loop"
         )
     learned = _learned_system(run, config)
-    origin = write_provenance(
-        {run.config["name"]: run}, source, config, {"run": run.config}, folder
-    )
+    runs, configurations = {run.config["name"]: run}, {"run": run.config}
+    origin = write_provenance(runs, source, config, configurations, folder)
     robot = build_part("robot", {**run.config["dataset"]["system"], **config["robot"]})
     reference = build_reference(config, robot)
     q0, v0 = _initial_states(config)
-    runs = len(reference(0.0).q.reshape(-1, robot.num_coordinates) if q0 is None else q0)
-    if config["trajectory"] >= runs:
-        raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {runs - 1}")
+    count = len(reference(0.0).q.reshape(-1, robot.num_coordinates) if q0 is None else q0)
+    if config["trajectory"] >= count:
+        raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    if "learned" not in laws and (
-        config["export"] or config["stability"] or config["guard"].get("threshold")
-    ):
+    threshold = config["guard"].get("threshold")
+    if "learned" not in laws and (config["export"] or config["stability"] or threshold):
         raise ConfigError("export, stability and guard need the controller 'learned'")
     if config["export"] is not None:
         path = export_law(laws["learned"], Path(config["export"]))
         log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
-    if config["guard"].get("threshold") is not None:
+    if threshold is not None:
         laws["learned"] = _guarded(laws["learned"], config, source)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     noisy = np.any(sensor.q_noise) or np.any(sensor.v_noise)
@@ -137,13 +135,10 @@ def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Con
     fallback = None
     if guard.get("fallback"):
         fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
-    region = DataRegion(
-        [_thinned(item.q) for item in train],
-        [_thinned(item.v) for item in train],
-        angles=getattr(law.model, "angles", ()),
+    steps = [max(1, len(item.q) // _REGION_SAMPLES) for item in train]
+    q, v = (
+        [getattr(item, name)[::step] for item, step in zip(train, steps, strict=True)]
+        for name in ("q", "v")
     )
+    region = DataRegion(q, v, angles=getattr(law.model, "angles", ()))
     return Guarded(law, fallback, region, threshold=guard["threshold"])
-
-
-def _thinned(samples: Tensor) -> Tensor:
-    return samples[:: max(1, samples.shape[0] // _REGION_SAMPLES)]

@@ -1,4 +1,4 @@
-"""Write tables, figures, animation, stability report and TensorBoard log of control.py."""
+"""Write tables, figures, animation and reports of control.py."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ from typing import Any
 
 import torch
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
-from pinn_dyn.app.run_folder import CONFIG
 from pinn_dyn.control import (
     ClosedLoopRecord,
     Helix,
@@ -63,23 +60,17 @@ def write_results(
     result.save(folder)
     figures, stability = _figures(records, source, robot, reference, config), None
     if config["stability"] is not None:
-        stability, figure = _stability(learned, robot, records["learned"], config, folder)
-        figures["steady_state"] = figure
+        stability, bounds = _stability(learned, robot, records["learned"], config, folder)
+        title = "Steady-state error of the learned regulator and its predicted bound"
+        if bounds[0].isfinite().any():
+            label = with_unit(ERROR, source.labels)
+            figures["steady_state"] = steady_state_figure(*bounds, title=title, label=label)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
-    with SummaryWriter(str(folder / "tensorboard")) as writer:
-        text = summary.set_index("controller").T.to_string(float_format="{:.4g}".format)
-        writer.add_text("closed_loop/summary", f"<pre>{text}</pre>")
-        configuration = (folder / CONFIG).read_text(encoding="utf-8")
-        writer.add_text("run/configuration", f"```yaml\n{configuration}\n```")
-        for name in figures:  # drawing them again would take seconds
-            picture = imread(folder / f"{name}.png")
-            writer.add_image(f"closed_loop/{name}", picture, dataformats="HWC")
-    animation = folder / f"animation_{first}.gif" if config["animate"] else None
-    if animation is not None and isinstance(robot, Drawable):
+    animation = folder / f"animation_{first}.gif"
+    drawn = config["animate"] and isinstance(robot, Drawable)
+    if drawn:
         animate(records[first], config["trajectory"], robot, animation)
-    else:
-        animation = None
 
     runs = len(records[first].stopped)
     print(f"\n{source.name}: {runs} run{'s' if runs > 1 else ''} of {config['duration']:g} s")
@@ -89,7 +80,7 @@ def write_results(
         result=result,
         figures=figures,
         labels=source.labels,
-        animation=animation,
+        animation=animation if drawn else None,
         stability=stability,
         origin=origin,
     )
@@ -104,8 +95,8 @@ def _stability(
     record: ClosedLoopRecord,
     config: dict[str, Any],
     folder: Path,
-) -> tuple[str, Figure]:
-    """Write Proposition 1 over a box, and the predicted steady states of the set points."""
+) -> tuple[str, tuple[Tensor, Tensor]]:
+    """Write Proposition 1 over a box; return the report, and bounds and errors of the set points."""
     box = config["stability"]
     low, high = (torch.tensor(box[key], dtype=torch.float64) for key in ("q_low", "q_high"))
     generator = torch.Generator().manual_seed(config["seed"])
@@ -126,12 +117,8 @@ def _stability(
     title = f"Stability of the regulator over {box['region']}, K_P = {gains[0]}, K_D = {gains[1]}"
     text = stability_report(title, conditions, predicted, measured, required)
     write_whole(folder / "stability.md", text)
-    figure = steady_state_figure(
-        torch.tensor(table["bound"].where(table["holds"], torch.inf).to_numpy()),
-        measured,
-        title="Steady-state error of the learned regulator and its predicted bound",
-    )
-    return text, figure
+    bound = torch.tensor(table["bound"].where(table["holds"], torch.inf).to_numpy())
+    return text, (bound, measured)
 
 
 def _figures(
@@ -145,10 +132,8 @@ def _figures(
     title = f"{source.name}: error of the closed loop"
     label = with_unit(ERROR, source.labels)
     figures = {"comparison": controller_comparison_figure(records, title=title, label=label)}
-    worst = {
-        int(control_errors(x).nan_to_num(torch.inf).mean(1).argmax()) for x in records.values()
-    }
-    for k in dict.fromkeys([run, *sorted(worst)]):
+    errors = [control_errors(x).nan_to_num(torch.inf).mean(1) for x in records.values()]
+    for k in dict.fromkeys([run, *sorted({int(x.argmax()) for x in errors})]):
         figures["closed_loop" if k == run else f"closed_loop_run_{k}"] = closed_loop_figure(
             records,
             k,
@@ -165,18 +150,14 @@ def _figures(
             title = f"{source.name}, {name} controller"
             figures["strip"] = pose_strip(first, run, robot, times, title=title)
     if isinstance(reference, Helix) and isinstance(robot, HasTip):
+        lost = {name: x.q[run].isnan().any(-1, keepdim=True) for name, x in records.items()}
         figures["tip_path"] = tip_path_figure(
             first.t,
-            {name: _tip_path(robot, record.q[run]) for name, record in records.items()},
+            {
+                name: robot.tip_position(x.q[run].nan_to_num()).where(~lost[name], torch.nan)
+                for name, x in records.items()
+            },
             torch.stack([torch.as_tensor(reference.path(float(t))) for t in first.t]),
             title=f"{source.name}: path of the end effector",
         )
     return figures
-
-
-def _tip_path(arm: HasTip, q: Tensor) -> Tensor:
-    """Return positions of the tip, ``(T, 3)``, NaN after a stop."""
-    alive = q.isfinite().all(-1)
-    path = q.new_full((len(q), 3), torch.nan)
-    path[alive] = arm.tip_position(q[alive])
-    return path

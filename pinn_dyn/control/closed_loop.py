@@ -49,11 +49,10 @@ def close_loop(
         sensor: noise of the measurement.
         delay: dead time of the input in control instants, with zero input before.
         q_bound: a copy with |q| beyond this bound has diverged, in the units of q.
-        progress: label of a progress bar; no bar if None.
+        progress: label of a progress bar; None shows no bar.
 
     Raises:
-        ValueError: on sizes that do not agree, initial states that are not finite, or a duration
-            that is no multiple of 1 / rate.
+        ValueError: on sizes that do not agree, or a duration that is no multiple of 1 / rate.
     """
     q0, v0 = q0.double(), v0.double()
     run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)

@@ -41,14 +41,10 @@ def close_loop_continuous(
     Args:
         system: the system that is controlled.
         controller: the law; it must have no memory.
-        reference, q0, v0, q_bound, progress: as for :func:`close_loop`.
-        duration: length of the run in s, an integer multiple of 1 / samples_rate.
+        reference, q0, v0, duration, q_bound, progress: as for :func:`close_loop`.
         samples_rate: samples of the record per second, 1/s.
         actuator: limits of the input, without a rate.
         rtol, atol: tolerances of the solver, relative and in the units of q and v.
-
-    Raises:
-        ValueError: as :func:`close_loop`, or on an actuator with a rate limit.
     """
     if actuator is not None and actuator.rate is not None:
         raise ValueError("actuator.rate needs control instants: leave it out, or give a rate")

@@ -26,9 +26,8 @@ class CompiledLaw:
     """A compiled law u = law(q, v, q_ref, v_ref, a_ref), for one state at a time.
 
     Attributes:
-        info: description of the law: ``law``, ``num_coordinates``, ``num_inputs``,
-            ``position_gain``, ``velocity_gain``, ``torch`` (version), and ``check``, states
-            ``(K, 5, N)`` with u ``(K, M)`` of the law before it was compiled.
+        info: sizes, gains and PyTorch version of the law, and ``check``, some states ``(K, 5, N)``
+            with their u ``(K, M)`` before the compilation.
     """
 
     def __init__(self, run: Callable[[list[Tensor]], list[Tensor]], info: dict[str, Any]):
@@ -56,13 +55,8 @@ def export_law(controller: Controller, path: str | Path) -> Path:
     """Compile u = law(q, v, q_ref, v_ref, a_ref) for one state and write it to a ``.pt2`` file.
 
     The file holds machine code of torch.export and AOTInductor for the processor and PyTorch
-    version of the export, and runs on one thread with PyTorch alone::
-
-        law = torch._inductor.aoti_load_package("law.pt2").loader
-        (u,) = law.run([q, v, q_ref, v_ref, a_ref])
-
-    Inputs are ``(N,)``, u is ``(M,)``, all float64. The file ``<path>.sha256`` holds the checksum
-    for :func:`load_law`. The export loads the file and compares it with the law.
+    version of the export, and runs on one thread with PyTorch alone, see docs/realtime.md. The
+    file ``<path>.sha256`` holds the checksum for :func:`load_law`.
 
     Args:
         controller: a law without memory, its model in float64 on the CPU.
@@ -70,8 +64,8 @@ def export_law(controller: Controller, path: str | Path) -> Path:
 
     Raises:
         TypeError: on a controller with a memory.
-        RuntimeError: if PyTorch cannot trace or compile the law (a C++ compiler is needed), or if
-            the file does not repeat the law to 1e-5.
+        RuntimeError: if the law cannot be compiled (a C++ compiler is needed), or the file does
+            not repeat the law to 1e-5.
     """
     if not isinstance(controller, StateFeedback):
         raise TypeError(f"{type(controller).__name__} has a memory: only laws without one compile")
@@ -95,14 +89,12 @@ def export_law(controller: Controller, path: str | Path) -> Path:
                 "u": [controller.law(*state).tolist() for state in states],
             },
         }
+        settings = {"cpp.threads": 1, "aot_inductor.metadata": {_KEY: json.dumps(info)}}
         try:
             torch._inductor.aoti_compile_and_package(
                 torch.export.export(_LawModule(controller), tuple(states[0])),
                 package_path=str(partial),
-                inductor_configs={
-                    "cpp.threads": 1,
-                    "aot_inductor.metadata": {_KEY: json.dumps(info)},
-                },
+                inductor_configs=settings,
             )
             load_law(partial)
             digest = _digest(partial)
@@ -117,7 +109,7 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
     """Load a compiled law and check it against the values that it was exported with.
 
     Loading runs the machine code of the file: load only files from people you trust, and give the
-    checksum of the export, received on another way than the file.
+    checksum of the export.
 
     Args:
         path: the ``.pt2`` file.

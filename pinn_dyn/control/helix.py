@@ -29,25 +29,22 @@ class Helix(Reference):
         p(phi) = p_0 + radius ((cos phi - 1) e_1 + sin phi e_2) + pitch phi / (2 pi) e_3
 
     p_0 is the tip's position in ``posture``, e_3 is the axis, and (e_1, e_2, e_3) are the axes of
-    the base in cyclic order: a helix about z starts in the direction of y, and its centre is at
-    -radius along x. The angle phi runs at 2 pi / period. It rises from rest and falls again within
-    ``rise_time`` by a quintic, with continuous velocity and acceleration.
+    the base in cyclic order: a helix about z starts along y. The angle phi runs at 2 pi / period,
+    and starts and stops within ``rise_time`` by a quintic.
 
-    The joints follow by inverse kinematics: of all configurations that put the tip at p(phi), the
-    solution is the one nearest to ``posture``, by damped least squares (Wampler 1986) with
-    null-space motion (Liegeois 1977). The orientation of the tip is free, so an arm needs three
-    joints or more. A quintic spline q(phi) runs through 64 such configurations per turn, and
-    v = q' dphi/dt and a = q'' (dphi/dt)^2 + q' d^2phi/dt^2 are its exact derivatives.
+    Damped least squares (Wampler 1986) with null-space motion (Liegeois 1977) give the
+    configuration nearest to ``posture`` that puts the tip at p(phi); the orientation is free. A
+    quintic spline runs through 64 such configurations per turn and has exact derivatives.
 
     Args:
         arm: the robot.
         posture: configuration at the start, ``(N,)``, rad.
         radius: m.
-        pitch: advance along the axis in one turn, m; 0 is a circle, negative advances backwards.
+        pitch: advance along the axis in one turn, m; 0 is a circle.
         period: duration of one turn at full speed, s.
-        turns: number of turns, not necessarily whole.
+        turns: number of turns.
         axis: axis of the base along which the helix advances.
-        rise_time: s, at most turns * period; None takes half a period, if that is not longer.
+        rise_time: s, at most turns * period; None takes half a period.
 
     Attributes:
         duration: turns * period + rise_time, s.

@@ -56,8 +56,7 @@ class PointToPoint(Reference):
         q_ref(t) = q_start + s(x) (q_end - q_start),  s = 10 x^3 - 15 x^4 + 6 x^5,
         x = (t - begin) / duration, cut to [0, 1]
 
-    The largest speed is 15/8 |q_end - q_start| / duration, and the largest acceleration
-    10/sqrt(3) |q_end - q_start| / duration^2.
+    The largest speed is 15/8 |q_end - q_start| / duration.
 
     Source: Siciliano et al. 2009, Robotics: Modelling, Planning and Control, sec. 4.2.
 
@@ -119,10 +118,9 @@ class Sines(Reference):
         self.rise_time = float(rise_time)
 
     def __call__(self, t: float) -> Motion:
-        w, rate, rate2 = 1.0, 0.0, 0.0
-        if self.rise_time:
-            w, rate, rate2 = smooth_step(t / self.rise_time)
-            rate, rate2 = rate / self.rise_time, rate2 / self.rise_time**2
+        w, rate, rate2 = smooth_step(t / self.rise_time) if self.rise_time else (1.0, 0.0, 0.0)
+        rise_time = self.rise_time or 1.0
+        rate, rate2 = rate / rise_time, rate2 / rise_time**2
         angle = self._omega * t + self._phase
         sine, cosine = torch.sin(angle), torch.cos(angle)
         wave = self._amplitude * sine

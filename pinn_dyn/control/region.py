@@ -26,8 +26,7 @@ class DataRegion:
         distance(q, v) = min_i |x - x_i| / r
 
     r is the 99th percentile, over the drawn states, of the distance to the nearest drawn state of
-    *another* trajectory. So 1 is the edge of the data. A single trajectory is cut into ten pieces,
-    which count as trajectories.
+    another trajectory, so 1 is the edge of the data. A single trajectory is cut into ten.
 
     Args:
         q, v: configurations and velocities of the training trajectories, ``(T_k, N)`` each.
@@ -95,8 +94,7 @@ class Guarded(Controller):
         u = fallback(t, q, v, reference)  if there is one and distance(q, v) > threshold
             law(t, q, v, reference)       otherwise
 
-    There is no hysteresis: a state near the edge may switch back and forth. One warning is logged
-    per run.
+    There is no hysteresis: a state near the edge may switch back and forth.
 
     Args:
         law: the law to guard.
@@ -132,14 +130,9 @@ class Guarded(Controller):
         if outside.any() and not self._warned:
             self._warned = True
             log.warning(
-                "t = %.4g s: %d of %d states are outside the training data, at distances up to "
-                "%.3g (1: the edge of the data; limit: %g); the %s law goes on",
-                t,
-                int(outside.sum()),
-                outside.numel(),
-                float(self._distance.nan_to_num(nan=0.0).max()),
-                self.threshold,
-                "learned" if self._fallback is None else "fallback",
+                f"t = {t:.4g} s: {int(outside.sum())} of {outside.numel()} states are outside the "
+                f"training data, at distances up to {float(self._distance.nan_to_num().max()):.3g} "
+                f"(1: edge of the data, {self.threshold:g}: threshold of the guard)"
             )
         if self._fallback is None or not outside.any():
             return u

@@ -48,7 +48,7 @@ def certify(
         - ``rest_error``: |Khat_P^-1 Delta_all|, the distance from q_ref of an arm that rests at q.
 
     Raises:
-        ValueError: on sizes that do not match, N != M, or an A or A_L without full rank.
+        ValueError: on sizes that do not match, or N != M.
     """
     model, truth, q = prepare(model, truth, q)
     K_P = diagonal_gain("position_gain", position_gain, q.shape[-1]).to(q)
@@ -114,14 +114,7 @@ def prepare(
     q = checked_samples(model, truth, q)
     if truth.num_coordinates != truth.num_inputs:
         raise ValueError(f"Proposition 1 needs N = M inputs, the robot has M = {truth.num_inputs}")
-    model, truth = double_copy(model, q.device), double_copy(truth, q.device)
-    for name, system in (("A", truth), ("A_L", model)):
-        with torch.no_grad():
-            smallest = torch.linalg.svdvals(system.input_matrix(q))[..., -1]
-        k = int(smallest.argmin())
-        if not smallest[k] > 1e-12:
-            raise ValueError(f"{name} is singular at q[{k}] = {q[k].tolist()}: leave it out")
-    return model, truth, q
+    return double_copy(model, q.device), double_copy(truth, q.device), q
 
 
 def per_configuration(q: Tensor, columns: dict[str, Tensor]) -> pd.DataFrame:

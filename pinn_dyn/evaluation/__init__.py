@@ -20,7 +20,6 @@ from pinn_dyn.evaluation.control_figures import (
 from pinn_dyn.evaluation.control_metrics import (
     ClosedLoopMetrics,
     closed_loop_metrics,
-    comparison_table,
 )
 from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
 from pinn_dyn.evaluation.figures import (
@@ -95,7 +94,6 @@ __all__ = [
     "closed_loop_metrics",
     "common_stride",
     "compare_terms",
-    "comparison_table",
     "controller_comparison_figure",
     "default_windows",
     "diverged_trajectories",

@@ -29,7 +29,7 @@ def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> 
         record: K runs.
         run: index of the run.
         robot: a system that gives its lines.
-        path: the GIF; its folder is created.
+        path: the GIF.
     """
     shape, goal = _shapes(record, run, robot)
     t = record.t[: len(shape)].double()
@@ -51,10 +51,7 @@ def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> 
 
     draw(0)
     _legend(figure, ax)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    animation = FuncAnimation(figure, draw, samples)
-    animation.save(path, PillowWriter(_FRAMES_PER_SECOND))
+    FuncAnimation(figure, draw, samples).save(path, PillowWriter(_FRAMES_PER_SECOND))
 
 
 def pose_strip(
@@ -105,7 +102,7 @@ def _set_space(ax: Axes3D, points: Tensor, z_is_down: bool) -> None:
     (x0, y0, z0), (x1, y1, z1) = (middle - size / 2).tolist(), (middle + size / 2).tolist()
     ax.set(xlim=(x0, x1), ylim=(y0, y1), zlim=(z1, z0) if z_is_down else (z0, z1))
     ax.set_box_aspect(size.tolist(), zoom=0.82)
-    for axis, name in ((ax.xaxis, "x (m)"), (ax.yaxis, "y (m)"), (ax.zaxis, "z (m)")):
+    for axis, name in ((ax.xaxis, "x [m]"), (ax.yaxis, "y [m]"), (ax.zaxis, "z [m]")):
         axis.set_label_text(name, fontsize="small")
         axis.labelpad = 5 if axis is ax.zaxis else -2
     ax.tick_params(labelsize="x-small", pad=0)

@@ -25,16 +25,10 @@ from pinn_dyn.control import (
 from pinn_dyn.control import close_loop as close_sampled_loop
 from pinn_dyn.control.references import check_limits
 from pinn_dyn.data.whole import whole
-from pinn_dyn.evaluation.control_metrics import (
-    ClosedLoopMetrics,
-    closed_loop_metrics,
-    comparison_table,
-)
+from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
 from pinn_dyn.evaluation.tables import write_table
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 from pinn_dyn.systems import HasDomain, HasLimits
-
-_DOMAIN_SAMPLES = 101  # of a reference
 
 
 @dataclass(frozen=True)
@@ -52,7 +46,7 @@ class ControlResult:
     @property
     def table(self) -> pd.DataFrame:
         """One row per law: errors in the units of q, inputs in the units of u."""
-        return comparison_table(self.metrics)
+        return pd.DataFrame([{"controller": name} | m.summary for name, m in self.metrics.items()])
 
     @property
     def coordinates(self) -> pd.DataFrame:
@@ -89,14 +83,10 @@ def close_loop(
     robot: MechanicalSystem,
     **settings: Any,
 ) -> ControlResult:
-    """Control a robot by a law on a trained model, and by the same law on the robot's true terms.
+    """Control a robot by a law on a trained model, and by the same law on the robot's true terms::
 
-    ::
-
-        run = pinn_dyn.load("runs/arm")
         law = functools.partial(Tracking, position_gain=100.0, velocity_gain=10.0)
         result = pinn_dyn.close_loop(run, law, Sines([0.2, 0.0, 0.1], 0.1, 0.5), SoftArm())
-        result.table
 
     Args:
         run: a loaded run, or a mechanical system, whose terms the law ``"learned"`` uses.
@@ -145,8 +135,8 @@ def close_loops(
         progress: show a progress bar on a terminal.
 
     Raises:
-        ValueError: if the reference leaves the limits or the domain of the robot, sizes do not
-            agree, or a law in continuous time has a delay or noise.
+        ValueError: if the reference leaves the limits or the domain of the robot, or a law in
+            continuous time has a delay or noise.
     """
     start = reference(0.0)
     if q0 is None or v0 is None:
@@ -181,15 +171,14 @@ def _check_reference(
     reference: Reference, robot: MechanicalSystem, q0: Tensor, duration: float
 ) -> None:
     """Check that a reference fits a robot and stays within its limits and its domain."""
-    for name, size in (("the reference", reference.num_coordinates), ("q0", q0.shape[-1])):
-        if size != robot.num_coordinates:
-            raise ValueError(f"{name} has {size} coordinates, the robot {robot.num_coordinates}")
+    sizes = reference.num_coordinates, robot.num_coordinates
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"the reference has {sizes[0]} coordinates, the robot {sizes[1]}")
     if isinstance(robot, HasLimits):
         check_limits(reference, robot.q_low, robot.q_high, duration, robot.v_max)
     if isinstance(robot, HasDomain):
-        times = np.linspace(0.0, duration, _DOMAIN_SAMPLES)
-        motion = [reference(float(t)).q.reshape(-1, q0.shape[-1]) for t in times]
-        visited = torch.cat([q0, *motion]).numpy()
+        times = np.linspace(0.0, duration, 101).tolist()
+        visited = torch.cat([q0, *(reference(t).q.reshape(-1, sizes[1]) for t in times)]).numpy()
         robot.check_domain(visited.min(0), visited.max(0))
 
 

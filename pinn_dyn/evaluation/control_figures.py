@@ -44,14 +44,13 @@ def closed_loop_figure(
 ) -> Figure:
     """Draw one run: configuration over the dotted reference, the error, and the inputs.
 
-    A dashed vertical line marks the time at which a run was stopped.
+    A dashed vertical line marks a stop.
 
     Args:
         laws: names of laws and K runs of each.
         run: index of the run.
         title: title of the figure.
-        labels: name and unit of each coordinate; None takes q1 ... qN.
-        input_labels: name and unit of each input; None takes u1 ... uM.
+        labels, input_labels: names and units; None takes q1 ... qN and u1 ... uM.
         held: the input is constant between two control instants.
     """
     first = next(iter(laws.values()))
@@ -89,13 +88,7 @@ def closed_loop_figure(
 def controller_comparison_figure(
     records: Mapping[str, ClosedLoopRecord], *, title: str, label: str = ERROR
 ) -> Figure:
-    """Draw the error over time of each law: mean and 10-90 % band of its complete runs.
-
-    Args:
-        records: names of laws and their runs.
-        title: title of the figure.
-        label: name and unit of the error.
-    """
+    """Draw the error over time of each law: mean and 10-90 % band of its complete runs."""
     errors = {
         name: Errors(record.t, control_errors(record), stopped_runs(record))
         for name, record in records.items()
@@ -128,12 +121,11 @@ def tip_path_figure(
         if 0 <= end < len(t) - 1:
             ax.plot(t[end], distance[end], "x", color=color, markersize=8, label=f"{name} stopped")
     space.scatter(*reference[0].numpy(), color="black", s=25, label="start")
-    space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     space.set_aspect("equal")
     space.locator_params(nbins=4)
-    ax.set(xlabel="time [s]", ylabel="distance to the reference position (mm)")
-    ax.set_xlim(float(t[0]), float(t[-1]))
-    ax.set_ylim(bottom=0)
+    ax.set(xlabel="time [s]", ylabel="distance to the reference position [mm]")
+    ax.set(xlim=(float(t[0]), float(t[-1])), ylim=(0, None))
     ax.grid(True, alpha=0.3)
     legend_below(figure)
     figure.suptitle(title)
@@ -145,12 +137,11 @@ def steady_state_figure(
 ) -> Figure:
     """Draw the steady-state error of each set point against its predicted bound, on log axes.
 
-    The bound holds below the diagonal. The title counts the bounds that hold, and the set points
-    that are not drawn, without a finite bound or error.
+    The bound holds below the diagonal. Set points without a finite bound or error are counted in
+    the title.
 
     Args:
-        bound: predicted bounds, ``(K,)``, in the units of q.
-        measured: steady-state errors, ``(K,)``, in the units of q.
+        bound, measured: predicted bounds and errors, ``(K,)``, in the units of q.
         title: title of the figure.
         label: name and unit of the error.
     """

@@ -23,30 +23,22 @@ class ClosedLoopMetrics(NamedTuple):
     """Tracking errors and input effort of K closed loops, with e(t) = q_ref(t) - q(t).
 
     Means are over the runs that were not stopped, and infinite if all were stopped. A worst or
-    largest value is infinite if any run was stopped. RMS values are over times, runs and the N
-    coordinates. The input is held between instants, so its last sample does not count.
-
-    The metrics marked with * exist only for set points: each reference is constant, and no run
-    starts at its reference. The step is s = q_ref - q(0).
+    largest value is infinite if any run was stopped. The last sample of a held input does not
+    count. Metrics with * need set points: constant references, and a step s = q_ref - q(0) != 0.
 
     Attributes:
         summary: metrics over all coordinates and inputs:
 
-            - ``runs``, ``stopped``: number of runs, and of stopped runs.
-            - ``rms_error``, ``mean_error``, ``max_error``: sqrt(mean e_i^2), mean and largest
-              |e|_2, in the units of q.
-            - ``step_error_after_<T>_s_mean_percent``, ``..._worst_percent`` *: largest |e|_2 from
-              T on, relative to |s|_2.
-            - ``settling_time_median_s``, ``settling_time_worst_s`` *: first time from which |e|_2
-              stays below ``settle_fraction`` |s|_2; ``never_settled``: number of runs without it.
-            - ``overshoot_mean_percent``, ``overshoot_worst_percent`` *: largest distance beyond the
-              set point, relative to the step of the coordinate.
-            - ``steady_state_error``: mean |e|_2 over the last tenth of the runs, and
-              ``steady_state_error_percent`` *, relative to |s|_2.
+            - ``runs``, ``stopped``: number of runs, and of stopped runs;
+            - ``rms_error``, ``mean_error``, ``max_error``: sqrt(mean e_i^2), mean and largest |e|;
+            - ``step_error_after_<T>_s_...`` *: largest |e| / |s| from T on;
+            - ``settling_time_...`` *: time after which |e| < ``settle_fraction`` |s|, and
+              ``never_settled``, the number of runs without it;
+            - ``overshoot_...`` *: largest distance beyond the set point over the coordinate's step;
+            - ``steady_state_error``, ``..._percent`` *: mean |e| and |e| / |s| of the last tenth;
             - ``input_rms``, ``input_peak``, ``input_square_integral`` (integral of |u|^2 over a
-              run), ``input_variation_per_s`` (path length of u per second).
-            - ``saturated_samples``, ``saturated_percent``: control instants of all runs at which
-              an input reaches a limit; absent without limits.
+              run), ``input_variation_per_s`` (path length of u per second);
+            - ``saturated_...``: control instants of all runs with an input at a limit.
         coordinates: one row per coordinate: RMS and largest error, and overshoot *.
         inputs: one row per input: RMS, peak and integral of the square.
     """
@@ -69,8 +61,7 @@ def closed_loop_metrics(
     Args:
         record: K runs of a control law, with at least two samples.
         settle_fraction: part of the step within which the error has settled.
-        settled_after: time from which the step error is taken, s; None or a time after the end
-            leaves the step error out.
+        settled_after: time from which the step error is taken, s; None leaves it out.
         u_low, u_high: limits of the inputs, one number or M; None for no limit.
     """
     t = record.t.double() - record.t[0].double()
@@ -84,9 +75,6 @@ def closed_loop_metrics(
 
     def mean(values: Tensor) -> Tensor:
         return marked(values)[counted].mean(dim=0)
-
-    def largest(values: Tensor) -> Tensor:
-        return marked(values)[counted].amax(dim=0)
 
     error = (record.reference.q - record.q).double()
     norm = error.norm(dim=-1)
@@ -135,7 +123,7 @@ def closed_loop_metrics(
     effort = (held.square() * t.diff()[:, None]).sum(dim=1)  # (K, M)
     summary |= {
         "input_rms": (mean(effort).mean() / duration).sqrt(),
-        "input_peak": largest(held.abs().amax(dim=(1, 2))),
+        "input_peak": marked(held.abs().amax(dim=(1, 2)))[counted].max(),
         "input_square_integral": mean(effort.sum(dim=-1)),
         "input_variation_per_s": mean(held.diff(dim=1).norm(dim=-1).sum(dim=1) / duration),
     }
@@ -148,7 +136,7 @@ def closed_loop_metrics(
         summary["saturated_percent"] = 100 * saturated / max(applied, 1)
     inputs = {
         "rms": (mean(effort) / duration).sqrt(),
-        "peak": largest(held.abs().amax(dim=1)),
+        "peak": marked(held.abs().amax(dim=1))[counted].amax(dim=0),
         "square_integral": mean(effort),
     }
     return ClosedLoopMetrics(
@@ -167,11 +155,6 @@ def stopped_runs(record: ClosedLoopRecord) -> Tensor:
 def samples_before_stop(record: ClosedLoopRecord, run: int) -> int:
     """Return the number of samples of a run before its first q that is not finite."""
     return int(torch.isfinite(record.q[run]).all(dim=-1).int().cumprod(0).sum())
-
-
-def comparison_table(results: Mapping[str, ClosedLoopMetrics]) -> pd.DataFrame:
-    """Return one row per control law; errors are in the units of q, inputs in the units of u."""
-    return pd.DataFrame([{"controller": name} | m.summary for name, m in results.items()])
 
 
 def _step(record: ClosedLoopRecord) -> Tensor | None:

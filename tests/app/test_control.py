@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from pinn_dyn.app.config import CONF
 from pinn_dyn.models import LagrangianNetwork
@@ -58,30 +57,16 @@ def test_the_table_has_a_row_for_each_controller(results):
     assert coordinates.groupby("controller").size().to_dict() == {"learned": 3, "truth": 3, "pd": 3}
 
 
-def test_the_motions_are_recorded(results):
-    with np.load(results / "record_learned.npz") as record:
-        assert record["q"].shape == record["q_ref"].shape == (3, 11, 3)
-        np.testing.assert_allclose(record["t"], np.arange(11) / 200)
-        assert (record["q"][:, 0] != record["q_ref"][:, 0]).all()
-        assert {"input_condition", "distance", "outside"} <= set(record)
-        assert (record["stopped"] == "").all()
-        rms = np.sqrt(np.mean((record["q"] - record["q_ref"]) ** 2))
-    summary = pd.read_csv(results / "summary.csv").set_index("controller")
-    assert summary.loc["learned", "rms_error"] == pytest.approx(rms)
-
-
-def test_figures_animation_log_page_and_provenance_are_written(results, lnn_run):
+def test_figures_animation_record_page_and_provenance_are_written(results, lnn_run):
     for name in ("closed_loop", "comparison", "strip"):
         assert (results / f"{name}.png").stat().st_size > 10_000
     with Image.open(results / "animation_learned.gif") as animation:
         assert animation.is_animated
-    log = EventAccumulator(str(results / "tensorboard")).Reload()
-    images = {f"closed_loop/{name}" for name in ("closed_loop", "comparison", "strip")}
-    assert images <= set(log.Tags()["images"])
-    (table,) = log.Tensors("closed_loop/summary/text_summary")[0].tensor_proto.string_val
     summary = pd.read_csv(results / "summary.csv")
-    (row,) = [line for line in table.decode().splitlines() if line.startswith("rms_error")]
-    assert [float(x) for x in row.split()[1:]] == pytest.approx(summary["rms_error"], rel=1e-3)
+    with np.load(results / "record_learned.npz") as record:
+        assert {"input_condition", "distance", "outside"} <= set(record)
+        rms = np.sqrt(np.mean((record["q"] - record["q_ref"]) ** 2))
+    assert summary["rms_error"][0] == pytest.approx(rms)
     record = json.loads((results / "provenance.json").read_text())
     assert {"config", "run", "commit", "hardware"} <= set(record)
     assert record["config"]["gains"]["position"] == 5
@@ -180,7 +165,8 @@ def test_measured_data_have_no_robot_to_control(tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
     words = [*TINY_TRAINING, NO_FIGURES, "compile=false", f"hydra.run.dir={run}"]
     run_script("train.py", "experiment=example_log", *words)
-    assert "measured data, without a simulated robot" in refused(capsys, run)
+    text = refused(capsys, run, f"hydra.run.dir={tmp_path}/out")
+    assert "measured data, without a simulated robot" in text
 
 
 @pytest.mark.panda
@@ -222,7 +208,3 @@ def panda_run(tmp_path_factory):
         f"hydra.run.dir={folder}",
     )
     return folder
-
-
-def test_an_experiment_of_training_is_none_of_control(capsys, lnn_run):
-    assert "experiment/soft_arm_1" in refused(capsys, lnn_run, "experiment=soft_arm_1")

@@ -36,12 +36,6 @@ def test_a_rate_is_counted_from_what_was_applied_not_from_what_was_asked():
     torch.testing.assert_close(actuator(double([-5.0]), 0.01)[0], double([0.0]))
 
 
-def test_without_limits_everything_passes_and_nan_stays_nan():
-    u = double([[1e9, torch.nan]])
-    torch.testing.assert_close(Actuator()(u, 0.1)[0], u, equal_nan=True)
-    assert Actuator(low=-1.0, high=1.0, rate=5.0)(u, 0.1)[0][0, 1].isnan()
-
-
 def test_noise_has_the_standard_deviations_asked_for_and_is_independent():
     sensor = Sensor(q_noise=[0.1, 0.0], v_noise=2.0, seed=3)
     q, v = torch.ones(20_000, 2, dtype=torch.float64), torch.zeros(20_000, 2, dtype=torch.float64)

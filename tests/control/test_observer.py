@@ -168,17 +168,6 @@ def test_a_wrong_model_tracks_far_better_with_the_observer():
     assert errors[1] < errors[0] / 15
 
 
-def test_a_load_leaves_no_steady_state_error():
-    plant = ExactPlant(unit_masses(2), [0.8, -0.5])
-    law = Regulation(unit_masses(2), 20.0, 8.0)
-    reference = SetPoint([0.2, 0.1])
-    plain = run(plant, law, reference, duration=3.0, rate=50.0)
-    observed = run(plant, DisturbanceObserver(law, 20.0), reference, duration=3.0, rate=50.0)
-    goal = reference(0.0).q
-    assert_near(plain.q[0, -1] - goal, tensor([0.8, -0.5]) / 20, 1e-3)  # d / K_P
-    assert (observed.q[0, -1] - goal).norm() < 1e-5
-
-
 @pytest.mark.parametrize(("factor", "stable"), [(0.3, True), (1.8, True), (2.2, False)])
 def test_a_fast_observer_is_stable_for_models_below_twice_the_mass(factor, stable):
     """a = 1 - exp(-K_O T) is 1 here: the residual's factor per period is 1 - M_L / M."""
@@ -199,17 +188,6 @@ def test_the_limited_rate_bounds_what_would_grow():
     assert_near(found[:14, 0], 0.05 * torch.arange(14, dtype=torch.float64), 1e-12)
     # M_L dv/dt = A u_law + d_L with d_L = 2.2 d - 1.2 r is at rest at r = d.
     assert (found[50:] - tensor([0.7, -1.3])).abs().max() < 0.06
-
-
-@pytest.mark.parametrize(("gain", "stable"), [(0.5, True), (0.7, False)])
-def test_an_unknown_dead_time_of_two_periods_limits_the_bandwidth(gain, stable):
-    """The limit for n = 2 is a = 2 sin(pi / 10) = 0.618."""
-    plant = ExactPlant(unit_masses(2), [0.8, -0.5])
-    law = Regulation(unit_masses(2), 1e-3, 1e-3)
-    observer = DisturbanceObserver(law, -np.log(1 - gain) / 0.01)
-    record = run(plant, observer, SetPoint([0.0, 0.0]), duration=1.0, rate=100.0, delay=2)
-    size = record.diagnostics["compensation"][0]
-    assert bool((size[-10:] - tensor([0.8, -0.5]).norm()).abs().max() < 0.05) == stable
 
 
 # The contract, memory and errors.
@@ -237,20 +215,6 @@ def test_the_rows_of_a_batch_do_not_see_each_other():
             expected = observer(0.01 * k, (1 - 0.1 * k) * q[row], v[row], at)
             assert_near(u[row], expected, 1e-12)
     assert together.residual.abs().min() > 1e-3
-
-
-def test_a_row_that_becomes_nan_leaves_the_memory_of_the_others_alone():
-    q, v, motion = states(2)
-    sound, struck = cart_pole_observer(), cart_pole_observer()
-    for k in range(3):
-        expected = sound(0.01 * k, q, v, motion)
-        lost = q.clone()
-        if k == 1:
-            lost[2] = torch.nan
-        u = struck(0.01 * k, lost, v, motion)
-    others = [0, 1, 3, 4, 5]
-    assert torch.equal(u[others], expected[others])
-    assert u[2].isnan().all()
 
 
 def test_a_reset_or_another_batch_starts_without_a_residual():

@@ -42,17 +42,6 @@ def test_derivatives_match_finite_differences(name):
         assert_near(a, slope(lambda e, t=t: reference(t + e).v), 1e-9, scale=10)
 
 
-def test_set_point_is_held_and_not_shared_with_its_argument():
-    q = torch.tensor(PAIR, dtype=torch.float32)
-    reference = SetPoint(q)
-    q += 1
-    for t in (0.0, 7.0):
-        motion = reference(t)
-        torch.testing.assert_close(motion.q.float(), torch.tensor(PAIR))
-        assert not motion.v.any()
-        assert not motion.a.any()
-
-
 def test_random_set_points_fill_their_box_and_follow_the_seed():
     low, high = [-1.0, 2.0], [1.0, 2.5]
     q = RandomSetPoints(low, high, count=2000, seed=5)(0.0).q.numpy()

@@ -74,13 +74,6 @@ def test_new_trajectories_of_the_same_kind_are_inside_and_far_states_outside():
     assert bool((region.distance(q[:, ::50], v[:, ::50] - 20) > 10).all())
 
 
-def test_the_edge_does_not_shrink_with_the_sample_time():
-    q, v = loops(20, seed=1)
-    fine = DataRegion(q, v, samples=10_000)
-    coarse = DataRegion(q[:, ::8], v[:, ::8], samples=10_000)
-    assert fine.radius == pytest.approx(coarse.radius, rel=0.1)
-
-
 def test_one_trajectory_is_cut_into_ten():
     """q = 0, 1 ... 999: a state of a piece is up to 50 from the next, at either end up to 100.
 
@@ -98,13 +91,6 @@ def test_an_angle_may_wind_and_another_coordinate_may_not():
     inside = region.distance(q[:, ::50], v[:, ::50])
     assert region.distance(q[:, ::50] + 3 * turn, v[:, ::50]) == pytest.approx(inside, abs=1e-9)
     assert bool((region.distance(q[:, ::50] + turn.flip(0), v[:, ::50]) > 2).all())
-
-
-def test_a_state_that_is_nan_has_no_distance():
-    region = DataRegion(*comb())
-    distance = region.distance(tensor([[1.0], [np.nan]]), tensor([[0.0], [0.0]]))
-    assert distance[0] == 0
-    assert torch.isnan(distance[1])
 
 
 @pytest.mark.parametrize(

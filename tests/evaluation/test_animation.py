@@ -48,7 +48,7 @@ def count_red(pixels):
 
 
 def test_a_gif_runs_in_real_time_and_ends_with_the_last_sample(bending, tmp_path):
-    path = tmp_path / "new" / "arm.gif"
+    path = tmp_path / "arm.gif"
     animate(bending, 0, SoftArm(2), path)
     found, times = frames(path)
     # From 0 s up to 0.45 s, and the last sample at 0.5 s.

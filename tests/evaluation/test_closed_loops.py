@@ -20,7 +20,7 @@ def test_a_wrong_model_has_a_larger_error_than_the_truth(tmp_path):
     law = functools.partial(Tracking, position_gain=5.0, velocity_gain=0.4)
     reference = Sines([0.2, 0.1, 0.1], 0.05, 0.5)
     heavy = SoftArm(mass=0.5).double()
-    result = pinn_dyn.close_loop(heavy, law, reference, SoftArm(), duration=0.5, rate=500.0)
+    result = pinn_dyn.close_loop(heavy, law, reference, SoftArm(), duration=0.2, rate=200.0)
     errors = result.table.set_index("controller")["rms_error"]
     assert list(errors.index) == ["learned", "truth"]
     assert errors["learned"] > 10 * errors["truth"]

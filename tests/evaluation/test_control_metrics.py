@@ -228,9 +228,3 @@ def test_a_moving_reference_has_no_step():
     assert not {"settling_time_worst_s", "overshoot_worst_percent"} & set(found.summary)
     assert found.summary["rms_error"] == pytest.approx(0.1)
     assert "overshoot_worst_percent" not in found.coordinates
-
-
-def test_a_run_that_starts_at_its_set_point_has_no_step():
-    t = clock(1.0, 0.01)
-    still = make_record(t, torch.ones(1, len(t), 2, dtype=torch.float64), double([1.0, 1.0]))
-    assert "settling_time_worst_s" not in closed_loop_metrics(still).summary

@@ -6,6 +6,7 @@ import torch
 from pinn_dyn.control import Controller, Motion, Reference
 from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.plants import SystemPlant
+from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.testing import LinearSystem
 
 K_P, K_D = 30.0, 4.0
@@ -62,3 +63,22 @@ def sampled(plant=None, controller=None, reference=None, q0=Q0, v0=V0, **changes
     reference = reference or Wave(double([0.5, -1.0]))
     settings = {"duration": 0.4, "rate": 50.0} | changes
     return close_loop(plant, controller or PD(), reference, q0, v0, **settings)
+
+
+class Vanishing(MechanicalSystem):
+    """A free mass 1 - q that is gone at q = 1."""
+
+    def __init__(self):
+        super().__init__(num_coordinates=1, num_inputs=1)
+
+    def mass_matrix(self, q):
+        return (1 - q).unsqueeze(-1)
+
+    def potential_energy(self, q):
+        return 0 * q[..., 0]
+
+    def damping_matrix(self, q):
+        return 0 * q.unsqueeze(-1)
+
+    def input_matrix(self, q):
+        return torch.ones_like(q).unsqueeze(-1)
