@@ -96,7 +96,7 @@ def _stability(
     config: dict[str, Any],
     folder: Path,
 ) -> tuple[str, tuple[Tensor, Tensor]]:
-    """Write Proposition 1 over a box; return the report, and bounds and errors of the set points."""
+    """Write Proposition 1 over a box; return the report, bounds and measured errors."""
     box = config["stability"]
     low, high = (torch.tensor(box[key], dtype=torch.float64) for key in ("q_low", "q_high"))
     generator = torch.Generator().manual_seed(config["seed"])

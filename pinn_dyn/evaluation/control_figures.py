@@ -145,27 +145,23 @@ def steady_state_figure(
         title: title of the figure.
         label: name and unit of the error.
     """
-    bounded = torch.isfinite(bound)
-    drawn = bounded & torch.isfinite(measured)
+    drawn = torch.isfinite(bound) & torch.isfinite(measured)
     x, y = (values[drawn].double().clamp(min=1e-12) for values in (bound, measured))  # log axes
     above = y > x
     figure = Figure(figsize=(6.5, 6.0), layout="constrained")
     ax = figure.subplots()
     ax.set(xscale="log", yscale="log", aspect="equal")
     ax.scatter(x[~above], y[~above], s=28, color=COLORS[0], label="below its bound")
-    if above.any():
-        ax.scatter(x[above], y[above], s=40, color=COLORS[1], marker="x", label="above its bound")
+    ax.scatter(x[above], y[above], s=40, color=COLORS[1], marker="x", label="above its bound")
     if len(x):
-        both = torch.cat([x, y])
-        ends = (0.5 * float(both.min()), 2 * float(both.max()))
+        ends = (0.5 * float(torch.minimum(x, y).min()), 2 * float(torch.maximum(x, y).max()))
         ax.plot(ends, ends, "--", color="0.4", linewidth=1, label="error = bound")
         ax.set(xlim=ends, ylim=ends)
     ax.grid(True, alpha=0.3)
     ax.set(xlabel=f"predicted bound on {label}", ylabel=f"measured {label}")
-    ax.legend(loc="upper left", fontsize="small")
-    lines = [title, f"{int((~above).sum())} of {int(bounded.sum())} bounds hold"]
-    unbounded, endless = int((~bounded).sum()), int((bounded & ~drawn).sum())
-    if unbounded or endless:
-        lines.append(f"not drawn: {unbounded} without a bound, {endless} without a finite error")
-    figure.suptitle("\n".join(lines), fontsize="medium")
+    ax.legend(loc="lower right", fontsize="small")
+    title += f"\n{int((~above).sum())} of {int(bound.isfinite().sum())} bounds hold"
+    if not drawn.all():
+        title += f"\nnot drawn: {int((~drawn).sum())} without a finite bound or error"
+    figure.suptitle(title, fontsize="medium")
     return figure

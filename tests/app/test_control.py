@@ -108,7 +108,6 @@ def test_the_stability_report_has_the_conditions_and_every_set_point(tmp_path, l
     points = pd.read_csv(folder / "stability_set_points.csv")
     assert len(points) == 3
     assert {"bound", "error", "measured_error", "holds"} <= set(points)
-    assert (folder / "steady_state.png").is_file()
 
 
 def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):

@@ -198,7 +198,7 @@ def test_bounds_that_fail_are_counted_and_drawn_as_crosses():
     np.testing.assert_allclose(above, [[1e-3, 2e-3], [1e-12, 1e-6]])
     _, counts, left_out = figure.get_suptitle().splitlines()
     assert counts == "2 of 5 bounds hold"
-    assert left_out == "not drawn: 1 without a bound, 1 without a finite error"
+    assert left_out == "not drawn: 2 without a finite bound or error"
 
 
 def test_a_sweep_has_a_line_through_the_means_over_seeds():
