@@ -9,24 +9,16 @@ from torch import Tensor
 
 
 def require_last_dim(name: str, value: Tensor, size: int, symbol: str) -> None:
-    """Check that ``value`` has shape ``(*batch, size)``.
-
-    Raises:
-        ValueError: if the last dimension differs. The message names the argument.
-    """
+    """Check that a value has shape ``(*batch, size)``."""
     if value.ndim == 0 or value.shape[-1] != size:
+        shape = tuple(value.shape)
         raise ValueError(
-            f"{name} has shape {tuple(value.shape)}, expected (*batch, {size}): "
-            f"the last dimension must be {symbol} = {size}"
+            f"{name} has shape {shape}, expected (*batch, {size}) with {symbol} = {size}"
         )
 
 
 def require_finite(name: str, value: Tensor) -> None:
-    """Check that ``value`` holds neither NaN nor infinity.
-
-    Raises:
-        ValueError: if an entry is not finite. The message names the argument and the first index.
-    """
+    """Check that a value is finite."""
     bad = ~torch.isfinite(value)
     if bad.any():
         first = tuple(int(i) for i in bad.nonzero()[0])
@@ -42,11 +34,7 @@ def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve ``matrix x = vector`` for a symmetric positive definite matrix, by Cholesky.
-
-    The solution is NaN for a matrix that is not positive definite, so that a diverging roll-out
-    does not stop the rest of its batch.
-    """
+    """Solve ``matrix x = vector`` for a symmetric positive definite matrix, or else return NaN."""
     return spd_solver(matrix)(vector)
 
 

@@ -163,10 +163,9 @@ def _refusing_to_wait() -> Iterator[None]:
 def compile_graph(
     function: Callable[..., Any], arguments: tuple[Tensor, ...]
 ) -> Callable[..., Any]:
-    """Compile a function for arguments of fixed shapes and types.
+    """Compile a function for arguments of fixed shapes and types, by a single trace.
 
-    The function is traced once. Numbers and tensors that are not arguments become constants. The
-    program has no checks. On a CPU it runs in one thread; on a GPU it is recorded as a CUDA graph.
+    The program has no checks. On a CPU it runs in one thread; on a GPU it is a CUDA graph.
     """
     _keep_rows()
     graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
@@ -216,7 +215,7 @@ def compile_loop(
 
         return scan(body, state, inputs)[1]
 
-    # The compiler stores programs by the code of a function, which all loops share: copy the code.
+    # The compiler stores programs by the code of a function, which all loops share.
     copied = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
     program = _compile(copied, {"cpp.threads": 1} if state.numel() < _WORTH_THREADS else {})
     # The compiler must treat the counter of the loop as symbolic.

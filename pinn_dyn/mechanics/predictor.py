@@ -43,15 +43,11 @@ class Predictor(nn.Module, abc.ABC):
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """Return increments x(t_k) - x(t_0), ``(*batch, T, 2N)``, without checks.
 
-        ``x0`` is ``(*batch, 2N)``, ``t`` ``(T,)`` are the times of the solution, s, and ``input``
-        is u of the same batch.
+        x0 is ``(*batch, 2N)``, t ``(T,)`` are times in s, and ``input`` is u of the same batch.
         """
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return a scalar that training adds to the prediction error if ``penalized`` is true.
-
-        States q, v, accelerations a ``(B, N)`` and inputs u ``(B, M)`` are those of the data.
-        """
+        """Return a scalar that training adds to the loss, at data q, v, a and u ``(B, N or M)``."""
         return q.new_zeros(())
 
     def acting_input(self, input: Signal) -> Signal:
@@ -67,7 +63,7 @@ class Predictor(nn.Module, abc.ABC):
         return input.at(truth.t).movedim(0, -2)
 
     def learned_figures(self) -> dict[str, float]:
-        """Return learned numbers to report by name, such as an input delay in s."""
+        """Return learned numbers by name, such as an input delay in s."""
         return {}
 
     @final
@@ -83,7 +79,6 @@ class Predictor(nn.Module, abc.ABC):
         return x0.unsqueeze(-2) + self.increments(x0, t, input)
 
     def _require_step(self, t: Tensor) -> None:
-        """Raise an error if times advance by other steps than the fixed step of the model."""
         step, spacing = self.fixed_step or 0.0, t.double().diff()
         if float((spacing - step).abs().max()) > 1e-3 * step:
             raise ValueError(
@@ -97,10 +92,7 @@ class ContinuousPredictor(Predictor):
 
     The integrated state ``(*batch, S)`` begins with the 2N numbers of (q, v) or (q, p). A model
     with more states, such as those of actuators, initializes them in :meth:`initial_state`.
-
-    Attributes:
-        integrator: the integration method.
-        learns_initial_state: true if roll-outs start at a learned state.
+    ``learns_initial_state`` is true if roll-outs start at a learned state.
     """
 
     integrator: Integrator = RK4()
@@ -111,31 +103,25 @@ class ContinuousPredictor(Predictor):
         """Return dx/dt, ``(*batch, S)``, of the state x ``(*batch, S)`` under u ``(*batch, M)``."""
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return a function from r to k with (1 - s J) k = r, both ``(*batch, S)``.
+        """Return a function from r to k with (1 - s J) k = r, with J the stiff part of df/dx.
 
-        s is the ``step``, and J the stiff part of df/dx at x. The default has J = 0.
+        The default has J = 0.
         """
         return lambda rate: rate
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """Return the initial state of a roll-out from the measured x0, ``(*batch, S)``.
-
-        u0 ``(*batch, M)`` is the input at the start. The default is x0 itself.
-        """
+        """Return the initial state ``(*batch, S)`` of a roll-out from measured x0 and input u0."""
         return x0
 
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """Take a step of the integrator. The arguments are those of :meth:`Integrator.step`."""
+        """Take a step of the integrator, see :meth:`Integrator.step`."""
         return self.integrator.step(self, increment, start, inputs, h)
 
     @final
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Integrate the state derivative.
-
-        Increments are relative to the measured ``x0``, even if the roll-out starts elsewhere.
-        """
+        """Integrate the state derivative. Increments are relative to the measured ``x0``."""
         input = self.acting_input(input)
         first = input.u[..., 0, :]
         if self.input_history:  # the signal begins before the start

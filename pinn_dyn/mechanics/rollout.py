@@ -52,8 +52,7 @@ def path_between(
     dynamics: Dynamics, integrator: Integrator, x0: Tensor, t: Tensor, input: Signal
 ) -> Tensor:
     """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks of a roll-out."""
-    # Times are made relative to the start before they are cast, so that the times of the solver and
-    # of the input have the same dtype and compare exactly.
+    # Times are relative before they are cast, so that those of solver and input compare exactly.
     input = input.since(t[0])
     grid = step_grid(t - t[0], input.t.detach(), integrator.substeps).to(x0.dtype)
     path = integrator.path(dynamics, x0, grid, input.to(x0.device, x0.dtype))
@@ -63,8 +62,8 @@ def path_between(
 def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
     """Return the times of the integrator's steps, ``(substeps (T - 1) + 1,)``.
 
-    There are ``substeps`` steps in each interval of t. A step that ends at a sample of the input up
-    to rounding ends at exactly that time, since a held input jumps there.
+    A step that ends at a sample of the input up to rounding ends at exactly that time, since a held
+    input jumps there.
     """
     fractions = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
     inner = t[:-1, None] + (t[1:] - t[:-1])[:, None] * fractions

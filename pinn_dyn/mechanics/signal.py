@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -140,12 +140,8 @@ class Signal:
     def stages(self, grid: Tensor, nodes: tuple[float, ...]) -> Tensor:
         """Return u at the stages of each step, ``(T - 1, stages, *batch, M)``.
 
-        A stage at the end of a step has the left value of a held input: the value of that step, not
-        of the next one.
-
-        Args:
-            grid: times of the steps, ``(T,)``, s.
-            nodes: times of the stages in a step, from 0 to 1; the last is 1.
+        ``grid`` ``(T,)`` are the times of the steps, and ``nodes`` those of the stages in a step,
+        from 0 to 1. A stage at the end of a step has the left value of a held input.
         """
         start, end = grid[:-1], grid[1:]
         inner = [torch.lerp(start, end, node) for node in nodes[:-1]]
@@ -157,10 +153,9 @@ class Signal:
 
     def means(self, grid: Tensor) -> Tensor:
         """Return the mean of u over each step of the grid ``(T,)``, ``(T - 1, *batch, M)``."""
-        integral = self._integral(grid)
-        return integral.diff(dim=0) / self._beside(grid.diff())
+        return self._integral(grid).diff(dim=0) / self._beside(grid.diff())
 
-    # Implementation. Samples are the first dimension, (K, *batch, M), so a row is contiguous.
+    # Samples are the first dimension, (K, *batch, M), so a row is contiguous.
 
     @cached_property
     def _times(self) -> list[float]:
@@ -175,11 +170,11 @@ class Signal:
         return None if self.rate is None else self.rate.movedim(-2, 0).contiguous()
 
     def _beside(self, values: Tensor) -> Tensor:
-        """Reshape a number for each sample so that it can be multiplied with the samples."""
+        """Reshape a number for each sample for products with the samples."""
         return values.reshape(*values.shape, *[1] * (self.u.ndim - 1)).to(self.u)
 
     def _at(self, times: Tensor, index: Tensor) -> Tensor:
-        """Return u at times after the samples ``index``, where -1 is before the first sample."""
+        """Return u at times after the samples ``index``, from -1 on."""
         last = self.t.shape[0] - 1
         if self.interpolation == "hold" or last == 0:
             return self._samples[index.clamp(0, last)]
@@ -189,7 +184,7 @@ class Signal:
         low, high = self._samples[index], self._samples[index + 1]
         if self._rates is None:
             return torch.lerp(low, high, share)
-        rates = self._beside(span) * self._rates[index], self._beside(span) * self._rates[index + 1]
+        rates = (self._beside(span) * self._rates[k] for k in (index, index + 1))
         return _combined(_cubic(share), low, high, *rates)
 
     def _integral(self, grid: Tensor) -> Tensor:
@@ -218,18 +213,10 @@ class Signal:
 
 
 def stacked(signals: Sequence[Signal], t: Tensor) -> Signal:
-    """Stack signals of the same interpolation and length, ``(len(signals), *batch, K, M)``.
-
-    The times of all signals are replaced by ``t`` ``(K,)``.
-    """
-    first = signals[0]
-    together = Signal(t, torch.stack([item.u for item in signals]), "hold")
+    """Stack signals of the same interpolation and length, and replace their times by ``t``."""
     rates = [item.rate for item in signals if item.rate is not None]
-    return replace(
-        together,
-        interpolation=first.interpolation,
-        rate=torch.stack(rates) if rates else None,
-    )
+    u = torch.stack([item.u for item in signals])
+    return signals[0]._made(t, u, torch.stack(rates) if rates else None)
 
 
 def _rates(t: Tensor, u: Tensor) -> Tensor:

@@ -28,8 +28,7 @@ class Sum(MechanicalSystem):
 
         X = sum over parts k of X_k,     for X = M, V, D, F, A and r
 
-    All parts have the same q and v, so the Coriolis forces add up, too. M is positive definite if
-    one M_k is positive definite and all others are semi-definite. The sum of passive parts is
+    All parts have the same q and v, so the Coriolis forces add up, too. The sum of passive parts is
     passive.
 
     Args:
@@ -37,19 +36,18 @@ class Sum(MechanicalSystem):
         integrator: the integration method.
 
     Raises:
-        ValueError: if there are no parts, the sizes of the parts differ, or a part learns a delay.
+        ValueError: if the sizes of the parts differ, or a part learns a delay.
     """
 
     def __init__(self, parts: Mapping[str, MechanicalSystem], integrator: Integrator | None = None):
         sizes = {name: (part.num_coordinates, part.num_inputs) for name, part in parts.items()}
         if len(set(sizes.values())) != 1:
-            text = ", ".join(f"{name}: {size}" for name, size in sizes.items()) or "none"
-            raise ValueError(f"the parts of a sum have (N, M) {text}; expected the same for all")
+            raise ValueError(f"the parts of a sum have (N, M) {sizes}, expected the same for all")
         for name, part in parts.items():
             if part.input_history:
                 raise ValueError(
                     f"the part {name} of a sum learns a delay of the input, which all parts share: "
-                    f"take ~{name}.delay, and shift the input by the step InputDelay"
+                    f"use ~{name}.delay, and shift the input by the step InputDelay"
                 )
         super().__init__(*next(iter(sizes.values())))
         self.integrator = integrator or RK4()

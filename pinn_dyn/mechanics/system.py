@@ -66,8 +66,6 @@ class MechanicalSystem(ContinuousPredictor):
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return A(q), ``(*batch, N, M)``."""
 
-    # Methods that a subclass may override by closed formulas.
-
     def _potential_force(self, q: Tensor) -> Tensor:
         return torch.func.grad(lambda x: self.potential_energy(x).sum())(q)
 
@@ -77,7 +75,7 @@ class MechanicalSystem(ContinuousPredictor):
         return matvec(mass, a) + matvec(mass_rate, v) - self._kinetic_gradient(q, v)
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        """Return the a that solves M(q) a + C(q, v) v + G(q) = force."""
+        """Solve M(q) a + C(q, v) v + G(q) = force for a."""
         mass, bias = self._mass_and_bias(q, v)
         return spd_solve(mass, force - bias)
 
@@ -93,7 +91,6 @@ class MechanicalSystem(ContinuousPredictor):
         return torch.zeros_like(v)
 
     def _friction_slope(self, v: Tensor) -> Tensor:
-        """Return dF_i/dv_i, ``(*batch, N)``."""
         return torch.zeros_like(v)
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
@@ -103,7 +100,6 @@ class MechanicalSystem(ContinuousPredictor):
         return torch.zeros_like(v)
 
     def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return A(q) u + r(q, v, u)."""
         force = self._input_force(q, u)
         return force + self._residual_force(q, v, u) if self.has_residual else force
 

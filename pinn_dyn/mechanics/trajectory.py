@@ -41,16 +41,11 @@ class Trajectory:
         samples = self.t.shape[0]
         if samples < 2:
             raise ValueError(f"t has shape ({samples},), expected (T,) with at least 2 samples")
-        batch = self.q.shape[:-2]
-        for name, value, width in (
-            ("q", self.q, self.q.shape[-1]),
-            ("v", self.v, self.q.shape[-1]),
-            ("u", self.u, self.input.num_inputs),
-        ):
-            if value.shape != (*batch, samples, width):
+        shape = (*self.u.shape[:-1], self.q.shape[-1])
+        for name, value in (("q", self.q), ("v", self.v)):
+            if value.shape != shape:
                 raise ValueError(
-                    f"{name} has shape {tuple(value.shape)}, expected (*batch, {samples}, {width}) "
-                    f"with the batch {tuple(batch)} of q"
+                    f"{name} has shape {tuple(value.shape)}, expected {shape}, as u has"
                 )
 
     @property
@@ -100,8 +95,8 @@ class Trajectory:
 
     def to(self, device: torch.device | str) -> Trajectory:
         """Move the trajectory to a device."""
-        moved = {name: getattr(self, name).to(device) for name in ("q", "v", "input")}
         past = None if self.past is None else self.past.to(device)
+        moved = {name: getattr(self, name).to(device) for name in ("q", "v", "input")}
         return replace(self, **moved, past=past)
 
     def until(self, horizon: float) -> Trajectory:
@@ -125,10 +120,8 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
     """Stack trajectories that share their sample times into one batched trajectory.
 
     Raises:
-        ValueError: if the list is empty, or sample times or interpolations differ.
+        ValueError: if sample times or interpolations differ.
     """
-    if not trajectories:
-        raise ValueError("trajectories is empty: expected at least one")
     first = trajectories[0]
     for index, item in enumerate(trajectories):
         kind, expected = item.input.interpolation, first.input.interpolation
@@ -163,8 +156,6 @@ def stack_until(trajectories: Sequence[Trajectory], duration: float | None = Non
     Raises:
         ValueError: if no trajectory is long enough, or they cannot be stacked, see :func:`stack`.
     """
-    if not trajectories:
-        return stack([])
     if duration is None:
         duration = min(item.duration for item in trajectories)
     longest = max(trajectories, key=lambda item: item.duration)
@@ -174,7 +165,6 @@ def stack_until(trajectories: Sequence[Trajectory], duration: float | None = Non
 
 
 def _stacked_past(trajectories: list[Trajectory]) -> Tensor | None:
-    """Stack the inputs before each start, to the longest known history."""
     pasts = [item.u[..., :0, :] if item.past is None else item.past for item in trajectories]
     count = max(past.shape[-2] for past in pasts)
     extended = [_extended(p, item.u, count) for p, item in zip(pasts, trajectories, strict=True)]
@@ -190,11 +180,7 @@ def _extended(past: Tensor, u: Tensor, count: int) -> Tensor:
 
 
 def samples_of(name: str, duration: float, t: Tensor) -> int:
-    """Return the number of sample times of t ``(T,)`` in a duration in s.
-
-    Raises:
-        ValueError: if the number is not a positive integer, or the sample time is not constant.
-    """
+    """Return the number of sample times of t ``(T,)`` in a duration in s, a positive integer."""
     steps = t.double().diff()
     sample_time = float(steps.mean())
     if float((steps - sample_time).abs().max()) > 1e-3 * sample_time:

@@ -19,9 +19,8 @@ from pinn_dyn.models.statistics import Statistics
 class NextStateMLP(Predictor):
     """x_{k+1} = x_k + s * network(x_k, u_k, u_{k+1}), the black box of the paper.
 
-    The state is x = (q, v). Inputs are normalized by mean and standard deviation, the output by
-    the standard deviation s of the state increment over one step. The step is that of the training
-    windows.
+    The state is x = (q, v), and s the standard deviation of its increment over a step, which is
+    that of the training windows.
 
     Args:
         statistics: scales of the data.
@@ -52,11 +51,7 @@ class NextStateMLP(Predictor):
         return float(self.step)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Apply the network step by step.
-
-        Raises:
-            ValueError: if the step of ``t`` is not that of the training windows.
-        """
+        """Apply the network step by step, of which ``t`` must have the length."""
         self._require_step(t)
         x = torch.zeros_like(x0)
         path = [x]
@@ -100,8 +95,9 @@ class AccelerationMLP(DelayedPredictor):
         mean, std = statistics.network_input(repeat_input=1)
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         self.register_buffer("scale", statistics.acceleration.float())
-        scales = Scales(statistics, statistics.v_std, tuple(angles))
-        self.initial_velocity = initial_velocity(scales)
+        self.initial_velocity = initial_velocity(
+            Scales(statistics, statistics.v_std, tuple(angles))
+        )
         self.learns_initial_state = self.initial_velocity.learned
         self.delay = delay or NoDelay()
 

@@ -77,12 +77,11 @@ class DelayedPredictor(ContinuousPredictor):
 
     @property
     def input_history(self) -> float:  # type: ignore[override]
-        """Longest delay of the head, s."""
+        """Longest delay, s."""
         return self.delay.longest
 
     def acting_input(self, input: Signal) -> Signal:
         return self.delay(input)
 
     def learned_figures(self) -> dict[str, float]:
-        """Return the delay of the input if it is learned."""
         return self.delay.figures()

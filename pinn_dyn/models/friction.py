@@ -89,7 +89,7 @@ class CoulombFriction(Friction):
         self._add_constants(scales)
 
     def _add_constants(self, scales: Scales) -> None:
-        """Add the constants that a subclass has in addition to level and width."""
+        """Add more constants in a subclass."""
 
     def physical_constants(self) -> list[Named]:
         """Return the constants of the law."""
@@ -115,10 +115,7 @@ class CoulombFriction(Friction):
 
 
 class AsymmetricCoulomb(CoulombFriction):
-    """Coulomb law with a level for each direction, as worn and preloaded gears have::
-
-    F_i(v) = c+_i tanh(v_i / w_i) for v_i > 0,    c-_i tanh(v_i / w_i) for v_i < 0
-    """
+    """Coulomb law with the level c+ for v > 0 and c- for v < 0, as worn gears have."""
 
     def _add_constants(self, scales: Scales) -> None:
         # c+ is the level times the asymmetry, c- is the level divided by the asymmetry.
@@ -140,8 +137,7 @@ class AsymmetricCoulomb(CoulombFriction):
 class Stribeck(AsymmetricCoulomb):
     """Stribeck law F_i(v) = (c_i + s_i exp(-(v_i / b_i)^2)) tanh(v_i / w_i), with c_i by direction.
 
-    Friction is larger by s_i > 0 near rest, where lubrication is not yet established, and decreases
-    at the Stribeck speed b_i. Source: Armstrong-Helouvry, Dupont and Canudas de Wit (1994), sec. 2.
+    b_i is the Stribeck speed. Source: Armstrong-Helouvry, Dupont and Canudas de Wit (1994), sec. 2.
     """
 
     def _add_constants(self, scales: Scales) -> None:
@@ -165,11 +161,8 @@ class LoadDependent(Stribeck):
 
         transmitted_i = f_i - l_i |f_i| tanh(v_i / w_i),      0 < l_i < 1
 
-    Gear teeth that transmit a larger force have more friction. l_i is the share of the drive force
-    that is lost while the drive moves the joint; if the joint moves the drive, the same share is
-    added. Source: model M3 of Duclusaud et al. (2025), "Extended friction models for the physics
-    simulation of servo actuators" (BAM), with the rise of M2. Their load is the difference of the
-    drive force and the force of the arm; here it is the drive force.
+    Source: model M3 of Duclusaud et al. (2025), "Extended friction models for the physics
+    simulation of servo actuators" (BAM), with the rise of M2, and the drive force as the load.
     """
 
     by_load = True
@@ -195,7 +188,7 @@ class LoadDependentStribeck(LoadDependent):
 
         l_i(v) = o_i / (1 + o_i),     o_i = odds_i + rise_i exp(-(v_i / b_i)^2)
 
-    b_i is the Stribeck speed. Source: model M4 of the source of :class:`LoadDependent`.
+    Source: model M4 of the source of :class:`LoadDependent`.
     """
 
     def _add_constants(self, scales: Scales) -> None:

@@ -14,11 +14,7 @@ from pinn_dyn.models.scales import Scales
 
 
 class InitialVelocity(nn.Module, abc.ABC):
-    """Initial velocity v_0 ``(*batch, N)`` of a roll-out from a measured state.
-
-    Attributes:
-        learned: true if v_0 differs from the measured velocity.
-    """
+    """Initial velocity v_0 ``(*batch, N)`` of a roll-out, ``learned`` or measured."""
 
     learned: bool
 
@@ -74,9 +70,8 @@ class LearnedVelocity(InitialVelocity):
         super().__init__()
         mean, std = scales.statistics.network_input(repeat_input=1)
         self.network = MLP(len(mean), scales.size, hidden, activation, mean, std, scales.angles)
-        last = self.network.linears[-1]
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        for parameter in self.network.linears[-1].parameters():
+            nn.init.zeros_(parameter)
         self.register_buffer("scale", scales.value.float().clone())
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:

@@ -15,14 +15,7 @@ from pinn_dyn.models.scales import Scales
 
 
 class InputMatrix(nn.Module, abc.ABC):
-    """Input matrix A(q) ``(*batch, N, M)``.
-
-    Args:
-        scales: scales of the data.
-
-    Attributes:
-        affine: true if A does not depend on u.
-    """
+    """Input matrix A(q) ``(*batch, N, M)``. ``affine`` is true if A does not depend on u."""
 
     affine: bool = True
 
@@ -39,10 +32,7 @@ class InputMatrix(nn.Module, abc.ABC):
         return matvec(self(q), u)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Return the initial root mean square of each generalized force, ``(N,)``.
-
-        The default for an unknown A is the root mean square over all inputs ``(M,)``.
-        """
+        """Return the initial root mean square of each generalized force, ``(N,)``."""
         return u_rms.square().mean().sqrt().expand(self.shape[0])
 
 
@@ -76,7 +66,7 @@ class NonlinearInput(InputMatrix):
     tightened tendon becomes stiffer and pulls in a different direction. Controllers refuse it.
 
     The columns of the ``linear`` inputs are constants, and the network does not depend on these
-    inputs. This prevents overfitting to inputs with little information, such as motor rates.
+    inputs, which prevents overfitting to motor rates.
 
     Args:
         scales: scales of the data. The value is the typical size of the columns of A, ``(M,)``.
@@ -151,9 +141,6 @@ class NoInput(InputMatrix):
 
     def forward(self, q: Tensor) -> Tensor:
         return q.new_zeros(*q.shape[:-1], *self.shape)
-
-    def force(self, q: Tensor, u: Tensor) -> Tensor:
-        return torch.zeros_like(q)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
         return u_rms if self.shape[0] == self.shape[1] else super().typical_force(u_rms)

@@ -19,7 +19,7 @@ from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import FrictionHead
 
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-"""Names of the ten inertial parameters of a body, in the order of the regressor's columns."""
+"""Names of the ten inertial parameters of a body."""
 
 Start = Literal["generic", "prior"]
 """Initial bodies: plausible rods along the links, or the bodies of the description."""
@@ -157,37 +157,28 @@ class KnownMechanics(LearnedConstants):
         return self.structure.parameters_of(self.bodies())
 
     def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``, all terms except the bodies.
-
-        The equation of motion is Y pi + drive force = 0.
-        """
+        """Return r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``, all terms except Y pi."""
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
         return resistance - self.offset() - self.friction.transmitted(v, self.drive_gain() * u)
 
     def slopes(self) -> KnownSlopes:
-        """Return the derivatives by closed formulas."""
         return KnownSlopes(self)
 
     def samples(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> KnownSamples:
-        """Return the samples by their regressor."""
         return KnownSamples(self, q, v, a, u)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M(q) + diag(r), ``(*batch, N, N)``."""
         self._check(q=q)
         return self.structure.mass_matrix(q, self.bodies()) + torch.diag(self.armature())
 
     def potential_energy(self, q: Tensor) -> Tensor:
-        """Return V(q) - o^T q, ``(*batch,)``, J."""
         self._check(q=q)
         return self.structure.potential_energy(q, self.bodies()) - (self.offset() * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """Return D = diag(d), ``(*batch, N, N)``."""
         return torch.diag_embed(self.viscous().expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """Return A = diag(k), ``(*batch, N, N)``."""
         return torch.diag_embed(self.drive_gain().expand_as(q))
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-_NO_LIMIT = -float("inf")
 
 
 class Named(NamedTuple):
@@ -19,7 +18,7 @@ class Named(NamedTuple):
     names: list[str]
     units: list[str]
     values: Tensor
-    lower: float = _NO_LIMIT
+    lower: float = -math.inf
 
 
 class Constants(nn.Module, abc.ABC):
@@ -30,13 +29,12 @@ class Constants(nn.Module, abc.ABC):
         lower: lower limit of the constants.
     """
 
-    lower: float = _NO_LIMIT
+    lower: float = -math.inf
 
     def __init__(self, start: Tensor, names: Sequence[str], units: Sequence[str]):
         super().__init__()
         self.z = nn.Parameter(start)
-        self.names = list(names)
-        self.units = list(units)
+        self.names, self.units = list(names), list(units)
 
     @abc.abstractmethod
     def forward(self) -> Tensor:
@@ -55,9 +53,6 @@ class PositiveConstants(Constants):
         spread: prior standard deviation of the logarithm; 0.7 is a factor of two.
         names, units: n names and units.
         floor: lower limit of the constants.
-
-    Raises:
-        ValueError: if a start is not positive.
     """
 
     start: Tensor
@@ -113,12 +108,7 @@ class SoftplusConstants(Constants):
 
 
 class RealConstants(Constants):
-    """Normal constants spread * z around zero.
-
-    Args:
-        spread: prior standard deviation, ``(n,)``.
-        names, units: n names and units.
-    """
+    """Normal constants spread * z around zero, with n spreads, names and units."""
 
     spread: Tensor
 
@@ -140,18 +130,14 @@ class PhysicalBodies(Constants):
               | 0     0     e^d3  t3 |
               | 0     0     0     1  |
 
-    m, c and S are the mass, the centre of mass and the covariance of the mass at the start. So a is
-    half the logarithm of the relative mass, d and s stretch and shear the body, and t shifts its
-    centre in units of its extent. Source: Rucker and Wensing (2022), "Smooth parameterization of
-    rigid-body inertia", eq. (9), here relative to a start.
+    m, c and S are the mass, the centre of mass and the covariance of the mass at the start. Source:
+    Rucker and Wensing (2022), "Smooth parameterization of rigid-body inertia", eq. (9), here
+    relative to a start.
 
     Args:
-        start: pseudo-inertias, ``(n, 4, 4)``, kg, kg m, kg m^2.
+        start: pseudo-inertias of bodies of positive density, ``(n, 4, 4)``, kg, kg m, kg m^2.
         spread: prior standard deviation of (a, d, s, t).
         bodies: n names.
-
-    Raises:
-        ValueError: if a start is not a body of positive density.
     """
 
     root: Tensor

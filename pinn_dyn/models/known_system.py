@@ -71,13 +71,11 @@ class KnownSystem(LearnedConstants):
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()
-        self.input_affine = structure.input_affine
-        self.has_residual = structure.has_residual
+        self.input_affine, self.has_residual = structure.input_affine, structure.has_residual
         self.learned = nn.ModuleDict()
         self.shapes: dict[str, torch.Size] = {}
-        buffers = dict(structure.named_buffers())
         for name, units in _units_of(structure).items():
-            start = buffers[name]
+            start = structure.get_buffer(name)
             names = [name] if len(units) == 1 else [f"{name} {k + 1}" for k in range(len(units))]
             self.learned[name] = PositiveConstants(start.flatten(), spread, names, units)
             self.shapes[name] = start.shape
@@ -108,18 +106,17 @@ class KnownSystem(LearnedConstants):
 
 
 def _units_of(structure: MechanicalSystem) -> dict[str, list[str]]:
-    """Return the units of each constant, a buffer of the structure."""
     kind = type(structure).__name__
     if not isinstance(structure, HasConstants) or not structure.constants:
         raise ValueError(
             f"structure {kind} names no constants to learn: add an attribute constants with the "
-            "units of each buffer, such as {'mass': ['kg']}; for rigid chains use model=known"
+            "units of each buffer, such as {'mass': ['kg']}, or use model=known for rigid chains"
         )
     sizes = {name: buffer.numel() for name, buffer in structure.named_buffers()}
     for name, units in structure.constants.items():
         if sizes.get(name) != len(units):
             raise ValueError(
                 f"structure {kind}: constants has {len(units)} units of {name}, expected one for "
-                f"each entry of a buffer (register_buffer); the buffers have the sizes {sizes}"
+                f"each entry of a buffer; the buffers have the sizes {sizes}"
             )
     return structure.constants

@@ -37,8 +37,7 @@ class LearnedConstants(MechanicalSystem):
 
     def physical_constants(self) -> list[Named]:
         """Return all constants in physical units."""
-        parts = [part for part in self.modules() if isinstance(part, Constants)]
-        return [part.named() for part in parts]
+        return [part.named() for part in self.modules() if isinstance(part, Constants)]
 
     def drive_gain(self) -> Tensor:
         """Return the gain k ``(N,)`` of each input: 1, unless gains are learned."""
@@ -65,7 +64,7 @@ class LearnedConstants(MechanicalSystem):
 
 
 class Slopes:
-    """Derivatives of the missing force e of a model, by a reverse pass for each entry of e."""
+    """Derivatives of the missing force e of a model, by reverse passes."""
 
     def __init__(self, model: LearnedConstants):
         self.model: Any = model

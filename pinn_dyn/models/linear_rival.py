@@ -26,8 +26,7 @@ class LinearRival(Predictor):
         s_k     = (x_k, x_{k-1}, ... x_{k-L+1}, u_{k-1}, ... u_{k-L+1})
 
     L is the number of lags. phi(s) is s for degree 1, and s with all products of two entries for
-    degree 2. u_{k+1} is the left value of the input at the end of the step. W and b come from ridge
-    regression on standardized features.
+    degree 2. u_{k+1} is the left value of the input at the end of the step.
 
     The state history before the start of a roll-out is estimated from (x_0, u_0) by a linear map
     fitted on the training windows, so the baseline uses the same measurements as a network.
@@ -44,15 +43,14 @@ class LinearRival(Predictor):
         ridge: weight of the squared coefficients, relative to the variance of the features.
 
     Raises:
-        ValueError: if the training trajectories are shorter than ``lags`` steps, the step is not a
-            multiple of the sample time, or there are too many features.
+        ValueError: if the trajectories are too short, the step does not fit, or L is too large.
     """
 
     mean: Tensor
     scale: Tensor
     weight: Tensor
     bias: Tensor
-    past: Tensor
+    past_weight: Tensor
     past_bias: Tensor
 
     def __init__(
@@ -73,27 +71,24 @@ class LinearRival(Predictor):
         self.register_buffer("mean", state.mean(0))
         self.register_buffer("scale", _spread(state))
         features = torch.cat([self._lift(state), ends], dim=1)
-        weight, bias = _ridge(features, target, ridge)
-        self.register_buffer("weight", weight)
-        self.register_buffer("bias", bias)
         # Map from (x_0, u_0) to the unobserved history, which is the last part of s.
-        start = torch.cat([state[:, : 2 * self.num_coordinates], ends[:, : self.num_inputs]], 1)
-        past, past_bias = _ridge(start, state[:, 2 * self.num_coordinates :], 1e-12)
-        self.register_buffer("past", past)
-        self.register_buffer("past_bias", past_bias)
+        x0, history = state.tensor_split([2 * self.num_coordinates], dim=1)
+        start = torch.cat([x0, ends[:, : self.num_inputs]], 1)
+        for prefix, fit in (
+            ("", _ridge(features, target, ridge)),
+            ("past_", _ridge(start, history, 1e-12)),
+        ):
+            self.register_buffer(f"{prefix}weight", fit[0])
+            self.register_buffer(f"{prefix}bias", fit[1])
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Apply the linear map step by step.
-
-        Raises:
-            ValueError: if the step of ``t`` is not that of the model.
-        """
+        """Apply the linear map step by step, of which ``t`` must have the length."""
         self._require_step(t)
         # A held input has the same value at both ends of a step.
         ends = input.stages(t, (0.0, 1.0)).to(x0)
         size, inputs = x0.shape[-1], self.num_inputs
         start = torch.cat([x0, ends[0, 0]], dim=-1)
-        past_x, past_u = (start @ self.past + self.past_bias).split(
+        past_x, past_u = (start @ self.past_weight + self.past_bias).split(
             [(self.lags - 1) * size, (self.lags - 1) * inputs], dim=-1
         )
         x = x0
@@ -124,9 +119,7 @@ def fit_linear_rival(
     step: float,
     degree: Literal[1, 2],
 ) -> LinearRival:
-    """Fit the baseline whose lags and ridge have the smallest validation error.
-
-    The error is the mean of |q_hat - q| over open-loop roll-outs of up to 500 steps.
+    """Fit the baseline whose lags and ridge have the smallest mean |q_hat - q| on validation.
 
     Raises:
         ValueError: if no number of lags can be fitted, see :class:`LinearRival`.
@@ -190,5 +183,4 @@ def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tens
 def _spread(values: Tensor) -> Tensor:
     """Return the standard deviations of columns, or 1 for a constant column."""
     spread = values.std(0, correction=0)
-    size = values.abs().amax(0)
-    return torch.where(spread > 1e-12 * size, spread, 1.0)
+    return torch.where(spread > 1e-12 * values.abs().amax(0), spread, 1.0)

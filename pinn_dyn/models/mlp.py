@@ -139,10 +139,7 @@ class MLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return y, ``(*batch, outputs)``, at x ``(*batch, inputs)``."""
-        h, _ = self._normalized(x)
-        if self._has_angles:
-            cosine = torch.cos(x).masked_fill(~self.is_angle, 0.0)
-            h = torch.cat([torch.where(self.is_angle, torch.sin(x), h), cosine], dim=-1)
+        h = rows(self._features(columns(x))[0], x)
         *hidden, last = self._layers()
         for weight, bias in hidden:
             h, _ = self._activation(F.linear(h, weight, bias))
@@ -161,7 +158,7 @@ class MLP(nn.Module):
     def linearize_along(self, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor, Tape]:
         """Return y, J dx and the tape in one pass."""
         features, slopes = self._features(columns(x))
-        tangent = self._tangent(columns(dx), slopes)
+        tangent = columns(dx).repeat(2 if self._has_angles else 1, 1) * slopes
         tape = [slopes]
         *hidden, (last, last_bias) = self._layers()
         for weight, bias in hidden:
@@ -187,33 +184,23 @@ class MLP(nn.Module):
             h = sine_or_linear + cosine
         return rows(h, dy)
 
-    def _normalized(self, x: Tensor, in_columns: bool = False) -> tuple[Tensor, Tensor]:
-        """Return z and its slope, at x ``(*batch, inputs)``, or ``(inputs, B)`` in columns."""
-        mean, std, limits = self.mean, self.std, self.limits
-        if in_columns:
-            mean, std = mean[:, None], std[:, None]
-            limits = None if limits is None else limits[..., None]
-        if limits is None:
-            return (x - mean) / std, (1 / std).expand_as(x)
-        clipped = x.clamp(limits[0], limits[1])
-        beyond = torch.tanh((x - clipped) / std)
-        return (clipped - mean) / std + beyond, (1 - beyond * beyond) / std
-
-    def _features(self, column: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the features of the first layer, and their slopes in x, each ``(n, B)``."""
-        z, slope = self._normalized(column, in_columns=True)
+    def _features(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the features of x ``(inputs, B)`` and their slopes in x, each ``(n, B)``."""
+        mean, std = self.mean[:, None], self.std[:, None]
+        if self.limits is None:
+            z, slope = (x - mean) / std, (1 / std).expand_as(x)
+        else:
+            clipped = x.clamp(*self.limits[..., None])
+            beyond = torch.tanh((x - clipped) / std)
+            z, slope = (clipped - mean) / std + beyond, (1 - beyond * beyond) / std
         if not self._has_angles:
             return z, slope
         # Twice as many features as entries, without indexing: z or sin(x), and 0 or cos(x).
-        is_angle, zero = self.is_angle[:, None], torch.zeros_like(column)
-        sine, cosine = torch.sin(column), torch.cos(column)
+        is_angle, zero = self.is_angle[:, None], torch.zeros_like(x)
+        sine, cosine = torch.sin(x), torch.cos(x)
         features = [torch.where(is_angle, sine, z), torch.where(is_angle, cosine, zero)]
         slopes = [torch.where(is_angle, cosine, slope), torch.where(is_angle, -sine, zero)]
         return torch.cat(features), torch.cat(slopes)
-
-    def _tangent(self, dx: Tensor, slopes: Tensor) -> Tensor:
-        """Return the tangent of the features for a tangent dx, ``(n, B)``."""
-        return (torch.cat([dx, dx]) if self._has_angles else dx) * slopes
 
 
 def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,13 +13,9 @@ from torch import Tensor
 
 
 class Positivity(abc.ABC):
-    """Map from free numbers y to the entries of a triangular factor, in units of their scale.
+    """Map from free numbers y to the entries of a triangular factor, in units of their scale."""
 
-    Attributes:
-        start: initial y of the diagonal entries.
-    """
-
-    start: float
+    start: float  # initial y of the diagonal entries
 
     @abc.abstractmethod
     def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:

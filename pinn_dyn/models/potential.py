@@ -66,7 +66,6 @@ class NetworkPotential(Potential):
         return self.scale * value
 
     def gradient(self, q: Tensor) -> Tensor:
-        """Return G(q) = dV/dq, ``(*batch, N)``, by one reverse pass."""
         y, tape = self.network.linearize(q)
         force = self.network.pullback(tape, torch.ones_like(y))
         if self.stiffness_root is not None:
@@ -110,9 +109,7 @@ class ChainPotential(Potential):
             )
         self.rank = rank
 
-        def normal(rows: int, columns: int) -> nn.Parameter:
-            return nn.Parameter(torch.randn(rows, columns) / rank**0.5)
-
+        normal = lambda *shape: nn.Parameter(torch.randn(shape) / rank**0.5)  # noqa: E731
         self.turns = nn.ParameterList(normal(3 * rank, rank) for _ in range(size))
         self.offsets = nn.ParameterList(normal(rank, 1) for _ in range(size + 1))
         self.base = normal(rank, 1)
@@ -126,7 +123,6 @@ class ChainPotential(Potential):
         return self.scale * (self.base * w).sum(0).reshape(q.shape[:-1])
 
     def gradient(self, q: Tensor) -> Tensor:
-        """Return G(q) = dV/dq, ``(*batch, N)``."""
         x = columns(q)
         sine, cosine = torch.sin(x), torch.cos(x)
         _, turned = self._moments(x)

@@ -12,15 +12,11 @@ from torch import Tensor, nn
 from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
-_REACH = 3.0
-"""Standard deviations of v and u at which the input of the network saturates."""
-
 
 class Residual(nn.Module, abc.ABC):
     """Generalized force r(q, v, u) ``(*batch, N)`` of effects that are not mechanical.
 
-    Attributes:
-        learned: true if the force is not zero.
+    ``learned`` is false if the force is zero.
     """
 
     learned: bool
@@ -60,7 +56,7 @@ class NetworkResidual(Residual):
 
     f is a typical generalized force. Due to the penalty, r only represents effects that the other
     heads cannot represent, such as hysteresis. The force is not passive, but bounded: the input of
-    the network saturates outside the data.
+    the network saturates outside the range of q, and three standard deviations of v and u.
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
@@ -83,7 +79,7 @@ class NetworkResidual(Residual):
         self.weight = weight
         data, size = scales.statistics, scales.size
         mean, std = data.network_input(repeat_input=1)
-        low, high = mean - _REACH * std, mean + _REACH * std
+        low, high = mean - 3 * std, mean + 3 * std
         low[:size], high[:size] = data.q_low, data.q_high
         sizes = len(mean), size
         limits = low, high

@@ -90,7 +90,7 @@ class Scales:
             scale: typical size, ``(N,)``.
             spread: prior standard deviation of the logarithm.
             units: N units.
-            floor: lower limit in units of the scale; with a prior, of the mean scale.
+            floor: lower limit in units of the scale, or of the mean scale with a prior.
         """
         names = [f"{label} of {joint.name}" for joint in self.joints]
         if self.prior:
@@ -108,7 +108,5 @@ class Scales:
     ) -> MLP:
         """Build a network of q. Its input saturates outside the data, see :class:`MLP`."""
         data = self.statistics
-        sizes = self.size, outputs
-        limits = data.q_low, data.q_high
-        normal = data.q_mean, data.q_std
-        return MLP(*sizes, hidden, activation, *normal, self.angles, after, limits)
+        normal, limits = (data.q_mean, data.q_std), (data.q_low, data.q_high)
+        return MLP(self.size, outputs, hidden, activation, *normal, self.angles, after, limits)

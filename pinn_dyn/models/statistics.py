@@ -16,13 +16,11 @@ class Statistics:
     """Means, standard deviations and ranges over the training windows, in SI units.
 
     Attributes:
-        q_mean, q_std: configuration, ``(N,)``.
-        q_low, q_high: smallest and largest configuration, ``(N,)``.
-        v_std: velocity, ``(N,)``.
-        p_std: momentum, ``(N,)``; ones if the data have no momenta.
+        q_mean, q_std, q_low, q_high: configuration, with its smallest and largest values, ``(N,)``.
+        v_std, p_std: velocity and momentum, ``(N,)``; ones if the data have no momenta.
         u_mean, u_std: input, ``(M,)``.
-        qv_increment_std: increments of (q, v) over 1 to H steps of a window, ``(H, 2N)``.
-        qp_increment_std: increments of (q, p), ``(H, 2N)``; ones if the data have no momenta.
+        qv_increment_std, qp_increment_std: increments of (q, v) and (q, p) over 1 to H steps of a
+            window, ``(H, 2N)``.
         step: length of a window's step, s.
     """
 
@@ -79,23 +77,16 @@ class Statistics:
         """Build from the result of :meth:`to_dict`.
 
         Raises:
-            ValueError: if a field is missing, has a wrong size, or is not finite or positive.
+            ValueError: if a field is missing, or is not finite or positive.
         """
         names = [item.name for item in fields(cls)]
         if missing := [name for name in names if name not in values]:
             raise ValueError(f"statistics has no {', '.join(missing)}")
         read = {name: torch.tensor(values[name], dtype=torch.float64) for name in names}
-        size, inputs = read["q_mean"].shape, read["u_mean"].shape
         for name, value in read.items():
-            shape = () if name == "step" else inputs if name.startswith("u_") else size
-            if name.endswith("increment_std"):
-                shape = torch.Size((*value.shape[:-1], 2 * size.numel()))
             positive = name.endswith("_std") or name == "step"
-            valid = value.isfinite() & (value > 0 if positive else True)
-            if value.shape != shape or not valid.all():
-                raise ValueError(
-                    f"statistics.{name} has shape {tuple(value.shape)}, expected "
-                    f"{'positive' if positive else 'finite'} numbers of shape {tuple(shape)}"
-                )
+            if not (value.isfinite() & (value > 0 if positive else True)).all():
+                kind = "positive" if positive else "finite"
+                raise ValueError(f"statistics.{name} is {value.tolist()}, expected {kind} numbers")
         step = float(read.pop("step"))
         return cls(**read, step=step)

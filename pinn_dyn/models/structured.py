@@ -51,8 +51,7 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         integrator: Integrator | None,
         delay: Delay | None,
     ):
-        size, inputs = statistics.num_coordinates, statistics.num_inputs
-        super().__init__(size, inputs, state)
+        super().__init__(statistics.num_coordinates, statistics.num_inputs, state)
         self.integrator = integrator or RK4()
         self.delay = delay or NoDelay()
         self.angles = tuple(angles)
@@ -74,7 +73,6 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return self.potential(q)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        """Return D(q) = L_D L_D^T, ``(*batch, N, N)``."""
         return self.damping.matrix(q)
 
     def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:

@@ -71,9 +71,9 @@ class IntegratorContract:
         torch.testing.assert_close(divided, short, rtol=0, atol=1e-13)
 
     def test_a_batch_gives_the_path_of_each_trajectory(self, kind, system):
-        t, first = samples(count=6, step=0.1)
-        _, second = samples(count=6, step=0.1, seed=1)
-        starts, inputs = torch.stack([START, -2 * START]), torch.stack([first, second])
+        t, _ = samples(count=6, step=0.1)
+        starts = torch.stack([START, -2 * START])
+        inputs = torch.stack([samples(count=6, step=0.1, seed=seed)[1] for seed in range(2)])
         both = increments(system, kind(2), starts, t, Signal(t, inputs))
         for row in range(2):
             alone = increments(system, kind(2), starts[row], t, Signal(t, inputs[row]))

@@ -10,17 +10,12 @@ from pinn_dyn.testing.finite_differences import assert_near, partial_derivatives
 class MotionContract:
     """The part of :class:`~.mechanical_system.MechanicalSystemContract` about motions."""
 
-    difference_tolerance = 1e-7
-    """Tolerance between a derivative and the five-point stencil with ``difference_step``."""
+    difference_tolerance = 1e-7  # of a derivative by the five-point stencil
     difference_step = 1e-3
-    gradient_tolerance = 5e-9
-    """Tolerance for a gradient through a step."""
-    steps = 10
-    """Number of integrator steps in a roll-out, even."""
-    step_times_rate = 0.02
-    """Step of a roll-out times the largest eigenvalue of the dynamics at its start."""
+    gradient_tolerance = 5e-9  # of a gradient through a step
+    steps = 10  # of a roll-out, even
+    step_times_rate = 0.02  # step times the largest eigenvalue of the dynamics at its start
     rollout_tolerance = 1e-5
-    """Tolerance between roll-outs."""
 
     def test_power_is_the_rate_of_the_total_energy(self, system, configurations):
         q, v, _, u = configurations
@@ -58,7 +53,7 @@ class MotionContract:
         return self.step_times_rate / float(torch.linalg.eigvals(jacobian).abs().max())
 
     def _input(self, configurations, t):
-        """Return an input that changes linearly from u to -u, ``(8, T, M)``."""
+        """Return an input from u to -u, ``(8, T, M)``."""
         return (1 - 2 * t / t[-1])[:, None] * configurations.u[:, None, :]
 
     def _rollout(self, system, configurations, derivative, t):
@@ -104,5 +99,4 @@ class MotionContract:
             actual = sum((gradient * direction).sum() for gradient, direction in pairs)
             error = float(abs(actual - expected))
             norm = sum(float(gradient.square().sum()) for gradient, _ in pairs) ** 0.5
-            scale = norm + float(value.abs())
-            assert error <= self.gradient_tolerance * scale, (name, actual, expected)
+            assert error <= self.gradient_tolerance * (norm + float(value.abs())), name

@@ -21,34 +21,22 @@ class Configurations(NamedTuple):
     u: Tensor
 
 
+OF_Q = ("mass_matrix", "damping_matrix", "input_matrix", "potential_energy", "potential_force")
+OF_QV = ("coriolis_matrix", "dissipative_force", "momentum", "kinetic_energy", "total_energy")
 FUNCTIONS = {
-    "mass_matrix": "q",
-    "damping_matrix": "q",
-    "input_matrix": "q",
-    "potential_energy": "q",
-    "potential_force": "q",
-    "coriolis_matrix": "qv",
-    "dissipative_force": "qv",
-    "forward_dynamics": "qvu",
-    "inverse_dynamics": "qva",
-    "momentum": "qv",
-    "velocity": "qp",
-    "kinetic_energy": "qv",
-    "total_energy": "qv",
-    "power": "qvu",
+    **dict.fromkeys(OF_Q, "q"),
+    **dict.fromkeys(OF_QV, "qv"),
+    **{"forward_dynamics": "qvu", "power": "qvu", "inverse_dynamics": "qva", "velocity": "qp"},
 }
+"""Arguments of the functions of a mechanical system."""
 
 
 def values_of(system, at):
     """Return the value of every function by name."""
     arguments = {**at._asdict(), "p": at.a}
-    values = {
-        name: getattr(system, name)(*(arguments[key] for key in keys))
-        for name, keys in FUNCTIONS.items()
-    }
-    x = torch.cat([at.q, at.v], -1)
-    values["velocity_derivative"] = system.velocity_derivative(x, at.u)
-    values["momentum_derivative"] = system.momentum_derivative(x, at.u)
+    values = {name: getattr(system, name)(*map(arguments.get, k)) for name, k in FUNCTIONS.items()}
+    for name in ("velocity_derivative", "momentum_derivative"):
+        values[name] = getattr(system, name)(torch.cat([at.q, at.v], -1), at.u)
     return values
 
 
@@ -58,7 +46,7 @@ class MechanicalSystemContract(MotionContract):
     exact_tolerance = 1e-9
     """Tolerance between two float64 computations of the same quantity."""
     float32_tolerance = 1e-3
-    """Tolerance of float32. Accelerations lose the condition number of M."""
+    """Tolerance of float32."""
 
     @pytest.fixture
     def system(self) -> MechanicalSystem:
@@ -67,7 +55,7 @@ class MechanicalSystemContract(MotionContract):
 
     @pytest.fixture
     def configurations(self, system) -> Configurations:
-        """Return the states to test at. Override it for a range other than [-1, 1]."""
+        """Return the states to test at, in [-1, 1]."""
         generator = torch.Generator().manual_seed(0)
         n, m = system.num_coordinates, system.num_inputs
         rows = (torch.rand(8, k, generator=generator, dtype=torch.float64) for k in (n, n, n, m))
@@ -186,9 +174,8 @@ class MechanicalSystemContract(MotionContract):
         assert_near(q_rate, v, self.exact_tolerance)
         expected = product(mass_rate, v) + product(mass, a)
         assert_near(p_rate, expected, self.difference_tolerance)
-        if system.state == "qp":
-            expected = torch.cat([q_rate, p_rate], -1)
-        else:
+        expected = torch.cat([q_rate, p_rate], -1)
+        if system.state == "qv":
             x, expected = torch.cat([q, v], -1), torch.cat([v, a], -1)
         assert_near(system.state_derivative(x, u), expected, self.exact_tolerance)
 
@@ -214,14 +201,11 @@ class MechanicalSystemContract(MotionContract):
 
     def test_closed_formulas_agree_with_automatic_differentiation(self, system, configurations):
         q, v, a, _ = configurations
-        arguments = {
+        arguments: dict[str, tuple[Tensor, ...]] = {
             "_potential_force": (q,),
-            "_inertial_force": (q, v, a),
-            "_acceleration": (q, v, a),
-            "_hamiltonian_gradient": (q, a),
-            "_momentum": (q, v),
-            "_velocity": (q, a),
-            "_kinetic_gradient": (q, v),
+            **dict.fromkeys(("_inertial_force", "_acceleration"), (q, v, a)),
+            **dict.fromkeys(("_momentum", "_kinetic_gradient"), (q, v)),
+            **dict.fromkeys(("_hamiltonian_gradient", "_velocity"), (q, a)),
         }
         for name, values in arguments.items():
             actual = getattr(system, name)(*values)

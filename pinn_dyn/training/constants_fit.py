@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 _FAR = 3.0
-"""Prior standard deviations from which a constant is reported: 3 of 1,000 by chance."""
+"""Prior standard deviations from which a constant is reported."""
 _CHECKS = {"drive gain": "units and sign", "torque offset": "sign", "force offset": "sign"}
 """Properties of an input to check, by the kind of the constant."""
 
@@ -49,29 +49,16 @@ class Fit:
 
     @classmethod
     def from_state(cls, state: Any, count: int) -> Fit:
-        """Build the fit of ``count`` parameters from a checkpoint.
-
-        Raises:
-            ValueError: if the checkpoint has no fit of these parameters.
-        """
-        prior = [state.get(key) for key in Prior._fields]
-        values = {item.name: state.get(item.name) for item in fields(cls) if item.name != "prior"}
-        tensors = [*prior, values["covariance"], values["information"]]
-        shapes = [x.shape if isinstance(x, Tensor) else None for x in tensors]
-        if shapes != [(count,), *3 * [(count, count)]]:
-            raise ValueError(
-                f"the checkpoint has no fit of the model's {count} constants: fit again in a new "
-                "folder"
-            )
-        return cls(prior=Prior(*prior), **values)
+        """Build the fit of ``count`` parameters from a checkpoint."""
+        values = dict(state)
+        if getattr(values.get("covariance"), "shape", None) != (count, count):
+            raise ValueError(f"the checkpoint has no fit of the model's {count} constants")
+        prior = Prior(values.pop("mean"), values.pop("root"))
+        return cls(prior=prior, **values)
 
 
 class StoppedFit(KeyboardInterrupt):
-    """Interrupt of a fit. The model has the best constants so far.
-
-    Attributes:
-        fit: result so far, from which the fit can continue.
-    """
+    """Interrupt of a fit, with the result so far. The model has the best constants so far."""
 
     def __init__(self, fit: Fit):
         super().__init__()

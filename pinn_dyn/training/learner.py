@@ -172,20 +172,13 @@ class DynamicsLearner(L.LightningModule):
 
     def log_losses(self, losses: Tensor) -> None:
         """Log the mean loss, once per epoch, since a call takes as long as a small step."""
-        self.log(
-            "train/loss",
-            losses.mean(),
-            prog_bar=True,
-            on_step=False,
-            on_epoch=True,
-            batch_size=1,
-            sync_dist=True,  # mean over processes that share a batch
-        )
+        # With several processes this is the mean over those that share a batch.
+        options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
+        self.log("train/loss", losses.mean(), prog_bar=True, batch_size=1, **options)
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
         """Roll out all validation trajectories."""
         figures = self.validator(self.model, batch)
-        # All processes compute the same metrics; sync_dist suppresses a warning.
         named = {f"val/{key}": value for key, value in figures.items()}
         named |= {f"model/{key}": value for key, value in self.model.learned_figures().items()}
         self.log_dict(named, batch_size=1, sync_dist=True)

@@ -33,16 +33,16 @@ log = logging.getLogger(__name__)
 AtLeastTwo = Annotated[int, Field(ge=2)]
 """Number of samples or evaluations: one sample has no spread."""
 
-_CHUNK = 500
-"""Number of windows whose derivatives are rolled out at once, to limit the memory."""
-_FIRST_NOISE = 0.1
-"""Largest assumed noise of the normalized residuals before the first fit."""
 REST = 0.05
 """Share of the typical speed of a joint below which it is considered at rest."""
-_CHANGED = 5.0
-"""Prior standard deviation of a changed body. A payload may be heavier than its link."""
-_DIVERGED = 1e4
-"""Residual of a diverged roll-out."""
+_CHUNK = 500  # windows whose derivatives are rolled out at once, to limit the memory
+_FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
+_CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
+_DIVERGED = 1e4  # residual of a diverged roll-out
+
+
+Residuals = Callable[[bool], Tensor]
+"""Residuals of the present model, ``(..., R)``, or their derivatives ``(..., R, P)``."""
 
 
 class LeastSquares:
@@ -84,11 +84,8 @@ class LeastSquares:
         velocity_weight: PositiveFloat = 1.0,
         changed: Sequence[str] = (),
     ):
-        self.cutoff = cutoff
-        self.rollouts = rollouts
-        self.samples = samples
-        self.evaluations = evaluations
-        self.velocity_weight = velocity_weight
+        self.cutoff, self.rollouts, self.samples = cutoff, rollouts, samples
+        self.evaluations, self.velocity_weight = evaluations, velocity_weight
         self.changed = list(changed)
 
     def fit(
@@ -118,9 +115,7 @@ class LeastSquares:
         model.double()
         prior = stopped.prior if stopped else self._prior(model, covariance)
         earlier = covariance is not None
-        stages: list[Callable[[], Fit]] = [
-            partial(self._identify, model, prior, trajectories, earlier)
-        ]
+        stages = [partial(self._identify, model, prior, trajectories, earlier)]
         if self.rollouts:
             windows = windows.to(torch.device("cpu"), torch.float64)
             steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
@@ -159,10 +154,8 @@ class LeastSquares:
             return Prior(0 * z, torch.eye(len(z)).to(z))
         owners = [name.split(" of ", 1)[-1] for name in names]
         if unknown := [owner for owner in self.changed if owner not in owners]:
-            raise ValueError(
-                f"changed names {', '.join(unknown)}, expected some of "
-                f"{', '.join(dict.fromkeys(owners))}"
-            )
+            expected = ", ".join(dict.fromkeys(owners))
+            raise ValueError(f"changed names {', '.join(unknown)}, expected some of {expected}")
         if covariance.shape != (len(z), len(z)):
             raise ValueError(
                 f"the earlier fit has {len(covariance)} constants, this model {len(z)}: use the "
@@ -177,13 +170,9 @@ class LeastSquares:
         return Prior(z, root)
 
     def _identify(
-        self,
-        model: LearnedConstants,
-        prior: Prior,
-        trajectories: Sequence[Trajectory],
-        earlier: bool,
+        self, model: LearnedConstants, prior: Prior, runs: Sequence[Trajectory], earlier: bool
     ) -> Fit:
-        q, v, a, u = filtered_motion(trajectories, self.cutoff, self.samples)
+        q, v, a, u = filtered_motion(runs, self.cutoff, self.samples)
         with torch.no_grad():
             spread = model.force_scale(q, v, a, u)
         moves = v.abs() > REST * v.std(0)
@@ -205,11 +194,11 @@ class LeastSquares:
             by_z = samples.by_parameters() - by_gain
             return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
 
-        self._solve("inverse dynamics", model, prior, residuals, correlated=1.0)
+        self._solve("inverse dynamics", model, prior, residuals, 1.0)
         with torch.no_grad():
             correlated = correlation_length((errors() * moves).numpy())
         stage = f"inverse dynamics, correlation over {correlated:.3g} samples"
-        return self._solve(stage, model, prior, residuals, correlated=correlated)
+        return self._solve(stage, model, prior, residuals, correlated)
 
     def _roll_out(self, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
@@ -225,21 +214,14 @@ class LeastSquares:
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
         stage = f"roll-outs of {float(windows.t[-1]):.3g} s"
-        return self._solve(stage, model, prior, residuals, correlated=float(measured.shape[1]))
+        return self._solve(stage, model, prior, residuals, float(measured.shape[1]))
 
     def _solve(
-        self,
-        stage: str,
-        model: LearnedConstants,
-        prior: Prior,
-        residuals: Callable[[bool], Tensor],
-        *,
-        correlated: float,
+        self, stage: str, model: LearnedConstants, prior: Prior, residuals: Residuals, group: float
     ) -> Fit:
         """Fit twice, the second time with the noise level of the first fit; set the model in place.
 
-        ``residuals`` returns the residuals ``(..., R)`` of the present model, or their derivatives
-        ``(..., R, P)``. ``correlated`` residuals are worth one independent residual.
+        A ``group`` of so many correlated residuals is worth one independent residual.
         """
         z = parameters_to_vector(model.parameters()).detach()
         mean, root = prior.mean.numpy(), prior.root.numpy()
@@ -251,7 +233,7 @@ class LeastSquares:
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
         best = np.inf, z.numpy()
         for _ in range(2):
-            weight = 1 / (noise * correlated**0.5)
+            weight = 1 / (noise * group**0.5)
             best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
@@ -283,7 +265,7 @@ class LeastSquares:
 
 
 def _evaluate(
-    model: LearnedConstants, z: np.ndarray, residuals: Callable[[bool], Tensor], derivative: bool
+    model: LearnedConstants, z: np.ndarray, residuals: Residuals, derivative: bool
 ) -> np.ndarray:
     """Return the residuals at z, flattened. A diverged roll-out has large residuals."""
     with torch.no_grad():

@@ -97,7 +97,7 @@ def test_the_past_of_a_step_is_that_of_the_steps_before():
     rival.weight.copy_(0.1 * torch.randn(rival.weight.shape, generator=generator))
     (truth,) = oscillators(1, samples=9)
     known = torch.cat([truth.states("qv")[0], truth.u[0]])
-    past = known @ rival.past + rival.past_bias
+    past = known @ rival.past_weight + rival.past_bias
     x = [*past[:8].split(4)[::-1], truth.states("qv")[0]]  # x_-2, x_-1, x_0
     u = [*past[8:].split(1)[::-1], *truth.u]
     for k in range(8):

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pinn_dyn.mechanics.signal import Signal
 
-# Number of steps whose inputs are computed at once, to limit the memory of large batches.
 BLOCK = 64
+"""Number of steps whose inputs are computed at once, to limit the memory of large batches."""
 
 
 class Dynamics(Protocol):
@@ -28,7 +28,7 @@ class Dynamics(Protocol):
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """Take a step of the integrator. The arguments are those of :meth:`Integrator.step`."""
+        """Take a step of the integrator, see :meth:`Integrator.step`."""
 
 
 class Integrator(abc.ABC):
@@ -39,14 +39,12 @@ class Integrator(abc.ABC):
     In float32 the increment of a small step is far below the resolution of the state.
 
     Args:
-        substeps: integrator steps in a step of the data. One is enough if the data resolve the
-            fastest motion. Data of a low sample rate need more.
+        substeps: integrator steps in a step of the data; more than one for a low sample rate.
 
     Attributes:
         nodes: times of the stages in a step, from 0 to 1.
         order: exponent of the error O(h^order).
-        mean_input: true to shift the inputs at the nodes so that their mean equals the mean of the
-            input over the step, for methods whose steps are longer than a sample.
+        mean_input: true to shift the inputs at the nodes so that their mean is that over the step.
     """
 
     nodes: tuple[float, ...]

@@ -17,8 +17,8 @@ class RK4(Integrator):
         k3 = f(x + h (k2 - k1/3), u(t + 2h/3))   k4 = f(x + h (k1 - k2 + k3), u(t + h))
         x(t + h) = x + h (k1 + 3 k2 + 3 k3 + k4)/8
 
-    Paths are computed by torchdiffeq, whose ``method="rk4"`` is this rule. :meth:`step` gives the
-    same numbers up to rounding, by operations that can be traced.
+    Paths are computed by torchdiffeq. :meth:`step` gives the same numbers up to rounding, by
+    operations that can be traced.
     """
 
     nodes = (0.0, 1 / 3, 2 / 3, 1.0)
@@ -42,8 +42,7 @@ class RK4(Integrator):
         def rate(time: Tensor, increment: Tensor) -> Tensor:
             return f(start + increment, signal(time))
 
-        # Both ends of a step need the value of a held input within the step: torchdiffeq then
-        # moves the times of these stages inwards.
+        # For a held input torchdiffeq moves the stages at both ends of a step inwards.
         held = signal.interpolation == "hold"
         zero = torch.zeros_like(start)
         return odeint(rate, zero, grid, method="rk4", options={"perturb": held})

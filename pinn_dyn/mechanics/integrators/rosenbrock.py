@@ -19,14 +19,12 @@ class Rosenbrock(Integrator):
         x(t + h) = x + h (3 k1 + k2)/2
 
     The order is 2 for any J. With J = df/dx the method is L-stable: motions that decay within a
-    fraction of a step are damped, while an explicit method would diverge. J only needs the stiff
-    part. A step takes two evaluations of f and two linear solves. Source: Verwer, Spee, Blom and
+    fraction of a step are damped. J only needs the stiff part. Source: Verwer, Spee, Blom and
     Hundsdorfer (1999), "A second-order Rosenbrock method applied to photochemical dispersion
     problems".
 
-    A step may span many samples of u. With the mean m of u over the step, both stages use
-    ``u + m - (u(t) + u(t + h))/2``, so that no impulse of the input between the stages is lost. The
-    shift is of order h^2, and zero if u is linear over the step.
+    With the mean m of u over the step, both stages use ``u + m - (u(t) + u(t + h))/2``, so that no
+    impulse of the input between the stages is lost.
     """
 
     nodes = (0.0, 1.0)

@@ -56,8 +56,7 @@ class Compiled:
     def _loss(self, windows: Windows) -> Tensor:
         with integrated_by(self.model, self._integrator):
             laid_out = StateWindows.of(windows, self.model.state)
-            # All stages share a compiled function, even if the first needs no gradient in x.
-            laid_out.x0.requires_grad_()
+            laid_out.x0.requires_grad_()  # so that all stages share a compiled function
             return self.loss(self.model, laid_out)
 
     def _loss_and_gradient(self, windows: Windows) -> tuple[Tensor, Tensor]:

@@ -120,5 +120,5 @@ def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return a pool of threads, each with one torch thread. Programs release the lock of Python."""
+    """Return a pool of threads, each with one torch thread."""
     return ThreadPoolExecutor(threads, "windows", torch.set_num_threads, (1,))
