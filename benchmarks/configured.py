@@ -9,7 +9,8 @@ import lightning as L
 
 from pinn_dyn.app import trainer
 from pinn_dyn.app.config import build_part
-from pinn_dyn.evaluation import RolloutValidator, RunDescription
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.training import DynamicsLearner

@@ -29,14 +29,13 @@ from pinn_dyn.evaluation import (
     save,
     steady_state_figure,
     tip_path_figure,
-    to_text,
-    write_table,
 )
 from pinn_dyn.evaluation.control_figures import ERROR, control_errors
 from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.plots import with_unit
 from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.control_page import shown_columns
+from pinn_dyn.evaluation.tables import to_text, write_table
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
 

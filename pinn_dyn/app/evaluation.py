@@ -15,15 +15,9 @@ from pinn_dyn.app.shared_data import (
 )
 from pinn_dyn.data import DataSource
 from pinn_dyn.data.fastest_motion import too_long_for
-from pinn_dyn.evaluation import (
-    Entry,
-    Evaluation,
-    build_baselines,
-    common_stride,
-    default_windows,
-    evaluate_models,
-    model_names,
-)
+from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
+from pinn_dyn.evaluation.prediction import common_stride, default_windows
+from pinn_dyn.evaluation.tables import model_names
 from pinn_dyn.mechanics import stack_until
 
 log = logging.getLogger(__name__)
@@ -129,7 +123,7 @@ def evaluate(
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
     """Return short names: the model, with seed and folder where these tell runs apart."""
     names, seeds = list(models), [f"seed {run.config['seed']}" for run in runs]
-    for words in (seeds, [run.folder.name for run in runs]):
+    for suffixes in (seeds, [run.folder.name for run in runs]):
         if len(set(names)) < len(names):
-            names = [f"{name} {word}" for name, word in zip(names, words, strict=True)]
+            names = [f"{name} {suffix}" for name, suffix in zip(names, suffixes, strict=True)]
     return names

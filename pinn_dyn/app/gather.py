@@ -16,14 +16,8 @@ from omegaconf import DictConfig
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.run_folder import CONFIG, METRICS
 from pinn_dyn.app.sweep import ERROR, first_line
-from pinn_dyn.evaluation import (
-    over_seeds,
-    save,
-    sweep_figure,
-    to_text,
-    varied_settings,
-    write_table,
-)
+from pinn_dyn.evaluation import save, sweep_figure
+from pinn_dyn.evaluation.tables import over_seeds, to_text, varied_settings, write_table
 from pinn_dyn.spelling import did_you_mean
 
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")

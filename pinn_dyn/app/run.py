@@ -20,7 +20,7 @@ from torch import Tensor
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import DataSource, LogSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
-from pinn_dyn.evaluation import half_widths
+from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import Statistics

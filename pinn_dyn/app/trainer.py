@@ -24,7 +24,8 @@ from pinn_dyn.app.run import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
-from pinn_dyn.evaluation import RolloutValidator, RunDescription
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics

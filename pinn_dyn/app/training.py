@@ -55,10 +55,7 @@ from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, st
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble, EnsembleData
-from pinn_dyn.evaluation import (
-    RolloutFigures,
-    RolloutValidator,
-)
+from pinn_dyn.evaluation import RolloutFigures, RolloutValidator
 from pinn_dyn.mechanics import Predictor, stack_until
 from pinn_dyn.models import (
     AccelerationMLP,

@@ -5,10 +5,6 @@ from pinn_dyn.evaluation.baselines import ConstantVelocity, HoldPosition, build_
 from pinn_dyn.evaluation.calibration import (
     Calibration,
     calibration,
-    calibration_figure,
-    calibration_table,
-    half_widths,
-    interval_lines,
 )
 from pinn_dyn.evaluation.closed_loops import ControlResult, close_loop, close_loops
 from pinn_dyn.evaluation.control_figures import (
@@ -41,21 +37,8 @@ from pinn_dyn.evaluation.metrics import (
 from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import (
     Prediction,
-    common_stride,
-    default_windows,
     predict_trajectories,
     predict_windows,
-)
-from pinn_dyn.evaluation.run_log import RunDescription
-from pinn_dyn.evaluation.tables import (
-    best,
-    best_baseline,
-    model_names,
-    over_seeds,
-    to_text,
-    unbeaten_baselines,
-    varied_settings,
-    write_table,
 )
 from pinn_dyn.evaluation.torque import (
     TorqueError,
@@ -77,34 +60,23 @@ __all__ = [
     "RolloutFigures",
     "RolloutMetrics",
     "RolloutValidator",
-    "RunDescription",
     "TermComparison",
     "TorqueError",
     "animate",
-    "best",
-    "best_baseline",
     "build_baselines",
     "calibration",
-    "calibration_figure",
-    "calibration_table",
     "cleaning_figure",
     "close_loop",
     "close_loops",
     "closed_loop_figure",
     "closed_loop_metrics",
-    "common_stride",
     "compare_terms",
     "controller_comparison_figure",
-    "default_windows",
     "diverged_trajectories",
     "error_figure",
     "evaluate_models",
-    "half_widths",
-    "interval_lines",
     "left_data",
     "member_metrics",
-    "model_names",
-    "over_seeds",
     "part_shares",
     "pose_strip",
     "predict_trajectories",
@@ -117,10 +89,6 @@ __all__ = [
     "sweep_figure",
     "terms_figure",
     "tip_path_figure",
-    "to_text",
     "torque_error",
     "trajectory_figure",
-    "unbeaten_baselines",
-    "varied_settings",
-    "write_table",
 ]

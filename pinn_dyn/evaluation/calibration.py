@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from scipy.stats import t as student
@@ -106,16 +105,6 @@ def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Return the share of errors up to each width; infinite errors are never within."""
     finite = np.sort(errors[np.isfinite(errors)])
     return np.searchsorted(finite, width, side="right") / max(len(errors), 1)
-
-
-def calibration_table(runs: Mapping[str, Mapping[float, Calibration]]) -> pd.DataFrame:
-    """Return one row per run, window and level, with ``share``, ``corrected`` and ``factor``."""
-    frames = [
-        pd.DataFrame({"run": run, "window": window, **vars(item)})
-        for run, windows in runs.items()
-        for window, item in windows.items()
-    ]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
 def interval_lines(runs: Mapping[str, Mapping[float, Calibration]]) -> list[str]:

@@ -19,7 +19,6 @@ from pinn_dyn.evaluation.calibration import (
     Calibration,
     calibration,
     calibration_figure,
-    calibration_table,
     interval_lines,
 )
 from pinn_dyn.evaluation.figures import ERROR, error_figure, terms_figure, trajectory_figure
@@ -34,7 +33,6 @@ from pinn_dyn.evaluation.plots import save, with_unit
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
 from pinn_dyn.evaluation.tables import (
     SEEDS_COLUMNS,
-    best_baseline,
     over_seeds,
     summary_columns,
     to_text,
@@ -54,7 +52,6 @@ from pinn_dyn.mechanics import (
 log = logging.getLogger(__name__)
 
 SPLITS = {"test": "unseen test trajectories", "validation": "validation trajectories"}
-"""Names of the splits of the data in tables and figures."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,7 @@ class Evaluation:
         split: ``test`` or ``validation``.
         truth: the K trajectories stacked, q ``(K, T, N)``.
         summary: one row per run and baseline, with all metrics.
-        by_model: mean and standard deviation over seeds, one row per model and settings.
+        by_model: mean and standard deviation over seeds.
         torque: torque errors, one row per run and joint; empty without mechanical models.
         parts: contributions of the parts of sums, one row per run, part and term.
         predictions: rollouts by name of the row, baselines included.
@@ -127,9 +124,9 @@ class Evaluation:
 
     @property
     def best_baseline(self) -> dict[str, Prediction]:
-        """Rollouts of the most accurate baseline, under its name."""
-        name = best_baseline(self.summary)
-        return {} if name is None else {name: self.predictions[name]}
+        """Rollouts of the most accurate baseline with the fewest diverged trajectories."""
+        rows = self.summary[self.summary["baseline"]].sort_values(["diverged", "error_mean"])
+        return {name: self.predictions[name] for name in rows["run"][:1]}
 
     @property
     def trajectories(self) -> str:
@@ -159,11 +156,7 @@ class Evaluation:
         return "\n".join(lines)
 
     def figures(self, trajectory: int = 0) -> Iterator[tuple[str, Figure]]:
-        """Yield the names of all figures, and the figures.
-
-        Args:
-            trajectory: index of the trajectory to draw.
-        """
+        """Yield the names of all figures, and the figures; one draws a single ``trajectory``."""
         title = f"{self.source.name}, {self.trajectories}"
         labels = self.source.labels
         yield (
@@ -190,12 +183,7 @@ class Evaluation:
                 yield f"terms_{_stem(run)}_{name}", figure
 
     def save(self, folder: str | Path, trajectory: int = 0) -> None:
-        """Write the tables as CSV, the figures as PNG, and the page ``report.html``.
-
-        Args:
-            folder: folder of the results; it is created.
-            trajectory: index of the trajectory to draw.
-        """
+        """Write the tables as CSV, the figures as PNG, and the page ``report.html``."""
         from pinn_dyn.evaluation.report.prediction_page import prediction_report
 
         folder = Path(folder)
@@ -204,7 +192,6 @@ class Evaluation:
             "by_model": self.by_model,
             "torque": self.torque,
             "parts": self.parts,
-            "calibration": calibration_table(self.intervals),
         }
         tables |= {f"terms_{_stem(run)}": x.to_frame() for run, x in self.terms.items()}
         for stem, table in tables.items():
@@ -238,8 +225,7 @@ def evaluate_models(
     """Roll out models and baselines along the test trajectories and compare them with the truth.
 
     Args:
-        entries: trained models.
-        baselines: predictors that the models have to beat.
+        entries, baselines: trained models, and predictors that they have to beat.
         source: the data set of the test trajectories.
         truth: the test trajectories stacked, q ``(K, T, N)``.
         split: ``test`` or ``validation``.

@@ -42,9 +42,10 @@ class TermComparison:
 
         Each is ``(K, N, .)``, G with one column. The third matrix of M_inverse is (P M)^-1.
         """
-        pairs = zip(Terms._fields, self.true, self.learned, strict=True)
-        columns = ((name, *(x.reshape(*self.q.shape, -1) for x in pair)) for name, *pair in pairs)
-        versions = {name: (true, learned, self.P @ true) for name, true, learned in columns}
+        versions = {}
+        for name, *pair in zip(Terms._fields, self.true, self.learned, strict=True):
+            true, learned = (x.reshape(*self.q.shape, -1) for x in pair)
+            versions[name] = (true, learned, self.P @ true)
         mass = versions.pop("M")
         inverse = (_inverse(mass[0]), _inverse(mass[1]), _inverse(mass[2]))
         return {"M": mass, "M_inverse": inverse, **versions}
@@ -52,10 +53,8 @@ class TermComparison:
     def to_frame(self) -> pd.DataFrame:
         """Return one row per configuration and term, with Frobenius norms::
 
-            relative_error_identity = |X_L - X| / |X|         (P = I)
-            relative_error_best_P   = |X_L - P X| / |X_L|
-
-        An error is 0 where both terms vanish and infinite where only the reference does.
+        relative_error_identity = |X_L - X| / |X|         (P = I)
+        relative_error_best_P   = |X_L - P X| / |X_L|
         """
         errors = {
             term: (_relative(learned - true, true), _relative(learned - fitted, learned))

@@ -76,7 +76,7 @@ def rollout_metrics(
     valid, second_half = error[~diverged], t > t[-1] / 2
     per_trajectory = torch.where(diverged, torch.inf, error.mean(dim=1))
     worst = int(per_trajectory.argmax())
-    exceeded = {name: ~(error <= value) for name, value in thresholds.items()}  # NaN exceeds all
+    above = {name: ~(error <= value) for name, value in thresholds.items()}  # NaN is above all
     return RolloutMetrics(
         trajectories=len(q),
         diverged=int(diverged.sum()),
@@ -91,8 +91,8 @@ def rollout_metrics(
         error_first_half=_mean(valid[:, ~second_half]),
         error_second_half=_mean(valid[:, second_half]),
         valid_time={
-            name: float(torch.where(late.any(1), t[late.int().argmax(1)], t[-1]).mean())
-            for name, late in exceeded.items()
+            name: float(torch.where(mask.any(1), t[mask.int().argmax(1)], t[-1]).mean())
+            for name, mask in above.items()
         },
     )
 
@@ -102,9 +102,8 @@ def member_metrics(prediction: Prediction) -> dict[str, float]:
 
     ``spread_over_error`` is sqrt((1 + 1/E) mean(s^2) / mean(e^2)), with the spread s(t) of
     :meth:`Prediction.spread` and the error e(t) of the ensemble: 1 if the truth is distributed
-    like the members, below 1 if the ensemble is overconfident. ``member_error_std`` is the (sample)
-    standard deviation of the mean errors of the members. Diverged rollouts of the ensemble are left
-    out of the means of s and e.
+    like the members, below 1 if the ensemble is overconfident. Diverged rollouts of the ensemble
+    are left out of the means of s and e.
     Source: Fortin et al. (2014), "Why should ensemble spread match the RMSE of the ensemble mean?"
     """
     valid = ~diverged_trajectories(prediction)
@@ -161,15 +160,11 @@ def state_squared_error(prediction: Prediction) -> dict[str, float]:
 
 
 def left_data(prediction: Prediction, train: Sequence[Trajectory]) -> dict[str, float]:
-    """Count the rollouts that leave the training data, beyond which a model knows nothing.
+    """Count the rollouts that leave the data of the training trajectories, q ``(T, N)`` each.
 
     A rollout has left the data once a predicted coordinate lies below ``low - (high - low)`` or
     above ``high + (high - low)``, with the extremes of all training trajectories, or is not finite.
     ``left_data_after`` is the first time in s at which one leaves, infinite if none does.
-
-    Args:
-        prediction: K rollouts.
-        train: training trajectories, q ``(T, N)`` each.
     """
     q = torch.cat([item.q for item in train])
     low, high = q.amin(dim=0), q.amax(dim=0)

@@ -11,8 +11,6 @@ from lightning.pytorch.utilities import rank_zero_only
 from matplotlib.figure import Figure
 from torch.utils.tensorboard.summary import hparams
 
-Setting = str | int | float | bool
-
 
 def log_figures(loggers: Iterable[Logger], figures: Mapping[str, Figure], step: int) -> None:
     """Log named figures at a training step, to the loggers that can show them."""
@@ -39,7 +37,7 @@ class RunDescription(L.Callback):
     def __init__(
         self,
         *,
-        settings: Mapping[str, Setting],
+        settings: Mapping[str, str | int | float | bool],
         configuration: str,
         provenance: Mapping[str, str],
     ):
@@ -63,20 +61,14 @@ class RunDescription(L.Callback):
 
     @rank_zero_only
     def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log settings, configuration and provenance."""
-        parameters = sum(p.numel() for p in pl_module.parameters())
-        rows = {**self.provenance, "parameters": str(parameters)}
+        """Log the settings; MLflow gets configuration and provenance too."""
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.file_writer.add_summary(self._start)
-                lines = ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in rows.items())]
-                logger.experiment.add_text("run/provenance", "\n".join(lines))
-                code = f"```yaml\n{self.configuration}\n```"
-                logger.experiment.add_text("run/configuration", code)
             elif isinstance(logger, MLFlowLogger):
                 logger.log_hyperparams(self.settings)
                 logger.experiment.log_text(logger.run_id, self.configuration, "config.yaml")
-                for key, value in rows.items():
+                for key, value in self.provenance.items():
                     logger.experiment.set_tag(logger.run_id, key, value)
 
     @rank_zero_only
@@ -84,8 +76,6 @@ class RunDescription(L.Callback):
         """Log the run time, and the success for TensorBoard."""
         for logger in trainer.loggers:
             # TensorBoard sorts metrics by name: this one comes after those of val/.
-            logger.log_metrics(
-                {"wall_time/training_seconds": self.seconds}, trainer.global_step - 1
-            )
+            logger.log_metrics({"wall_time/seconds": self.seconds}, trainer.global_step - 1)
             if isinstance(logger, TensorBoardLogger):
                 logger.experiment.file_writer.add_summary(self._end)

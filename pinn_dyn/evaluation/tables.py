@@ -12,15 +12,13 @@ import pandas as pd
 
 from pinn_dyn.data.whole import write_whole
 
-MAX_COLUMNS = 9
-"""Number of columns that a page and the terminal show of a summary. The CSV file has all."""
+MAX_COLUMNS = 9  # of a summary on a page and in the terminal; the CSV file has all
 SEEDS_COLUMNS = {
     "model": "model",
     "seeds": "seeds",
     "error_mean": "mean error ± std over seeds",
     "error_worst": "worst trajectory ± std over seeds",
 }
-"""Columns of the table over seeds that a page and the terminal show."""
 _LOWER_IS_BETTER = r".*(error_(mean|median|worst|\w+_half)|diverged|torque_(error|share))"
 _NAMES = ["dataset.name", "model_name", "search.draw"]
 _WINDOW = r"window_(.*)s_error_mean"
@@ -31,7 +29,7 @@ _HEADERS = {
     "diverged": "diverged",
     "left_data": "left the data",
     "valid_time_.*": "valid time [s]",
-    _WINDOW: "error, reset every {} s",
+    _WINDOW: r"error, reset every \1 s",
     "torque_share": "torque error / spread",
     "residual_share": "residual force, share",
     "spread_over_error": "spread / error",
@@ -44,8 +42,8 @@ _HEADERS = {
 def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return the settings in which runs differ, one row per run and one dotted column per setting.
 
-    Left out are the seed and all keys that follow it, keys that vary together with an earlier key,
-    and keys that the names of the model and of the data set, or the draw of a search, determine.
+    Left out are keys that follow the seed or an earlier key, and keys that the names of the model
+    and of the data set, or the draw of a search, determine.
     """
     settings = pd.json_normalize(list(configs))
     text = settings.map(str)
@@ -82,11 +80,8 @@ def over_seeds(runs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """Return one row per configuration, in order of appearance: means over its seeds.
 
     ``seeds`` is the number of runs. A figure x keeps its name for the mean, and ``x_std`` is the
-    sample standard deviation: missing for a single seed, and if the mean is infinite.
-
-    Args:
-        runs: one row per run, with a column ``seed``.
-        by: columns that tell configurations apart.
+    sample standard deviation: missing for a single seed, and if the mean is infinite. The columns
+    ``by`` tell configurations apart.
     """
     left_out = ["seed", "worst_trajectory", "error_std", *by]
     figures = runs.select_dtypes("number").columns.difference(left_out, sort=False)
@@ -109,13 +104,8 @@ def summary_columns(summary: pd.DataFrame) -> dict[str, str]:
         names = [name for name in summary if re.fullmatch(pattern, name)]
         column = summary[names[-1]] if names else pd.Series()
         if (column.notna() & (column != 0)).any():
-            headers[names[-1]] = header.format(_span(names[-1]))
+            headers[names[-1]] = re.sub(pattern, header, names[-1])
     return dict(list(headers.items())[:MAX_COLUMNS])
-
-
-def _span(name: str) -> str:
-    """Return the window of the column of a windowed error."""
-    return re.sub(_WINDOW, r"\1", name)
 
 
 def formatted(
@@ -129,7 +119,7 @@ def formatted(
     Args:
         frame: table.
         headers: columns to show and their headings; None shows all columns under their names.
-        star: mark behind the best entry of each column, see :func:`best`.
+        star: mark behind the best entry of each column.
     """
     text = {}
     for name, header in (headers or {name: str(name) for name in frame}).items():
@@ -206,19 +196,12 @@ def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
         figures = _competing(summary, name)
         if baseline.any() and not figures[~baseline].min() < figures[baseline].min():
             row = summary.loc[figures[baseline].idxmin()]
-            error = "mean error" if name == "error_mean" else f"reset every {_span(name)} s"
+            error = re.sub(_WINDOW, r"reset every \1 s", name).replace("error_mean", "mean error")
             errors.setdefault(row["run"], []).append(f"{error} {number(row[name])}")
     return [
         f"No model is more accurate than the baseline '{name}': {', '.join(texts)}."
         for name, texts in errors.items()
     ]
-
-
-def best_baseline(summary: pd.DataFrame) -> str | None:
-    """Return the name of the most accurate baseline with the fewest diverged trajectories."""
-    baselines = summary[summary["baseline"].astype(bool)]
-    ranked = baselines.sort_values(["diverged", "error_mean"])
-    return None if ranked.empty else str(ranked["run"].iloc[0])
 
 
 def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> Path:

@@ -160,9 +160,9 @@ class RolloutFigures(L.Callback):
             ),
             "rollout/error": error_figure(predictions, title=f"Validation error, {validator}"),
         }
-        comparison = compare_with_source(model, source)
-        for k, name in enumerate(comparison.names if comparison else []):
-            title = f"Learned and true terms at {name}"
-            figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
+        if comparison := compare_with_source(model, source):
+            for k, name in enumerate(comparison.names):
+                title = f"Learned and true terms at {name}"
+                figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
         # The step at which Lightning logs the errors of the same validation.
         log_figures(trainer.loggers, figures, trainer.global_step - 1)

@@ -31,10 +31,6 @@ def session(log):
     return settings, end.status == api_pb2.STATUS_SUCCESS
 
 
-def text(log, tag):
-    return log.Tensors(f"{tag}/text_summary")[0].tensor_proto.string_val[0].decode()
-
-
 def test_tensorboard_has_few_settings_and_all_that_were_given(hnn_run):
     log = tensorboard(hnn_run)
     settings, success = session(log)
@@ -47,19 +43,6 @@ def test_tensorboard_has_few_settings_and_all_that_were_given(hnn_run):
     assert settings["dataset.train_inputs"] == config["dataset"]["train_inputs"]
     assert settings["validator.step"] == "None"
     assert not [key for key in settings if "callbacks" in key or "_target_" in key]
-
-
-def test_tensorboard_has_the_configuration_and_where_it_comes_from(hnn_run):
-    log = tensorboard(hnn_run)
-    code = text(log, "run/configuration")
-    assert code.startswith("```yaml\n")
-    assert yaml.safe_load(code.removeprefix("```yaml\n").removesuffix("```")) == yaml.safe_load(
-        (hnn_run / "config.yaml").read_text()
-    )
-    record = json.loads((hnn_run / "metrics.json").read_text())
-    table = text(log, "run/provenance")
-    for key in ("commit", "torch", "hardware", "parameters"):
-        assert f"| {key} | {record[key]} |" in table
 
 
 def test_figures_are_logged_at_the_step_of_the_errors_that_they_explain(hnn_run):

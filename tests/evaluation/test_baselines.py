@@ -5,13 +5,8 @@ import logging
 import pytest
 import torch
 
-from pinn_dyn.evaluation import (
-    build_baselines,
-    common_stride,
-    default_windows,
-    predict_trajectories,
-    predict_windows,
-)
+from pinn_dyn.evaluation import build_baselines, predict_trajectories, predict_windows
+from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 
 T = 0.05 * torch.arange(81, dtype=torch.float64)

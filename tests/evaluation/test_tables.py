@@ -5,17 +5,17 @@ import math
 import pandas as pd
 import pytest
 
-from pinn_dyn.evaluation import (
+from pinn_dyn.evaluation.tables import (
     best,
-    best_baseline,
     model_names,
+    number,
     over_seeds,
+    summary_columns,
     to_text,
     unbeaten_baselines,
     varied_settings,
     write_table,
 )
-from pinn_dyn.evaluation.tables import number, summary_columns
 
 
 def config(model="lnn", width=8, lr=0.1, seed=0, **model_settings):
@@ -141,12 +141,6 @@ def test_the_summary_shows_at_most_nine_columns_with_information():
     assert len(columns) == 9
     assert columns["window_1s_error_mean"] == "error, reset every 1 s"
     assert {"valid_time_small", "window_0.1s_error_mean"}.isdisjoint(columns)
-
-
-def test_the_best_baseline_is_the_most_accurate_with_the_fewest_diverged_rollouts():
-    baselines = {"hold": 0.5, "ARX": 0.25, "EDMDc": 0.1}
-    assert best_baseline(summary({"lnn": 0.01}, baselines, lost=("EDMDc",))) == "ARX"
-    assert best_baseline(summary({"lnn": 0.01})) is None
 
 
 def test_a_file_keeps_all_digits(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -33,21 +33,6 @@ _PANEL, _ABOVE, _BELOW = 140, 110, 90  # heights of a panel and of the margins, 
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 
 
-class _Curve(NamedTuple):
-    """A curve of each trajectory: row of its panel, times ``(T,)`` and values ``(K, T)``."""
-
-    row: int
-    name: str
-    line: dict[str, Any]
-    t: Tensor
-    values: Tensor
-
-    def samples(self, trajectory: int) -> np.ndarray:
-        """Return the values of one trajectory in single precision; a gap where they overflow."""
-        y = _thinned(self.values[trajectory])
-        return np.where(np.abs(y) < 1e6, y, np.nan).astype(np.float32)
-
-
 def trajectory_browser(
     truth: Trajectory,
     predictions: Mapping[str, Prediction],
@@ -59,13 +44,8 @@ def trajectory_browser(
 ) -> go.Figure:
     """Return a figure of one trajectory at a time: configuration, error and input over time.
 
-    A slider selects the trajectory. The truth sets the range of the panels of the configuration.
-
-    Args:
-        truth: K trajectories stacked, q ``(K, T, N)``.
-        predictions, baselines: names and rollouts of the same trajectories.
-        labels, input_labels: name and unit of each coordinate and input.
-        trajectories: indices of the trajectories to offer; the first is shown at first.
+    A slider selects one of the ``trajectories``; the first is shown at first. The truth, K
+    trajectories stacked, sets the range of the panels of the configuration.
     """
     rollouts = {**predictions, **baselines}
     styles = {}
@@ -77,22 +57,20 @@ def trajectory_browser(
     real = {"color": TRUTH, "width": 4}
     shape = "hv" if truth.input.interpolation == "hold" else "linear"
     driven = {"color": DARK, "width": 1.2, "shape": shape}
-    curves = []
+    curves: list[tuple[int, str, dict[str, Any], Tensor, Tensor]] = []  # row, name, line, t, values
     for k in range(size):
-        curves.append(_Curve(k, "truth", real, truth.t, truth.q[..., k]))
-        for name, item in rollouts.items():
-            curves.append(_Curve(k, name, styles[name], item.t, item.q_hat[..., k]))
-    for name, item in rollouts.items():
-        curves.append(_Curve(size, name, styles[name], item.t, item.error()))
+        curves.append((k, "truth", real, truth.t, truth.q[..., k]))
+        curves += [(k, name, styles[name], x.t, x.q_hat[..., k]) for name, x in rollouts.items()]
+    curves += [(size, name, styles[name], x.t, x.error()) for name, x in rollouts.items()]
     for k in range(len(input_labels)):
-        curves.append(_Curve(size + 1 + k, "input", driven, truth.t, truth.u[..., k]))
+        curves.append((size + 1 + k, "input", driven, truth.t, truth.u[..., k]))
 
     titles = [*labels, with_unit(ERROR, labels), *input_labels]
     drawn = make_subplots(len(titles), 1, shared_xaxes=True, vertical_spacing=0.2 / len(titles))
     first, names = trajectories[0], set()
     for row, name, line, t, _ in curves:
         drawn.add_scatter(
-            x=_thinned(t).astype(np.float32),
+            x=_thinned(t),
             name=html.escape(name),
             legendgroup=name,
             showlegend=name not in names,
@@ -109,7 +87,7 @@ def trajectory_browser(
         errors = log_limits([item.error()[k] for item in rollouts.values()])
         ends.append((math.log10(errors[0]), math.log10(errors[1])))
         ranges = {f"yaxis{row + 1}": {"range": pair} for row, pair in enumerate(ends)}
-        data = [{"y": curve.samples(k)} for curve in curves]
+        data = [{"y": _thinned(values[k])} for *_, values in curves]
         frames[k] = go.Frame(name=str(k), data=data, layout=ranges)
     drawn.frames = list(frames.values())
     for trace, start in zip(drawn.data, frames[first].data, strict=True):
@@ -145,5 +123,6 @@ def trajectory_browser(
 
 
 def _thinned(values: Tensor) -> np.ndarray:
-    """Return at most 400 equally spaced samples."""
-    return values.detach()[:: -(-len(values) // _POINTS)].double().numpy()
+    """Return at most 400 equally spaced samples in single precision; a gap where they overflow."""
+    samples = values.detach()[:: -(-len(values) // _POINTS)].double().numpy()
+    return np.where(np.abs(samples) < 1e6, samples, np.nan).astype(np.float32)
