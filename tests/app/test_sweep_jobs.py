@@ -84,28 +84,15 @@ def test_the_same_sweep_again_skips_what_is_done_and_runs_the_rest(sweep, tmp_pa
     assert again["validation"]["val/error_mean"] == expected["validation"]["val/error_mean"]
 
 
-@pytest.mark.parametrize("finished", [True, False])
-def test_another_configuration_in_the_folder_is_refused_with_the_keys_that_differ(
-    sweep, tmp_path, finished
-):
+def test_another_configuration_in_the_folder_is_refused_with_the_keys_that_differ(sweep, tmp_path):
     assert sweep("model=lnn", "data.pairs=64") is None
     folder = job(tmp_path, "0_lnn-seed0")
-    if not finished:
-        (folder / "metrics.json").unlink()
     before = (folder / "config.yaml").read_text()
     said = sweep("model=lnn", "data.pairs=96", "optimizer.lr=0.001")
     assert "sweep/0_lnn-seed0 holds a training of another configuration" in said
     assert "data.pairs=96 (there 64)" in said
     assert "optimizer.lr=0.001 (there 0.005)" in said
     assert (folder / "config.yaml").read_text() == before
-    assert (folder / "metrics.json").exists() == finished
-
-
-def test_a_mistake_that_was_mended_is_no_other_training(sweep, tmp_path):
-    assert "ConfigError" in sweep("model=lnn", "data.pairs=100000")
-    assert sweep("model=lnn", "data.pairs=64") is None
-    config = yaml.safe_load((job(tmp_path, "0_lnn-seed0") / "config.yaml").read_text())
-    assert config["data"]["pairs"] == 64
 
 
 def test_a_folder_in_which_another_process_trains_is_refused(tmp_path, monkeypatch):
@@ -116,17 +103,6 @@ def test_a_folder_in_which_another_process_trains_is_refused(tmp_path, monkeypat
         error = fails("train.py", *TINY, NO_FIGURES, "model=lnn", "hydra.run.dir=run")
     assert "run is in use: another process trains there" in str(error.code)
     assert not (tmp_path / "run" / "config.yaml").exists()
-
-
-def test_a_single_training_in_a_named_folder_follows_the_same_rules(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = ["train.py", *TINY, NO_FIGURES, "model=lnn", "hydra.run.dir=run"]
-    run_script(*words)
-    before = (tmp_path / "run" / "metrics.json").stat().st_mtime_ns
-    run_script(*words)
-    assert (tmp_path / "run" / "metrics.json").stat().st_mtime_ns == before
-    error = fails(*words, "seed=1")
-    assert "seed=1 (there 0)" in str(error.code)
 
 
 def test_a_search_goes_past_diverged_trials_and_asks_for_the_same_ones_again(sweep, tmp_path):

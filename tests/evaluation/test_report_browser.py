@@ -104,12 +104,6 @@ def test_the_slider_of_the_browser_selects_a_trajectory(browser, prediction):
     assert page.fine()
 
 
-def test_an_error_on_the_console_would_be_noticed(browser, tmp_path):
-    path = tmp_path / "page.html"
-    path.write_text("<!DOCTYPE html><p class=main-svg>A figure</p><script>nothing.at(1)</script>")
-    assert not Opened(browser, path).fine()
-
-
 @pytest.mark.parametrize("width", [500, 1280])
 def test_a_page_does_not_scroll_sideways(browser, prediction, width):
     """Chromium makes no window narrower than 500 px."""

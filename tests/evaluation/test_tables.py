@@ -8,13 +8,11 @@ import pytest
 from pinn_dyn.evaluation.tables import (
     best,
     model_names,
-    number,
     over_seeds,
     summary_columns,
     to_text,
     unbeaten_baselines,
     varied_settings,
-    write_table,
 )
 
 
@@ -141,18 +139,3 @@ def test_the_summary_shows_at_most_nine_columns_with_information():
     assert len(columns) == 9
     assert columns["window_1s_error_mean"] == "error, reset every 1 s"
     assert {"valid_time_small", "window_0.1s_error_mean"}.isdisjoint(columns)
-
-
-def test_a_file_keeps_all_digits(tmp_path):
-    frame = summary({"lnn": 0.123456789012345678, "mlp": math.inf})
-    table = pd.read_csv(write_table(frame, tmp_path / "new", "summary"))
-    assert table["error_mean"].tolist() == frame["error_mean"].tolist()
-    assert table["baseline"].tolist() == [False, False]
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.00123456, "0.00123"), (12345.6, "12346"), (7, "7"), (math.nan, "-"), (pd.NA, "-")],
-)
-def test_numbers_have_three_significant_digits(value, text):
-    assert number(value) == text

@@ -44,11 +44,6 @@ def test_the_error_is_that_of_the_horizon_re_set_every_window(window, errors, te
     assert str(validator(window)) == text
 
 
-def test_without_a_step_the_roll_out_takes_that_of_the_training():
-    prediction = validator(None, step=None).predict(Drift(), truth())
-    torch.testing.assert_close(prediction.t, T[:13])
-
-
 @pytest.mark.parametrize(
     ("window", "horizon", "step", "words"),
     [
