@@ -42,7 +42,7 @@ def main(command: str) -> None:
         run = partial(_run, command)
         hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
-        raise SystemExit("interrupted: the same command on the same folder goes on") from None
+        raise SystemExit("interrupted") from None
     except (HydraException, OmegaConfBaseException) as error:
         raise SystemExit(f"Error: {explained(error)}") from error
     except ConfigError as error:

@@ -64,6 +64,9 @@ def train(cfg: DictConfig) -> float:
             raise
         if HydraConfig.get().mode == RunMode.RUN:
             log.warning("interrupted; resume with: python train.py resume=%s", folder)
+        else:
+            sweep = HydraConfig.get().sweep.dir
+            log.warning("interrupted; go on with the same command and hydra.sweep.dir=%s", sweep)
         raise SystemExit(stop.code or 128 + signal.SIGTERM) from interrupt
     return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
 
