@@ -26,50 +26,15 @@ Signal = Callable[[np.ndarray], np.ndarray]
 """Maps times ``(T,)`` in s to inputs ``(count, T, M)``: ``count`` signals drawn together."""
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """Signals drawn together: a function of time and of arrays with one row per signal."""
+def joined(signals: Sequence[Signal], which: np.ndarray, row: np.ndarray) -> Signal:
+    """Join signals of several draws: signal k is number ``row[k]`` of ``signals[which[k]]``."""
 
-    function: Callable[..., np.ndarray]
-    arrays: Sequence[np.ndarray]
+    def signal(t: np.ndarray) -> np.ndarray:
+        values = [part(t) for part in signals]
+        starts = np.cumsum([0, *map(len, values[:-1])])
+        return np.concatenate(values)[starts[which] + row]
 
-    def __call__(self, t: np.ndarray) -> np.ndarray:
-        return self.function(t, *self.arrays)
-
-    def rows(self, index: np.ndarray) -> Signal:
-        """Select some of the signals; the other signals are not computed."""
-        return Drawn(self.function, [array[index] for array in self.arrays])
-
-
-class Joined:
-    """Signals of several draws as one: signal k is number ``row[k]`` of ``signals[which[k]]``.
-
-    Only the rows of a :class:`Drawn` that are needed are computed.
-    """
-
-    def __init__(self, signals: Sequence[Signal], which: np.ndarray, row: np.ndarray):
-        self._signals, self._which, self._row = signals, which, row
-        self._parts: list[Signal] = []
-        self._pick = np.empty(len(which), dtype=int)
-        count = 0
-        for k in np.unique(which):
-            needed, position = np.unique(row[which == k], return_inverse=True)
-            self._parts.append(_rows(signals[k], needed))
-            self._pick[which == k] = count + position
-            count += len(needed)
-
-    def __call__(self, t: np.ndarray) -> np.ndarray:
-        return np.concatenate([part(t) for part in self._parts])[self._pick]
-
-    def rows(self, index: np.ndarray) -> Signal:
-        """Select some of the signals."""
-        return Joined(self._signals, self._which[index], self._row[index])
-
-
-def _rows(signal: Signal, index: np.ndarray) -> Signal:
-    if isinstance(signal, (Drawn, Joined)):
-        return signal.rows(index)
-    return lambda t: signal(t)[index]
+    return signal
 
 
 class Excitation(abc.ABC):
@@ -94,8 +59,7 @@ class _Bounded(Excitation):
         return np.asarray(self.offset) + peak[:, None, :] * shape
 
     def _peaks(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        low = np.asarray(self.amplitude, dtype=float)
-        return low * rng.uniform(1 / 3, 1.0, (count, len(low)))
+        return np.array(self.amplitude) * rng.uniform(1 / 3, 1.0, (count, len(self.amplitude)))
 
 
 @dataclass(frozen=True)
@@ -120,12 +84,12 @@ class MultiSine(_Bounded):
         frequency = np.exp(rng.uniform(low, high, shape))
         phase = rng.uniform(0, 2 * np.pi, shape)
         weight = rng.dirichlet(np.ones(self.harmonics), peak.shape)
-        return Drawn(self._signal, (peak, frequency, phase, weight))
 
-    def _signal(self, t: np.ndarray, peak: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
-        frequency, phase, weight = (array[:, None] for array in arrays)
-        angle = 2 * np.pi * frequency * t[:, None, None] + phase
-        return self._scaled((weight * np.sin(angle)).sum(-1), peak)
+        def signal(t: np.ndarray) -> np.ndarray:
+            angle = 2 * np.pi * frequency[:, None] * t[:, None, None] + phase[:, None]
+            return self._scaled((weight[:, None] * np.sin(angle)).sum(-1), peak)
+
+        return signal
 
 
 @dataclass(frozen=True)
@@ -147,13 +111,12 @@ class Chirp(_Bounded):
         down = rng.random(peak.shape) < 0.5
         start = np.where(down, self.frequency[1], self.frequency[0])
         rate = np.where(down, -1, 1) * (self.frequency[1] - self.frequency[0]) / duration
-        return Drawn(self._signal, (peak, phase, start, rate))
 
-    def _signal(self, t: np.ndarray, peak: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
-        phase, start, rate = (array[:, None] for array in arrays)
-        time = t[:, None]
-        cycles = start * time + 0.5 * rate * time**2
-        return self._scaled(np.sin(phase + 2 * np.pi * cycles), peak)
+        def signal(t: np.ndarray) -> np.ndarray:
+            cycles = start[:, None] * t[:, None] + 0.5 * rate[:, None] * t[:, None] ** 2
+            return self._scaled(np.sin(phase[:, None] + 2 * np.pi * cycles), peak)
+
+        return signal
 
 
 @dataclass(frozen=True)
@@ -183,18 +146,19 @@ class Steps(_Bounded):
         shape = (*peak.shape, number)
         level = rng.uniform(-1, 1, shape)
         start = np.cumsum(rng.uniform(self.hold[0], self.hold[1], shape), axis=-1)
-        return Drawn(self._signal, (peak, level, start))
+        rows, _, columns = np.ix_(range(count), range(1), range(peak.shape[1]))
 
-    def _signal(self, t: np.ndarray, peak: np.ndarray, *arrays: np.ndarray) -> np.ndarray:
-        level, start = arrays
-        rows, _, columns = np.ix_(range(len(peak)), range(1), range(peak.shape[1]))
-        # A ramp ends before the next begins: only the last one begun is under way.
-        begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)
-        last = np.maximum(begun - 1, 0)
-        before = level[rows, columns, last]
-        ramp = np.clip((t[:, None] - start[rows, columns, last]) / self.rise_time, 0.0, 1.0)
-        smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
-        return self._scaled(before + (level[rows, columns, last + 1] - before) * smooth, peak)
+        def signal(t: np.ndarray) -> np.ndarray:
+            # A ramp ends before the next begins: only the last ramp begun is under way.
+            begun = (t[:, None, None] >= start[:, None, :, :-1]).sum(-1)
+            last = np.maximum(begun - 1, 0)
+            before = level[rows, columns, last]
+            ramp = np.clip((t[:, None] - start[rows, columns, last]) / self.rise_time, 0.0, 1.0)
+            smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
+            step = level[rows, columns, last + 1] - before
+            return self._scaled(before + step * smooth, peak)
+
+        return signal
 
 
 @dataclass(frozen=True)
@@ -211,4 +175,4 @@ class Mixture(Excitation):
             part.draw(size, duration, rng) for part, size in zip(self.parts, sizes, strict=True)
         ]
         index = np.arange(count)
-        return Joined(signals, index % kinds, index // kinds)
+        return joined(signals, index % kinds, index // kinds)

@@ -13,7 +13,7 @@ import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from pinn_dyn.data.cache import Arrays, load_or_make
-from pinn_dyn.data.excitation import Excitation, Joined
+from pinn_dyn.data.excitation import Excitation, joined
 from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
 from pinn_dyn.data.initial_states import InitialStates
@@ -104,15 +104,12 @@ class SimulatedSource(DataSource):
                 f"{self.name}: test_duration is {self.test_duration} s, expected from keep_every * "
                 f"step = {self.keep_every * self.step:g} to duration = {self.duration} s"
             )
-        if self.pairing == "matched" and self.train_initial_states != self.train_inputs:
+        matched = self.pairing == "matched" and self.train_initial_states == self.train_inputs
+        if not matched and (self.pairing == "matched" or self.q_limits is not None):
             raise ValueError(
-                f"{self.name}: pairing is 'matched' with {self.train_initial_states} initial "
-                f"states and {self.train_inputs} inputs for training, expected as many of each"
-            )
-        if self.q_limits is not None and self.pairing != "matched":
-            raise ValueError(
-                f"{self.name}: q_limits draw motions anew, which breaks the combinations of "
-                "pairing = 'product': set pairing = 'matched'"
+                f"{self.name}: pairing is {self.pairing!r} with {self.train_initial_states} initial"
+                f" states and {self.train_inputs} inputs for training, expected 'matched' with as "
+                "many of each, also for q_limits"
             )
         states, size = self.initial_states, self.system.num_coordinates
         for key, values, expected in (
@@ -125,11 +122,8 @@ class SimulatedSource(DataSource):
                 raise ValueError(
                     f"{self.name}: {key} has {len(values)} entries, the system needs {expected}"
                 )
-        low, high = np.array(self.q_limits or [states.q_low, states.q_high], dtype=float)
-        if (low > states.q_low).any() or (high < states.q_high).any():
-            raise ValueError(f"{self.name}: q_limits do not hold all initial states")
         if isinstance(self.system, HasDomain):
-            self.system.check_domain(low, high)
+            self.system.check_domain(*np.array(self.q_limits or [states.q_low, states.q_high]))
         self.angles = tuple(getattr(self.system, "angles", ()))
         self.labels, self.input_labels = list(self.labels), list(self.input_labels)
 
@@ -166,15 +160,12 @@ class SimulatedSource(DataSource):
 
     def simulate(self) -> Arrays:
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
-        # Splits of one duration are one batch.
-        if self.test_duration == self.duration:
+        if self.test_duration in (None, self.duration):
             return self._simulate(SPLITS, self.duration, 0)
         # Two batches of one size: the compiled equation of motion serves both.
         size = max(len(self._pairs("train")), self.validation + self.test)
-        return {
-            **self._simulate(SPLITS[1:], self.test_duration or self.duration, size),
-            **self._simulate(SPLITS[:1], self.duration, size),  # the longer times, "t", last
-        }
+        short = self._simulate(SPLITS[1:], self.test_duration, size)
+        return {**short, **self._simulate(SPLITS[:1], self.duration, size)}  # the longer "t"
 
     def _simulate(self, splits: Sequence[str], duration: float, size: int) -> Arrays:
         """Simulate the trajectories of some splits in one batch, padded with copies to ``size``."""
@@ -214,18 +205,19 @@ class SimulatedSource(DataSource):
             signals.append(self.excitation.draw(inputs, self.duration, rng))
             rows += [(index, number) for number in pairs[:, 1]]
         q0, v0 = np.concatenate(starts, axis=1)
-        return _Draw(q0, v0, Joined(signals, *np.array(rows).T))
+        return _Draw(q0, v0, joined(signals, *np.array(rows).T))
 
     def _move(
         self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Simulate q, v and u of some motions: ``rows`` of the concatenated draws."""
-        size = len(draws[0].q0)
-        signal = Joined([draw.signal for draw in draws], rows // size, rows % size)
+        q0, v0, signals = zip(*draws, strict=True)
+        size = len(q0[0])
+        signal = joined(signals, rows // size, rows % size)
         q, v = simulate(
             self.system,
-            np.concatenate([draw.q0 for draw in draws])[rows],
-            np.concatenate([draw.v0 for draw in draws])[rows],
+            np.concatenate(q0)[rows],
+            np.concatenate(v0)[rows],
             signal,
             t,
             rtol=self.rtol,
@@ -252,11 +244,10 @@ class SimulatedSource(DataSource):
         while (left := np.flatnonzero(~stays(q))).size:
             if drawn >= _DRAWS:
                 passed = ((q[left] < low) | (q[left] > high)).any((0, 1))
-                names = [label for label, beyond in zip(self.labels, passed, strict=True) if beyond]
                 raise SimulationError(
                     f"{self.name}: {left.size} of {len(q)} motions leave q_limits of "
-                    f"{', '.join(names)} in each of {drawn} draws: reduce the amplitude of the "
-                    "excitation or the initial states, or widen q_limits"
+                    f"{', '.join(np.array(self.labels)[passed])} in each of {drawn} draws: reduce "
+                    "the excitation or the initial states, or widen q_limits"
                 )
             draws = [self._draw(rngs) for _ in range(_AT_ONCE)]
             drawn += _AT_ONCE

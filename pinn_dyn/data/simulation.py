@@ -97,16 +97,15 @@ def simulate(
             slope = equation(x, u).numpy()
         return np.where(left[:, None], 0.0, slope).ravel()
 
-    def give_up(time: float, reason: str) -> SimulationError:
+    def give_up(time: float) -> SimulationError:
         return SimulationError(
-            f"the simulation stopped at t = {time:.4g} s of {t[-1]:.4g} s: {reason}; reduce the "
-            f"input or the initial states, or loosen rtol = {rtol:g} and atol = {atol:g}"
+            f"the simulation stopped at t = {time:.4g} s of {t[-1]:.4g} s: the mass matrix is no "
+            "longer positive definite (an arm of length zero, say), or the input is not finite; "
+            f"reduce the input or the initial states, or loosen rtol = {rtol:g}, atol = {atol:g}"
         )
 
     if not np.isfinite(derivative(t[0], x0.ravel())).all():
-        raise give_up(
-            t[0], "the acceleration is not finite (M not positive definite, or a bad input)"
-        )
+        raise give_up(t[0])
     states = np.full((count, len(t), size), np.nan)
     states[:, 0] = x0
     filled = 1
@@ -118,16 +117,11 @@ def simulate(
         bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
     ) as bar:
         while solver.status == "running" and not left.all():
-            message = solver.step()
-            if solver.status == "failed":
-                raise give_up(solver.t, message)
+            solver.step()
             # The very last step may be short: it ends where the time does.
-            if solver.status == "running" and solver.step_size < _SMALLEST_STEP * t[-1]:
-                raise give_up(
-                    solver.t,
-                    f"its step shrank to {solver.step_size:.1e} s, as it does where the mass "
-                    "matrix is no longer positive definite (an arm of length zero, say)",
-                )
+            stuck = solver.status == "running" and solver.step_size < _SMALLEST_STEP * t[-1]
+            if stuck or solver.status == "failed":
+                raise give_up(solver.t)
             until = int(np.searchsorted(t, solver.t, side="right"))
             if until > filled:
                 dense = solver.dense_output()(t[filled:until]).reshape(count, size, -1)

@@ -164,11 +164,10 @@ def draw_windows(
     span = steps * stride
     sample = float(trajectories[0].t[1] - trajectories[0].t[0])
     for k, item in enumerate(trajectories):
-        spacing = item.t.diff()
-        if (spacing - sample).abs().max() > 1e-6 * sample:
+        if (item.t.diff() - sample).abs().max() > 1e-6 * sample:
             raise ValueError(
-                f"training trajectory {k} has sample times from {float(spacing.min()):g} to "
-                f"{float(spacing.max()):g} s, expected {sample:g} s throughout: resample it first"
+                f"training trajectory {k} has sample times that differ from {sample:g} s, those of "
+                "the first: resample it"
             )
     if history and trajectories[0].input.interpolation == "hold":
         raise ValueError(
@@ -181,9 +180,9 @@ def draw_windows(
     count = max(total, 1) if count is None else count
     if total < count:
         raise ValueError(
-            f"{count} windows of {span + past} samples ({(span + past) * sample:g} s) were asked "
-            f"for, but the {len(trajectories)} training trajectories have only {total} starts for "
-            "them: ask for fewer pairs, a shorter window or more data"
+            f"{count} windows of {span + past} samples ({(span + past) * sample:g} s) do not fit: "
+            f"the training trajectories have only {total} starts: take fewer pairs, a shorter "
+            "window or more data"
         )
     generator = torch.Generator().manual_seed(seed)
     if coverage > 0:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pinn_dyn.data import Chirp, Mixture, MultiSine, Steps
-from pinn_dyn.data.excitation import Joined
+from pinn_dyn.data.excitation import joined
 
 OFFSET = np.array([0.5, -2.0])
 AMPLITUDE = np.array([1.0, 0.25])
@@ -52,31 +52,11 @@ def test_a_signal_is_a_function_of_time_alone(kind):
     np.testing.assert_allclose(one_by_one[:, ::-1], together, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_rows_of_signals_are_those_of_all_of_them(kind):
-    """To the last bit: data are the same whatever is simulated beside them."""
-    signal = KINDS[kind].draw(13, DURATION, np.random.default_rng(5))
-    rows = np.array([7, 0, 12, 7, 3])
-    for t in (TIME, TIME[40:41]):
-        np.testing.assert_array_equal(signal.rows(rows)(t), signal(t)[rows])
-        np.testing.assert_array_equal(signal.rows(rows).rows(rows[1:2])(t), signal(t)[7:8])
-
-
-def test_signals_of_several_draws_are_joined_and_what_is_not_needed_is_not_computed():
+def test_signals_of_several_draws_are_joined():
     draws = [KINDS["steps"].draw(4, DURATION, np.random.default_rng(k)) for k in range(2)]
-    evaluated = []
-
-    def plain(t):  # a signal of a user's own, which has no rows to choose from
-        evaluated.append(t)
-        return np.stack([np.full((t.size, 2), float(k)) for k in range(3)])
-
-    which, row = np.array([2, 0, 1, 0]), np.array([1, 3, 0, 3])
-    joined = Joined([*draws, plain], which, row)
-    expected = np.stack([plain(TIME)[1], draws[0](TIME)[3], draws[1](TIME)[0], draws[0](TIME)[3]])
-    np.testing.assert_array_equal(joined(TIME), expected)
-    evaluated.clear()
-    np.testing.assert_array_equal(joined.rows(np.array([3, 2]))(TIME), expected[[3, 2]])
-    assert not evaluated
+    signal = joined(draws, np.array([0, 1, 0]), np.array([3, 0, 3]))
+    expected = np.stack([draws[0](TIME)[3], draws[1](TIME)[0], draws[0](TIME)[3]])
+    np.testing.assert_array_equal(signal(TIME), expected)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])
