@@ -1,4 +1,4 @@
-"""What a misspelt name probably meant; outside the rooms, as all of them have names."""
+"""Suggestions for misspelled names."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 
-def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The known names that are like another one, as the end of a sentence; "" without any."""
-    close = difflib.get_close_matches(str(name), list(known))
+def did_you_mean(name: object, names: Iterable[str]) -> str:
+    """Return the names that resemble one, as the end of a sentence; "" without any."""
+    close = difflib.get_close_matches(str(name), list(names))
     return f": did you mean {' or '.join(close)}?" if close else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pkgutil
 import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,19 +31,17 @@ def config_folder(command: str) -> Path:
     return folder if folder.is_dir() else CONF
 
 
-def completed(command: str, words: list[str]) -> list[str]:
+def completed(command: str, overrides: Sequence[str]) -> list[str]:
     """Put ``++`` before every override of a value, so that keys in no YAML can be set as well.
 
     Unknown keys are refused later, by the signatures of the classes: see :mod:`validation`.
     """
     folder = config_folder(command)
-
-    def is_value(word: str) -> bool:
-        key, equals, _ = word.partition("=")
-        plain = re.fullmatch(r"[A-Za-z]\w*(\.\w+)*", key) and not key.startswith("hydra.")
-        return bool(equals and plain and not (folder / key).is_dir())
-
-    return [f"++{word}" if is_value(word) else word for word in words]
+    matches = [re.match(r"(?!hydra\.)([A-Za-z]\w*(?:\.\w+)*)=", text) for text in overrides]
+    return [
+        f"++{text}" if match and not (folder / match[1]).is_dir() else text
+        for text, match in zip(overrides, matches, strict=True)
+    ]
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -73,25 +72,25 @@ def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
     return config
 
 
-def composed(command: str, words: list[str], config_dir: str | None = None) -> dict[str, Any]:
+def composed(
+    command: str, overrides: Sequence[str], config_dir: str | None = None
+) -> dict[str, Any]:
     """Compose and check the configuration of a command; of a sweep the first value counts.
 
-    ``words`` are overrides, ``config_dir`` is a folder with further options of groups.
+    ``config_dir`` is a folder with further options of groups.
 
     Raises:
         ConfigError: as :func:`check`, or with the message of Hydra.
     """
     search_path = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
-    before = HydraConfig.instance().cfg
+    folder, before = str(config_folder(command)), HydraConfig.instance().cfg
     try:
-        with hydra.initialize_config_dir(
-            version_base="1.3", config_dir=str(config_folder(command))
-        ):
-            overrides = [*search_path, *_first_of_sweeps(completed(command, words))]
+        with hydra.initialize_config_dir(version_base="1.3", config_dir=folder):
+            texts = [*search_path, *_first_of_sweeps(completed(command, overrides))]
             try:
-                cfg = hydra.compose(command, overrides=overrides, return_hydra_config=True)
+                cfg = hydra.compose(command, overrides=texts, return_hydra_config=True)
             except (ValueError, TypeError, AttributeError) as error:  # of Hydra, without a message
-                raise ConfigError(f"Hydra cannot use {' '.join(words)}: {error}") from error
+                raise ConfigError(f"Hydra cannot use {' '.join(overrides)}: {error}") from error
             HydraConfig.instance().set_config(cfg)  # resolves ${hydra:...}
             with open_dict(cfg):
                 del cfg["hydra"]
@@ -102,15 +101,17 @@ def composed(command: str, words: list[str], config_dir: str | None = None) -> d
         HydraConfig.instance().cfg = before
 
 
-def _first_of_sweeps(words: list[str]) -> list[str]:
+def _first_of_sweeps(overrides: list[str]) -> list[str]:
     first = []
-    for word, override in zip(words, OverridesParser.create().parse_overrides(words), strict=True):
+    for text, override in zip(
+        overrides, OverridesParser.create().parse_overrides(overrides), strict=True
+    ):
         value = override.value()
         if isinstance(value, IntervalSweep):
-            word = f"{word.split('=')[0]}={value.start}"
+            text = f"{text.split('=')[0]}={value.start}"
         elif override.is_sweep_override():
-            word = f"{word.split('=')[0]}={next(override.sweep_string_iterator(), 'null')}"
-        first.append(word)
+            text = f"{text.split('=')[0]}={next(override.sweep_string_iterator(), 'null')}"
+        first.append(text)
     return first
 
 

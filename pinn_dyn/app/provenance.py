@@ -71,14 +71,11 @@ def write_provenance(
     write_whole(folder / "provenance.json", content)
     texts = {"this program": config} | {name: run.config for name, run in runs.items()}
     facts = {"data set": source.name} | {k.replace("_", " "): x for k, x in record.items()}
-    return Origin(
-        facts,
-        pd.DataFrame(rows),
-        {
-            f"Configuration of {name}": yaml.safe_dump(value, sort_keys=False, allow_unicode=True)
-            for name, value in texts.items()
-        },
-    )
+    configurations = {
+        f"Configuration of {name}": yaml.safe_dump(value, sort_keys=False, allow_unicode=True)
+        for name, value in texts.items()
+    }
+    return Origin(facts, pd.DataFrame(rows), configurations)
 
 
 def _git(*arguments: str) -> str:

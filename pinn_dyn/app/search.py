@@ -51,14 +51,10 @@ class EqualSearch:
         def chosen(choices: Sequence[Any]) -> Any:
             return choices[int(next(point) * len(choices))]
 
-        def drawn_between(low: float, high: float) -> float:
-            return float(low * (high / low) ** next(point))
-
-        optimizer = {
-            **config["optimizer"],
-            "lr": drawn_between(*self.lr),
-            "weight_decay": drawn_between(*self.weight_decay),
-        }
+        optimizer = {**config["optimizer"]}
+        for name in ("lr", "weight_decay"):
+            low, high = getattr(self, name)
+            optimizer[name] = float(low * (high / low) ** next(point))
         width, depth = chosen(self.width), chosen(self.depth)
         drawn = {
             "hidden": [width] * depth,

@@ -123,8 +123,8 @@ def train(
         data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)
         optimizer=partial(torch.optim.AdamW, lr=0.002)
 
-    A training into a folder that holds an interrupted training of the same arguments resumes it. A
-    finished one is loaded instead.
+    If the folder holds an interrupted training of the same arguments, it is resumed. A finished
+    training is loaded.
 
     Args:
         source: the data.
@@ -280,7 +280,7 @@ def _description(source: DataSource) -> dict[str, Any]:
 def build_data(
     data: Callable[..., DynamicsData], source: DataSource, seed: int, batches: int
 ) -> DynamicsData:
-    """Build the windows, with the seed of the training unless they have their own."""
+    """Build the windows, with the seed of the training unless they have one."""
     seeds = {} if "seed" in getattr(data, "keywords", {}) else {"seed": seed}
     with naming("data"):
         return data(source=source, batches_per_epoch=batches, **seeds)
@@ -353,15 +353,15 @@ def _fit(
     try:
         with naming("optimizer") if solver else contextlib.nullcontext():
             trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
+        if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
+            trainer.validate(learner, data, verbose=False)
     except SystemExit as stop:  # Lightning's end of an interrupted training
         if solver and solver.result is not None:
             trainer.save_checkpoint(last)
-            write_constants(learner.model, solver.result, source, folder)
         raise KeyboardInterrupt from stop
-    if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
-        trainer.validate(learner, data, verbose=False)
-    if solver and solver.result is not None:
-        write_constants(learner.model, solver.result, source, folder)
+    finally:
+        if solver and solver.result is not None:
+            write_constants(learner.model, solver.result, source, folder)
     # Other processes have counted the steps of theirs.
     record = recorder.record(trainer, learner.model, read_checkpoint(last)["global_step"])
     finish(folder, record)

@@ -15,7 +15,7 @@ from scipy.signal import savgol_filter
 import pinn_dyn
 from pinn_dyn.app.build import training_arguments
 from pinn_dyn.app.config import composed
-from pinn_dyn.data import DynamicsData, InitialStates, MultiSine, SimulatedSource
+from pinn_dyn.data import DynamicsData
 from pinn_dyn.data.logs import MovingAverage
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import AccelerationMLP, LagrangianNetwork
@@ -349,37 +349,3 @@ def test_a_folder_of_another_training_is_refused(tmp_path):
     pinn_dyn.train(Still(), "acceleration", folder=tmp_path, **SHORT)
     with pytest.raises(ValueError, match=r"another configuration: seed=1 \(there 0\)"):
         pinn_dyn.train(Still(), "acceleration", folder=tmp_path, seed=1, **SHORT)
-
-
-def test_a_simulated_source_of_an_own_robot_is_trained_on(tmp_path):
-    class Mass(pinn_dyn.MechanicalSystem):
-        def mass_matrix(self, q):
-            return torch.ones_like(q).unsqueeze(-1)
-
-        def potential_energy(self, q):
-            return q.square().sum(-1) / 2
-
-        def damping_matrix(self, q):
-            return torch.zeros_like(q).unsqueeze(-1)
-
-        def input_matrix(self, q):
-            return torch.ones_like(q).unsqueeze(-1)
-
-    source = SimulatedSource(
-        name="mass",
-        system=Mass(num_coordinates=1, num_inputs=1),
-        excitation=MultiSine([0.0], [1.0]),
-        initial_states=InitialStates([-1.0], [1.0], [1.0]),
-        duration=0.2,
-        step=0.01,
-        train_initial_states=1,
-        train_inputs=2,
-        validation=1,
-        test=1,
-        labels=["x [m]"],
-        input_labels=["f [N]"],
-        cache=str(tmp_path),
-    )
-    run = pinn_dyn.train(source, "hnn", **SHORT)
-    assert run.source is source
-    assert run.terms([0.0]).M.shape == (1, 1)

@@ -43,10 +43,7 @@ def test_every_experiment_is_accepted(monkeypatch, command, experiment):
     ("steps", "validations", "expected"),
     [
         (20000, 4, (20, 1000, 5)),
-        (60000, 6, (60, 1000, 10)),
         (5000, 25, (25, 200, 1)),
-        (500, 10, (10, 50, 1)),
-        (5, 1, (1, 5, 1)),
         (4500, 3, (6, 750, 2)),
         (1009, 1, (1, 1009, 1)),  # a prime
     ],
@@ -72,14 +69,11 @@ def test_steps_that_are_no_multiple_of_the_validations_say_which_are():
         ("train", "loss.huber=0.01", "loss.huber"),
         ("train", "trainer.precision=bf16-mixed", "trainer.precision"),
         ("train", "dataset.system.mass=0.4", "dataset.system.mass"),
-        ("train", "+dataset.system.mass=0.4", "dataset.system.mass"),
-        ("train", "resume=runs/x", "resume"),
         ("train", "trust=[my_package]", "trust"),
         ("train", "model.angles=[0],[1]", "model.angles"),
         ("control", "actuator.low=-1", "actuator.low"),
         ("control", "robot.mass=0.36", "robot.mass"),
         ("evaluate", "thresholds.tiny=0.001", "thresholds.tiny"),
-        ("gather", "filter.model=lnn", "filter.model"),
         ("check", "dataset.max_age=0.2", "dataset.max_age"),
     ],
 )
@@ -108,7 +102,6 @@ def test_options_of_a_users_own_folder_are_checked(tmp_path):
         ("++model.integrator.substep=1", "did you mean model.integrator.substeps"),
         ("~validator", "no value for validator"),
         ("data=[1]", "Hydra cannot use data=[1]"),
-        ("model=lagrangian", "'model/lagrangian' does not exist"),
         ("optimizer=adam", "did you mean adamw"),
         ("model.delay=learned", "write model/delay=learned"),
         ("data.pairs=${oc.env:NOWHERE_AT_ALL}", "NOWHERE_AT_ALL"),
@@ -140,11 +133,8 @@ def test_all_mistakes_are_reported_at_once():
 RK4 = {"_target_": "pinn_dyn.mechanics.RK4"}
 HEAD = {"_target_": "pinn_dyn.models.ConstantCholesky", "_partial_": True}
 FITTING = [
-    (1, int),
     (1, float),
-    (None, int | None),
     ([1, 2], tuple[float, float]),
-    ([], Sequence[int]),
     ({"a": 1}, Mapping[str, int]),
     (RK4, Integrator),
     ([RK4], Sequence[Integrator]),
@@ -153,7 +143,6 @@ FITTING = [
     (0.5, Annotated[float, Field(lt=1)]),
 ]
 UNFITTING = [
-    (True, int),
     (1.0, int),
     (float("inf"), float),
     ("1e-3", float),
