@@ -12,7 +12,8 @@ from pinn_dyn.app.config import ConfigError, build_part, checked
 from pinn_dyn.app.known_data import check_structure
 from pinn_dyn.app.run_folder import write_config
 from pinn_dyn.app.sweep import command_line
-from pinn_dyn.data.logs import LogError, LogSource
+from pinn_dyn.app.trainer import naming
+from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation.log_check import check as check_log
 from pinn_dyn.models.known import Structure
 
@@ -24,7 +25,6 @@ def check(cfg: DictConfig) -> None:
         ConfigError: if the data set is no log or cannot be used, or a training makes no sense.
     """
     config = checked("check", cfg)
-    folder = Path(HydraConfig.get().runtime.output_dir)
     source = build_source(config)
     if not isinstance(source, LogSource):
         raise ConfigError(
@@ -39,10 +39,9 @@ def check(cfg: DictConfig) -> None:
                 "model/structure=urdf model.structure.urdf=my_robot.urdf"
             )
         check_structure("model.structure", structure, source)
-    try:
+    with naming(source.name):
         report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
-    except LogError as error:
-        raise ConfigError(f"{source.name}: {error}") from error
+    folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
     page = report.save(folder, command_line())
     print(f"\n{report}\n\nthe page is {page}")

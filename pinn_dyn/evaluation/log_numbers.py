@@ -1,4 +1,4 @@
-"""Numbers of a log check: noise, regressors, shares of the motion, distances, bandwidth."""
+"""Numbers of a log check: noise, share of the inputs, bandwidth, distances."""
 
 from __future__ import annotations
 
@@ -22,31 +22,6 @@ def white_noise(x: np.ndarray) -> np.ndarray:
     return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
 
 
-def _smooth_motion(item: Recording, width: float) -> list[np.ndarray]:
-    """Return q, v, a averaged by a Gaussian kernel of a width in samples; v, a per sample."""
-    return [gaussian_filter1d(item.q, width, axis=0, order=k) for k in range(3)]
-
-
-def independent_shares(training: Sequence[Recording], step: float) -> np.ndarray:
-    """Return the share of each a_k that 1, q_k, v_k and the other a do not explain, ``(N,)``."""
-    width = max(_SMOOTH / step, 1.5)
-    inner = slice(int(4 * width), -int(4 * width), max(1, int(width / 2)))
-    size = training[0].q.shape[1]
-    motion = [np.hstack([x[inner] for x in _smooth_motion(item, width)]) for item in training]
-    x = np.vstack(motion)
-    if not len(x):
-        return np.full(size, np.nan)
-    x = (x - x.mean(axis=0)) / x.std(axis=0).clip(min=1e-300)
-    shares = []
-    for k in range(size):
-        a = x[:, 2 * size + k]
-        known = np.delete(x[:, 2 * size :], k, axis=1)
-        known = np.column_stack([np.ones(len(x)), x[:, k], x[:, size + k], known])
-        remainder = a - known @ np.linalg.lstsq(known, a, rcond=None)[0]
-        shares.append(remainder.var() / max(a.var(), 1e-300))
-    return np.array(shares)
-
-
 def explained_share(
     training: Sequence[Recording], delays: Sequence[DelayCurve], step: float
 ) -> float:
@@ -63,16 +38,17 @@ def explained_share(
         rows = np.arange(edge + max(lags), len(item) - edge, max(1, int(3.5 * width)))
         smooth = gaussian_filter1d(item.u, width, axis=0)
         acting = np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)])
-        parts.append([*(x[rows] for x in _smooth_motion(item, width)), acting])
+        motion = [gaussian_filter1d(item.q, width, axis=0, order=k)[rows] for k in range(3)]
+        parts.append([*motion, acting])
     q, v, a, u = map(np.vstack, zip(*parts, strict=True))
     if len(q) < 6 * (3 * q.shape[1] + len(lags)):
         return 1.0
-    known = np.hstack([np.ones((len(q), 1)), q, np.sin(q), np.cos(q)])
+    basis = np.hstack([np.ones((len(q), 1)), q, np.sin(q), np.cos(q)])
     return max(
-        _unexplained(v, known) - _unexplained(v, np.hstack([known, u])),
-        _unexplained(a, np.hstack([known, v])) - _unexplained(a, np.hstack([known, v, u])),
+        _unexplained(v, basis) - _unexplained(v, np.hstack([basis, u])),
+        _unexplained(a, np.hstack([basis, v])) - _unexplained(a, np.hstack([basis, v, u])),
         # The acceleration of a controlled robot may follow from q and v; its torque then does too.
-        1 - _unexplained(u, np.hstack([known, v, a])),
+        1 - _unexplained(u, np.hstack([basis, v, a])),
     )
 
 
@@ -106,12 +82,12 @@ def distance_from(training: Sequence[Recording], test: Sequence[Trajectory]) -> 
     The unit is the distance between a tenth of the training and the nine others, at least a
     twentieth of the spread.
     """
-    known = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
+    reference = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
     samples = np.vstack([np.hstack([item.q.numpy(), item.v.numpy()]) for item in test])
-    spread = known.std(axis=0).clip(min=1e-300)
-    known = known[:: max(1, len(known) // _POINTS)] / spread
+    spread = reference.std(axis=0).clip(min=1e-300)
+    reference = reference[:: max(1, len(reference) // _POINTS)] / spread
     samples = samples[:: max(1, len(samples) // _POINTS)] / spread
-    tenth = np.arange(len(known)) * 10 // len(known)
-    between = [cKDTree(known[tenth != k]).query(known[tenth == k])[0] for k in range(10)]
-    unit = max(float(np.median(np.concatenate(between))), _NEAR * known.shape[1] ** 0.5)
-    return cKDTree(known).query(samples)[0] / unit
+    tenth = np.arange(len(reference)) * 10 // len(reference)
+    between = [cKDTree(reference[tenth != k]).query(reference[tenth == k])[0] for k in range(10)]
+    unit = max(float(np.median(np.concatenate(between))), _NEAR * reference.shape[1] ** 0.5)
+    return cKDTree(reference).query(samples)[0] / unit

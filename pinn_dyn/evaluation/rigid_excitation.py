@@ -18,7 +18,6 @@ from pinn_dyn.training.least_squares import REST
 
 MOST = 100.0
 """Condition number up to which a motion is well conditioned, as Gautier and Khalil take it."""
-_SAMPLES, _STATES = 2000, 600
 _DEPENDENT = 1e-6  # remainder of a dependent column, as a share of its length
 _DRIVE = ("armature", "viscous friction", "dry friction", "offset")
 
@@ -29,7 +28,7 @@ class RigidExcitation:
 
     Attributes:
         condition: condition number of the regressor; infinite if a column is zero.
-        count: number of base parameters, with those of drives.
+        count: number of base parameters, drives included.
         joints: table of each joint: number of base parameters, and of undetermined ones.
         undetermined: directions that the motions do not determine, in words.
     """
@@ -82,21 +81,20 @@ def rigid_excitation(
     robots"; Swevers et al. 1997, "Optimal robot excitation and identification".
 
     Args:
-        structure: the kinematics.
-        trajectories: the motions.
+        structure, trajectories: kinematics and motions.
         cutoff: frequency of the filter, Hz: above the motion, below the noise.
         still: true for joints that move by no more than their noise; they count as at rest.
 
     Raises:
         ValueError: if all trajectories are too short for the filter.
     """
-    q, v, a, _ = filtered_motion(trajectories, cutoff, _SAMPLES)
+    q, v, a, _ = filtered_motion(trajectories, cutoff, 2000)
     size = structure.num_coordinates
     rests = torch.tensor(list(still) or [False] * size)
     moves = (v.abs() > REST * v.std(0)) & ~rests
     motion = (torch.where(rests, q.mean(0), q), v * ~rests, a * ~rests)
     generator = torch.Generator().manual_seed(0)
-    states = 3 * torch.rand(3, _STATES, size, generator=generator).to(q) - 1.5
+    states = 3 * torch.rand(3, 600, size, generator=generator).to(q) - 1.5
     base = base_parameters(_regressor(structure, *states).flatten(0, 1).numpy())
     rows = _regressor(structure, *motion)[moves].numpy()[:, base]
     rows = np.vstack([rows, np.zeros((len(base), len(base)))])  # short motions have fewer rows

@@ -102,11 +102,6 @@ def test_a_test_outside_the_training_is_warned_of(good):
     assert verdicts(result)["share of the test far away", ""] == "warning"
 
 
-def test_coordinates_that_move_together_are_not_identified(good):
-    result = checked(good.assign(q2=good["q1"] * 0.5 + 1e-6 * np.sin(9 * good["t"])))
-    assert verdicts(result)["independent share of a", "q1 [m]"] == "warning"
-
-
 @given(st.floats(1e-6, 1e2), st.floats(0.2, 2.0))
 def test_white_noise_is_measured_beside_a_smooth_motion(size, frequency):
     t = np.arange(4000) / RATE

@@ -93,10 +93,10 @@ def terms(data: Smoothed, form: str) -> np.ndarray:
     return np.hstack(parts)
 
 
-def input_shares(known: np.ndarray, data: Smoothed, inputs: slice) -> np.ndarray:
+def input_shares(basis: np.ndarray, data: Smoothed, inputs: slice) -> np.ndarray:
     """Return the share of these inputs that known terms leave, ``(B + 1, D, M)``."""
     u = data.u[..., inputs]
-    left, squares = _remainders(known, u.reshape(len(u), -1), data.block)
+    left, squares = _remainders(basis, u.reshape(len(u), -1), data.block)
     shares = np.diagonal(left, axis1=1, axis2=2) / squares
     return shares.reshape(-1, *u.shape[1:]).clip(1e-12, 1)
 
@@ -112,12 +112,12 @@ def rigid_shares(data: Smoothed, rigid: Regressor) -> np.ndarray:
     return np.concatenate(shares, axis=-1)
 
 
-def motion_shares(known: np.ndarray, data: Smoothed, motion: np.ndarray) -> np.ndarray:
+def motion_shares(basis: np.ndarray, data: Smoothed, motion: np.ndarray) -> np.ndarray:
     """Return the share of v or a that terms and inputs of one lag leave, ``(B + 1, D, 1)``."""
     _, lags, inputs = data.u.shape
     m = lags * inputs
     x = np.hstack([data.u.reshape(len(data.u), m), _standard(motion)])
-    left, squares = _remainders(known, x, data.block)
+    left, squares = _remainders(basis, x, data.block)
     gram = np.einsum("bdidj->bdij", left[:, :m, :m].reshape(-1, lags, inputs, lags, inputs))
     gram = gram + 1e-6 * squares[:, :1, None, None] * np.eye(inputs)
     product = left[:, :m, m:].reshape(len(left), lags, inputs, -1)
@@ -127,17 +127,17 @@ def motion_shares(known: np.ndarray, data: Smoothed, motion: np.ndarray) -> np.n
 
 
 def _remainders(
-    known: np.ndarray, x: np.ndarray, block: np.ndarray
+    basis: np.ndarray, x: np.ndarray, block: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inner products of x without its known part, ``(B + 1, C, C)``, and squares of x.
 
     The first entry is of all data, each of the next leaves a tenth of the data out.
     """
-    known = known / np.sqrt((known**2).mean(axis=0)).clip(min=1e-300)
-    values, vectors = np.linalg.eigh(known.T @ known / len(known))
+    basis = basis / np.sqrt((basis**2).mean(axis=0)).clip(min=1e-300)
+    values, vectors = np.linalg.eigh(basis.T @ basis / len(basis))
     large = values > 1e-9 * values[-1]
-    known = known @ (vectors[:, large] / np.sqrt(values[large]))
-    both, k = np.hstack([known, x]), known.shape[1]
+    basis = basis @ (vectors[:, large] / np.sqrt(values[large]))
+    both, k = np.hstack([basis, x]), basis.shape[1]
     blocks = np.stack([y.T @ y for y in (both[block == b] for b in range(BLOCKS))])
     grams = np.concatenate([blocks.sum(axis=0)[None], blocks.sum(axis=0) - blocks])
     ridge = 1e-9 * np.trace(grams[0, :k, :k]) / k * np.eye(k)

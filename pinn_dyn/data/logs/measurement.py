@@ -13,10 +13,8 @@ class Measurement:
     """A number that a check measured, and its meaning for a training.
 
     Attributes:
-        name, place, value: measured quantity; its run, column or input; the number.
-        expected: range of a good log, in words.
-        verdict: ``"stop"`` if a training makes no sense.
-        text: explanation of a warning or a stop, a full sentence.
+        name, place, value, expected: quantity; run, column or input; number; range of a good log.
+        verdict, text: ``"stop"`` if a training makes no sense; a sentence unless ``"ok"``.
         section: section of the documentation.
     """
 

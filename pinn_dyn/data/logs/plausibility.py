@@ -181,10 +181,10 @@ def check_force_signs(training: list[Recording], u: Columns, step: float) -> lis
     signals = [x.values()[:, : 3 * size] for x in training]
     rows = [np.hstack([x, np.gradient(x[:, size : 2 * size], step, axis=0)]) for x in signals]
     q, v, forces, a = np.hsplit(np.vstack([x[thin] for x in rows]), 4)
-    known = np.hstack([np.ones((len(q), 1)), q, q**2, np.sin(q), np.cos(q), v])
+    basis = np.hstack([np.ones((len(q), 1)), q, q**2, np.sin(q), np.cos(q), v])
     results = []
     for k, name in enumerate(u.columns):
-        x = np.hstack([known, np.delete(forces, k, axis=1)])
+        x = np.hstack([basis, np.delete(forces, k, axis=1)])
         y = np.column_stack([a[:, k], forces[:, k]])
         remainders = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
         norm = np.linalg.norm(remainders, axis=0).prod()

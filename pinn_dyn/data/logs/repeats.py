@@ -13,7 +13,6 @@ from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
 _SAME = 0.05  # distance of a repeated motion, as a share of its spread
-_SAMPLES = 300  # of a motion that are compared
 
 
 def check_copies(parts: Mapping[str, list[Recording]]) -> list[Measurement]:
@@ -44,8 +43,7 @@ def check_repeats(
 ) -> list[Measurement]:
     """Count the roll-outs of the split ``name`` that repeat a motion of the training.
 
-    A roll-out repeats a training stretch if, at a shift s along it, the mean over its samples of
-    ‖q_test(t) - q_train(t + s)‖² is below 0.05² times the variance of q_test, all at one rate.
+    At a shift s, the mean of ‖q_test(t) - q_train(t + s)‖² is below 0.05² times the variance of q.
     """
     pairs = Counter(
         (piece.run, item.run) for piece in pieces for item in training if _is_in(piece, item)
@@ -66,7 +64,7 @@ def _is_in(piece: Recording, item: Recording) -> bool:
     cut_out = piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
     if cut_out or len(item) < len(piece):
         return False
-    thin = max(1, len(piece) // _SAMPLES)
+    thin = max(1, len(piece) // 300)
     q = piece.q[::thin]
     center = q.mean(axis=0)
     q = q - center

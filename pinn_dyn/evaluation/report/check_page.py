@@ -27,10 +27,6 @@ def check_report(check: LogCheck, *, command: str) -> str:
     if check.steps:
         text = "Steps that follow from the measured delay and noise, for the YAML of the data set:"
         verdict += [paragraph(text), preformatted("\n".join(["steps:", *check.steps]))]
-    coordinates = (
-        "The independent share of an acceleration is the share that 1, q and v of the same "
-        "coordinate and the other accelerations do not explain."
-    )
     inputs = (
         "The curve shows the share of the equation of motion that stays unexplained if an input is "
         "shifted by a delay. The delay is at its minimum."
@@ -49,7 +45,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
         Section("Verdict", verdict),
         Section("Measurements", [table(measurements)]),
         Section("Clock", [table(check.runs)]),
-        Section("Coordinates", [paragraph(coordinates), table(check.coordinates), coverage]),
+        Section("Coordinates", [table(check.coordinates), coverage]),
         *_rigid(check),
         Section("Inputs and their delays", [paragraph(inputs), table(check.inputs), curves]),
         Section("Cleaning", [drawing(cleaning, "raw and cleaned signals"), notes]),
