@@ -41,13 +41,11 @@ class DisturbanceObserver(Controller):
 
     where each entry is limited to max_rate T, and T is the time between two calls.
 
-    Stability without the limit, for a square A: with a = 1 - exp(-K_O T) and mu the largest
-    eigenvalue of M_L M^-1 (model M_L, plant M), the loop is stable for a mu < 2. An unknown dead
-    time of n periods reduces this for M_L = M to a < 2 sin(pi / (4 n + 2)). Beyond either, r
-    alternates until the input saturates; max_rate bounds the alternation.
+    Stability for a square A: with a = 1 - exp(-K_O T) and mu the largest eigenvalue of M_L M^-1
+    (model M_L, plant M), the loop is stable for a mu < 2. An unknown dead time of n periods reduces
+    this for M_L = M to a < 2 sin(pi / (4 n + 2)). Beyond, r alternates within max_rate T.
 
     Assumptions: d changes little within 1 / K_O, u reaches the plant at once, and A has full rank.
-    With fewer inputs than coordinates, only the part of d in the range of A is compensated.
 
     Source: De Luca and Mattone 2005, Sensorless robot collision detection and hybrid force/motion
     control; Haddadin, De Luca, Albu-Schaeffer 2017, Robot collisions: a survey. Not in the paper.
@@ -111,8 +109,8 @@ class DisturbanceObserver(Controller):
                 applied = last.u
                 if self._actuator is not None:
                     applied, _ = self._actuator(applied, period)
-                known = 0.5 * (last.force + force + matvec(last.A + A, applied))
-                disturbance = (momentum - last.momentum) / period - known
+                modeled = 0.5 * (last.force + force + matvec(last.A + A, applied))
+                disturbance = (momentum - last.momentum) / period - modeled
                 gain = -math.expm1(-self.bandwidth * period)
                 change = gain * (disturbance - self.residual)
                 limit = self._max_rate * period

@@ -97,7 +97,7 @@ def required_gain(
 
 
 def _input_error(model: MechanicalSystem, truth: MechanicalSystem, q: Tensor) -> Tensor:
-    """w(q) = (A A_L^T)^-1 Delta_all = A_L^-T (A_L^-1 G_L - A^-1 G), ``(*batch, N)``."""
+    """Return w(q) = (A A_L^T)^-1 Delta_all = A_L^-T (A_L^-1 G_L - A^-1 G), ``(*batch, N)``."""
     A, A_L = truth.input_matrix(q), model.input_matrix(q)
     held = solve(A_L, model.potential_force(q)) - solve(A, truth.potential_force(q))
     return solve(A_L.mT, held)

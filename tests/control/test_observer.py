@@ -10,7 +10,6 @@ from torch import nn
 
 from pinn_dyn.control import Motion, Plant, close_loop, close_loop_continuous
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.control.export import export_law
 from pinn_dyn.control.laws import Regulation, Tracking
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.plants import SystemPlant
@@ -242,8 +241,3 @@ def test_time_that_goes_back_is_refused_and_with_it_continuous_time():
             unit_masses(2), observer, SetPoint([0.1, 0.2]), q[:1], v[:1], duration=0.1,
             samples_rate=100.0,
         )  # fmt: skip
-
-
-def test_it_cannot_be_exported(tmp_path):
-    with pytest.raises(TypeError, match="DisturbanceObserver has a memory"):
-        export_law(cart_pole_observer(), tmp_path / "law.pt2")
