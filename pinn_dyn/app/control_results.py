@@ -66,9 +66,9 @@ def write_results(
             figures["steady_state"] = steady_state_figure(*bounds, title=title, label=label)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
-    animation = folder / f"animation_{first}.gif"
-    drawn = config["animate"] and isinstance(robot, Drawable)
-    if drawn:
+    animation: Path | None = None
+    if config["animate"] and isinstance(robot, Drawable):
+        animation = folder / f"animation_{first}.gif"
         animate(records[first], config["trajectory"], robot, animation)
 
     runs = len(records[first].stopped)
@@ -79,7 +79,7 @@ def write_results(
         result=result,
         figures=figures,
         labels=source.labels,
-        animation=animation if drawn else None,
+        animation=animation,
         stability=stability,
         origin=origin,
     )
