@@ -23,7 +23,7 @@ class EnsembleData(L.LightningDataModule):
 
     @property
     def source(self) -> DataSource:
-        """The source of the trajectories."""
+        """Source of the trajectories."""
         return self.data.source
 
     @property

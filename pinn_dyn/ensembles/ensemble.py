@@ -67,7 +67,6 @@ class Ensemble(Predictor):
         return self.stack.increments(for_each(x0), t, input.mapped(for_each))
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Return mean increment over the members, ``(*batch, T, 2N)``."""
         return self.member_increments(x0, t, input).mean(0)
 
     @staticmethod

@@ -28,7 +28,6 @@ class EnsembleLearner(DynamicsLearner):
     model: Ensemble
 
     def output_limits(self, model: Predictor, q: Tensor) -> dict[str, Tensor]:
-        """Return the limits that hold for all members."""
         assert isinstance(model, Ensemble)
         limits = [output_limits(model.member(k), q) for k in range(model.size)]
         return {f"{model.prefix}{name}": x for name, x in joint_limits(limits).items()}
@@ -43,12 +42,10 @@ class EnsembleLearner(DynamicsLearner):
         return Eager(self.loss, stack, vector)
 
     def log_losses(self, losses: Tensor) -> None:
-        """Log mean and standard deviation over the members."""
         super().log_losses(losses)
         self.log("train/loss_spread", losses.std(), on_step=False, on_epoch=True, batch_size=1)
 
     def built_optimizer(self, vector: ParameterVector) -> Optimizer:
-        """Build the optimizer. SOAP has preconditioners for each member."""
         optimizer = super().built_optimizer(vector)
         if type(optimizer) is SOAP:
             return MemberSOAP(vector.parameters, **optimizer.defaults)

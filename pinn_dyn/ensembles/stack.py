@@ -26,7 +26,6 @@ class Template(nn.Module, Generic[Model]):
             self._set(self.model, name, values)
 
     def forward(self, evaluate: Callable[..., Tensor], arguments: tuple[Any, ...]) -> Tensor:
-        """Evaluate a function of the model with the parameters of a member."""
         return evaluate(self.model, *arguments)
 
     def mapped(self, evaluate: Callable[..., Tensor], *stacked: Any) -> Tensor:
@@ -67,15 +66,12 @@ class ContinuousStack(ContinuousPredictor):
         self.template: Template[ContinuousPredictor] = Template(members)
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return the penalty of each member, ``(E,)``."""
         return self.template.mapped(lambda model, *at: model.penalty(*at), q, v, a, u)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
-        """Return dx/dt of every member, ``(E, *batch, S)``."""
         return self.template.mapped(lambda model, *xu: model.state_derivative(*xu), x, u)
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """Return the initial state of each member, ``(E, *batch, S)``."""
         if not self.learns_initial_state:
             return x0
         return self.template.mapped(lambda model, *xu: model.initial_state(*xu), x0, u0)
@@ -83,7 +79,6 @@ class ContinuousStack(ContinuousPredictor):
     def integration_step(
         self, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        """Take a step of all members."""
         # The inputs are (stages, E, *batch, M).
         return self.template.mapped(
             lambda model, *arguments: model.integration_step(*arguments, h),
@@ -102,8 +97,6 @@ class DiscreteStack(Predictor):
         self.template: Template[Predictor] = Template(members)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Return increments of every member, ``(E, *batch, T, 2N)``."""
-
         def member_increments(model: Predictor, x0: Tensor, *samples: Tensor) -> Tensor:
             return model.increments(x0, t, input.with_samples(*samples))
 

@@ -71,7 +71,7 @@ class Signal:
 
     @property
     def batch(self) -> torch.Size:
-        """Batch shape of u."""
+        """Batch shape."""
         return self.u.shape[:-2]
 
     def part(self, samples: slice) -> Signal:
@@ -83,11 +83,7 @@ class Signal:
         return self._changed(self.t - start, lambda value: value)
 
     def delayed(self, delay: Tensor) -> Signal:
-        """Return u(t - d), for d ``()`` in s. Its gradient by d is -du/dt.
-
-        Raises:
-            ValueError: if u is held, since it has no slope between its jumps.
-        """
+        """Return u(t - d), for d ``()`` in s, of an input that is not held."""
         if self.interpolation == "hold":
             raise ValueError(
                 "interpolation is 'hold', expected 'linear' or 'cubic': the delay of a held input "
@@ -220,7 +216,7 @@ def stacked(signals: Sequence[Signal], t: Tensor) -> Signal:
 
 
 def _rates(t: Tensor, u: Tensor) -> Tensor:
-    """Return du/dt at the samples by differences, of second order from three samples on."""
+    """Return du/dt at the samples by differences."""
     if t.shape[0] < 2:
         return torch.zeros_like(u)
     order = 1 if t.shape[0] == 2 else 2

@@ -69,13 +69,10 @@ class NetworkCholesky(CholeskyFactor):
     the data and a margin m (0.2 on the diagonal, a tenth of the range elsewhere), which bounds the
     eigenvalues of the matrix from both sides.
 
-    In M = L^T L of a chain of bodies (``transposed``), row i of L describes the bodies from joint i
-    to the tip, and most entries are simpler functions of q than in M = L L^T (Featherstone 2005,
-    "Efficient factorization of the joint-space inertia matrix for branched kinematic trees").
-
-    In a serial chain of rigid bodies with the joints ordered from base to tip, column j of L in
-    M = L^T L, and in M^-1 = L L^T, depends only on the joints after j. ``chain`` enforces this
-    property by masked weights.
+    In a chain of bodies most entries of M = L^T L (``transposed``) are simpler functions of q than
+    in M = L L^T (Featherstone 2005, "Efficient factorization of the joint-space inertia matrix for
+    branched kinematic trees"). With revolute or prismatic joints from base to tip, column j of L in
+    M = L^T L, and in M^-1 = L L^T, depends only on the joints after j (``chain``, by a mask).
 
     Args:
         scales: scales of the data. The value is the typical size of the rows of L, or of its

@@ -78,7 +78,6 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         return self.inverse_mass.matrix(q)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M(q) = W(q)^-1, ``(*batch, N, N)``."""
         # Not cholesky_inverse: torch 2.13 gets its forward-mode derivative wrong.
         factor = self.inverse_mass(q)
         eye = torch.eye(self.num_coordinates, dtype=q.dtype, device=q.device)
@@ -106,7 +105,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         return -self.inverse_mass.pullback(tape, p.unsqueeze(-1) * w.unsqueeze(-2))
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Return M a + C v = M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
+        """Return M (a - (dW/dt) p) + d(p^T W p / 2)/dq, with p = M v and dW along v."""
         factor, bias, mass_rate_p = self._factor_and_rates(q, v)
         return upper_solve(factor, lower_solve(factor, a - mass_rate_p)) + bias
 

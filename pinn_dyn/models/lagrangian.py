@@ -73,7 +73,6 @@ class LagrangianNetwork(structured.StructuredNetwork):
         return self.initial_velocity.initial_state(x0, u0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Return M(q) = L L^T, or L^T L with a transposed head, ``(*batch, N, N)``."""
         return self.mass.matrix(q)
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
@@ -121,7 +120,6 @@ class LagrangianNetwork(structured.StructuredNetwork):
         return self.mass.pullback(tape, left.unsqueeze(-1) * right.unsqueeze(-2))
 
     def _solve(self, factor: Tensor, force: Tensor) -> Tensor:
-        """Return M^-1 force, by the two triangular solves."""
         if self.mass.transposed:
             return lower_solve(factor, upper_solve(factor, force))
         return upper_solve(factor, lower_solve(factor, force))

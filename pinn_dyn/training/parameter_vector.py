@@ -53,10 +53,7 @@ class ParameterVector:
         return [part.view((*part.shape[:-1], *shape)) for part, shape in pairs]
 
     def joined(self, gradients: Sequence[Tensor | None], leading: tuple[int, ...] = ()) -> Tensor:
-        """Join gradients ``(*leading, *shape)`` of the parameters to a vector ``(*leading, P)``.
-
-        None stands for a parameter that the loss does not depend on, with a zero gradient.
-        """
+        """Join gradients ``(*leading, *shape)``, with None for zero, to ``(*leading, P)``."""
         rows = [
             self.values.new_zeros(*leading, n) if value is None else value.reshape(*leading, n)
             for value, n in zip(gradients, self._sizes, strict=True)

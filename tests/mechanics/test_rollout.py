@@ -11,7 +11,6 @@ from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, rollout
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
-from tests.support.cart_pole import CartPole
 
 START = torch.tensor([0.5, -0.3, 0.2, 0.8], dtype=torch.float64)
 
@@ -113,17 +112,6 @@ def test_increments_keep_float32_precision_late_in_a_recording(system, start):
     u = torch.ones(2, 1, dtype=torch.float64)
     exact, rounded = one_step(system, torch.tensor([1.0, -1.0, 0.5, 0.2]), t, u)
     assert ((rounded - exact) / exact).abs().max() < 1e-5
-
-
-def test_prediction_is_the_rollout_in_the_systems_own_coordinates():
-    t, u = samples(count=6, step=0.05)
-    names = {"qv": "velocity_derivative", "qp": "momentum_derivative"}
-    for state in ("qv", "qp"):
-        system = CartPole(state).requires_grad_(False)
-        derivative = getattr(system, names[state])
-        expected = rollout(derivative, START, t, Signal(t, u, "hold"))
-        actual = system.predict(START, t, Signal(t, u, "hold"))
-        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-14)
 
 
 class WithActuator(LinearSystem):

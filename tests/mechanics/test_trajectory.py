@@ -55,11 +55,6 @@ def test_state_stacks_configuration_and_velocity_or_momentum():
         assert torch.equal(item.states(state, slice(2, 9, 3)), found[:, 2:9:3])
 
 
-def test_state_in_momentum_says_that_the_mass_is_not_known():
-    with pytest.raises(ValueError, match="no momentum p"):
-        trajectory(momentum=None).states("qp")
-
-
 @pytest.mark.parametrize("known", [0, 2, 5])
 def test_input_history_is_the_latest_input_before_the_start(known):
     """Three samples of 0.1 s are needed. Where fewer are known, the earliest value is held."""

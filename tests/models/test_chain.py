@@ -1,7 +1,5 @@
 """The heads of a serial chain, against a chain of rigid bodies that is written out here."""
 
-import math
-
 import pytest
 import torch
 
@@ -168,12 +166,6 @@ def test_three_rows_hold_the_potential_of_a_true_chain(q):
     assert_near(head(q), expected, 1e-12)
     force = torch.stack([torch.func.grad(true_potential)(row) for row in q])
     assert_near(head.gradient(q), force, 1e-12)
-
-
-def test_it_has_the_period_of_its_joints(q):
-    head = make_potential(5)
-    shifted = q + 2 * math.pi * torch.tensor([1.0, -2.0, 0.0, 3.0], dtype=torch.float64)
-    assert_near(head(shifted), head(q), 1e-12)
 
 
 @pytest.mark.parametrize("angles", [[], [0, 1, 3]])

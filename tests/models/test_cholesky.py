@@ -132,14 +132,6 @@ def test_the_floor_is_the_smallest_diagonal_entry(name, q):
     assert_near(torch.linalg.det(head.matrix(q)), floor.prod().square().expand(40), 1e-3)
 
 
-def test_a_transposed_head_has_the_scale_in_its_columns(q):
-    plain, transposed = (
-        make(partial(NetworkCholesky, hidden=[5], transposed=flag)) for flag in (False, True)
-    )
-    unscaled = plain(q) / SCALE[:, None]
-    assert_near(transposed(q), unscaled * SCALE, 1e-12)
-
-
 def test_outputs_far_from_the_data_end_at_the_margin_of_their_kind(q):
     """The margin is 0.2 for the diagonal, and a tenth of the range on the data elsewhere."""
     head = make(partial(NetworkCholesky, hidden=[5], positivity=Positive(0.0)), spread=8.0)

@@ -9,7 +9,7 @@ from pinn_dyn.control import Tracking
 from pinn_dyn.data.logs import SavitzkyGolayVelocity
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.evaluation import predict_trajectories, predict_windows, torque_error
+from pinn_dyn.evaluation import predict_trajectories, predict_windows
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Sum, Trajectory
 from pinn_dyn.models import (
     AccelerationMLP,
@@ -19,10 +19,9 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     LearnedDelay,
     NetworkPotential,
-    NoDelay,
 )
 from pinn_dyn.testing import assert_near
-from pinn_dyn.training.losses import IncrementLoss, MidpointLoss
+from pinn_dyn.training.losses import IncrementLoss
 from tests.models.builders import STEP, make_statistics, perturb
 from tests.support.delayed_robots import log
 
@@ -94,22 +93,6 @@ def test_the_gradient_is_that_of_finite_differences(interpolation, integrator):
         difference = float(loss(at + h) - loss(at - h)) / (2 * h)
     assert abs(difference) > 1e-3
     assert float(gradient) / model.delay.longest == pytest.approx(difference, rel=1e-6)
-
-
-def test_the_gradient_of_the_midpoint_loss_is_that_of_finite_differences():
-    windows = pendulum_windows(steps=1, history=0.1, count=50)
-    scales = windows.statistics()
-    model = pendulum_model(scales).double()
-    loss = MidpointLoss(scales, model).double()
-
-    def value(seconds):
-        return loss(set_delay(model, seconds), windows)
-
-    at, h = 0.0337, 1e-6
-    (gradient,) = torch.autograd.grad(value(at), model.delay.share)
-    with torch.no_grad():
-        difference = float(value(at + h) - value(at - h)) / (2 * h)
-    assert float(gradient) / model.delay.longest == pytest.approx(difference, rel=1e-5)
 
 
 def test_it_is_never_negative_nor_beyond_the_longest_and_comes_back():
@@ -222,25 +205,6 @@ def test_roll_outs_see_the_input_before_their_start():
 
 def make_scales():
     return pendulum_windows(steps=1, history=0.0, count=100).statistics()
-
-
-def test_terms_are_compared_under_the_input_that_acts():
-    model = set_delay(pendulum_model(make_scales(), LearnedDelay(0.1)), 0.05).double()
-    whole = pendulum_trajectory()
-    late = Trajectory(
-        whole.q[None, 5:],
-        whole.v[None, 5:],
-        whole.input.part(slice(0, -5)).mapped(lambda u: u[None]),
-    )
-    whole = Trajectory(whole.q[None], whole.v[None], whole.input.mapped(lambda u: u[None]))
-    assert_near(model.acting_samples(whole)[:, 5:], late.u, 1e-9)
-    with_delay = torque_error(model, whole, system=None)
-    model.delay = NoDelay()
-    # Five samples of 1200 are the others' start.
-    assert with_delay.share == pytest.approx(torque_error(model, late, system=None).share, rel=0.02)
-    assert with_delay.share != pytest.approx(
-        torque_error(model, whole, system=None).share, rel=0.05
-    )
 
 
 def test_sums_laws_and_ensembles_refuse_it_by_name():

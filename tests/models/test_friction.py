@@ -60,18 +60,6 @@ def test_friction_takes_energy_whatever_its_parameters(law, seed, std, v, force,
         assert (v * friction.transmitted(v, force) <= v * force + 1e-12 * (v * force).abs()).all()
 
 
-@pytest.mark.parametrize("prior", [False, True])
-def test_friction_starts_at_its_level_and_width(prior):
-    """c = level times the force and w = (width + 0.01) times the speed."""
-    force, v_std = torch.tensor([2.0, 30.0]), torch.tensor([0.5, 0.5])
-    scales = make_scales(2, 1, force, v_std=v_std, prior=prior)
-    friction = CoulombFriction(scales, level=0.05, width=0.03)
-    torch.testing.assert_close(friction(1e3 * v_std), 0.05 * force)
-    width = 0.04 * v_std
-    torch.testing.assert_close(friction(-width), -0.05 * force * torch.tanh(torch.ones(2)))
-    torch.testing.assert_close(friction.slope(torch.zeros(2)), 0.05 * force / width)
-
-
 def sliding_mass():
     """A free mass with friction alone: the model, m, c and w."""
     model = make_structured("lnn", n=1, m=1, friction=CoulombFriction)
@@ -104,17 +92,6 @@ def test_friction_alone_stops_a_free_mass_and_takes_its_energy():
 
 
 # The other laws.
-
-
-def test_each_law_has_the_effect_of_its_name():
-    fast = torch.tensor([[50.0], [-50.0]]).double()
-    asymmetric = anywhere(AsymmetricCoulomb(unit_scales(1)))
-    forward, back = asymmetric(fast).flatten().tolist()
-    assert forward > 0 > back
-    assert abs(forward) != pytest.approx(abs(back))
-    stribeck = Stribeck(unit_scales(1), width=0.001).double()
-    slow = torch.tensor([[0.05]]).double()
-    assert float(stribeck(slow)) > float(stribeck(fast[:1]))
 
 
 def test_a_loaded_gear_transmits_less_forwards_and_takes_more_backwards():

@@ -11,7 +11,7 @@ from pinn_dyn.mechanics import Signal, Trajectory, stack
 from pinn_dyn.models import NetworkResidual, NoResidual
 from pinn_dyn.testing import assert_near
 from pinn_dyn.training import IncrementLoss, Penalized
-from tests.models.builders import make_statistics, make_structured, perturb, random_batch
+from tests.models.builders import make_statistics, make_structured, random_batch
 
 RESIDUAL = partial(NetworkResidual, hidden=[6])
 
@@ -27,14 +27,6 @@ def motion(model):
     with torch.no_grad():
         q, v = model.predict(start, t, Signal(t, u)).chunk(2, dim=-1)
     return Trajectory(q, v, Signal(t, u))
-
-
-def test_it_is_zero_before_training_and_there_afterwards():
-    scales = make_structured("lnn")._scales(make_statistics(3, 3), torch.ones(3).double())
-    head = RESIDUAL(scales).double()
-    q, v, _, u = random_batch(3, 3)
-    assert not head(q, v, u).any()
-    assert perturb(head)(q, v, u).abs().min() > 0
 
 
 def test_every_form_of_the_dynamics_has_it():

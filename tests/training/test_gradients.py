@@ -160,23 +160,3 @@ def test_a_batch_taken_in_parts_has_the_same_loss_and_gradient(monkeypatch):
     monkeypatch.setattr(compiled, "_loss", lambda part: seen.append(len(part)) or loss(model, part))
     assert_same(compiled(batch), Eager(loss, model, compiled.vector)(batch))
     assert seen == [9, 8, 8]
-
-
-def test_a_vector_holds_the_parameters_and_the_gradient_that_autograd_gives():
-    model = make_model("lnn")
-    values = [p.detach().clone() for p in model.parameters()]
-    loss = IncrementLoss(one_step(size=2), model).double()
-    batch = make_windows(4, size=2)
-    expected = torch.autograd.grad(loss(model, batch), list(model.parameters()), allow_unused=True)
-    eager = engine(Eager, loss, model)
-    _, gradient = eager(batch)
-    eager.vector.gradient.copy_(gradient)
-    for parameter, value, slope in zip(model.parameters(), values, expected, strict=True):
-        assert torch.equal(parameter, value)
-        torch.testing.assert_close(
-            parameter.grad, torch.zeros_like(value) if slope is None else slope
-        )
-    with torch.no_grad():
-        eager.vector.values.mul_(2.0)
-    for parameter, value in zip(model.parameters(), values, strict=True):
-        assert torch.equal(parameter, 2 * value)

@@ -5,9 +5,9 @@ import torch
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.evaluation.identification import constants_table, undetermined
-from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.training import LeastSquares
-from tests.support.known import known_arm, known_cart_pole, motion, motions
+from tests.support.known import known_arm, known_cart_pole, motions
 
 RATE = 100.0  # Hz
 STIFFNESS = [20, 18, 30, 15, 16, 25]  # of two segments
@@ -96,20 +96,6 @@ def test_the_truth_lies_in_the_intervals(arm_runs, rollouts, fits, unlikely):
         # Not by being wide: the intervals are a few per cent.
         assert ((table.high - table.low) / table.value).max() < 0.3
     assert outside < unlikely
-
-
-@pytest.mark.slow
-def test_what_no_motion_shows_is_named():
-    """In the plane of x nothing tells of bending along y."""
-    truth, model = known_arm(), known_arm(mass=2.0)
-    run = motion(truth, seconds=1.0, rate=RATE)
-    u = run.u * torch.tensor([0.0, 1.0, 1.0])  # the torque about y bends along x
-    start = torch.tensor([0.3, 0, 0.2, 0, 0, 0]).double()
-    with torch.no_grad():
-        q, v = truth.predict(start, run.t, Signal(run.t, u)).chunk(2, dim=-1)
-    _, fit = fitted(model, [Trajectory(q, v, Signal(run.t, u))], rollouts=False)
-    found = {text.split(":")[0] for text in undetermined(model, fit)}
-    assert found == {"stiffness 2", "damping 2"}
 
 
 def test_data_at_rest_are_refused(arm_runs):

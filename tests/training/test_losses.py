@@ -99,19 +99,6 @@ def test_the_pseudo_huber_loss_equals_a_hand_computation(huber):
     assert float(loss.error(PREDICTED, MEASURED)) == pytest.approx(float(expected), rel=1e-5)
 
 
-def test_the_pseudo_huber_loss_is_the_squared_error_of_small_errors_and_linear_in_large_ones():
-    loss = IncrementLoss(STATISTICS, MODELS["lnn"](), huber=1.0)
-    squared = IncrementLoss(STATISTICS, MODELS["lnn"]())
-    tiny = MEASURED.double() + 1e-6 * (PREDICTED - MEASURED).double()
-    found, expected = (float(kind.error(tiny, MEASURED.double())) for kind in (loss, squared))
-    assert found == pytest.approx(expected, rel=1e-9)
-    huge, twice = (
-        float(loss.error(MEASURED + factor * (PREDICTED - MEASURED), MEASURED))
-        for factor in (1e4, 2e4)
-    )
-    assert twice == pytest.approx(2 * huge, rel=1e-3)
-
-
 @pytest.mark.parametrize("kind", MODELS)
 def test_the_loss_of_one_step_equals_a_hand_computation(kind):
     loss = IncrementLoss(ONE_STEP, MODELS[kind]())
@@ -166,21 +153,3 @@ def test_a_curriculum_rolls_out_and_compares_the_first_steps_alone(windows, prog
 def test_a_curriculum_has_to_increase_to_all_steps(windows, curriculum):
     with pytest.raises(ValueError, match=r"curriculum is .*to the 10 of the windows"):
         IncrementLoss(windows.statistics(), Drift(), curriculum=curriculum)
-
-
-@pytest.mark.parametrize("interpolation", ["linear", "hold"])
-def test_cut_windows_are_windows_of_fewer_steps(interpolation):
-    generator = torch.Generator().manual_seed(0)
-    t = torch.arange(21, dtype=torch.float64) * 0.01
-    q, v, u = torch.randn(3, 21, 2, generator=generator, dtype=torch.float64)
-    trajectory = Trajectory(q, v, Signal(t, u, interpolation), momentum=lambda q, v: 2 * v)
-    # One start each, the first sample.
-    whole = draw_windows([trajectory], count=1, steps=5, stride=4, seed=0)
-    short = Trajectory(q[:9], v[:9], Signal(t[:9], u[:9], interpolation))
-    short = replace(short, momentum=trajectory.momentum)
-    expected = draw_windows([short], count=1, steps=2, stride=4, seed=0)
-    found = whole.first(2)
-    for name in ("t", "q", "v", "p", "dq", "dv", "dp", "u"):
-        assert torch.equal(getattr(found, name), getattr(expected, name))
-    assert torch.equal(found.input.t, expected.input.t)
-    assert found.input.interpolation == interpolation

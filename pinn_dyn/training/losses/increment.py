@@ -77,7 +77,6 @@ class IncrementLoss(WindowLoss):
         self.exact_coordinates = model.num_coordinates if exact_rate else 0
 
     def selected(self, windows: Windows, progress: float) -> Windows:
-        """Return the first steps of the windows, as the curriculum prescribes."""
         stages = len(self.curriculum)
         return windows.first(self.curriculum[min(int(progress * stages), stages - 1)])
 
@@ -87,10 +86,7 @@ class IncrementLoss(WindowLoss):
         return self.error(predicted[..., 1:, :], windows.increments(model.state))
 
     def error(self, predicted: Tensor, measured: Tensor) -> Tensor:
-        """Return the loss of increments over the first k steps, ``(B, k, 2N)``.
-
-        Increments ``(E, B, k, 2N)`` of an ensemble give the loss of each member, ``(E,)``.
-        """
+        """Return the loss of increments ``(B, k, 2N)``, or ``(E,)`` losses of an ensemble's."""
         steps = predicted.shape[-2]
         residual = (predicted - measured) / self.scale[:steps]
         residual = residual[..., self.exact_coordinates if steps == 1 else 0 :]
