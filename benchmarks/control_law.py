@@ -36,8 +36,7 @@ from pinn_dyn.control.export import INPUTS
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.predictor import double_copy
 from pinn_dyn.models import Statistics
-from pinn_dyn.systems import BulletArm
-from pinn_dyn.systems.bullet_client import connect
+from pinn_dyn.systems.urdf import read_urdf
 
 RESULTS = Path(__file__).parent / "results"
 PANDA = "franka_panda/panda.urdf"
@@ -68,20 +67,19 @@ def untrained() -> MechanicalSystem:
 def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     """Return the inverse dynamics of the true arm at (q_ref, v_ref, a_ref) by each library."""
     try:
-        arm = BulletArm(PANDA, locked_joints=FINGERS)
+        import pybullet
     except ImportError as error:
         print(error)
         return {}
-    client = connect()
-    body = client.loadURDF(
-        str(arm.path), useFixedBase=True, flags=client.URDF_USE_INERTIA_FROM_FILE
-    )
-    client.setGravity(0, 0, -9.81)
+    path = str(read_urdf(PANDA).path)
+    pybullet.connect(pybullet.DIRECT)
+    body = pybullet.loadURDF(path, useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
+    pybullet.setGravity(0, 0, -9.81)
     fingers = [0.0] * len(FINGERS)
 
     def bullet(q: list[float], v: list[float], a: list[float]) -> Any:
         at = (q + fingers, v + fingers, a + fingers)
-        return client.calculateInverseDynamics(body, *at)[:JOINTS]
+        return pybullet.calculateInverseDynamics(body, *at)[:JOINTS]
 
     desired = states[:, 2:].numpy()
     rivals: dict[str, Call] = {"PyBullet inverse dynamics": (bullet, desired.tolist())}
@@ -90,7 +88,7 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     except ImportError:
         print("Pinocchio is not installed (pip install pin)")
         return rivals
-    full = pinocchio.buildModelFromUrdf(str(arm.path))
+    full = pinocchio.buildModelFromUrdf(path)
     locked = [full.getJointId(name) for name in FINGERS]
     model = pinocchio.buildReducedModel(full, locked, pinocchio.neutral(full))
     data = model.createData()

@@ -12,6 +12,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.systems.inertia import inertial_parameters, pseudo_inertia_basis, rod
+from pinn_dyn.systems.segment_frames import cross_matrix
 from pinn_dyn.systems.urdf import read_urdf
 
 
@@ -108,8 +109,7 @@ class RigidChain(MechanicalSystem):
         turning = torch.tensor(tree.turning)
         axes = torch.where(turning[:, None], tree.axes, 0)
         cross = torch.zeros(size, 4, 4, dtype=double)
-        units = torch.eye(3, dtype=double).expand(size, 3, 3)
-        cross[:, :3, :3] = torch.linalg.cross(axes[:, None].expand_as(units), units).mT
+        cross[:, :3, :3] = cross_matrix(axes)
         slide = torch.zeros(size, 4, 4, dtype=double)
         slide[:, :3, 3] = tree.axes - axes
         start = torch.eye(4, dtype=double).expand(size, 4, 4)
@@ -247,7 +247,7 @@ class RigidChain(MechanicalSystem):
             [starts[j] for j, parent in enumerate(self.parents) if parent == k]
             for k in range(self.num_coordinates)
         ]
-        ends = [max(points, key=lambda p: float(p.norm()), default=None) for points in behind]
+        ends = [max(points, key=torch.linalg.norm, default=None) for points in behind]
         lengths = [float(end.norm()) for end in ends if end is not None and end.norm() > 0.02]
         usual = sum(lengths) / len(lengths) if lengths else 0.1
         bodies = []
@@ -342,8 +342,6 @@ def _pairs(first: Tensor, second: Tensor) -> Tensor:
 def _screw_basis() -> Tensor:
     """The 4 x 4 matrices of the six unit twists, ``(6, 4, 4)``: turns about x, y, z, and slides."""
     basis = torch.zeros(6, 4, 4, dtype=torch.float64)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        basis[k, j, i], basis[k, i, j] = 1, -1
-        basis[3 + k, k, 3] = 1
+    basis[:3, :3, :3] = cross_matrix(torch.eye(3))
+    basis[3:, :3, 3] = torch.eye(3)
     return basis

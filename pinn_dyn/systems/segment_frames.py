@@ -66,28 +66,28 @@ def in_world(
     """Move one segment's kinematics from the frame of its base into the world frame."""
     rotation = base.rotation
     arm = r @ rotation.transpose(-1, -2)  # (*batch, S, 3)
-    own = rotation.unsqueeze(-3) @ jac
+    local = rotation.unsqueeze(-3) @ jac
     world_r = base.position.unsqueeze(-2) + arm
-    world_jac = base.linear.unsqueeze(-3) + own - cross_matrix(arm) @ base.angular.unsqueeze(-3)
+    world_jac = base.linear.unsqueeze(-3) + local - cross_matrix(arm) @ base.angular.unsqueeze(-3)
     world_spin = base.angular + rotation @ spin
     if v is None:
         return world_r, world_jac, bias, rotation @ turn, world_spin, spin_bias
 
     omega = matvec(base.angular, v).unsqueeze(-2)
-    own_rate = matvec(own, v[..., None, :])
-    own_spin = matvec(rotation @ spin, v)
+    local_rate = matvec(local, v[..., None, :])
+    local_spin = matvec(rotation @ spin, v)
     world_bias = (
         base.linear_bias.unsqueeze(-2)
         + torch.linalg.cross(base.angular_bias.unsqueeze(-2).expand_as(arm), arm)
         + torch.linalg.cross(
-            omega.expand_as(arm), torch.linalg.cross(omega.expand_as(arm), arm) + 2 * own_rate
+            omega.expand_as(arm), torch.linalg.cross(omega.expand_as(arm), arm) + 2 * local_rate
         )
         + bias @ rotation.transpose(-1, -2)
     )
     world_spin_bias = (
         base.angular_bias
         + matvec(rotation, spin_bias)
-        + torch.linalg.cross(omega.squeeze(-2), own_spin)
+        + torch.linalg.cross(omega.squeeze(-2), local_spin)
     )
     return world_r, world_jac, world_bias, rotation @ turn, world_spin, world_spin_bias
 

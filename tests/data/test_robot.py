@@ -262,14 +262,6 @@ def test_a_motion_beyond_the_limits_is_given_up_with_its_place(cache):
         source.simulate()
 
 
-def test_torques_are_clipped_to_the_limits(cache):
-    """And recorded as they were applied."""
-    source = build(cache, duration=0.005)
-    source.excitations = [Push()]
-    arrays = source.simulate()
-    np.testing.assert_array_equal(arrays["test_u"][0], np.tile(source.system.u_max, (7, 1)))
-
-
 def test_a_robot_too_weak_to_hold_itself_is_reported(source):
     weak = TrackedMultiSine(**{**TRACKED, "torque": 0.1})
     with pytest.raises(ValueError, match=r"of the torque allowed at joint 'panda_joint5'"):
