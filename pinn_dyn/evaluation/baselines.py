@@ -36,13 +36,9 @@ def build_baselines(
 ) -> dict[str, Predictor]:
     """Build all baselines: hold position, constant velocity, ARX, and EDMDc of degree 2.
 
-    The linear models are fitted to the training trajectories. The validation trajectories select
-    their number of lags. A linear model that cannot be fitted, because the training trajectories
-    are too short or unevenly sampled, is left out with a warning.
-
-    Args:
-        train, validation: trajectories of the data source, q ``(T, N)`` each.
-        step: step of the linear models, s.
+    The linear models of step ``step`` in s are fitted to the training trajectories, q ``(T, N)``
+    each. The validation trajectories select their number of lags. A linear model that cannot be
+    fitted, because the trajectories are too short or unevenly sampled, is left out with a warning.
     """
     size, inputs = train[0].q.shape[-1], train[0].u.shape[-1]
     baselines: dict[str, Predictor] = {

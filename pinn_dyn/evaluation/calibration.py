@@ -120,10 +120,6 @@ def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title
     """Draw the coverage of intervals over their nominal level, one panel per window.
 
     An interval on the diagonal has the nominal coverage; below the diagonal it is too narrow.
-
-    Args:
-        runs: names of runs, and their calibration for each window in s.
-        title: title of the figure.
     """
     windows = sorted({window for item in runs.values() for window in item})
     size = (max(3.6 * len(windows) + 0.6, 6.0), 4.2 + 0.25 * len(runs))

@@ -110,11 +110,7 @@ def terms_figure(comparison: TermComparison, *, configuration: int, title: str) 
 
     The inverse of M replaces M where the model's equations contain the inverse. The three matrices
     of a term share one color scale. The color follows the square root of an entry.
-
-    Args:
-        comparison: true and learned terms.
-        configuration: index of the configuration.
-        title: title of the figure.
+    ``configuration`` is an index.
     """
     matrices = comparison.matrices()
     matrices.pop("M" if comparison.of_inverse_mass else "M_inverse")

@@ -106,8 +106,7 @@ def _jacobian(model: LearnedConstants) -> Tensor:
 def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
     """Describe the directions of the parameters that only the prior determines.
 
-    The directions span the eigenvectors of the covariance whose variance is more than half of the
-    prior's, see :func:`named_directions`. Those of drives come first, then bodies.
+    They span the eigenvectors of the covariance whose variance is more than half of the prior's.
     """
     variances, vectors = torch.linalg.eigh(fit.covariance)
     space = vectors[:, variances > OPEN].T.numpy()

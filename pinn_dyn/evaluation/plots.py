@@ -145,9 +145,8 @@ def mean_error_figure(
     The start is not drawn, since its error may be 0. Baselines are thin grey means without a band.
 
     Args:
-        models, baselines: names and errors; the order of the models fixes their colors.
-        title, note: titles of the figure and of the legend.
-        label: name and unit of the error.
+        models, baselines: names and errors.
+        title, note, label: titles of the figure and of the legend, name and unit of the error.
         lost: word for excluded trajectories, such as "diverged", which the legend counts.
     """
     figure = Figure(figsize=(8, 4.8), layout="constrained")

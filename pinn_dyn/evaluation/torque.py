@@ -54,9 +54,6 @@ def torque_error(
         model: the learned system.
         truth: K trajectories stacked, q ``(K, T, N)``.
         system: the true system, or None for measured data.
-
-    Raises:
-        ValueError: if a measured trajectory has fewer than 5 samples or its sample time varies.
     """
     learned = double_copy(model)
     with torch.no_grad():

@@ -130,7 +130,7 @@ def _table(frame: pd.DataFrame, headers: Mapping[str, str], text: str) -> Iterat
     """Yield a text and a table, unless the table is empty."""
     if len(frame):
         yield paragraph(text)
-        yield table(frame, headers=headers)
+        yield table(frame[[*headers]].rename(columns=headers))  # no joint or part is the best
 
 
 def _intervals(item: Evaluation, figures: Mapping[str, Figure]) -> Iterator[Markup]:
