@@ -333,7 +333,7 @@ def test_a_built_model_is_trained_and_loaded_by_a_builder(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"q": ["bend_x", "bendy"]}, "the frame: no column 'bendy', which q .*bend_y"),
+        ({"q": ["bend_x", "bendy"]}, "frame: no column 'bendy', which q .*bend_y"),
         ({"run": None}, "time goes back"),
         ({"data": partial(DynamicsData, pairs=8, batch_size=9, stride=1)}, "data: batch_size is 9"),
         ({"validator": partial(RolloutValidator, horizon=5.0)}, "validator: horizon is 5.0 s"),

@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import pinn_dyn
@@ -71,15 +70,10 @@ def test_an_ensemble_is_evaluated_beside_a_single_model(tmp_path, ensemble_run, 
     figures = both[["member_error_std", "spread_mean", "spread_over_error"]].astype(float)
     assert np.isfinite(figures).all()
     assert np.isnan(single["members"])
-    (picture,) = tmp_path.glob("spread_*.png")
-    assert imread(picture).std() > 0
     # 0.02 s is shorter than the validation motions, so widths are corrected too.
     assert 0 <= both["window_0.02s_within"] <= 1
     assert both["window_0.02s_factor"] > 0
     assert np.isnan(single["window_0.02s_within"])
-    levels = pd.read_csv(tmp_path / "calibration.csv")
-    assert set(levels.run) == {both["run"]}
-    assert levels.share.is_monotonic_increasing
     assert "Intervals" in (tmp_path / "report.html").read_text()
 
 
