@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs import LogSource
-from pinn_dyn.data.logs.readers import Request, read_table
+from pinn_dyn.data.logs import LogSource, Request
+from pinn_dyn.data.logs.readers import read_table
 from pinn_dyn.evaluation.log_check import check as check_log
 
 RATE = 1000.0

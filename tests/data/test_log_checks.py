@@ -93,7 +93,7 @@ BAD = {
     "mixture": (alternating(motion(), motion(phase=2.0)), r"line 3, .*rows go to and fro"),
     "dates": (
         motion().assign(t=pd.date_range("2026-11-25", periods=1001, freq="10ms").astype(str)),
-        "line 2, column 't' .*expected .* a time in seconds",
+        "line 2, column 't' .*expected a number",
     ),
 }  # fmt: skip
 
@@ -134,7 +134,7 @@ def test_a_run_of_another_sample_time_is_named(tmp_path):
 
 def test_files_that_are_not_there_and_runs_of_one_name(tmp_path):
     write(tmp_path, motion(), "b.csv")
-    with pytest.raises(LogError, match=r"nothing matches .* has b\.csv.*dataset.root"):
+    with pytest.raises(LogError, match=r"nothing matches .*b\.csv"):
         source(tmp_path, files="*.txt").load()
     with pytest.raises(LogError, match="absent', which is no folder"):
         source(tmp_path / "absent").load()

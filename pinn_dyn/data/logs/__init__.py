@@ -14,12 +14,12 @@ from pinn_dyn.data.logs.filters import (
 from pinn_dyn.data.logs.input_delay import InputDelay
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned
-from pinn_dyn.data.logs.readers import READERS, Request
+from pinn_dyn.data.logs.readers import READERS
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part, default_split
 from pinn_dyn.data.logs.step import Step, window_samples
-from pinn_dyn.data.logs.table import Table
+from pinn_dyn.data.logs.table import Request, Table
 from pinn_dyn.data.logs.units import UNITS
 
 __all__ = [

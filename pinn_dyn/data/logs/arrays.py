@@ -16,7 +16,7 @@ import pandas as pd
 from scipy.io import loadmat
 
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.readers import Request, optional
+from pinn_dyn.data.logs.table import Request, optional
 from pinn_dyn.spelling import did_you_mean
 
 

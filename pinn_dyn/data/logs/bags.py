@@ -22,8 +22,7 @@ import pandas as pd
 
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.readers import Request, optional
-from pinn_dyn.data.logs.table import Table
+from pinn_dyn.data.logs.table import Request, Table, optional
 from pinn_dyn.data.whole import whole
 
 # Names of the entries of a message's arrays, in sensor_msgs and trajectory_msgs.
@@ -34,10 +33,6 @@ def read_bag(path: Path, request: Request) -> Table:
     """Read columns of a bag, one row per message of the topic of the time.
 
     The rows are kept as a Parquet file in the cache, since decoding takes 20 µs a message.
-
-    Raises:
-        LogError: on topics, fields or joints that the bag does not have, and on topics whose
-            clocks never overlap.
     """
     optional("pyarrow", path)
     files = sorted(path.iterdir()) if path.is_dir() else [path]
@@ -68,10 +63,10 @@ def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
         for connection, stamp, raw in reader.messages(connections):
             message = reader.deserialize(raw, connection.msgtype)
             time = _time(message, stamp)
-            place = f"{path}, topic {connection.topic}"
+            topic = f"{path}, topic {connection.topic}"
             numbers[connection.topic].append(time)
             numbers[connection.topic].extend(
-                time if field == "t" else _number(message, field, place)
+                time if field == "t" else _number(message, field, topic)
                 for field in fields[connection.topic].values()
             )
     topics = {}
@@ -105,7 +100,7 @@ def _time(message: Any, received: int) -> float:
     return 1e-9 * received
 
 
-def _number(message: Any, field: str, place: str) -> float:
+def _number(message: Any, field: str, topic: str) -> float:
     """Return the number at a path such as ``position/joint1``; NaN for a missing entry."""
     node = message
     for step in field.split("/"):
@@ -119,12 +114,10 @@ def _number(message: Any, field: str, place: str) -> float:
             node = getattr(node, step)
         else:
             names = [name for name in message.__dataclass_fields__ if not name.startswith("__")]
-            raise LogError(f"{place}: no {field!r} in its messages, which have {listed(names)}")
+            raise LogError(f"{topic}: no {field!r} in its messages, which have {listed(names)}")
     if not isinstance(node, (int, float, np.number, np.bool_)):
-        raise LogError(
-            f"{place}: {field!r} is a {type(node).__name__}, expected a number: name an entry of "
-            "it, or the column '<topic>/t' for the time"
-        )
+        kind = type(node).__name__
+        raise LogError(f"{topic}: {field!r} is a {kind}, expected a number, or '<topic>/t'")
     return float(node)
 
 

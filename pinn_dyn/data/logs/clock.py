@@ -18,10 +18,8 @@ from pinn_dyn.data.logs.step import Step
 class Deduplicate(Step):
     """Drop rows with the time of the row before, and rows that repeat all its values.
 
-    Some loggers write faster than the robot answers: the row is then stale, though its time is new.
-
     Args:
-        longest: the most repeats in a row that count as stale; more are a robot at rest, and stay.
+        longest: longest series of repeats that counts as stale; a longer one is a robot at rest.
     """
 
     longest: PositiveInt = 5
@@ -34,8 +32,7 @@ class Deduplicate(Step):
         values = recording.values()
         same_time = np.r_[False, np.diff(recording.t) == 0]
         stale = np.r_[False, (values[1:] == values[:-1]).all(axis=1)]
-        edges = np.flatnonzero(np.diff(np.r_[False, stale, False]))
-        for first, end in edges.reshape(-1, 2):
+        for first, end in np.flatnonzero(np.diff(np.r_[False, stale, False])).reshape(-1, 2):
             if end - first > self.longest:
                 stale[first:end] = False
         drop = same_time | stale
@@ -65,9 +62,9 @@ class SplitGaps(Step):
         gaps = np.flatnonzero((spacing > self.longest) | (spacing < 0)) + 1
         edges = [0, *gaps.tolist(), len(recording)]
         parts = [recording.rows(slice(a, b)) for a, b in itertools.pairwise(edges)]
-        stretches = [part for part in parts if len(part) > 1]
         times = listed(f"{recording.t[k - 1]:.6g} s" for k in gaps)
-        return stretches, f"{len(gaps)} gaps" + (f", after {times}" if times else "")
+        text = f"{len(gaps)} gaps" + (f", after {times}" if times else "")
+        return [part for part in parts if len(part) > 1], text
 
 
 @dataclass(frozen=True)
@@ -97,8 +94,7 @@ class Resample(Step):
         if spacing[widest] > self.max_gap:
             raise LogError(
                 f"{recording.place}: Resample found a gap of {spacing[widest]:.4g} s after t = "
-                f"{t[widest]:.6g} s, longer than max_gap, {self.max_gap} s: put SplitGaps before "
-                "it, or raise max_gap"
+                f"{t[widest]:.6g} s: put SplitGaps before it, or raise max_gap, {self.max_gap} s"
             )
         # The last sample may round to just beyond the end.
         count = int(np.floor((t[-1] - t[0]) * self.rate + 1e-6)) + 1

@@ -21,22 +21,18 @@ _Described = TypeVar("_Described")
 def described(kind: type[_Described], name: str, value: _Described | Mapping[str, Any]) -> Any:
     """Return an object of a class, built from a mapping of its arguments if need be.
 
-    Args:
-        kind: the class.
-        name: argument that holds the value, for messages.
-        value: the object or the mapping.
-
     Raises:
-        LogError: naming each argument that is missing, unknown or wrong, and the expected value.
+        LogError: naming each argument of ``name`` that is missing, unknown or wrong.
     """
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
         mistakes = []
         for item in error.errors(include_url=False):
+            # Without the names of alternative types.
             keys = [str(x) for x in item["loc"] if isinstance(x, int) or x.isidentifier()]
-            place = ".".join([name, *keys])  # without the names of alternative types
-            mistakes.append(f"{place}: {item['msg'].removeprefix('Value error, ')}")
+            key, message = ".".join([name, *keys]), item["msg"].removeprefix("Value error, ")
+            mistakes.append(f"{key}: {message}")
         raise LogError("; ".join(mistakes)) from error
 
 
@@ -53,17 +49,14 @@ class Columns:
 
         x = sign * scale * factor(unit) * (raw - offset)
 
-    with the offset in the unit of the file. All but ``columns`` is one value, or one per column.
+    All but ``columns`` is one value, or one per column.
 
     Args:
         columns: names of the columns in the file.
         unit: unit in the file, see :data:`~pinn_dyn.data.logs.UNITS`.
         sign: 1 or -1.
         scale: factor beside that of the unit, such as a gear ratio.
-        offset: value in the file at x = 0.
-
-    Raises:
-        LogError: on a repeated column, an unknown unit, or lengths that differ.
+        offset: value at x = 0, in the unit of the file.
     """
 
     columns: Annotated[list[str], PerColumn]
@@ -73,26 +66,18 @@ class Columns:
     offset: Annotated[list[Finite], PerColumn] = field(default_factory=lambda: [0.0])
 
     def __post_init__(self) -> None:
-        if not self.columns or len(set(self.columns)) < len(self.columns):
+        size = len(self.columns)
+        if len(set(self.columns)) < size:
             raise LogError(f"columns is {self.columns}, expected distinct names")
-        if 0 in self.scale:
-            raise LogError(f"scale is {self.scale}, expected numbers other than 0")
         for key in ("unit", "sign", "scale", "offset"):
             values = getattr(self, key)
-            if len(values) not in (1, len(self.columns)):
-                raise LogError(
-                    f"{key} has {len(values)} entries, expected one, or {len(self.columns)}"
-                )
-            setattr(self, key, values * (len(self.columns) // len(values)))
+            if len(values) not in (1, size):
+                raise LogError(f"{key} has {len(values)} entries, expected one, or {size}")
+            setattr(self, key, values * (size // len(values)))
         units = [to_si(name) for name in self.unit]
         self.units = [name for name, _ in units]
         """SI unit of each column."""
         self.factors = np.array(self.sign) * self.scale * [factor for _, factor in units]
-
-    @property
-    def file_units(self) -> list[str]:
-        """Unit of each column in the file."""
-        return self.unit
 
     @property
     def labels(self) -> list[str]:
@@ -112,8 +97,6 @@ class Columns:
 
     def check_units(self, signal: str, expected: Sequence[str]) -> None:
         """Raise a LogError unless all SI units are among the expected ones."""
-        for label, unit in zip(self.columns, self.units, strict=True):
+        for column, unit in zip(self.columns, self.units, strict=True):
             if unit not in expected:
-                raise LogError(
-                    f"{signal} has the column {label!r} in {unit}, expected {', '.join(expected)}"
-                )
+                raise LogError(f"{signal} has the column {column!r} in {unit}, expected {expected}")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs.readers import Request, optional
+from pinn_dyn.data.logs.table import Request, optional
 
 
 def read_parquet(path: Path, request: Request) -> pd.DataFrame:

@@ -60,9 +60,7 @@ def pieces_of(
         return pieces, f"{summary(pieces, step)}, each one roll-out"
     span = round(part.piece / step)
     if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
-        raise LogError(
-            f"{name}.piece is {part.piece} s, expected a multiple of the sample time, {step:g} s"
-        )
+        raise LogError(f"{name}.piece is {part.piece} s, expected a multiple of {step:g} s")
     pieces = [
         replace(
             item.rows(slice(first, first + span + 1)),

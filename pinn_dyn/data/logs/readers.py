@@ -12,45 +12,20 @@ from __future__ import annotations
 
 import csv
 import gzip
-import importlib
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
+from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
+from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.table import Table
-
-
-@dataclass(frozen=True)
-class Request:
-    """Columns that a data set needs of a file.
-
-    Attributes:
-        time: column of the time.
-        columns: all columns, the time among them. A reader may return more.
-        max_age: oldest message of another topic of a bag that a row may use, s.
-    """
-
-    time: str
-    columns: Sequence[str]
-    max_age: float = 0.1
-
+from pinn_dyn.data.logs.parquet import read_parquet
+from pinn_dyn.data.logs.table import Request, Table
 
 Reader = Callable[[Path, Request], pd.DataFrame | Table]
 """Function that reads a file. One row per sample; the index names a row in messages."""
-
-
-def optional(name: str, path: Path) -> Any:
-    """Import a module of the extra ``logs``."""
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        package = name.split(".")[0]
-        raise LogError(f"{path} needs {package}: pip install 'pinn_dyn[logs]'") from error
 
 
 def read_csv(path: Path, request: Request) -> Table:
@@ -77,21 +52,13 @@ def read_csv(path: Path, request: Request) -> Table:
     return Table(frame.dropna(how="all"), str(path), "line")
 
 
-def _lazy(module: str, function: str) -> Reader:
-    def read(path: Path, request: Request) -> pd.DataFrame | Table:
-        reader: Reader = getattr(importlib.import_module(f"{__package__}.{module}"), function)
-        return reader(path, request)
-
-    return read
-
-
 READERS: dict[str, Reader] = {
     **dict.fromkeys((".csv", ".gz", ".txt", ".tsv", ".dat", ".log"), read_csv),
-    ".mat": _lazy("arrays", "read_mat"),
-    **dict.fromkeys((".h5", ".hdf5"), _lazy("arrays", "read_hdf5")),
-    ".npz": _lazy("arrays", "read_npz"),
-    ".parquet": _lazy("parquet", "read_parquet"),
-    **dict.fromkeys((".bag", ".mcap", ".db3"), _lazy("bags", "read_bag")),
+    ".mat": read_mat,
+    **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
+    ".npz": read_npz,
+    ".parquet": read_parquet,
+    **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
 """Reader of each suffix; the folder of a ROS 2 bag is read as ``.db3``."""
 
@@ -109,19 +76,14 @@ def read_table(path: Path, request: Request) -> Table:
     """
     suffix = ".db3" if _is_bag(path) else path.suffix.lower()
     if suffix not in READERS:
-        raise LogError(
-            f"{path}: no reader for {suffix!r}, expected one of {', '.join(READERS)}: convert it "
-            "with pandas (to_csv, to_parquet), or add a function to pinn_dyn.data.logs.READERS"
-        )
+        raise LogError(f"{path}: no reader for {suffix!r}, expected one of {', '.join(READERS)}")
     try:
         table = READERS[suffix](path, request)
-    except LogError:
-        raise
     except Exception as error:  # a damaged file raises nearly anything
-        raise LogError(
-            f"{path}: cannot be read as {suffix}, it may be damaged or cut short: "
-            f"{' '.join(str(error).split()) or type(error).__name__}"
-        ) from error
+        if isinstance(error, LogError):
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise LogError(f"{path}: cannot be read as {suffix}, is it cut short? {text}") from error
     if isinstance(table, pd.DataFrame):
         table = Table(table, str(path))
     if not len(table):
@@ -137,18 +99,14 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        raise LogError(
-            f"root is {str(folder.absolute())!r}, which is no folder: set dataset.root, or the "
-            "environment variable PINN_DYN_LOGS"
-        )
+        raise LogError(f"root is {str(folder.absolute())!r}, which is no folder (PINN_DYN_LOGS)")
     files: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = [path for path in folder.glob(pattern) if path.is_file() or _is_bag(path)]
         if not matches:
             names = listed(sorted(path.name for path in folder.iterdir()))
             raise LogError(
-                f"files: nothing matches {pattern!r} in the folder {folder.absolute()}, which has "
-                f"{names or 'no files'}: correct dataset.files or dataset.root"
+                f"files: nothing matches {pattern!r} in the folder {folder.absolute()}: {names}"
             )
         files.update(matches)
     return sorted(files)

@@ -102,9 +102,9 @@ class Report:
     measurements: list[Measurement] = field(default_factory=list)
     sections: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
-    def add(self, section: str, place: str, text: str) -> None:
+    def add(self, section: str, run: str, text: str) -> None:
         """Add a note on one run to a section."""
-        self.sections.setdefault(section, {}).setdefault(text, []).append(place)
+        self.sections.setdefault(section, {}).setdefault(text, []).append(run)
 
     def warn(self, name: str, text: str) -> None:
         """Add a warning."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,12 +21,12 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
-from pinn_dyn.data.logs.readers import Request, find_files, read_table, run_name
+from pinn_dyn.data.logs.readers import find_files, read_table, run_name
 from pinn_dyn.data.logs.recording import Recording, Report, since_start
 from pinn_dyn.data.logs.repeats import check_copies, check_repeats
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.step import Step
-from pinn_dyn.data.logs.table import Table
+from pinn_dyn.data.logs.table import Request, Table
 from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
@@ -44,11 +45,8 @@ class LogSource(DataSource):
     """Trajectories from logs: CSV, MATLAB, HDF5, NPZ, Parquet, bags of ROS, or data frames.
 
     Runs are split, or cut with a guard, before the steps: no filter sees both sides of a border.
-    Then the steps are applied in order, validation and test are cut into pieces of one length, and
-    every trajectory starts at t = 0. Without a velocity, :class:`SavitzkyGolayVelocity` derives it.
-
-    Columns and parts may also be mappings of their arguments, such as
-    ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
+    Every trajectory starts at t = 0. Without a velocity, :class:`SavitzkyGolayVelocity` derives it.
+    Columns and parts may be mappings, as ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
 
     Args:
         name: short name, for tables and titles.
@@ -128,8 +126,6 @@ class LogSource(DataSource):
     def _check_units(self) -> None:
         """Check the units of the signals, and that no column is in two of them."""
         self.time.check_units("time", ["s"])
-        if len(self.time.columns) > 1:
-            raise LogError(f"time has the columns {self.time.columns}, expected one")
         self.q.check_units("q", ["rad", "m", "1"])
         self.u.check_units("u", sorted({unit for unit, _ in UNITS.values()} - {"s"}))
         if self.v is not None and self.v.units != [f"{unit}/s" for unit in self.q.units]:
@@ -142,7 +138,7 @@ class LogSource(DataSource):
         """Return the cleaned trajectories.
 
         Raises:
-            LogError: on a file that cannot be used; names the file, the place and what to do.
+            LogError: on a file that cannot be used; names the place and what to do.
         """
         return self._loaded.splits
 
@@ -170,33 +166,25 @@ class LogSource(DataSource):
         return self._loaded.report.markdown()
 
     def recordings(self, frame: pd.DataFrame) -> list[tuple[np.ndarray, Recording, Recording]]:
-        """Read the runs of a table with the columns and units of the log, and clean each alone.
+        """Read the runs of a frame with the columns and units of the log, and clean each alone.
 
         A frame without the column of the trajectory is one run.
-
-        Args:
-            frame: the columns of time, q, u, and v where the log has it.
 
         Returns:
             For each run the positions of its rows in the frame, these rows in SI units, and the
             run after the cleaning.
 
         Raises:
-            LogError: on a frame that cannot be used, as on a file, or if the steps do not leave
-                exactly one stretch of a run.
+            LogError: as :meth:`load`, or if the steps do not leave one stretch of each run.
         """
         table, report = Table(frame, "the frame"), Report(self.name)
-        runs = {"the frame": np.ones(len(frame), dtype=bool)}
-        if self.trajectory is not None and self.trajectory in frame:
-            runs = table.runs(self.trajectory)
+        column = self.trajectory if self.trajectory in frame else None
+        runs = table.runs(column, "the frame")
         raws = self._recordings(table, runs, report)
         cleaned = self._clean([Cleaned("", raw, [raw]) for raw in raws], report)
         for part in cleaned:
-            if len(part.clean) != 1:
-                raise LogError(
-                    f"{part.raw.place}: the steps leave {len(part.clean)} stretches, expected one: "
-                    "pass each in its own frame"
-                )
+            if (count := len(part.clean)) != 1:
+                raise LogError(f"{part.raw.place}: the steps leave {count} stretches, expected one")
         return [
             (np.flatnonzero(rows), part.raw, part.clean[0])
             for rows, part in zip(runs.values(), cleaned, strict=True)
@@ -236,12 +224,11 @@ class LogSource(DataSource):
             measurements += check_repeats(training, pieces[name], name)
         for text in report.warnings:
             log.warning("%s: %s", self.name, text)
-        trajectories = {
-            name: [trajectory(item, step, self.interpolation) for item in items]
-            for name, items in pieces.items()
-        }
         names = {name: [item.place for item in items] for name, items in pieces.items()}
-        return _Loaded(Splits(**trajectories), names, cleaned, report)
+        splits = (
+            [trajectory(item, step, self.interpolation) for item in pieces[name]] for name in SPLITS
+        )
+        return _Loaded(Splits(*splits), names, cleaned, report)
 
     def _read(self, report: Report) -> list[Recording]:
         recordings: list[Recording] = []
@@ -249,11 +236,9 @@ class LogSource(DataSource):
         for stem, table in tables.items():
             for note in table.notes:
                 report.warn("rows", f"{stem}: {note}")
-            runs = {stem: np.ones(len(table), dtype=bool)}
-            if self.trajectory is not None:
-                prefix = f"{stem}:" if len(tables) > 1 else ""
-                rows_of_runs = table.runs(self.trajectory)
-                runs = {f"{prefix}{run}": rows for run, rows in rows_of_runs.items()}
+            prefix = f"{stem}:" if self.trajectory is not None and len(tables) > 1 else ""
+            rows_of_runs = table.runs(self.trajectory, stem)
+            runs = {f"{prefix}{run}": rows for run, rows in rows_of_runs.items()}
             recordings += self._recordings(table, runs, report)
         return recordings
 
@@ -277,7 +262,8 @@ class LogSource(DataSource):
         self, table: Table, runs: Mapping[str, np.ndarray], report: Report
     ) -> list[Recording]:
         """Convert the runs of a table, masks of its rows, to SI units, and check them."""
-        times = self.time.to_si(table.numbers(self.time.columns, "time"))[:, 0]
+        (clock,) = self.time.columns
+        times = self.time.to_si(table.numbers([clock], "time"))[:, 0]
         values = {
             signal: columns.to_si(table.numbers(columns.columns, signal))
             for signal, columns in self._signals.items()
@@ -286,7 +272,7 @@ class LogSource(DataSource):
         for run, rows in runs.items():
             part = table.select(rows)
             t, remark = since_start(times[rows])
-            check_clock(t, part, self.time.columns[0], self._repairs)
+            check_clock(t, part, clock, self._repairs)
             signals = {signal: x[rows] for signal, x in values.items()}
             for signal, x in signals.items():
                 columns = self._signals[signal]
@@ -314,23 +300,19 @@ class LogSource(DataSource):
         limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
         result = []
         for part in cleaned:
-            clean, limit = [], limits[part.split]
-            for item in part.clean:
-                # Half a sample: times are rounded.
-                if len(item) > 1 and item.duration >= limit - 0.5 * (item.t[1] - item.t[0]):
-                    clean.append(item)
-                    continue
-                report.warn(
-                    "length",
-                    f"{part.split} {item.place} after {name}: {item.duration:.4g} s, shorter "
-                    f"than {limit:g} s (piece or shortest): dropped",
-                )
-            result.append(replace(part, clean=clean))
-        if lost := limits.keys() - {part.split for part in result if part.clean}:
-            key = min(lost)
+            limit = limits[part.split]
+            # Half a sample: times are rounded.
+            long = [
+                len(item) > 1 and item.duration >= limit - 0.5 * (item.t[1] - item.t[0])
+                for item in part.clean
+            ]
+            for item in itertools.compress(part.clean, np.logical_not(long)):
+                text = f"{item.duration:.4g} s, shorter than {limit:g} s (piece or shortest)"
+                report.warn("length", f"{part.split} {item.place} after {name}: {text}: dropped")
+            result.append(replace(part, clean=list(itertools.compress(part.clean, long))))
+        for key in limits.keys() - {part.split for part in result if part.clean}:
             raise LogError(
-                f"{key}: after {name} no stretch lasts {limits[key]:g} s (its piece, or shortest): "
-                "lower it, or loosen the steps"
+                f"{key}: after {name} no stretch lasts {limits[key]:g} s: lower piece or shortest"
             )
         return result
 

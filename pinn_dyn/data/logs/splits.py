@@ -40,11 +40,7 @@ class Part:
 
     def __post_init__(self) -> None:
         if (self.runs is None) == (self.seconds is None):
-            raise LogError(
-                f"runs is {self.runs} and seconds is {self.seconds}, expected one of them"
-            )
-        if self.seconds is not None and self.piece != "whole" and self.piece > self.seconds:
-            raise LogError(f"piece is {self.piece} s, expected at most seconds, {self.seconds} s")
+            raise LogError(f"expected either runs or seconds, not {self.runs} and {self.seconds}")
 
     @property
     def names(self) -> list[str]:
@@ -80,9 +76,7 @@ def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part
 def split(
     recordings: list[Recording], validation: Part, test: Part, *, guard: float, seed: int
 ) -> dict[str, list[Recording]]:
-    """Assign whole runs, and cut parts out of the other runs, before any filter sees them.
-
-    A run that is cut at its end consists of training, guard, validation, guard, test.
+    """Assign whole runs, and cut the other runs into training, guard, validation, guard, test.
 
     Raises:
         LogError: on unknown or doubly used runs, or too few or too short ones.
@@ -102,10 +96,9 @@ def split(
         name: part.runs if isinstance(part.runs, int) else 0
         for name, part in (("test", test), ("validation", validation))
     }
-    if sum(counts.values()) >= len(free):
+    if (count := sum(counts.values())) >= len(free):
         raise LogError(
-            f"{len(free)} runs to choose from, expected more than {sum(counts.values())}, so that "
-            "one is left for training; with a single run, split by 'seconds'"
+            f"{len(free)} runs to choose from, expected more than {count}, or a split by 'seconds'"
         )
     drawn = iter(np.random.default_rng(seed).permutation(len(free)))
     for name, count in counts.items():

@@ -41,18 +41,18 @@ class Step(abc.ABC):
         return labels
 
 
-def window_samples(window: Length, recording: Recording, least: int, *, odd: bool = False) -> int:
-    """Return a window in samples of a recording, at least ``least``; rounds a time.
+def window_samples(window: Length, recording: Recording, minimum: int, *, odd: bool = False) -> int:
+    """Return a window in samples of a recording, at least ``minimum``; rounds a time.
 
     Raises:
         LogError: if a number of samples is too small, or even where it must be odd.
     """
     if isinstance(window, str):
         count = seconds_of("window", window) / float(np.median(np.diff(recording.t)))
-        return max(2 * round((count - 1) / 2) + 1 if odd else round(count), least)
-    if window < least or (odd and window % 2 == 0):
+        return max(2 * round((count - 1) / 2) + 1 if odd else round(count), minimum)
+    if window < minimum or (odd and window % 2 == 0):
         raise LogError(
             f"a window is {window}, expected {'an odd' if odd else 'a'} number of samples, at "
-            f"least {least}, or a time, such as '0.1 s'"
+            f"least {minimum}, or a time, such as '0.1 s'"
         )
     return window

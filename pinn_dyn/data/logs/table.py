@@ -1,15 +1,42 @@
-"""A table of a log, which names its rows and columns in messages."""
+"""A table of a log, and the request of its columns that a reader gets."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.errors import LogError, listed, shown
 from pinn_dyn.spelling import did_you_mean
+
+
+@dataclass(frozen=True)
+class Request:
+    """Columns that a data set needs of a file.
+
+    Attributes:
+        time: column of the time.
+        columns: all columns, the time among them. A reader may return more.
+        max_age: oldest message of another topic of a bag that a row may use, s.
+    """
+
+    time: str
+    columns: Sequence[str]
+    max_age: float = 0.1
+
+
+def optional(name: str, path: Path) -> Any:
+    """Import a module of the extra ``logs``."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        package = name.split(".")[0]
+        raise LogError(f"{path} needs {package}: pip install 'pinn_dyn[logs]'") from error
 
 
 @dataclass(frozen=True)
@@ -42,28 +69,18 @@ class Table:
         return text + (f" ({signal})" if signal else "")
 
     def column(self, name: str, signal: str) -> pd.Series:
-        """Return one column as it is.
-
-        Raises:
-            LogError: if the column is missing or ambiguous; names the closest column.
-        """
+        """Return one column as it is."""
         count = list(self.frame.columns).count(name)
         if count > 1:
             raise LogError(f"{self.name}: {count} columns have the name {name!r}")
         if not count:
             hint = did_you_mean(name, map(str, self.frame.columns)) or "."
-            raise LogError(
-                f"{self.name}: no column {name!r}, which {signal} reads{hint} "
-                f"The log has {listed(self.frame.columns)}"
-            )
+            text = f"{self.name}: no column {name!r}, which {signal} reads{hint} The log has"
+            raise LogError(f"{text} {listed(self.frame.columns)}")
         return self.frame[name]
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
-        """Return columns as finite numbers, ``(T, K)``.
-
-        Raises:
-            LogError: if a column is missing, or a value is no finite number; names its row.
-        """
+        """Return columns as finite numbers, ``(T, K)``."""
         return np.column_stack([self._numbers(name, signal) for name in columns])
 
     def _numbers(self, name: str, signal: str) -> np.ndarray:
@@ -73,18 +90,19 @@ class Table:
         if bad.any():
             k = int(bad.argmax())
             text = "empty or NaN" if pd.isna(raw.iloc[k]) else shown(str(raw.iloc[k]))
-            raise LogError(
-                f"{self.place(k, name, signal)}: the value is {text}, expected a number with a "
-                f"decimal point, a time in seconds ({int(bad.sum())} such rows in this column)"
-            )
+            text += f", expected a number with a decimal point ({int(bad.sum())} such rows)"
+            raise LogError(f"{self.place(k, name, signal)}: the value is {text}")
         return values
 
-    def runs(self, column: str) -> dict[str, np.ndarray]:
+    def runs(self, column: str | None, name: str) -> dict[str, np.ndarray]:
         """Return the rows of each run, masks ``(T,)``, in order of appearance.
 
-        Raises:
-            LogError: if a row has no name of a run in the column.
+        Args:
+            column: column that names the runs; None if the table is one run.
+            name: name of a single run.
         """
+        if column is None:
+            return {name: np.ones(len(self), dtype=bool)}
         names = self.column(column, "trajectory")
         if names.isna().any():
             row = int(names.isna().to_numpy().argmax())

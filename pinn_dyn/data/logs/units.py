@@ -7,57 +7,31 @@ import math
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.spelling import did_you_mean
 
-_DEGREE = math.pi / 180
+_DEGREE, _TURN = math.pi / 180, 2 * math.pi
+
+_FACTORS: dict[str, dict[str, float]] = {
+    "1": {"1": 1.0, "%": 0.01},
+    "1/s": {"1/s": 1.0},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN},
+    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "rpm": _TURN / 60},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "Nm": {"Nm": 1.0, "mNm": 1e-3},
+    "N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "V": {"V": 1.0, "mV": 1e-3},
+    "Pa": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "mbar": 1e2, "bar": 1e5, "psi": 6894.757293168361},
+}
 
 UNITS: dict[str, tuple[str, float]] = {
-    "1": ("1", 1.0),
-    "%": ("1", 0.01),
-    "1/s": ("1/s", 1.0),
-    "s": ("s", 1.0),
-    "ms": ("s", 1e-3),
-    "us": ("s", 1e-6),
-    "ns": ("s", 1e-9),
-    "min": ("s", 60.0),
-    "rad": ("rad", 1.0),
-    "mrad": ("rad", 1e-3),
-    "deg": ("rad", _DEGREE),
-    "rev": ("rad", 2 * math.pi),
-    "rad/s": ("rad/s", 1.0),
-    "mrad/s": ("rad/s", 1e-3),
-    "deg/s": ("rad/s", _DEGREE),
-    "rpm": ("rad/s", 2 * math.pi / 60),
-    "m": ("m", 1.0),
-    "cm": ("m", 1e-2),
-    "mm": ("m", 1e-3),
-    "um": ("m", 1e-6),
-    "m/s": ("m/s", 1.0),
-    "cm/s": ("m/s", 1e-2),
-    "mm/s": ("m/s", 1e-3),
-    "Nm": ("Nm", 1.0),
-    "mNm": ("Nm", 1e-3),
-    "N": ("N", 1.0),
-    "mN": ("N", 1e-3),
-    "kN": ("N", 1e3),
-    "A": ("A", 1.0),
-    "mA": ("A", 1e-3),
-    "V": ("V", 1.0),
-    "mV": ("V", 1e-3),
-    "Pa": ("Pa", 1.0),
-    "kPa": ("Pa", 1e3),
-    "MPa": ("Pa", 1e6),
-    "mbar": ("Pa", 1e2),
-    "bar": ("Pa", 1e5),
-    "psi": ("Pa", 6894.757293168361),
+    unit: (si, factor) for si, units in _FACTORS.items() for unit, factor in units.items()
 }
 """SI unit of each unit, and the factor to it: x_SI = factor * x."""
 
 
 def to_si(unit: str) -> tuple[str, float]:
-    """Return the SI unit of a unit, and the factor to it.
-
-    Raises:
-        LogError: on an unknown unit; lists the known units.
-    """
+    """Return the SI unit of a unit, and the factor to it."""
     if unit not in UNITS:
         hint = did_you_mean(unit, UNITS) or "."
         raise LogError(f"unit is {unit!r}{hint} Known units are {', '.join(UNITS)}")
