@@ -85,6 +85,7 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
     assert not (tmp_path / "out" / "terms.txt").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
     run_script(
         "train.py",
@@ -103,7 +104,6 @@ def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
     delays = pd.read_csv(tmp_path / "out" / "summary.csv")["input_delay_seconds"]
     assert delays[0] == pytest.approx(seconds, abs=1e-3)
     assert delays[1:].isna().all()
-    assert "input delay [s]" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.usefixtures("undrawn")
