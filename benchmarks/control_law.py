@@ -71,7 +71,7 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     except ImportError as error:
         print(error)
         return {}
-    path = str(read_urdf(PANDA).path)
+    path = str(read_urdf(PANDA, locked_joints=FINGERS).path)
     pybullet.connect(pybullet.DIRECT)
     body = pybullet.loadURDF(path, useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
     pybullet.setGravity(0, 0, -9.81)
