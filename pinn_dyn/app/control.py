@@ -26,6 +26,7 @@ from pinn_dyn.control import (
     ModelBasedLaw,
     ProportionalDerivative,
     export_law,
+    term_conditions,
 )
 from pinn_dyn.data import DataSource
 from pinn_dyn.ensembles import Ensemble
@@ -51,18 +52,15 @@ def control(cfg: DictConfig) -> float:
     run = load_run(Path(config["run"]), config["checkpoint"], packages(config.get("trust")))
     try:
         return _close_loops(run, config, folder)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except ValueError as error:
         raise ConfigError(str(error)) from error
 
 
 def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     source = build_source(run.config)
-    if source.system is None:
-        raise ConfigError(
-            f"{source.name} is measured data, without a simulated robot to close a loop with; "
-            "pinn_dyn.control.export_law writes a law on the model for your own loop"
-        )
     learned = _learned_system(run, config)
+    if source.system is None:
+        return _without_robot(learned, source, config, folder)
     runs, configurations = {run.config["name"]: run}, {"run": run.config}
     origin = write_provenance(runs, source, config, configurations, folder)
     robot = build_part("robot", {**run.config["dataset"]["system"], **config["robot"]})
@@ -73,11 +71,9 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     threshold = config["guard"].get("threshold")
-    if "learned" not in laws and (config["export"] or config["stability"] or threshold):
-        raise ConfigError("export, stability and guard need the controller 'learned'")
-    if config["export"] is not None:
-        path = export_law(laws["learned"], Path(config["export"]))
-        log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
+    if "learned" not in laws and (config["stability"] or threshold):
+        raise ConfigError("stability and guard need the controller 'learned'")
+    _export(laws.get("learned"), config)
     if threshold is not None:
         laws["learned"] = _guarded(laws["learned"], config, source)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
@@ -100,6 +96,37 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
             if reason:
                 log.warning("%s, run %d was stopped: %s", name, index, reason)
     return write_results(result, source, learned, robot, reference, config, folder, origin)
+
+
+def _without_robot(
+    learned: MechanicalSystem, source: DataSource, config: dict[str, Any], folder: Path
+) -> float:
+    """Export the law on a model of measured data, and write how well it is conditioned."""
+    _export(build_law(config, "learned", learned, learned), config)
+    q = torch.cat([_thinned(item.q) for item in source.load().train])
+    table = term_conditions(learned, q)
+    table.to_csv(folder / "conditions.csv", index=False)
+    print(table.describe().loc[["min", "50%", "max"]].to_string(float_format="{:.3g}".format))
+    log.info(
+        "%s is measured data without a simulated robot, so no loop is closed; the table over the "
+        "training data is in %s. M and D must be positive definite, and A well conditioned",
+        source.name,
+        folder / "conditions.csv",
+    )
+    return float("nan")
+
+
+def _export(law: Controller | None, config: dict[str, Any]) -> None:
+    if config["export"] is None:
+        return
+    if law is None:
+        raise ConfigError("export needs the controller 'learned'")
+    path = export_law(law, Path(config["export"]))
+    log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
+
+
+def _thinned(values: Tensor) -> Tensor:
+    return values[:: max(1, len(values) // _REGION_SAMPLES)]
 
 
 def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem:
@@ -135,10 +162,6 @@ def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Con
     fallback = None
     if guard.get("fallback"):
         fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
-    steps = [max(1, len(item.q) // _REGION_SAMPLES) for item in train]
-    q, v = (
-        [getattr(item, name)[::step] for item, step in zip(train, steps, strict=True)]
-        for name in ("q", "v")
-    )
+    q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
     region = DataRegion(q, v, angles=getattr(law.model, "angles", ()))
     return Guarded(law, fallback, region, threshold=guard["threshold"])

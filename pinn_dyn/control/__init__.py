@@ -24,7 +24,7 @@ from pinn_dyn.control.references import (
     Sines,
 )
 from pinn_dyn.control.region import DataRegion, Guarded
-from pinn_dyn.control.stability import certify
+from pinn_dyn.control.stability import certify, term_conditions
 from pinn_dyn.control.stability_report import stability_report
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 
@@ -60,4 +60,5 @@ __all__ = [
     "predict_steady_state",
     "required_gain",
     "stability_report",
+    "term_conditions",
 ]

@@ -98,6 +98,25 @@ def factor_bounds(P: Tensor, true: Terms, learned: Terms) -> dict[str, Tensor]:
     }
 
 
+def term_conditions(model: MechanicalSystem, q: Tensor) -> pd.DataFrame:
+    """Return the conditioning of the terms of a model at configurations q ``(K, N)``, a row each.
+
+    The truth is not needed. Next to ``q1`` to ``qN`` there are ``mass_min`` and ``damping_min``,
+    the smallest eigenvalues of M and D, and ``mass_condition`` and ``input_condition``, the
+    condition numbers of M and A in the 2-norm. A law that inverts A turns a small error of G into a
+    large error of u where ``input_condition`` is large.
+    """
+    with torch.no_grad():
+        terms = double_copy(model, q.device).terms(q.double())
+    columns = {
+        "mass_min": smallest_eigenvalue(terms.M),
+        "damping_min": smallest_eigenvalue(terms.D),
+        "mass_condition": torch.linalg.cond(terms.M),
+        "input_condition": torch.linalg.cond(terms.A),
+    }
+    return per_configuration(q, columns)
+
+
 def checked_samples(model: MechanicalSystem, truth: MechanicalSystem, q: Tensor) -> Tensor:
     """Return configurations ``(K, N)`` of two systems of the same N and M in float64."""
     sizes = [(system.num_coordinates, system.num_inputs) for system in (model, truth)]

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+import pinn_dyn
 from pinn_dyn.app.config import CONF
 from pinn_dyn.models import LagrangianNetwork
 from tests.app.entry import (
@@ -159,13 +160,19 @@ def test_a_force_that_is_not_linear_in_the_input_is_refused(tmp_path, capsys):
     assert "model/input=network" in text
 
 
-def test_measured_data_have_no_robot_to_control(tmp_path, monkeypatch, capsys):
+def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, monkeypatch):
     monkeypatch.chdir(CONF.parent)  # the example log is found from here
     run = tmp_path / "run"
     words = [*TINY_TRAINING, NO_FIGURES, "compile=false", f"hydra.run.dir={run}"]
     run_script("train.py", "experiment=example_log", *words)
-    text = refused(capsys, run, f"hydra.run.dir={tmp_path}/out")
-    assert "measured data, without a simulated robot" in text
+    law = tmp_path / "law.pt2"
+    control(tmp_path / "out", run, f"export={law}")
+    assert law.is_file()
+    table = pd.read_csv(tmp_path / "out" / "conditions.csv")
+    model = pinn_dyn.load(run)
+    terms = model.terms(table[["q1", "q2", "q3"]].to_numpy())
+    np.testing.assert_allclose(np.linalg.eigvalsh(terms.M)[:, 0], table["mass_min"], rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.cond(terms.A), table["input_condition"], rtol=1e-6)
 
 
 @pytest.mark.panda
