@@ -1,4 +1,4 @@
-"""Three sentences on what the demo has shown: python examples/demo_summary.py runs"""
+"""Print three results of the demo: python examples/demo_summary.py runs"""
 
 import sys
 from pathlib import Path
@@ -7,36 +7,35 @@ import pandas as pd
 
 
 def rows(folder: Path, table: str = "summary") -> dict[str, dict]:
-    """A table that evaluate.py or control.py wrote, by its first column."""
+    """Return a table of evaluate.py or control.py by the first column."""
     return pd.read_csv(folder / f"{table}.csv", index_col=0).to_dict("index")
 
 
 def errors(folder: Path) -> str:
-    """Mean errors, the models before what they have to beat."""
-    found = rows(folder)
-    models = {k: row for k, row in found.items() if not row["baseline"]}
+    """Return the mean errors of the models, and of the baseline."""
+    table = rows(folder)
+    models = {k: row for k, row in table.items() if not row["baseline"]}
     parts = [f"{name} {row['error_mean']:.3g}" for name, row in models.items()]
-    baseline = found["constant velocity"]["error_mean"]
-    lost = [f"{name} {row['diverged']}" for name, row in models.items() if row["diverged"]]
+    baseline = table["constant velocity"]["error_mean"]
+    diverged = [f"{name} {row['diverged']}" for name, row in models.items() if row["diverged"]]
     return f"{', '.join(parts)}; q + v t {baseline:.3g}" + (
-        f" (diverged: {', '.join(lost)})" if lost else ""
+        f" (diverged: {', '.join(diverged)})" if diverged else ""
     )
 
 
 def main(runs: Path) -> None:
-    """Print them."""
+    """Print the results in the folder ``runs``."""
     pairs = {row["pairs"] for row in rows(runs / "demo-evaluation").values() if row["pairs"] > 0}
     control = rows(runs / "demo-control")
     reached = {name: row["step_error_after_1_s_mean_percent"] for name, row in control.items()}
     peak = control["learned"]["input_peak"]
     print(
-        f"\n1. Learned from {min(pairs):.0f} pairs of states, mean error of five seconds of unseen "
-        f"motion [rad, m]: {errors(runs / 'demo-evaluation')}.\n"
-        f"2. A third beyond the range of the training: {errors(runs / 'demo-beyond')}.\n"
-        f"3. Only a model with structure has the matrices that a controller needs: with at most "
-        f"{peak:.2g} Nm or N the arm is {reached['learned']:.2g} % of its step from the set point "
-        f"after a second by the learned matrices, {reached['truth']:.2g} % by the true ones, "
-        f"{reached['pd']:.2g} % without a model."
+        f"\n1. Mean error over 5 s of test motions, from {min(pairs):.0f} pairs [rad, m]: "
+        f"{errors(runs / 'demo-evaluation')}.\n"
+        f"2. On motions a third larger than in training: {errors(runs / 'demo-beyond')}.\n"
+        f"3. Control with inputs of at most {peak:.2g} Nm or N: 1 s after a step, the arm is "
+        f"{reached['learned']:.2g} % of the step from the set point with learned matrices, "
+        f"{reached['truth']:.2g} % with true matrices, {reached['pd']:.2g} % without a model."
     )
 
 
