@@ -19,7 +19,7 @@ PLAYED = ("docs/tutorial.md", "docs/your_log.md", "docs/your_robot.md")
 _FENCE = re.compile(r"^( *)(`{3,})([\w+-]*)(.*)$")
 _TITLE = re.compile(r'title="([^"]+)"')
 _REASON = re.compile(r"<!-- not run: (\S.*?) -->$")
-_COMMAND = re.compile(r"^(\w+=\S+ )*(python3?|make|pinn-dyn-\w+)( |$)")
+_COMMAND = re.compile(r"^(\w+=\S+ )*(python3?|make|pinn-dyn-\w+)( |$)", re.M)
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,6 @@ def blocks(page: Path) -> list[Block]:
             while index < len(lines) and lines[index].startswith("    "):
                 index += 1
             code = "\n".join(row.strip() for row in lines[start:index])
-            if _COMMAND.match(code):
+            if _COMMAND.search(code):
                 result.append(Block(page, start + 1, "bash", code, reason=text))
     return result
