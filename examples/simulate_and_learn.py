@@ -27,12 +27,13 @@ source = pinn_dyn.dataset(
     train_initial_states=5,
     train_inputs=4,
     validation=2,
+    test=1,
 )
 windows = partial(DynamicsData, stride=1)
 model = pinn_dyn.train(source, "lnn", loss=MidpointLoss, data=windows, steps=args.steps)
 print(model)
 
-# A motion of the true arm that no training saw, by the same roll-out.
+# A motion of the true arm that is not part of the training data.
 arm = pinn_dyn.SoftArm(segments=1).double()
 t = torch.arange(0, 2, 0.01, dtype=torch.float64)
 u = torch.stack([torch.sin(4 * t), torch.cos(3 * t), torch.full_like(t, -1.15)], dim=1)
@@ -41,6 +42,6 @@ true = rollout(arm.velocity_derivative, start, t, pinn_dyn.Signal(t, u)).numpy()
 error = np.abs(model.predict(start, u, t) - true)[:, :3].mean(axis=0)
 print("mean error over 2 s:", dict(zip(model.labels, error.round(4), strict=True)))
 
-# Motions leave the terms free up to one common matrix: A^-1 M is what they can tell.
+# Motions determine the terms up to a common matrix, and therefore A^-1 M.
 for name, terms in (("learned", model.terms(start[:3])), ("true", arm.terms(start[:3]))):
     print(f"A^-1 M, {name}:", np.linalg.solve(np.asarray(terms.A), np.asarray(terms.M)), sep="\n")
