@@ -7,13 +7,26 @@ from typing import Any
 
 import lightning as L
 
-from pinn_dyn.app import trainer
+from pinn_dyn.app import trainer, training
+from pinn_dyn.app.build import build_source, model_builder
 from pinn_dyn.app.config import build_part
+from pinn_dyn.data import DataSource, DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import Statistics
 from pinn_dyn.training import DynamicsLearner
+
+
+def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:
+    """Build the windows of a configuration, on a source or else that of the configuration."""
+    batches = trainer.epochs(config["trainer"]["steps"], config["trainer"]["validations"])[1]
+    builder = build_part("data", config["data"], partial_=True)
+    return training.build_data(builder, source or build_source(config), config["seed"], batches)
+
+
+def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
+    """Build the model of a configuration, scaled to the data."""
+    return training.build_predictor(model_builder(config), statistics, config["seed"])
 
 
 def build_validator(config: dict[str, Any], step: float) -> RolloutValidator:
@@ -42,8 +55,5 @@ def build_trainer(config: dict[str, Any], folder: Path) -> L.Trainer:
     """Build the trainer of a configuration, with a TensorBoard log."""
     settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
     length = trainer.epochs(settings.pop("steps"), settings.pop("validations"))
-    description = RunDescription(
-        settings=trainer.few_settings(config), configuration="", provenance={}
-    )
     loggers = [trainer.tensorboard(folder)]
-    return trainer.build_trainer(folder, settings, [description], loggers, length)
+    return trainer.build_trainer(folder, settings, [], loggers, length)

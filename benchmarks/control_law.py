@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from configured import build_model
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.build import build_model
 from pinn_dyn.app.config import CONF, plain
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run_folder import load_run

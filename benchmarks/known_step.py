@@ -20,9 +20,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from configured import build_model
 from training_step import STEP, make_windows
 
-from pinn_dyn.app.build import build_model
 from pinn_dyn.app.config import composed
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM

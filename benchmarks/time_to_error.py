@@ -27,10 +27,9 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from configured import build_learner, build_validator
+from configured import build_data, build_learner, build_model, build_validator
 from hydra import compose, initialize_config_dir
 
-from pinn_dyn.app.build import build_data, build_model
 from pinn_dyn.app.config import CONF, plain
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.trainer import epochs

@@ -175,7 +175,7 @@ def run_cell(
     trainer.LONGEST_EPOCH = steps
     config = configuration(size, batch, loss, optimizer, members, device, compiled)
     L.seed_everything(0, verbose=False)
-    data = build.build_data(config, Sines(size))
+    data = configured.build_data(config, Sines(size))
     model = training.build_predictor(
         build.model_builder(config), data.statistics, 0, config["ensemble"]
     )
@@ -286,7 +286,7 @@ def check_weights(config: dict[str, Any], data: Any, name: str, tree: dict[str, 
 
     config = {**config, "compile": False}
     trainer.LONGEST_EPOCH, steps = CHECKED, trainer.LONGEST_EPOCH
-    data = build.build_data(config, data.source)
+    data = configured.build_data(config, data.source)
     L.seed_everything(0, verbose=False)
     model = training.build_predictor(
         build.model_builder(config), data.statistics, 0, config["ensemble"]

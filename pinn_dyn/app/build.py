@@ -12,13 +12,10 @@ from lightning.pytorch.loggers import Logger
 
 from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.app.run import ModelBuilder
-from pinn_dyn.app.trainer import epochs, tensorboard
-from pinn_dyn.app.training import build_data as build_windows
-from pinn_dyn.app.training import build_predictor
+from pinn_dyn.app.trainer import tensorboard
 from pinn_dyn.control import Controller, Reference
-from pinn_dyn.data import DataSource, DynamicsData
+from pinn_dyn.data import DataSource
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
-from pinn_dyn.models import Statistics
 
 
 def build_source(config: dict[str, Any]) -> DataSource:
@@ -29,23 +26,11 @@ def build_source(config: dict[str, Any]) -> DataSource:
     return build_part("dataset", part)
 
 
-def build_data(config: dict[str, Any], source: DataSource | None = None) -> DynamicsData:
-    """Build the windows of ``config["data"]``, on a source or else that of ``config``."""
-    batches = epochs(config["trainer"]["steps"], config["trainer"]["validations"])[1]
-    builder = build_part("data", config["data"], partial_=True)
-    return build_windows(builder, source or build_source(config), config["seed"], batches)
-
-
 def model_builder(config: dict[str, Any]) -> ModelBuilder:
     """Return the builder of ``config["model"]``."""
     if config["model"] is None:
         raise ConfigError("the model was built in Python: use pinn_dyn.load(folder, model=builder)")
     return build_part("model", config["model"], partial_=True)
-
-
-def build_model(config: dict[str, Any], statistics: Statistics) -> Predictor:
-    """Build the model of ``config["model"]``, scaled to the data."""
-    return build_predictor(model_builder(config), statistics, config["seed"])
 
 
 def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -75,8 +60,7 @@ def _logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
     """Build a logger that writes to the run folder."""
     if name == "tensorboard":
         return tensorboard(folder)
-    extra: dict[str, Any] = {"tags": {"folder": str(folder.resolve())}} if name == "mlflow" else {}
-    return build_part(f"logger.{name}", config, save_dir=str(folder), **extra)
+    return build_part(f"logger.{name}", config, save_dir=str(folder))
 
 
 def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:

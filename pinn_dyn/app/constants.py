@@ -19,24 +19,16 @@ from pinn_dyn.training import Fit
 log = logging.getLogger(__name__)
 
 _CONSTANTS = "constants.csv"
-_UNFINISHED = "constants_unfinished.csv"
 _UNDETERMINED = "undetermined.md"
 _SHOWN = 2  # directions in the log
 
 
 def write_constants(model: Predictor, result: Fit, source: DataSource, folder: Path) -> None:
-    """Write the constants with their 95 % intervals, and the directions that the prior determines.
-
-    A fit that was stopped writes its constants alone, to ``constants_unfinished.csv``.
-    """
+    """Write the constants with 95 % intervals, and the directions that the prior determines."""
     assert isinstance(model, LearnedConstants)
     table = constants_table(model, result, [units([label]) for label in source.input_labels])
-    path = folder / (_CONSTANTS if result.stopped_in is None else _UNFINISHED)
+    path = folder / _CONSTANTS
     write_whole(path, table.to_csv(index=False))
-    if result.stopped_in is not None:
-        log.warning("the fit is not finished: its best constants so far are in %s", path)
-        return
-    (folder / _UNFINISHED).unlink(missing_ok=True)
     log.info("constants and their intervals are in %s", path)
     lines = undetermined(model, result)
     head = f"{len(lines)} of {len(table)} directions of the constants are held by the prior"

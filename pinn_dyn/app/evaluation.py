@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping, Sequence
 
 from pinn_dyn.app.constants import read_constants
-from pinn_dyn.app.identification import identified
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.shared_data import (
     require_fitting_test,
@@ -102,9 +101,6 @@ def evaluate(
     training = splits[sources[0]]
     predictors = build_baselines(training.train, training.validation, step=grid)
     baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
-    for k, predictor in identified(runs, sources).items():
-        name = f"identification of {names[k]}"
-        baselines.append(Entry(name, predictor, splits[sources[k]], steps[k], name))
     evaluation = evaluate_models(
         entries,
         baselines,

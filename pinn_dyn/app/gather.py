@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import glob
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import yaml
@@ -18,7 +17,6 @@ from pinn_dyn.app.run_folder import CONFIG, METRICS
 from pinn_dyn.app.sweep import ERROR, first_line
 from pinn_dyn.evaluation import save, sweep_figure
 from pinn_dyn.evaluation.tables import over_seeds, to_text, varied_settings, write_table
-from pinn_dyn.spelling import did_you_mean
 
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")
 _SHOWN = ("val/error_mean", "val/diverged", "test/error_mean", "test/diverged", "training_seconds")
@@ -52,19 +50,6 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
     return pd.DataFrame(rows), configs, problems
 
 
-def select(settings: pd.DataFrame, conditions: Mapping[str, Any]) -> list[int]:
-    """Return the rows that have the values of all conditions; a list means any of its values."""
-    for key, value in conditions.items():
-        if key not in settings:
-            hint = did_you_mean(key, list(settings))
-            raise ConfigError(f"filter: the runs have no key '{key}'{hint}")
-        values = value if isinstance(value, list) else [value]
-        settings = settings[settings[key].map(str).isin(map(str, values))]
-    if settings.empty:
-        raise ConfigError(f"filter: no run has {dict(conditions)}")
-    return list(settings.index)
-
-
 def read_test_errors(folders: Sequence[str], patterns: Sequence[str]) -> pd.DataFrame:
     """Return the test errors of runs, indexed by folder, from folders of evaluate.py or globs.
 
@@ -91,9 +76,7 @@ def gather(cfg: DictConfig) -> None:
     if runs.empty and not problems:
         raise ConfigError(f"runs: {config['runs']} lead to no run of train.py")
     if len(runs):
-        chosen = select(pd.json_normalize(configs), config["filter"] or {})
-        runs = runs.loc[chosen]
-        settings = varied_settings([configs[k] for k in chosen]).set_index(runs.index)
+        settings = varied_settings(configs)
         runs = runs.join(settings)
         if config["evaluations"]:
             errors = read_test_errors([*runs["folder"]], config["evaluations"])

@@ -67,7 +67,8 @@ def load_run(
     model: ModelBuilder | None = None,
 ) -> Run:
     """Load a run as :func:`load` does; ``trust=None`` trusts all classes that the run names."""
-    from pinn_dyn.app.build import build_predictor, model_builder
+    from pinn_dyn.app.build import model_builder
+    from pinn_dyn.app.training import build_predictor
 
     path = folder / CHECKPOINTS / f"{checkpoint}.ckpt"
     saved = read_checkpoint(path)

@@ -15,7 +15,6 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.search import EqualSearch
 from pinn_dyn.app.validation import SET_BY_PROGRAM, STAND_INS, Seed
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
@@ -39,7 +38,7 @@ class TrainSettings:
     start_from: str | None = None
     resume: str | None = None
     trust: Names | None = None
-    search: EqualSearch | dict[str, int] | None = None  # a run folder holds the draw alone
+    search: Mapping[Literal["draw"], NonNegativeInt] | None = None
     dataset: DataSource
     data: DynamicsData | Callable[..., DynamicsData]
     model: Predictor | Callable[..., Predictor]
@@ -65,9 +64,6 @@ class TrainerArguments:
     gradient_clip_val: PositiveFloat | None = None
     gradient_clip_algorithm: Literal["norm", "value"] | None = None
     enable_progress_bar: bool = True
-    deterministic: bool | Literal["warn"] = False
-    detect_anomaly: bool = False
-    profiler: Literal["simple", "advanced"] | None = None
 
 
 STAND_INS[L.Trainer] = TrainerArguments
@@ -185,7 +181,6 @@ class GatherSettings:
 
     runs: Names
     evaluations: Names | None
-    filter: Mapping[str, Any] | None
     sort: str
     plot: str | None
 

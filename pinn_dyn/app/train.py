@@ -14,23 +14,20 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app import training
 from pinn_dyn.app.build import training_arguments
-from pinn_dyn.app.config import ConfigError, build_part, check, checked
+from pinn_dyn.app.config import ConfigError, check, checked
 from pinn_dyn.app.run import VALIDATION_ERROR
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
-    flattened,
     load_run,
     newest_checkpoint,
     read_checkpoint,
 )
-from pinn_dyn.app.trainer import few_settings
+from pinn_dyn.app.search import with_draw
 from pinn_dyn.app.trust import check_name, packages, require_trusted
 
 log = logging.getLogger(__name__)
 
 _RESUME = ("resume=", "trust=")
-# Keys that do not change what is learned.
-_IGNORED = ("callbacks", "logger", "name", "model_name", "threads", "search", "resume")
 
 
 def train(cfg: DictConfig) -> float:
@@ -49,7 +46,7 @@ def train(cfg: DictConfig) -> float:
         check_name("model_name", config["model_name"])  # files are named by it
         check_name("dataset.name", config["dataset"].get("name", "data"))
         if config.get("search"):
-            config = build_part("search", config["search"]).applied(config)
+            config = with_draw(config, config["search"]["draw"])
     start = config.get("start_from")
     try:
         run = training.train(
@@ -57,7 +54,6 @@ def train(cfg: DictConfig) -> float:
             start_from=None if start is None else load_run(Path(start), "best", trust),
             folder=folder,
             config=config,
-            settings=_settings(config),
         )
     except KeyboardInterrupt as interrupt:
         if not isinstance(stop := interrupt.__cause__, SystemExit):
@@ -85,16 +81,3 @@ def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:
     require_trusted(config, str(path), trust)
     check("train", config)
     return config
-
-
-def _settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings that loggers compare: a few, and those of the command line."""
-    settings, values = few_settings(config), flattened(config)
-    settings |= {f"search.{key}": x for key, x in (config.get("search") or {}).items()}
-    for override in HydraConfig.get().overrides.task:
-        key, _, value = override.lstrip("+").partition("=")
-        if key.split(".")[0] not in _IGNORED and not key.startswith("~"):
-            value = values.get(key, value)
-            number = isinstance(value, (bool, int, float))
-            settings.setdefault(key, value if number else str(value))
-    return settings

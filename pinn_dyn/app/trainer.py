@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,7 +26,6 @@ from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.evaluation.run_log import RunDescription
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
@@ -190,36 +190,30 @@ def tensorboard(folder: Path) -> TensorBoardLogger:
     return TensorBoardLogger(str(folder), name="tensorboard", version="", default_hp_metric=False)
 
 
-def few_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that loggers compare by default."""
-    settings = {"model": config["model_name"], "dataset": config["dataset"]["name"]}
-    for key in ("data.pairs", "data.steps", "data.stride", "optimizer.lr", "trainer.steps"):
-        part, name = key.split(".")
-        if name in (config[part] or {}):
-            settings[key] = config[part][name]
-    return {**settings, "seed": config["seed"]}
+class Recorder(L.Callback):
+    """Run time of a training, its metrics and the identity of its data, for its checkpoints.
 
-
-class Recorder(RunDescription):
-    """Description of a run, which puts its metrics and the identity of its data into checkpoints.
-
-    Attributes:
-        facts: name, seed and number of training windows.
-        identity: identity of the data.
+    The run time of a resumed training includes the time before the checkpoint.
     """
 
-    facts: dict[str, Any]
-    identity: Mapping[str, Any]
+    def __init__(self, facts: dict[str, Any], identity: Mapping[str, Any]):
+        self.facts, self.identity = facts, identity
+        self._started = time.perf_counter()
+
+    def state_dict(self) -> dict[str, float]:
+        return {"wall_seconds": time.perf_counter() - self._started}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        self._started = time.perf_counter() - state_dict["wall_seconds"]
 
     def record(self, trainer: L.Trainer, model: torch.nn.Module, steps: int) -> dict[str, Any]:
         """Return the record of the run so far."""
         return {
             **self.facts,
             "parameters": sum(p.numel() for p in model.parameters()),
-            "training_seconds": self.seconds,
+            "training_seconds": time.perf_counter() - self._started,
             "steps": steps,
             "validation": {key: float(x) for key, x in trainer.callback_metrics.items()},
-            **self.provenance,
         }
 
     def on_save_checkpoint(

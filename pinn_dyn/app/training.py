@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import lightning as L
 import torch
-import yaml
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.seed import isolate_rng
 from pydantic import PositiveInt
@@ -47,7 +46,6 @@ from pinn_dyn.app.trainer import (
     compiles,
     epochs,
     even_validations,
-    few_settings,
     naming,
     tensorboard,
 )
@@ -112,7 +110,6 @@ def train(
     folder: str | Path | None = None,
     model_name: str | None = None,
     config: Mapping[str, Any] | None = None,
-    settings: Mapping[str, Any] | None = None,
 ) -> Run:
     """Train a model on the data of a source, and return the run with the best checkpoint.
 
@@ -148,7 +145,6 @@ def train(
         folder: the run folder; None uses a temporary one, see :meth:`Run.save`.
         model_name: short name of the model for tables; None takes that of ``model``.
         config: description of the run that its checkpoint keeps; None describes the arguments.
-        settings: settings that loggers compare; None takes a few of the configuration.
 
     Raises:
         ValueError: if the data, the model or the settings do not fit together.
@@ -211,13 +207,9 @@ def train(
             L.seed_everything(seed, verbose=False)
             windows = build_data(data, source, seed, length[1])
             statistics = _statistics(windows, loop.world_size)
-            recorder = Recorder(
-                settings=few_settings(config) if settings is None else settings,
-                configuration=yaml.safe_dump(config, sort_keys=False, allow_unicode=True),
-                provenance=provenance(),
-            )
-            recorder.identity = data_identity(source)
-            recorder.facts = {"name": config["name"], "seed": seed, "pairs": len(windows.windows)}
+            name, pairs = config["name"], len(windows.windows)
+            facts = {"name": name, "seed": seed, "pairs": pairs, **provenance()}
+            recorder = Recorder(facts, data_identity(source))
             loop.callbacks.insert(0, recorder)  # type: ignore[attr-defined]
             require_same_data(run_folder, saved.get(DATA, {}), source.name, recorder.identity)
             if isinstance(source, LogSource):
@@ -250,7 +242,7 @@ def train(
             record = _fit(loop, learner, batches, checkpoint, run_folder, source, recorder)
             log.info(
                 "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s",
-                *(config["name"], seed, record["validation"].get(VALIDATION_ERROR, float("nan"))),
+                *(name, seed, record["validation"].get(VALIDATION_ERROR, float("nan"))),
                 *(rollouts, record["training_seconds"], run_folder),
             )
     # The builder of a built model gives a model for the weights of the checkpoint.
@@ -359,9 +351,8 @@ def _fit(
         if solver and solver.result is not None:
             trainer.save_checkpoint(last)
         raise KeyboardInterrupt from stop
-    finally:
-        if solver and solver.result is not None:
-            write_constants(learner.model, solver.result, source, folder)
+    if solver and solver.result is not None:
+        write_constants(learner.model, solver.result, source, folder)
     # Other processes have counted the steps of theirs.
     record = recorder.record(trainer, learner.model, read_checkpoint(last)["global_step"])
     finish(folder, record)

@@ -31,20 +31,17 @@ _CLASSES = {
     "lightning": "Trainer",
     "lightning.pytorch": "Trainer",
     "lightning.pytorch.callbacks": _CALLBACKS,
-    "lightning.pytorch.loggers": "CSVLogger MLFlowLogger TensorBoardLogger",
+    "lightning.pytorch.loggers": "CSVLogger TensorBoardLogger",
     "torch.optim": "Adadelta Adagrad Adam AdamW Adamax NAdam RAdam RMSprop SGD",
     "torch.optim.lr_scheduler": _SCHEDULERS,
 }
 _ALLOWED = {f"{package}.{name}" for package, names in _CLASSES.items() for name in names.split()}
 
-# Arguments that say where something is written or sent to, with the values in our own conf/.
-_DESTINATIONS: dict[str, tuple[Any, ...]] = {
-    **dict.fromkeys(("cache", "default_root_dir", "dirpath", "log_dir"), ()),
-    **dict.fromkeys(("plugins", "prefix", "root_dir", "save_dir", "sub_dir"), ()),
-    "artifact_location": ("runs/mlflow/artifacts", None),
-    "profiler": ("simple", "advanced", None),
-    "tracking_uri": ("sqlite:///runs/mlflow/mlflow.db",),
-}
+_DESTINATIONS = (
+    *("artifact_location", "cache", "default_root_dir", "dirpath", "log_dir", "plugins", "prefix"),
+    *("profiler", "root_dir", "save_dir", "sub_dir", "tracking_uri"),
+)
+"""Arguments that say where something is written or sent to."""
 
 
 def packages(trust: str | list[str] | None) -> tuple[str, ...]:
@@ -87,8 +84,8 @@ def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, 
             "classes of pinn_dyn and a few others only. If this is your own class and you trust "
             f"the author of the folder, add trust={str(target).split('.')[0]} (SECURITY.md)"
         )
-    for key, allowed in _DESTINATIONS.items():
-        if key in part and part[key] not in allowed:
+    for key in _DESTINATIONS:
+        if part.get(key) is not None:
             raise ConfigError(
                 f"{path}.{key} is {part[key]!r}: a configuration from a run folder does not choose "
                 f"where something is written, unless you add trust={target}"

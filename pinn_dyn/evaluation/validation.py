@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lightning as L
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 from pydantic import PositiveFloat, PositiveInt
 
@@ -18,7 +19,6 @@ from pinn_dyn.evaluation.prediction import (
     samples_of,
     samples_of_window,
 )
-from pinn_dyn.evaluation.run_log import log_figures
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
@@ -165,4 +165,7 @@ class RolloutFigures(L.Callback):
                 title = f"Learned and true terms at {name}"
                 figures[f"terms/{name}"] = terms_figure(comparison, configuration=k, title=title)
         # The step at which Lightning logs the errors of the same validation.
-        log_figures(trainer.loggers, figures, trainer.global_step - 1)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                for name, figure in figures.items():
+                    logger.experiment.add_figure(name, figure, trainer.global_step - 1)

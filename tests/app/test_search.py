@@ -4,7 +4,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from pinn_dyn.app.config import build_part, composed
+from pinn_dyn.app.config import composed
+from pinn_dyn.app.search import with_draw
 from tests.app.entry import NO_FIGURES, TINY, run_script
 
 MODELS = ["lnn", "hnn", "mlp", "acceleration"]
@@ -15,8 +16,7 @@ def drawn(experiment, draw, *words):
         "train",
         ["search=equal", f"search.draw={draw}", *experiment.split(), "model_name=x", *words],
     )
-    before = {**config, "search": {"draw": draw}}
-    return before, build_part("search", config["search"]).applied(config)
+    return config, with_draw(config, draw)
 
 
 def values(part, key):

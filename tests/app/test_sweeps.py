@@ -90,23 +90,8 @@ def test_a_sweep_has_one_row_per_choice_with_mean_and_deviation_over_seeds(sweep
 
 
 @pytest.mark.parametrize(
-    ("condition", "choices"),
-    [
-        ("{model_name:lnn}", {("lnn", 16), ("lnn", 128)}),
-        ("{data.pairs:[16,128],model_name:mlp}", {("mlp", 16), ("mlp", 128)}),
-    ],
-)
-def test_a_filter_selects_the_runs_that_meet_all_conditions(sweep, gather, condition, choices):
-    table, _ = gather(f"runs=[{sweep}]", f"filter={condition}")
-    errors = {round(error, 9) for error in table["val/error_mean"]}
-    assert errors == {round(statistics.mean(ERRORS[choice]), 9) for choice in choices}
-
-
-@pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["filter={data.pair:16}"], ["no key 'data.pair'", "data.pairs"]),
-        (["filter={data.pairs:17}"], ["17"]),
         (["sort=error"], ["sort is 'error'", "val/error_mean"]),
         (["plot=data.pair"], ["plot is 'data.pair'", "data.pairs"]),
         (["evaluations=[nowhere]"], ["evaluations", "nowhere"]),

@@ -86,15 +86,6 @@ CHANGES = [
         "callbacks.more.dirpath is '/tmp'",
     ),
     (lambda c: c["logger"]["tensorboard"].update(version="../x"), "logger.tensorboard.version"),
-    (
-        lambda c: c["logger"].update(
-            mlflow={
-                "_target_": "lightning.pytorch.loggers.MLFlowLogger",
-                "tracking_uri": "https://example.org",
-            }
-        ),
-        "logger.mlflow.tracking_uri",
-    ),
     (lambda c: c["trainer"].update(default_root_dir="/"), "trainer.default_root_dir"),
     (lambda c: c["dataset"].update(name="${oc.env:HOME}"), "the expression"),
     (lambda c: c["model"]["integrator"].update(substeps=0), "integrator.substeps is 0"),
