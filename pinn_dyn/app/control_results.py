@@ -25,13 +25,11 @@ from pinn_dyn.evaluation import (
     animate,
     closed_loop_figure,
     controller_comparison_figure,
-    pose_strip,
     save,
     steady_state_figure,
     tip_path_figure,
 )
 from pinn_dyn.evaluation.control_figures import ERROR, control_errors
-from pinn_dyn.evaluation.control_metrics import samples_before_stop
 from pinn_dyn.evaluation.plots import with_unit
 from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.control_page import shown_columns
@@ -39,7 +37,6 @@ from pinn_dyn.evaluation.tables import to_text, write_table
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.systems import Drawable, HasTip
 
-_STRIP_TIMES = (0.0, 0.1, 0.3, 0.6, 1.0)  # s, as in the paper's figure
 _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 
 
@@ -141,22 +138,16 @@ def _figures(
             input_labels=source.input_labels,
             held=config["rate"] is not None,
         )
-    name, first = next(iter(records.items()))
-    if isinstance(robot, Drawable):
-        end = float(first.t[samples_before_stop(first, run) - 1])
-        times = [time for time in _STRIP_TIMES if time <= end]
-        if first.stopped[run] is None or len(times) > 1:  # one pose is no motion
-            title = f"{source.name}, {name} controller"
-            figures["strip"] = pose_strip(first, run, robot, times, title=title)
     if isinstance(reference, Helix) and isinstance(robot, HasTip):
+        t = next(iter(records.values())).t
         lost = {name: x.q[run].isnan().any(-1, keepdim=True) for name, x in records.items()}
         figures["tip_path"] = tip_path_figure(
-            first.t,
+            t,
             {
                 name: robot.tip_position(x.q[run].nan_to_num()).where(~lost[name], torch.nan)
                 for name, x in records.items()
             },
-            torch.stack([torch.as_tensor(reference.path(float(t))) for t in first.t]),
+            torch.stack([torch.as_tensor(reference.path(float(time))) for time in t]),
             title=f"{source.name}: path of the end effector",
         )
     return figures

@@ -1,6 +1,6 @@
 """Accuracy of models: rollout errors, learned terms beside true terms, tables and figures."""
 
-from pinn_dyn.evaluation.animation import animate, pose_strip
+from pinn_dyn.evaluation.animation import animate
 from pinn_dyn.evaluation.baselines import ConstantVelocity, HoldPosition, build_baselines
 from pinn_dyn.evaluation.calibration import (
     Calibration,
@@ -78,7 +78,6 @@ __all__ = [
     "left_data",
     "member_metrics",
     "part_shares",
-    "pose_strip",
     "predict_trajectories",
     "predict_windows",
     "residual_share",

@@ -1,8 +1,7 @@
-"""Animations of closed loops as GIF, and a strip of poses, drawn without a display."""
+"""Animations of closed loops as GIF, drawn without a display."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -31,14 +30,18 @@ def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> 
         robot: a system that gives its lines.
         path: the GIF.
     """
-    shape, goal = _shapes(record, run, robot)
-    t = record.t[: len(shape)].double()
+    end = samples_before_stop(record, run)
+    shape, goal = (robot.lines(q[run, :end].double()) for q in (record.q, record.reference.q))
+    t = record.t[:end].double()
     times = torch.arange(float(t[0]), float(t[-1]), 1 / _FRAMES_PER_SECOND, dtype=t.dtype)
-    last = len(t) - 1
+    last = end - 1
     samples = [*(t - times[:, None]).abs().argmin(dim=1).tolist(), *[last] * _FRAMES_PER_SECOND]
     figure = Figure(figsize=(4.8, 4.8), dpi=90)
     ax = figure.add_axes((0.0, 0.07, 0.95, 0.88), projection="3d")
-    _set_space(ax, _scene(record, run, shape, goal), robot.z_is_down)
+    # A stopped run may run away in its last tenth.
+    visible = end if record.stopped[run] is None else 1 + int(0.9 * last)
+    points = [shape[:visible].reshape(-1, 3), shape.new_zeros(1, 3), goal.reshape(-1, 3)]
+    _set_space(ax, torch.cat(points), robot.z_is_down)
 
     def draw(sample: int) -> None:
         for line in list(ax.lines):
@@ -50,48 +53,9 @@ def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> 
         figure.suptitle(text, x=0.03, y=0.98, ha="left", fontsize="medium", family="monospace")
 
     draw(0)
-    _legend(figure, ax)
+    handles, names = ax.get_legend_handles_labels()
+    figure.legend(handles, names, loc="lower center", ncols=len(names), fontsize="small")
     FuncAnimation(figure, draw, samples).save(path, PillowWriter(_FRAMES_PER_SECOND))
-
-
-def pose_strip(
-    record: ClosedLoopRecord, run: int, robot: Drawable, times: Sequence[float], *, title: str
-) -> Figure:
-    """Draw poses side by side: the robot, the reference in grey, the path of the tip in red.
-
-    Args:
-        record: K runs.
-        run: index of the run.
-        robot: a system that gives its lines.
-        times: times of the poses, s; the nearest sample before the end or stop is drawn.
-        title: title of the figure.
-    """
-    shape, goal = _shapes(record, run, robot)
-    t = record.t[: len(shape)]
-    figure = Figure(figsize=(2.7 * len(times), 3.9))
-    axes = figure.subplots(1, len(times), subplot_kw={"projection": "3d"}, squeeze=False)[0]
-    scene = _scene(record, run, shape, goal)
-    for ax, time in zip(axes, times, strict=True):
-        _set_space(ax, scene, robot.z_is_down)
-        _draw_pose(ax, shape, goal, int((t - time).abs().argmin()))
-        ax.set_title(f"{time:g} s", y=1.0)
-    _legend(figure, axes[0])
-    figure.suptitle(title)
-    figure.subplots_adjust(left=0.0, right=0.98, bottom=0.12, top=0.86, wspace=0.05)
-    return figure
-
-
-def _shapes(record: ClosedLoopRecord, run: int, robot: Drawable) -> tuple[Tensor, Tensor]:
-    """Return the lines of robot and reference up to the stop, ``(T, S, P, 3)`` each."""
-    end = samples_before_stop(record, run)
-    q, q_ref = record.q[run, :end], record.reference.q[run, :end]
-    return robot.lines(q.double()), robot.lines(q_ref.double())
-
-
-def _scene(record: ClosedLoopRecord, run: int, shape: Tensor, goal: Tensor) -> Tensor:
-    """Return all visible points ``(P, 3)``. A stopped run may run away in its last tenth."""
-    end = len(shape) if record.stopped[run] is None else 1 + int(0.9 * (len(shape) - 1))
-    return torch.cat([shape[:end].reshape(-1, 3), shape.new_zeros(1, 3), goal.reshape(-1, 3)])
 
 
 def _set_space(ax: Axes3D, points: Tensor, z_is_down: bool) -> None:
@@ -108,11 +72,6 @@ def _set_space(ax: Axes3D, points: Tensor, z_is_down: bool) -> None:
     ax.tick_params(labelsize="x-small", pad=0)
     ax.locator_params(nbins=3)
     ax.view_init(elev=15, azim=-60)
-
-
-def _legend(figure: Figure, ax: Axes3D) -> None:
-    handles, names = ax.get_legend_handles_labels()
-    figure.legend(handles, names, loc="lower center", ncols=len(names), fontsize="small")
 
 
 def _draw_pose(ax: Axes3D, shape: Tensor, goal: Tensor, sample: int) -> None:

@@ -7,7 +7,7 @@ import torch
 from pinn_dyn.control import Helix, SimulatorPlant
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.evaluation import animate, pose_strip
+from pinn_dyn.evaluation import animate
 from pinn_dyn.mechanics import MechanicalSystem
 
 
@@ -66,11 +66,6 @@ def test_a_robot_of_ones_own_is_drawn(tmp_path):
     record = ClosedLoopRecord(t, q[None], 0 * q[None], 0 * q[None], 0 * q[None], motion, [None])
     animate(record, 0, Crane(), tmp_path / "crane.gif")
     assert (tmp_path / "crane.gif").stat().st_size > 1000
-    (axes,) = pose_strip(record, 0, Crane(), [0.3], title="crane").axes
-    low, high = axes.get_zlim()
-    assert low < high  # upwards
-    drawn = axes.lines[1].get_data_3d()
-    np.testing.assert_allclose(np.transpose(drawn), Crane().lines(q[-1])[0], atol=1e-12)
 
 
 class Hopping:

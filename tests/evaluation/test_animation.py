@@ -1,4 +1,3 @@
-import matplotlib.image
 import numpy as np
 import pytest
 import torch
@@ -6,8 +5,7 @@ from PIL import Image
 
 from pinn_dyn.control.contracts import Motion
 from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.evaluation import save
-from pinn_dyn.evaluation.animation import animate, pose_strip
+from pinn_dyn.evaluation.animation import animate
 from pinn_dyn.systems import SoftArm
 
 RED = np.array([0xCC, 0, 0])
@@ -65,24 +63,3 @@ def test_a_stopped_run_is_drawn_up_to_its_stop(bending, tmp_path):
     stop(bending, 21)
     animate(bending, 0, SoftArm(2), tmp_path / "arm.gif")
     assert frames(tmp_path / "arm.gif")[1] == [50] * 4 + [1000]  # 0 to 0.15 s, 0.2 s
-
-
-def test_a_strip_shows_the_arm_at_the_times_asked_for(bending, tmp_path):
-    times = [0.0, 0.1, 0.3]
-    arm = SoftArm(2)
-    figure = pose_strip(bending, 0, arm, times, title="fake")
-    save(figure, tmp_path / "strip.png")
-    assert np.ptp(matplotlib.image.imread(tmp_path / "strip.png")[..., :3]) > 0.5
-    assert [ax.get_title() for ax in figure.axes] == ["0 s", "0.1 s", "0.3 s"]
-    for ax, time in zip(figure.axes, times, strict=True):
-        wanted, upper, lower, _base, path, tip = (np.array(line.get_data_3d()) for line in ax.lines)
-        tips = arm.tip_positions(bending.reference.q[0, 0] * 2 * time)
-        np.testing.assert_allclose(upper[:, -1], tips[0], atol=1e-12)
-        np.testing.assert_allclose(lower[:, -1], tips[1], atol=1e-12)
-        np.testing.assert_allclose(tip[:, 0], tips[1], atol=1e-12)
-        np.testing.assert_allclose(wanted[:, -1], arm.tip_positions(bending.reference.q[0, 0])[1])
-        assert path.shape[1] == round(time / 0.01) + 1
-        low, high = ax.get_zlim()
-        assert low > high  # gravity, +z, points downwards
-    limits = {(ax.get_xlim(), ax.get_ylim(), ax.get_zlim()) for ax in figure.axes}
-    assert len(limits) == 1
