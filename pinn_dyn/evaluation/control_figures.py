@@ -14,7 +14,6 @@ from pinn_dyn.evaluation.plots import (
     COLORS,
     DARK,
     TRUTH,
-    Errors,
     default_labels,
     legend_below,
     limits,
@@ -90,7 +89,7 @@ def controller_comparison_figure(
 ) -> Figure:
     """Draw the error over time of each law: mean and 10-90 % band of its complete runs."""
     errors = {
-        name: Errors(record.t, control_errors(record), stopped_runs(record))
+        name: (record.t, control_errors(record), stopped_runs(record))
         for name, record in records.items()
     }
     note = "mean over runs, 10–90 % band"

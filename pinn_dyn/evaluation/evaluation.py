@@ -197,9 +197,6 @@ class Evaluation:
         for stem, table in tables.items():
             if len(table):
                 write_table(table, folder, stem)
-        if self.terms:
-            text = "\n\n".join(f"{k}\n{x.to_text()}" for k, x in self.terms.items())
-            write_whole(folder / "terms.txt", text + "\n")
         figures = dict(self.figures(trajectory))
         for name, figure in figures.items():
             save(figure, folder / f"{name}.png")

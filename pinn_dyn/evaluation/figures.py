@@ -15,7 +15,6 @@ from pinn_dyn.evaluation.metrics import diverged_trajectories
 from pinn_dyn.evaluation.plots import (
     DARK,
     TRUTH,
-    Errors,
     baseline_style,
     default_labels,
     legend_below,
@@ -99,7 +98,7 @@ def error_figure(
     """
     note = "mean over test trajectories, 10–90 % band" + ("; grey: baselines" if baselines else "")
     models, grey = (
-        {name: Errors(x.t, x.error(), diverged_trajectories(x)) for name, x in items.items()}
+        {name: (x.t, x.error(), diverged_trajectories(x)) for name, x in items.items()}
         for items in (predictions, baselines or {})
     )
     return mean_error_figure(models, grey, title=title, label=label, note=note, lost="diverged")

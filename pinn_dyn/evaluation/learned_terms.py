@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
@@ -24,8 +23,6 @@ class TermComparison:
         q: configurations, ``(K, N)``.
         true, learned: M, D, G, A of the true system and of the model.
         P: best-fit factor, ``(K, N, N)``, see :func:`pinn_dyn.control.factor.fit_factor`.
-        P_min_eigenvalue: smallest eigenvalue of (P + P^T) / 2, ``(K,)``. The proof for the paper's
-            controllers needs a positive one.
         of_inverse_mass: the equations of the model, in (q, p), contain the inverse of M.
     """
 
@@ -34,7 +31,6 @@ class TermComparison:
     true: Terms
     learned: Terms
     P: Tensor
-    P_min_eigenvalue: Tensor
     of_inverse_mass: bool
 
     def matrices(self) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
@@ -68,23 +64,6 @@ class TermComparison:
         columns = ["configuration", "term", "relative_error_identity", "relative_error_best_P"]
         return pd.DataFrame(rows, columns=columns)
 
-    def to_text(self) -> str:
-        """Return the true and the learned matrices, as in the paper's tables, and P."""
-        errors = self.to_frame().set_index(["configuration", "term"])
-        lines = []
-        for k, name in enumerate(self.names):
-            lines.append(f"configuration {name}, q = {_array(self.q[k])}")
-            for term, (true, learned, _) in self.matrices().items():
-                identity, best = errors.loc[(name, term)]
-                lines.append(f"{term} true\n{_array(true[k])}")
-                lines.append(f"{term} learned: error {identity:.2g}, with the best P {best:.2g}")
-                lines.append(_array(learned[k]))
-            smallest = float(self.P_min_eigenvalue[k])
-            verdict = "positive definite" if smallest > 0 else "NOT positive definite"
-            lines.append(f"P, best fit of learned = P true: {verdict}, eigenvalue {smallest:.3g}")
-            lines.append(f"{_array(self.P[k])}\n")
-        return "\n".join(lines)
-
 
 def compare_terms(
     model: MechanicalSystem,
@@ -105,9 +84,7 @@ def compare_terms(
     labels = list(names) if names else [str(k + 1) for k in range(len(q))]
     with torch.no_grad():
         true, learned = (double_copy(system, q.device).terms(q) for system in (truth, model))
-    P = fit_factor(true, learned)
-    smallest = torch.linalg.eigvalsh(0.5 * (P + P.transpose(-1, -2)))[..., 0]
-    return TermComparison(labels, q, true, learned, P, smallest, model.state == "qp")
+    return TermComparison(labels, q, true, learned, fit_factor(true, learned), model.state == "qp")
 
 
 def compare_with_source(model: Predictor, source: DataSource) -> TermComparison | None:
@@ -128,9 +105,3 @@ def _inverse(matrix: Tensor) -> Tensor:
 def _relative(difference: Tensor, reference: Tensor) -> Tensor:
     size = torch.linalg.matrix_norm(difference)
     return torch.where(size > 0, size / torch.linalg.matrix_norm(reference), 0.0)
-
-
-def _array(values: Tensor) -> str:
-    """Return an array as text with three significant digits; rounding errors print as 0."""
-    clean = torch.where(values.abs() < 1e-9 * values.abs().max(), 0.0, values)
-    return np.array2string(clean.numpy(), formatter={"float_kind": "{:10.3g}".format})

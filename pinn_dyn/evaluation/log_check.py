@@ -22,7 +22,7 @@ from pinn_dyn.models.known import Structure
 
 _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
-_FAR, _OUTSIDE = 3.0, 0.05  # distance of a test sample from the training; share of the test
+_OUTSIDE = 0.05  # share of the test outside the range of the training
 _ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
 # Column of the table of coordinates, its upper limit, and the text beyond it.
@@ -42,8 +42,6 @@ class LogCheck:
         measurements: the measurements, each with its verdict.
         runs, coordinates, inputs: tables of stretches, coordinates and inputs.
         delays: delay curve of each input.
-        distance: distance of the test samples from the nearest training sample, ``(S,)``; 1 is the
-            distance between tenths of the training.
         steps: lines for the YAML of the data set: filter cutoff and delay, if needed.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
     """
@@ -54,7 +52,6 @@ class LogCheck:
     coordinates: pd.DataFrame
     inputs: pd.DataFrame
     delays: list[logs.DelayCurve]
-    distance: np.ndarray
     steps: list[str]
     rigid: RigidExcitation | None = None
 
@@ -136,11 +133,10 @@ def check(
     coordinates = _coordinates(source, training, splits.test)
     noise = coordinates["noise of q"].to_numpy()
     highest = numbers.bandwidth(training, step, noise)
-    distance = numbers.distance_from(training, splits.test)
     explained = numbers.explained_share(training, delays, step)
     measurements = [
         *source.measurements,
-        *_measured(coordinates, distance, explained),
+        *_measured(coordinates, explained),
     ]
     for name, curve in zip(source.u.columns, delays, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
@@ -174,7 +170,6 @@ def check(
         coordinates,
         pd.DataFrame(table),
         delays,
-        distance,
         [*_filter(source, training, step, noise, highest), *_delay(delays, step)],
         excitation,
     )
@@ -219,22 +214,13 @@ def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
     return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
 
-def _measured(
-    coordinates: pd.DataFrame, distance: np.ndarray, explained: float
-) -> list[Measurement]:
+def _measured(coordinates: pd.DataFrame, explained: float) -> list[Measurement]:
     """Measure noise, coverage of the test, and the share of the motion that inputs explain."""
     results = []
     for name, limit, text in _LIMITS:
         for label, value in zip(coordinates["coordinate"], coordinates[name], strict=True):
             message = f"{label}: {text.format(100 * value)}"
             results.append(_judged(name, label, value, f"below {limit}", value > limit, message))
-    far = float((distance > _FAR).mean())
-    text = (
-        f"{100 * far:.0f} % of the test is {_FAR:g} times further from the training than tenths of "
-        "it are from each other"
-    )
-    name, expected = "share of the test far away", f"below {_OUTSIDE}"
-    results.append(_judged(name, "", far, expected, far > _OUTSIDE, text))
     text = (
         f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these the "
         "inputs of this robot, on the same clock?"

@@ -1,4 +1,4 @@
-"""Numbers of a log check: noise, share of the inputs, bandwidth, distances."""
+"""Numbers of a log check: noise, share of the inputs, bandwidth."""
 
 from __future__ import annotations
 
@@ -7,14 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import welch
-from scipy.spatial import cKDTree
 
 from pinn_dyn.data.logs import DelayCurve, Recording
-from pinn_dyn.mechanics import Trajectory
 
 _SMOOTH = 0.03  # width of the kernel before a derivative, s
-_POINTS = 4000  # largest number of samples in a search among neighbors
-_NEAR = 0.05  # distance that always counts as near, as a share of the spread
 
 
 def white_noise(x: np.ndarray) -> np.ndarray:
@@ -74,20 +70,3 @@ def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> 
     power = np.where(density > 4 * level, density, 0.0) * f[:, None] ** 2
     share = np.cumsum(power, axis=0) / power.sum(axis=0).clip(min=1e-300)
     return max((float(f[np.searchsorted(x, 0.99)]) for x in share.T if x[-1] > 0), default=0.0)
-
-
-def distance_from(training: Sequence[Recording], test: Sequence[Trajectory]) -> np.ndarray:
-    """Return the distance of test samples (q, v) from the nearest training sample, ``(S,)``.
-
-    The unit is the distance between a tenth of the training and the nine others, at least a
-    twentieth of the spread.
-    """
-    reference = np.vstack([np.hstack([item.q, item.v]) for item in training if item.v is not None])
-    samples = np.vstack([np.hstack([item.q.numpy(), item.v.numpy()]) for item in test])
-    spread = reference.std(axis=0).clip(min=1e-300)
-    reference = reference[:: max(1, len(reference) // _POINTS)] / spread
-    samples = samples[:: max(1, len(samples) // _POINTS)] / spread
-    tenth = np.arange(len(reference)) * 10 // len(reference)
-    between = [cKDTree(reference[tenth != k]).query(reference[tenth == k])[0] for k in range(10)]
-    unit = max(float(np.median(np.concatenate(between))), _NEAR * reference.shape[1] ** 0.5)
-    return cKDTree(reference).query(samples)[0] / unit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -109,19 +110,16 @@ def member_metrics(prediction: Prediction) -> dict[str, float]:
     valid = ~diverged_trajectories(prediction)
     spread, error = prediction.spread()[valid], prediction.error()[valid]
     assert prediction.members is not None
-    members = [
-        rollout_metrics(q_hat, prediction.q, prediction.t, thresholds={})
+    errors = [
+        rollout_metrics(q_hat, prediction.q, prediction.t, thresholds={}).error_mean
         for q_hat in prediction.members
     ]
-    errors = torch.tensor([item.error_mean for item in members], dtype=torch.float64)
     ratio = math.inf
     if 0 < _mean(error.square()) < math.inf:
-        ratio = (1 + 1 / len(members)) * _mean(spread.square()) / _mean(error.square())
+        ratio = (1 + 1 / len(errors)) * _mean(spread.square()) / _mean(error.square())
     return {
-        "members": len(members),
-        "member_error_mean": float(errors.mean()),
-        "member_error_std": float(errors.std().nan_to_num(math.inf)),
-        "member_diverged": sum(item.diverged for item in members),
+        "members": len(errors),
+        "member_error_mean": statistics.fmean(errors),
         "spread_mean": _mean(spread),
         "spread_over_error": ratio**0.5,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,18 +22,8 @@ TRUTH, BASELINE, DARK = "#b3b3b3", "#9aa5ae", "#24303c"
 _LINE_STYLES = ("-", "--", ":", "-.")
 
 
-class Errors(NamedTuple):
-    """Errors of K trajectories over time.
-
-    Attributes:
-        t: times, ``(T,)``, s.
-        error: errors, ``(K, T)``.
-        excluded: trajectories that diverged or were stopped, ``(K,)``, bool. No mean has them.
-    """
-
-    t: Tensor
-    error: Tensor
-    excluded: Tensor
+Errors = tuple[Tensor, Tensor, Tensor]
+"""Times ``(T,)`` in s, errors ``(K, T)``, and trajectories ``(K,)`` that no mean contains, bool."""
 
 
 def model_style(index: int) -> dict[str, Any]:
@@ -168,7 +158,7 @@ def mean_error_figure(
     ax.set(yscale="log", xlabel="time [s]", ylabel=label)
     if highest > 0:
         ax.set_ylim(log_limits(means)[0], 2 * highest)
-    ax.set_xlim(0, max(float(errors.t[-1]) for _, errors in curves))
+    ax.set_xlim(0, max(float(t[-1]) for _, (t, _, _) in curves))
     ax.grid(True, alpha=0.3)
     legend_below(figure, columns=4, title=note, fontsize="small")
     figure.suptitle(title, fontsize="medium")

@@ -189,19 +189,17 @@ def _diverged(name: str) -> str:
 
 
 def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
-    """Return a sentence for each baseline that is more accurate than all models in some error."""
-    errors: dict[str, list[str]] = {}
-    baseline = summary["baseline"].astype(bool)
+    """Return a sentence for each error in which a baseline is as accurate as all models."""
+    lines, baseline = [], summary["baseline"].astype(bool)
     for name in (x for x in summary if re.fullmatch(f"error_mean|{_WINDOW}", x)):
         figures = _competing(summary, name)
         if baseline.any() and not figures[~baseline].min() < figures[baseline].min():
             row = summary.loc[figures[baseline].idxmin()]
-            error = re.sub(_WINDOW, r"reset every \1 s", name).replace("error_mean", "mean error")
-            errors.setdefault(row["run"], []).append(f"{error} {number(row[name])}")
-    return [
-        f"No model is more accurate than the baseline '{name}': {', '.join(texts)}."
-        for name, texts in errors.items()
-    ]
+            lines.append(
+                f"No model is more accurate than the baseline '{row['run']}': {name} "
+                f"{number(row[name])}."
+            )
+    return lines
 
 
 def write_table(frame: pd.DataFrame, folder: Path, stem: str) -> Path:

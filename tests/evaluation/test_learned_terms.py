@@ -40,8 +40,6 @@ class Transformed(MechanicalSystem):
 def test_a_constant_factor_is_recovered():
     comparison = compare_terms(Transformed(P), SoftArm(), Q)
     torch.testing.assert_close(comparison.P, P.expand(2, 3, 3))
-    smallest = torch.linalg.eigvalsh((P + P.T) / 2)[0]
-    torch.testing.assert_close(comparison.P_min_eigenvalue, smallest.expand(2))
     frame = comparison.to_frame()
     assert (frame.relative_error_best_P < 1e-9).all()
     assert (frame.relative_error_identity > 0.3).all()
@@ -76,15 +74,6 @@ def test_a_term_that_vanishes_gives_no_nan():
     same = compare_terms(SoftArm(damping=0.0), SoftArm(damping=0.0), Q).to_frame()
     assert list(same.relative_error_identity) == [0] * 10
     assert (same.relative_error_best_P < 1e-9).all()
-
-
-def test_the_text_shows_the_numbers_of_the_paper():
-    text = compare_terms(SoftArm(damping=0.12), SoftArm(), Q, names=["bent", "long"]).to_text()
-    for number in ("0.00173", "-3.12e-05", "593", "-1.15", "0.777", "0.12", "bent", "long"):
-        assert number in text
-    assert "M true" in text
-    assert "M learned" in text
-    assert len(max(text.splitlines(), key=len)) <= 100
 
 
 @pytest.mark.parametrize("state", ["qv", "qp"])

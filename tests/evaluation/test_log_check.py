@@ -99,7 +99,6 @@ def test_a_test_outside_the_training_is_warned_of(good):
     far.loc[len(far) - 800 :, "q1"] += 3.0
     result = checked(far)
     assert verdicts(result)["test outside", "q1 [m]"] == "warning"
-    assert verdicts(result)["share of the test far away", ""] == "warning"
 
 
 @given(st.floats(1e-6, 1e2), st.floats(0.2, 2.0))

@@ -264,8 +264,6 @@ def test_a_truth_that_is_like_a_member_is_calibrated_and_a_common_error_is_not()
     assert found["spread_over_error"] == pytest.approx(1, abs=0.02)
     # |x - y| of independent standard normal x, y in the plane has the mean sqrt(pi).
     assert found["member_error_mean"] == pytest.approx(math.sqrt(math.pi), rel=0.01)
-    # Given the truth the members' errors differ by what 20,000 draws leave over.
-    assert 0 < found["member_error_std"] < 0.02
     # sqrt(s^2) with s^2 the variance of 5 points in the plane, a gamma variable of shape 4.
     expected = math.sqrt(2 / 4) * math.gamma(4.5) / math.gamma(4)
     assert found["spread_mean"] == pytest.approx(expected, rel=0.01)

@@ -113,8 +113,8 @@ def test_sections_of_constants_torques_and_parts_appear_with_their_data(predicti
     assert (mass["value"], mass["unit"], mass["note"]) == ("91.1", "kg", "")
     assert armature["note"] == "not determined"
     assert (odd["name"], odd["start"]) == (ODD, "-")
-    assert page.table("RMS / spread")[0]["RMS / spread"] == "0.25"
-    assert page.table("share of all parts")[0]["part"] == "net"
+    assert page.table("torque share")[0]["torque share"] == "0.25"
+    assert page.table("part")[0]["part"] == "net"
     titles = [attributes.get("href") for tag, attributes in prediction[1].tags if tag == "a"]
     assert len(titles) == 4  # of the sections without data none is there
 

@@ -111,7 +111,7 @@ def test_the_best_model_beats_all_baselines(models, lost, winner):
     assert frame["run"][best(frame, "error_mean")].tolist() == ([winner] if winner else [])
     sentences = unbeaten_baselines(frame)
     assert len(sentences) == (winner is None)
-    assert all("'ARX': mean error 0.3" in sentence for sentence in sentences)
+    assert all("'ARX': error_mean 0.3" in sentence for sentence in sentences)
     text = to_text(frame, summary_columns(frame))
     assert text.count("*") == (winner is not None)
     assert "[ARX]" in text

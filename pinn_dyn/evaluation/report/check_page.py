@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from pinn_dyn.evaluation.log_check import LogCheck
@@ -20,7 +19,7 @@ from pinn_dyn.evaluation.report.page import (
 
 
 def check_report(check: LogCheck, *, command: str) -> str:
-    """Return the HTML page of a check: verdict, measurements, delay curves, coverage, cleaning."""
+    """Return the HTML page of a check: verdict, measurements, delay curves, cleaning."""
     source = check.source
     verdict = [paragraph(text) for text in check.problems or ["A training makes sense."]]
     verdict += [paragraph(f"Warning: {text}") for text in check.warnings]
@@ -38,14 +37,13 @@ def check_report(check: LogCheck, *, command: str) -> str:
         input_labels=source.input_labels,
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
-    coverage = drawing(_coverage(check), "coverage of the test by the training")
     curves = drawing(_delays(check), "unexplained share over the delay")
     notes = details("Notes of each step", from_markdown(source.report))
     sections = [
         Section("Verdict", verdict),
         Section("Measurements", [table(measurements)]),
         Section("Clock", [table(check.runs)]),
-        Section("Coordinates", [table(check.coordinates), coverage]),
+        Section("Coordinates", [table(check.coordinates)]),
         *_rigid(check),
         Section("Inputs and their delays", [paragraph(inputs), table(check.inputs), curves]),
         Section("Cleaning", [drawing(cleaning, "raw and cleaned signals"), notes]),
@@ -75,19 +73,4 @@ def _delays(check: LogCheck) -> Figure:
             ax.axvline(1e3 * curve.delay, color=f"C{k}", linewidth=0.8, linestyle="--")
     ax.set(xlabel="delay (ms)", ylabel="unexplained (%)", yscale="log")
     ax.legend(fontsize="small")
-    return figure
-
-
-def _coverage(check: LogCheck) -> Figure:
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    splits, label = check.source.load(), check.source.labels[0]
-    for name, color, items in (("training", "0.7", splits.train), ("test", "C0", splits.test)):
-        x, y = (np.concatenate([getattr(item, key)[:, 0] for item in items]) for key in "qv")
-        thin = slice(None, None, max(1, len(x) // 4000))
-        left.plot(x[thin], y[thin], ".", color=color, markersize=2, label=name)
-    left.set(xlabel=label, ylabel=f"velocity of {label}")
-    left.legend(fontsize="small")
-    right.hist(check.distance, bins=40)
-    right.set(xlabel="distance of a test sample from the training", ylabel="samples")
     return figure

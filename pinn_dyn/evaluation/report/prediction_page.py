@@ -28,23 +28,12 @@ from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.evaluation import Evaluation
 
-_TORQUE = {
-    "run": "run",
-    "joint": "joint",
-    "torque_rms": "RMS of τ̂ − τ",
-    "torque_spread": "spread of τ",
-    "torque_share": "RMS / spread",
-}
-_TORQUE_TEXT = "Error of the inverse dynamics on the same motions, with τ = A(q) u."
-_PARTS = {
-    "run": "run",
-    "term": "term",
-    "part": "part",
-    "rms": "RMS of its force",
-    "share": "share of all parts",
-}
-_PARTS_TEXT = (
-    "Contributions of the parts of a sum along the test motions. A network with a large share "
+_TORQUE = (
+    "Error of the inverse dynamics on the same motions: RMS of τ̂ − τ with τ = A(q) u, spread of τ, "
+    "and their ratio."
+)
+_PARTS = (
+    "RMS of the forces of the parts of a sum along the test motions. A network with a large share "
     "shows that the known mechanics lack something, or have wrong constants."
 )
 
@@ -65,8 +54,8 @@ def prediction_report(
         "Error over time": [drawing(figures["error"], "error over time")],
         "Trajectories": _trajectories(item, trajectory),
         "Constants": _constants(item.constants),
-        "Torque": _table(item.torque, _TORQUE, _TORQUE_TEXT),
-        "Parts": _table(item.parts, _PARTS, _PARTS_TEXT),
+        "Torque": _table(item.torque, _TORQUE),
+        "Parts": _table(item.parts, _PARTS),
         "Intervals": _intervals(item, figures),
         "Learned and true terms": _terms(item, figures),
     }
@@ -126,11 +115,12 @@ def _constants(constants: Mapping[str, pd.DataFrame]) -> Iterator[Markup]:
         yield details(title, table(rows.drop(columns="known")))
 
 
-def _table(frame: pd.DataFrame, headers: Mapping[str, str], text: str) -> Iterator[Markup]:
+def _table(frame: pd.DataFrame, text: str) -> Iterator[Markup]:
     """Yield a text and a table, unless the table is empty."""
     if len(frame):
         yield paragraph(text)
-        yield table(frame[[*headers]].rename(columns=headers))  # no joint or part is the best
+        frame = frame[["run", *frame.columns.drop("run")]]
+        yield table(frame.rename(columns=lambda name: name.replace("_", " ")))  # marks no best row
 
 
 def _intervals(item: Evaluation, figures: Mapping[str, Figure]) -> Iterator[Markup]:
