@@ -1,11 +1,8 @@
 """Accuracy of models: rollout errors, learned terms beside true terms, tables and figures."""
 
 from pinn_dyn.evaluation.animation import animate
-from pinn_dyn.evaluation.baselines import ConstantVelocity, HoldPosition, build_baselines
-from pinn_dyn.evaluation.calibration import (
-    Calibration,
-    calibration,
-)
+from pinn_dyn.evaluation.baselines import build_baselines
+from pinn_dyn.evaluation.calibration import Calibration, calibration
 from pinn_dyn.evaluation.closed_loops import ControlResult, close_loop, close_loops
 from pinn_dyn.evaluation.control_figures import (
     closed_loop_figure,
@@ -13,49 +10,23 @@ from pinn_dyn.evaluation.control_figures import (
     steady_state_figure,
     tip_path_figure,
 )
-from pinn_dyn.evaluation.control_metrics import (
-    ClosedLoopMetrics,
-    closed_loop_metrics,
-)
+from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
 from pinn_dyn.evaluation.evaluation import Entry, Evaluation, evaluate_models
-from pinn_dyn.evaluation.figures import (
-    error_figure,
-    sweep_figure,
-    terms_figure,
-    trajectory_figure,
-)
+from pinn_dyn.evaluation.figures import error_figure, sweep_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
-from pinn_dyn.evaluation.metrics import (
-    RolloutMetrics,
-    diverged_trajectories,
-    left_data,
-    member_metrics,
-    rollout_metrics,
-    state_squared_error,
-)
+from pinn_dyn.evaluation.metrics import RolloutMetrics, rollout_metrics
 from pinn_dyn.evaluation.plots import save
-from pinn_dyn.evaluation.prediction import (
-    Prediction,
-    predict_trajectories,
-    predict_windows,
-)
-from pinn_dyn.evaluation.torque import (
-    TorqueError,
-    part_shares,
-    residual_share,
-    torque_error,
-)
+from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
+from pinn_dyn.evaluation.torque import TorqueError, torque_error
 from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
 
 __all__ = [
     "Calibration",
     "ClosedLoopMetrics",
-    "ConstantVelocity",
     "ControlResult",
     "Entry",
     "Evaluation",
-    "HoldPosition",
     "Prediction",
     "RolloutFigures",
     "RolloutMetrics",
@@ -72,18 +43,12 @@ __all__ = [
     "closed_loop_metrics",
     "compare_terms",
     "controller_comparison_figure",
-    "diverged_trajectories",
     "error_figure",
     "evaluate_models",
-    "left_data",
-    "member_metrics",
-    "part_shares",
     "predict_trajectories",
     "predict_windows",
-    "residual_share",
     "rollout_metrics",
     "save",
-    "state_squared_error",
     "steady_state_figure",
     "sweep_figure",
     "terms_figure",

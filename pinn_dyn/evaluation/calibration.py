@@ -47,12 +47,6 @@ class Calibration:
         """``corrected`` of the 95 % interval."""
         return None if self.corrected is None else float(self.corrected[_AT])
 
-    def __str__(self) -> str:
-        text = f"{100 * self.within:.0f} %"
-        if self.corrected is None:
-            return text
-        return f"{text} ({100 * self.corrected[_AT]:.0f} % with {self.factor:.3g} times the width)"
-
 
 def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
     """Return half the width of an interval in standard deviations sqrt(1 + 1/E) s of E members.
@@ -105,15 +99,6 @@ def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Return the share of errors up to each width; infinite errors are never within."""
     finite = np.sort(errors[np.isfinite(errors)])
     return np.searchsorted(finite, width, side="right") / max(len(errors), 1)
-
-
-def interval_lines(runs: Mapping[str, Mapping[float, Calibration]]) -> list[str]:
-    """Return one sentence per run about the coverage of its 95 % intervals."""
-    shares = {
-        run: ", ".join(f"{item} after {window:g} s" for window, item in windows.items())
-        for run, windows in runs.items()
-    }
-    return [f"{run}: share of errors within 95 % intervals: {text}" for run, text in shares.items()]
 
 
 def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:

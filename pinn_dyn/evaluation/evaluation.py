@@ -15,12 +15,7 @@ from tqdm import tqdm
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.evaluation.calibration import (
-    Calibration,
-    calibration,
-    calibration_figure,
-    interval_lines,
-)
+from pinn_dyn.evaluation.calibration import Calibration, calibration, calibration_figure
 from pinn_dyn.evaluation.figures import ERROR, error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import TermComparison, compare_with_source
 from pinn_dyn.evaluation.metrics import (
@@ -40,14 +35,7 @@ from pinn_dyn.evaluation.tables import (
     write_table,
 )
 from pinn_dyn.evaluation.torque import part_shares, residual_share, torque_error
-from pinn_dyn.mechanics import (
-    MechanicalSystem,
-    Predictor,
-    Sum,
-    Trajectory,
-    samples_of,
-    stack_until,
-)
+from pinn_dyn.mechanics import MechanicalSystem, Predictor, Sum, Trajectory, samples_of, stack_until
 
 log = logging.getLogger(__name__)
 
@@ -134,22 +122,12 @@ class Evaluation:
         horizon = f"{self.truth.duration:g} s open loop"
         return f"{len(self.truth.q)} {SPLITS[self.split]}, {horizon}"
 
-    def remarks(self) -> list[str]:
-        """Return sentences for below the summary."""
-        rows = self.summary[~self.summary["baseline"] & (self.summary["left_data"] > 0)]
-        leaving = [
-            f"{row.run}: {row.left_data} rollouts leave the training data, the first after "
-            f"{row.left_data_after:.3g} s."
-            for row in rows.itertuples()
-        ]
-        return [*unbeaten_baselines(self.summary), *leaving, *interval_lines(self.intervals)]
-
     def __str__(self) -> str:
         lines = [
             f"{self.source.name}: {self.trajectories}",
             to_text(self.summary, summary_columns(self.summary)),
             "* best in its column, and better than all baselines (in brackets)",
-            *self.remarks(),
+            *unbeaten_baselines(self.summary),
         ]
         if len(self.by_model) < len(self.summary):
             lines += ["", "over seeds:", to_text(self.by_model, SEEDS_COLUMNS)]

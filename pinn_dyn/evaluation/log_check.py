@@ -81,7 +81,7 @@ class LogCheck:
             "Measurements": self.table()[["verdict", "measurement", "of", "value", "expected"]],
         }
         if self.rigid is not None:
-            tables[f"Rigid bodies, not determined: {self.rigid.summary}"] = self.rigid.joints
+            tables[f"Rigid bodies, not determined: {self.rigid.undetermined}"] = self.rigid.joints
         lines = [f"{self.source.name}: check of the log"]
         for title, frame in tables.items():
             text = frame.to_string(

@@ -30,23 +30,18 @@ class RigidExcitation:
         condition: condition number of the regressor; infinite if a column is zero.
         count: number of base parameters, drives included.
         joints: table of each joint: number of base parameters, and of undetermined ones.
-        undetermined: directions that the motions do not determine, in words.
+        undetermined: directions that the motions do not determine.
     """
 
     condition: float
     count: int
     joints: pd.DataFrame
-    undetermined: list[str]
+    undetermined: str
 
     @property
     def open_joints(self) -> list[str]:
         """Joints with constants of body or drive that are not determined."""
         return self.joints.loc[self.joints["not determined"] > 0, "joint"].tolist()
-
-    @property
-    def summary(self) -> str:
-        """Directions that are not determined."""
-        return "; ".join(self.undetermined) or "none"
 
 
 def base_parameters(regressor: np.ndarray) -> np.ndarray:
@@ -116,7 +111,7 @@ def rigid_excitation(
         condition=float(sizes[0] / sizes[-1]) if sizes[-1] > rounding else float("inf"),
         count=len(base),
         joints=pd.DataFrame(table),
-        undetermined=[x.text for x in lost],
+        undetermined="; ".join(x.text for x in lost) or "none",
     )
 
 

@@ -11,12 +11,12 @@ from pinn_dyn.data import Splits
 from pinn_dyn.evaluation import (
     ControlResult,
     Entry,
-    HoldPosition,
     closed_loop_figure,
     closed_loop_metrics,
     controller_comparison_figure,
     evaluate_models,
 )
+from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.prediction_page import prediction_report
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory

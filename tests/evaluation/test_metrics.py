@@ -6,13 +6,11 @@ import torch
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
     Prediction,
-    left_data,
-    member_metrics,
     predict_trajectories,
     predict_windows,
     rollout_metrics,
-    state_squared_error,
 )
+from pinn_dyn.evaluation.metrics import left_data, member_metrics, state_squared_error
 from pinn_dyn.evaluation.prediction import model_for_roll_outs
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
 from pinn_dyn.mechanics.compilation import CompiledLoop

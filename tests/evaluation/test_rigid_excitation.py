@@ -73,7 +73,7 @@ def test_the_condition_number_of_a_pendulum_is_that_of_its_six_columns():
     columns = np.stack([x[moves] / np.linalg.norm(x[moves]) for x in columns], axis=1)
     assert excitation.count == 6
     assert excitation.condition == pytest.approx(np.linalg.cond(columns), rel=0.02)
-    assert excitation.undetermined == []
+    assert excitation.undetermined == "none"
 
 
 def test_motions_of_all_joints_leave_nothing_open():
@@ -81,7 +81,6 @@ def test_motions_of_all_joints_leave_nothing_open():
     excitation = rigid_excitation(chain, [motion(4, seconds=60.0)], cutoff=10.0)
     assert excitation.condition < 100
     assert excitation.open_joints == []
-    assert excitation.summary == "none"
 
 
 def test_a_joint_that_rests_is_named_despite_noise():
@@ -105,7 +104,7 @@ def test_one_slow_sine_does_not_tell_the_constants_apart():
     excitation = rigid_excitation(
         RigidChain(PENDULUM), [Trajectory(q, v, Signal(t[:, 0], 0 * q))], cutoff=20.0
     )
-    assert len(excitation.undetermined) == 2
+    assert excitation.undetermined.count(";") == 1
     assert excitation.open_joints == ["hinge"]
     assert excitation.condition > 1000
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation import RolloutValidator, residual_share
+from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from pinn_dyn.models import NetworkResidual, NoResidual
 from pinn_dyn.testing import assert_near

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.evaluation import part_shares
+from pinn_dyn.evaluation.torque import part_shares
 from pinn_dyn.mechanics import Sum, stack
 from pinn_dyn.models import (
     CoulombFriction,

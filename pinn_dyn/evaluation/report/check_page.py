@@ -59,7 +59,7 @@ def _rigid(check: LogCheck) -> list[Section]:
         "regressor of the training motions, each column of unit norm, has the condition number "
         f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. Directions with "
         "less than a hundredth of the largest singular value are not determined: "
-        f"{check.rigid.summary}."
+        f"{check.rigid.undetermined}."
     )
     return [Section("Rigid bodies", [paragraph(text), table(check.rigid.joints)])]
 

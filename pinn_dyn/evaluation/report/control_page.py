@@ -23,7 +23,6 @@ from pinn_dyn.evaluation.report.page import (
     table,
 )
 
-_MAX_ANIMATION = 5e6  # bytes of an animation that is embedded
 _HEADERS = {
     "controller": "law",
     "stopped": "stopped",
@@ -62,10 +61,7 @@ def control_report(
         Section("Summary", _summary(result, labels)),
         Section("Figures", [drawing(figure, name) for name, figure in figures.items()]),
     ]
-    if animation is not None and animation.stat().st_size > _MAX_ANIMATION:
-        note = paragraph(f"{animation.name} is too large for this page and lies beside it.")
-        sections.append(Section("Animation", [note]))
-    elif animation is not None:
+    if animation is not None:
         gif = picture(animation.read_bytes(), "gif", "animation of the first law in real time")
         sections.append(Section("Animation", [gif]))
     if stability is not None:

@@ -23,7 +23,7 @@ from pinn_dyn.evaluation.report.page import (
     table,
     turned,
 )
-from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns
+from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns, unbeaten_baselines
 
 if TYPE_CHECKING:
     from pinn_dyn.evaluation.evaluation import Evaluation
@@ -75,7 +75,7 @@ def _summary(item: Evaluation) -> Iterator[Markup]:
         "better than all baselines."
     )
     yield table(item.summary, headers=summary_columns(item.summary))
-    yield from map(paragraph, item.remarks())
+    yield from map(paragraph, unbeaten_baselines(item.summary))
     if len(item.by_model) < len(item.summary):
         yield table(item.by_model, headers=SEEDS_COLUMNS)
     yield details("All columns (summary.csv)", table(turned(item.summary, "run")))
