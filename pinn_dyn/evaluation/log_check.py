@@ -134,10 +134,7 @@ def check(
     noise = coordinates["noise of q"].to_numpy()
     highest = numbers.bandwidth(training, step, noise)
     explained = numbers.explained_share(training, delays, step)
-    measurements = [
-        *source.measurements,
-        *_measured(coordinates, explained),
-    ]
+    measurements = [*source.measurements, *_measured(coordinates, explained)]
     for name, curve in zip(source.u.columns, delays, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (

@@ -4,8 +4,4 @@ from pinn_dyn.evaluation.report.check_page import check_report
 from pinn_dyn.evaluation.report.control_page import control_report
 from pinn_dyn.evaluation.report.page import Origin
 
-__all__ = [
-    "Origin",
-    "check_report",
-    "control_report",
-]
+__all__ = ["Origin", "check_report", "control_report"]

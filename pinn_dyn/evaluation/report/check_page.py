@@ -31,10 +31,7 @@ def check_report(check: LogCheck, *, command: str) -> str:
         "shifted by a delay. The delay is at its minimum."
     )
     cleaning = cleaning_figure(
-        source.cleaned[0],
-        title=source.name,
-        labels=source.labels,
-        input_labels=source.input_labels,
+        source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
     curves = drawing(_delays(check), "unexplained share over the delay")
