@@ -181,7 +181,10 @@ def build_trainer(
     with naming("trainer"):
         trainer = L.Trainer(**arguments)
     if isinstance(trainer.strategy.launcher, _SubprocessScriptLauncher):
-        raise ConfigError("use trainer.strategy=ddp_spawn_find_unused_parameters_true")
+        raise ConfigError(
+            "trainer.strategy would start the whole program once per device: use "
+            "trainer.strategy=ddp_spawn_find_unused_parameters_true"
+        )
     return trainer
 
 

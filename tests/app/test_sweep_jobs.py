@@ -221,8 +221,8 @@ def test_two_processes_train_as_one_does_also_in_a_sweep(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["trainer.devices=2"], ["starts the whole program again", DDP[1]]),
-        ([*DDP, "data.batch_size=31"], ["batch_size is 31"]),
+        (["trainer.devices=2"], [DDP[1]]),
+        ([*DDP, "data.batch_size=31"], ["batch_size 31", "2 devices"]),
     ],
 )
 def test_what_goes_wrong_on_several_devices_is_refused(tmp_path, monkeypatch, overrides, words):
