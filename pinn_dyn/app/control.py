@@ -24,7 +24,6 @@ from pinn_dyn.control import (
     DataRegion,
     Guarded,
     ModelBasedLaw,
-    ProportionalDerivative,
     export_law,
     term_conditions,
 )
@@ -158,10 +157,7 @@ def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Con
     """Return the learned law with a guard on its distance from the training data."""
     if not isinstance(law, ModelBasedLaw):
         raise ConfigError("guard.threshold needs a law without an observer: leave one of them out")
-    gains, guard, train = config["gains"], config["guard"], source.load().train
-    fallback = None
-    if guard.get("fallback"):
-        fallback = ProportionalDerivative(law.model, gains["position"], gains["velocity"])
+    train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
     region = DataRegion(q, v, angles=getattr(law.model, "angles", ()))
-    return Guarded(law, fallback, region, threshold=guard["threshold"])
+    return Guarded(law, region, threshold=config["guard"]["threshold"])

@@ -114,7 +114,6 @@ class Guard:
     """Reaction to states far from the training data."""
 
     threshold: PositiveFloat | None = None
-    fallback: bool = False
 
 
 @dataclass(kw_only=True)

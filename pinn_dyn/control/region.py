@@ -1,4 +1,4 @@
-"""The region that training data cover, and a guard for control laws outside this region."""
+"""The region that training data cover, and a guard that warns outside this region."""
 
 from __future__ import annotations
 
@@ -89,37 +89,21 @@ class DataRegion:
 
 
 class Guarded(Controller):
-    """A law with a guard, which warns outside the training data and may use a fallback law there::
-
-        u = fallback(t, q, v, reference)  if there is one and distance(q, v) > threshold
-            law(t, q, v, reference)       otherwise
-
-    There is no hysteresis: a state near the edge may switch back and forth.
+    """A law with a guard, which warns once per run if a state is far from the training data.
 
     Args:
         law: the law to guard.
-        fallback: the law outside, such as PD; None for a guard that only warns.
         region: the training data of the law's model.
         threshold: distance from which a state is outside; 1 is the edge of the data.
     """
 
-    def __init__(
-        self,
-        law: Controller,
-        fallback: Controller | None,
-        region: DataRegion,
-        *,
-        threshold: PositiveFloat = 2.0,
-    ):
+    def __init__(self, law: Controller, region: DataRegion, *, threshold: PositiveFloat = 2.0):
         super().__init__(law.num_coordinates, law.num_inputs)
         self.law, self.region, self.threshold = law, region, threshold
-        self._fallback = fallback
         self.reset()
 
     def reset(self) -> None:
         self.law.reset()
-        if self._fallback is not None:
-            self._fallback.reset()
         self._distance: Tensor | None = None
         self._warned = False
 
@@ -134,26 +118,14 @@ class Guarded(Controller):
                 f"training data, at distances up to {float(self._distance.nan_to_num().max()):.3g} "
                 f"(1: edge of the data, {self.threshold:g}: threshold of the guard)"
             )
-        if self._fallback is None or not outside.any():
-            return u
-        return torch.where(outside.unsqueeze(-1), self._fallback(t, q, v, reference), u)
+        return u
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """Return those of the law, ``distance``, and ``outside`` and ``fallback`` as 0 or 1."""
+        """Return those of the law, ``distance``, and ``outside`` as 0 or 1."""
         if self._distance is None:
             return {}
         outside = (self._distance > self.threshold).to(self._distance)
-        fallback = 0 * outside if self._fallback is None else outside
-        guard = {"distance": self._distance, "outside": outside, "fallback": fallback}
-        return self.law.diagnostics() | guard
+        return self.law.diagnostics() | {"distance": self._distance, "outside": outside}
 
     def faults(self) -> dict[str, Tensor]:
-        """Return the faults of the law, and of the fallback where the fallback acts."""
-        if self._distance is None or self._fallback is None:
-            return self.law.faults()
-        outside = self._distance > self.threshold
-        faults = {reason: mask & ~outside for reason, mask in self.law.faults().items()}
-        if outside.any():
-            for reason, mask in self._fallback.faults().items():
-                faults[reason] = faults.get(reason, torch.zeros_like(mask)) | (mask & outside)
-        return faults
+        return self.law.faults()

@@ -190,7 +190,6 @@ MISTAKES = {
         sensor._target_=pinn_dyn.control.Actuator
         initial_states={_target_: pinn_dyn.data.Chirp}
         guard.threshold=-1
-        guard.fallback=x
         guard.threshhold=1
         stability={}
         stability={region: a}

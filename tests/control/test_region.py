@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.control import Controller, Motion
-from pinn_dyn.control.laws import ProportionalDerivative, Regulation
+from pinn_dyn.control import Motion
+from pinn_dyn.control.laws import Regulation
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.testing import ControllerContract, LinearSystem
 from pinn_dyn.testing.controller import states
-from tests.support.linear import unit_masses
 
 LOGGER = "pinn_dyn.control.region"
 
@@ -108,36 +107,26 @@ def spring():
     return LinearSystem([[1.0]], [[2.0]], [[0.1]], [[4.0]])
 
 
-def guard(active, threshold=2.0):
-    pd = ProportionalDerivative(unit_masses(1), 1.0, 1.0) if active else None
-    return Guarded(Regulation(spring(), 3.0, 1.0), pd, DataRegion(*comb()), threshold=threshold)
+def guard(threshold=2.0):
+    return Guarded(Regulation(spring(), 3.0, 1.0), DataRegion(*comb()), threshold=threshold)
 
 
 MIXED = tensor([[10.0], [103.5], [100.5], [-9.0]])  # distances 0, 4.5, 1.5 and 9
 REST = Motion(*(torch.zeros(1, dtype=torch.float64) for _ in range(3)))
 
 
-def law_and_pd(q):
-    """2 q / 4 - 4 * 3 q and -q, by hand, at rest and with the reference zero."""
-    return 0.5 * q - 12 * q, -q
-
-
-def test_the_fallback_takes_the_states_outside_and_no_others():
-    guarded = guard(active=True)
+def test_the_law_is_unchanged_and_the_distance_recorded():
+    guarded = guard()
     u = guarded(0.5, MIXED, 0 * MIXED, REST)
-    law, pd = law_and_pd(MIXED)
-    expected = torch.stack([law[0], pd[1], law[2], pd[3]])
-    assert u == pytest.approx(expected, rel=1e-12)
+    assert u == pytest.approx(0.5 * MIXED - 12 * MIXED, rel=1e-12)  # 2 q / 4 - 4 * 3 q, by hand
     found = guarded.diagnostics()
     assert found["distance"] == pytest.approx(tensor([0.0, 4.5, 1.5, 9.0]))
     assert found["outside"].tolist() == [0, 1, 0, 1]
-    assert found["fallback"].tolist() == [0, 1, 0, 1]
     assert found["input_condition"].tolist() == [1, 1, 1, 1]
 
 
-@pytest.mark.parametrize("active", [True, False])
-def test_one_warning_in_each_run(active, caplog):
-    guarded = guard(active)
+def test_one_warning_in_each_run(caplog):
+    guarded = guard()
     with caplog.at_level(logging.WARNING, LOGGER):
         for run in (1, 2):
             guarded.reset()
@@ -150,41 +139,11 @@ def test_one_warning_in_each_run(active, caplog):
     assert "up to 9 (" in caplog.messages[-1]
 
 
-class Faulty(Controller):
-    """Finds fault with every state, under two reasons."""
-
-    def __init__(self, *reasons):
-        super().__init__(1, 1)
-        self.reasons = reasons
-        self.size = None
-
-    def __call__(self, t, q, v, reference):
-        self.size = q.shape[:-1]
-        return 0 * q
-
-    def faults(self):
-        return {reason: torch.ones(self.size, dtype=torch.bool) for reason in self.reasons}
-
-
-def test_faults_are_those_of_who_is_in_charge():
-    law, fallback = Faulty("law", "both"), Faulty("fallback", "both")
-    for active, expected in (
-        (False, {"law": [1, 1, 1, 1], "both": [1, 1, 1, 1]}),
-        (True, {"law": [1, 0, 1, 0], "both": [1, 1, 1, 1], "fallback": [0, 1, 0, 1]}),
-    ):
-        guarded = Guarded(law, fallback if active else None, DataRegion(*comb()))
-        guarded(0.0, MIXED, 0 * MIXED, REST)
-        found = {reason: mask.int().tolist() for reason, mask in guarded.faults().items()}
-        assert found == expected
-
-
 @pytest.mark.parametrize("threshold", [0.01, 1.0, 1e3], ids=["outside", "both", "inside"])
-@pytest.mark.parametrize("active", [True, False])
 class TestGuarded(ControllerContract):
     @pytest.fixture
-    def controller(self, threshold, active):
+    def controller(self, threshold):
         system = LinearSystem(np.eye(2), np.eye(2), np.eye(2), [[1.0, 0.5], [0.0, 2.0]])
-        law, pd = Regulation(system, 2.0, 1.0), ProportionalDerivative(unit_masses(2), 1.0, 1.0)
         q, v, _ = states(2, batch=60, seed=1)
         region = DataRegion(0.5 * q.unflatten(0, (6, 10)), 0.5 * v.unflatten(0, (6, 10)))
-        return Guarded(law, pd if active else None, region, threshold=threshold)
+        return Guarded(Regulation(system, 2.0, 1.0), region, threshold=threshold)
