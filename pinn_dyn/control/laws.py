@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import torch
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
@@ -60,21 +60,15 @@ class StateFeedback(Controller):
 class ModelBasedLaw(StateFeedback):
     """A law on the terms of a model, with A^+(q), the pseudo-inverse of its input matrix.
 
-    For A of full rank, and with damping d (damped least squares, Nakamura and Hanafusa 1986)::
-
-        N <= M:  A^+ = A^T (A A^T + d^2 I)^-1         N > M:  A^+ = (A^T A + d^2 I)^-1 A^T
-
-    - Fully actuated, M = N and d = 0: A^+ is the inverse, and A A^+ tau = tau.
+    - Fully actuated, M = N: A^+ is the inverse, and A A^+ tau = tau.
     - Under-actuated, M < N: A A^+ tau is the orthogonal projection of tau on the range of A.
     - Over-actuated, M > N: A^+ tau is the input of least norm that gives tau.
 
-    d = 0 gives infinite or NaN inputs where A loses its rank. d > 0 keeps them below |tau| / (2 d),
-    at the price of A A^+ tau != tau everywhere.
+    Inputs are infinite or NaN where A loses its rank.
 
     Args:
         model: the mechanical system whose terms the law uses, in float64.
         position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
-        inverse_damping: d, in the unit of the entries of A.
         max_condition: largest condition number of A(q) that is no fault.
 
     Raises:
@@ -89,7 +83,6 @@ class ModelBasedLaw(StateFeedback):
         position_gain: Gain,
         velocity_gain: Gain,
         *,
-        inverse_damping: NonNegativeFloat = 0.0,
         max_condition: Annotated[float, Field(ge=1)] = 1e6,
     ):
         if not isinstance(model, MechanicalSystem):
@@ -116,7 +109,6 @@ class ModelBasedLaw(StateFeedback):
             )
         super().__init__(model.num_coordinates, model.num_inputs, position_gain, velocity_gain)
         self.model = model
-        self.inverse_damping = float(inverse_damping)
         self.max_condition = float(max_condition)
         self._condition: Tensor | None = None
 
@@ -180,7 +172,7 @@ class Regulation(ModelBasedLaw):
     """
 
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        potential = pseudo_inverse_times(A, self.model.potential_force(q), self.inverse_damping)
+        potential = pseudo_inverse_times(A, self.model.potential_force(q))
         return potential + matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
 
 
@@ -198,8 +190,7 @@ class Tracking(ModelBasedLaw):
     """
 
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        force = self.model.inverse_dynamics(*reference)
-        feed_forward = pseudo_inverse_times(A, force, self.inverse_damping)
+        feed_forward = pseudo_inverse_times(A, self.model.inverse_dynamics(*reference))
         return feed_forward + matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
 
 
@@ -216,29 +207,18 @@ class ComputedTorque(ModelBasedLaw):
 
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         a = reference.a + self._feedback(q, v, reference)
-        return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a), self.inverse_damping)
+        return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a))
 
 
-def pseudo_inverse_times(A: Tensor, tau: Tensor, damping: float) -> Tensor:
-    """Return A^+ tau, ``(*batch, M)``; formulas in :class:`ModelBasedLaw`.
+def pseudo_inverse_times(A: Tensor, tau: Tensor) -> Tensor:
+    """Return A^+ tau, ``(*batch, M)``, for A ``(*batch, N, M)`` and tau ``(*batch, N)``.
 
     A row of the batch where A lost its rank or is not finite gives infinities or NaN.
-
-    Args:
-        A: input matrix, ``(*batch, N, M)``.
-        tau: generalized force, ``(*batch, N)``, or ``(N,)`` for the whole batch.
-        damping: d, 0 or more.
     """
     rows, columns = A.shape[-2:]
     transposed = A.transpose(-1, -2)
     b = tau.expand(A.shape[:-1]).unsqueeze(-1)
-    if damping > 0:
-        square = damping**2 * torch.eye(min(rows, columns), dtype=A.dtype, device=A.device)
-        if rows <= columns:
-            x = transposed @ torch.linalg.solve_ex(A @ transposed + square, b).result
-        else:
-            x = torch.linalg.solve_ex(transposed @ A + square, transposed @ b).result
-    elif rows == columns:
+    if rows == columns:
         x = torch.linalg.solve_ex(A, b).result
     elif rows < columns:
         Q, R = torch.linalg.qr(transposed)

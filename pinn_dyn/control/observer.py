@@ -115,7 +115,7 @@ class DisturbanceObserver(Controller):
                 change = gain * (disturbance - self.residual)
                 limit = self._max_rate * period
                 self.residual = self.residual + change.clamp(-limit, limit)
-            compensation = pseudo_inverse_times(A, self.residual, self.law.inverse_damping)
+            compensation = pseudo_inverse_times(A, self.residual)
             u = u - compensation
         self._size = torch.linalg.vector_norm(compensation, dim=-1)
         self._memory = _Memory(t, momentum, force, A, u)

@@ -13,7 +13,7 @@ Install pytest, inherit a suite in a test file and override its fixtures::
 import pytest
 
 # pytest explains failed assertions in test files only, unless a module is registered.
-_MODULES = "controller data_source heads integrator loss mechanical_motion mechanical_system plant"
+_MODULES = "controller data_source heads integrator loss mechanical_system plant"
 pytest.register_assert_rewrite(*(f"{__name__}.{module}" for module in _MODULES.split()))
 
 from pinn_dyn.testing.controller import ControllerContract  # noqa: E402
