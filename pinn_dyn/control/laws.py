@@ -99,8 +99,7 @@ class ModelBasedLaw(StateFeedback):
         if not model.input_affine:
             raise ValueError(
                 f"{type(self).__name__}: the model has a force that is not linear in the input "
-                "(model/input=nonlinear or model/friction=load_dependent), and the law inverts "
-                "A(q): train with model/input=network, or another friction"
+                "(model/input=nonlinear), and the law inverts A(q): train with model/input=network"
             )
         if model.has_residual:
             raise ValueError(

@@ -12,8 +12,6 @@ from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
     CoulombFriction,
     Friction,
-    LoadDependent,
-    LoadDependentStribeck,
     NoFriction,
     Stribeck,
 )
@@ -64,8 +62,6 @@ __all__ = [
     "LearnedConstants",
     "LearnedDelay",
     "LearnedVelocity",
-    "LoadDependent",
-    "LoadDependentStribeck",
     "MeasuredVelocity",
     "NetworkCholesky",
     "NetworkInput",

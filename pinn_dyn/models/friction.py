@@ -8,7 +8,7 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor, nn
 
-from pinn_dyn.models.known_constants import Constants, Named
+from pinn_dyn.models.known_constants import Named
 from pinn_dyn.models.scales import Scales
 
 _SMALLEST_WIDTH = 0.01
@@ -16,13 +16,7 @@ _SMALLEST_WIDTH = 0.01
 
 
 class Friction(nn.Module, abc.ABC):
-    """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
-
-    Attributes:
-        by_load: true if transmission losses depend on the drive force, see :meth:`transmitted`.
-    """
-
-    by_load: bool = False
+    """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0."""
 
     @abc.abstractmethod
     def forward(self, v: Tensor) -> Tensor:
@@ -31,10 +25,6 @@ class Friction(nn.Module, abc.ABC):
     @abc.abstractmethod
     def slope(self, v: Tensor) -> Tensor:
         """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends on v_i alone."""
-
-    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        """Return the joint force after transmission losses, ``(*batch, N)``. By default none."""
-        return force
 
     def physical_constants(self) -> list[Named]:
         """Return the learned constants in physical units. The default has none."""
@@ -119,7 +109,9 @@ class AsymmetricCoulomb(CoulombFriction):
 
     def _add_constants(self, scales: Scales) -> None:
         # c+ is the level times the asymmetry, c- is the level divided by the asymmetry.
-        self.ratio = _dimensionless(scales, "friction asymmetry", 1.0, spread=0.5)
+        ones = torch.ones(scales.size, dtype=scales.value.dtype)
+        units = ["1"] * scales.size
+        self.ratio = scales.positive("friction asymmetry", 1.0, ones, 0.5, units)
 
     def _levels(self) -> list[Named]:
         level, ratio = self.level(), self.ratio()
@@ -154,60 +146,3 @@ class Stribeck(AsymmetricCoulomb):
         speed = self.speed()
         rise = self.rise() * torch.exp(-((v / speed) ** 2))
         return level + rise, -2 * v / speed**2 * rise
-
-
-class LoadDependent(Stribeck):
-    """Stribeck law, and a transmission loss that grows with the drive force f_i::
-
-        transmitted_i = f_i - l_i |f_i| tanh(v_i / w_i),      0 < l_i < 1
-
-    Source: model M3 of Duclusaud et al. (2025), "Extended friction models for the physics
-    simulation of servo actuators" (BAM), with the rise of M2, and the drive force as the load.
-    """
-
-    by_load = True
-
-    def _add_constants(self, scales: Scales) -> None:
-        super()._add_constants(scales)
-        self.odds = _dimensionless(scales, "loss by load", 0.05)
-
-    def physical_constants(self) -> list[Named]:
-        loss = self.odds.named()._replace(values=_share(self.odds()))
-        return [*super().physical_constants(), loss]
-
-    def transmitted(self, v: Tensor, force: Tensor) -> Tensor:
-        return force - self._loss(v) * force.abs() * torch.tanh(v / self.width())
-
-    def _loss(self, v: Tensor) -> Tensor:
-        """Return l at v."""
-        return _share(self.odds())
-
-
-class LoadDependentStribeck(LoadDependent):
-    """Load-dependent friction with a loss that is larger near rest::
-
-        l_i(v) = o_i / (1 + o_i),     o_i = odds_i + rise_i exp(-(v_i / b_i)^2)
-
-    Source: model M4 of the source of :class:`LoadDependent`.
-    """
-
-    def _add_constants(self, scales: Scales) -> None:
-        super()._add_constants(scales)
-        self.odds_rise = _dimensionless(scales, "loss by load near rest", 0.02)
-
-    def physical_constants(self) -> list[Named]:
-        at_rest = _share(self.odds() + self.odds_rise())
-        return [*super().physical_constants(), self.odds_rise.named()._replace(values=at_rest)]
-
-    def _loss(self, v: Tensor) -> Tensor:
-        return _share(self.odds() + self.odds_rise() * torch.exp(-((v / self.speed()) ** 2)))
-
-
-def _dimensionless(scales: Scales, label: str, start: float, spread: float = 1.0) -> Constants:
-    ones = torch.ones(scales.size, dtype=scales.value.dtype)
-    return scales.positive(label, start, ones, spread, ["1"] * scales.size)
-
-
-def _share(odds: Tensor) -> Tensor:
-    """Convert odds to a share between 0 and 1."""
-    return odds / (1 + odds)

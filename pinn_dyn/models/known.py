@@ -55,14 +55,14 @@ class Structure(Protocol):
 class KnownMechanics(LearnedConstants):
     """Rigid bodies with known kinematics and drives, and learned constants::
 
-        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = T(v, diag(k) u)
+        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = diag(k) u
 
-    T is the drive force k u after transmission losses. M, C and G are those of the ``structure``
-    with learned pseudo-inertias. r is the armature (inertia of the rotors at the joint), o a
-    constant torque, D = diag(d) viscous friction and F dry friction. k are the drive gains from the
-    input to the torque, for example in Nm/A. Bodies have a positive density, and r, d, k > 0 for
-    all values of the parameters, which are standard normal a priori (:mod:`.known_constants`).
-    Scales come from the data: with the typical torque f = k u, d ~ f/v, F ~ f, o ~ f, r ~ f/a.
+    M, C and G are those of the ``structure`` with learned pseudo-inertias. r is the armature
+    (inertia of the rotors at the joint), o a constant torque, D = diag(d) viscous friction and F
+    dry friction. k are the drive gains from the input to the torque, such as in Nm/A. Bodies have a
+    positive density, and r, d, k > 0 for all values of the parameters, which are standard normal a
+    priori (:mod:`.known_constants`). Scales come from the data: with the typical torque f = k u, d
+    ~ f/v, F ~ f, o ~ f, r ~ f/a.
 
     Args:
         statistics: scales of the data.
@@ -126,7 +126,6 @@ class KnownMechanics(LearnedConstants):
             [joint.force for joint in joints],
         )
         self.friction = friction(scales)
-        self.input_affine = not self.friction.by_load
         self.gain: Constants | None = None
         if gain_spread > 0:
             units = [f"{joint.force}/u" for joint in joints]
@@ -157,9 +156,9 @@ class KnownMechanics(LearnedConstants):
         return self.structure.parameters_of(self.bodies())
 
     def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return r a + D v + F(v) - o - T(v, k u), ``(*batch, N)``, all terms except Y pi."""
+        """Return r a + D v + F(v) - o - k u, ``(*batch, N)``, all terms except Y pi."""
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
-        return resistance - self.offset() - self.friction.transmitted(v, self.drive_gain() * u)
+        return resistance - self.offset() - self.drive_gain() * u
 
     def slopes(self) -> KnownSlopes:
         return KnownSlopes(self)
@@ -183,9 +182,6 @@ class KnownMechanics(LearnedConstants):
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.drive_gain() * u
-
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return self.friction.transmitted(v, self._input_force(q, u))
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)

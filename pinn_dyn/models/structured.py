@@ -62,7 +62,7 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         self.potential = potential(self._scales(statistics, energy))
         self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
         self.friction = friction(self._scales(statistics, force))
-        self.input_affine = self.input.affine and not self.friction.by_load
+        self.input_affine = self.input.affine
         self.residual = residual(self._scales(statistics, force))
         self.has_residual = self.penalized = self.residual.learned
 
@@ -89,10 +89,6 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)
-
-    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        force = self.friction.transmitted(v, self._input_force(q, u))
-        return force + self.residual(q, v, u) if self.has_residual else force
 
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         return self.residual(q, v, u)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -18,13 +17,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
-from pinn_dyn.training.constants_fit import (
-    Fit,
-    Prior,
-    StoppedFit,
-    far_from_start,
-    posterior_covariance,
-)
+from pinn_dyn.training.constants_fit import Fit, Prior, far_from_start, posterior_covariance
 from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
 from pinn_dyn.training.sensitivity import rollout_slopes
 
@@ -94,26 +87,23 @@ class LeastSquares:
         trajectories: Sequence[Trajectory],
         windows: Windows,
         covariance: Tensor | None = None,
-        stopped: Fit | None = None,
     ) -> Fit:
-        """Fit the model in place. Its precision does not change.
+        """Fit the model in place. Its precision does not change. An interrupt undoes the fit.
 
         Args:
             model: the model to fit.
             trajectories: training trajectories for the inverse dynamics.
             windows: training windows for the roll-outs.
             covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
-            stopped: interrupted result of this fit, to continue from the present z.
 
         Raises:
             ValueError: if trajectories are too short for the filter, there are fewer residuals than
                 parameters, the covariance does not fit the model, or changed bodies are unknown.
-            StoppedFit: on an interrupt. The model then has the best z so far.
         """
-        count = sum(p.numel() for p in model.parameters())
-        precision = next(model.parameters()).dtype
+        start = parameters_to_vector(model.parameters()).detach().clone()
+        count = len(start)
         model.double()
-        prior = stopped.prior if stopped else self._prior(model, covariance)
+        prior = self._prior(model, covariance)
         earlier = covariance is not None
         stages = [partial(self._identify, model, prior, trajectories, earlier)]
         if self.rollouts:
@@ -128,19 +118,14 @@ class LeastSquares:
             enough = size * _informative_blocks(short) * short >= count
             for length in [short, steps] if enough and short < steps else [steps]:
                 stages.append(partial(self._roll_out, model, prior, windows.first(length)))
-        result, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         try:
-            while number < len(stages):
-                result = stages[number]()
-                number += 1
-        except KeyboardInterrupt as interrupt:
-            zero = torch.zeros_like(prior.root)
-            covariance = posterior_covariance(zero, prior.root)
-            partial_fit = result or Fit(covariance, zero, prior, float("nan"), 0)
-            raise StoppedFit(replace(partial_fit, stopped_in=number)) from interrupt
+            for stage in stages:
+                result = stage()
+        except KeyboardInterrupt:
+            vector_to_parameters(start.double(), model.parameters())
+            raise
         finally:
-            model.to(precision)
-        assert result is not None
+            model.to(start.dtype)
         z = parameters_to_vector(model.parameters()).detach().to(prior.mean)
         for line in far_from_start(model.parameter_names(), z, prior):
             log.warning("least squares: %s", line)
@@ -231,29 +216,19 @@ class LeastSquares:
             return max(float(np.sqrt(square)), np.finfo(float).eps)
 
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
-        best = np.inf, z.numpy()
         for _ in range(2):
             weight = 1 / (noise * group**0.5)
-            best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
-                nonlocal best
                 data = weight * _evaluate(model, at, residuals, False)
-                errors = np.concatenate([data, root @ (at - mean)])
-                if (cost := float(errors @ errors)) < best[0]:
-                    best = cost, at.copy()
-                return errors
+                return np.concatenate([data, root @ (at - mean)])
 
             def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
                 return np.concatenate([data, root])
 
             limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
-            try:
-                solution = least_squares(value, z.numpy(), slope, **limit)
-            except KeyboardInterrupt:
-                vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
-                raise
+            solution = least_squares(value, z.numpy(), slope, **limit)
             z = torch.from_numpy(solution.x)
             noise = spread(solution.x)
             steps += int(solution.njev)

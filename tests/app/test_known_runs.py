@@ -153,7 +153,7 @@ def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, words, 
     assert re.search(message, refused_text(capsys, "train.py", *arguments))
 
 
-def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
+def test_a_stopped_fit_ends_at_once_and_starts_again(tmp_path, monkeypatch):
     folder, begun, log = tmp_path / "run", tmp_path / "begun", tmp_path / "log.txt"
 
     def endless(*_):
@@ -177,8 +177,6 @@ def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
     assert f"train.py resume={folder}" in text
     assert not (folder / "constants.csv").exists()
     assert not (folder / "metrics.json").exists()
-    kept = constants(folder)
-    assert max(float(value.abs().max()) for value in kept.values()) > 0.1
     run_script("train.py", f"resume={folder}")
     assert (folder / "constants.csv").exists()
     assert (folder / "metrics.json").exists()
