@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pinn_dyn.app.dataset import dataset as dataset
+    from pinn_dyn.app.build import dataset as dataset
     from pinn_dyn.app.evaluation import evaluate as evaluate
     from pinn_dyn.app.fit import fit as fit
     from pinn_dyn.app.run import Run as Run
@@ -41,7 +41,7 @@ _MODULES = {
     "Trajectory": "pinn_dyn.mechanics",
     "check": "pinn_dyn.evaluation.log_check",
     "close_loop": "pinn_dyn.evaluation.closed_loops",
-    "dataset": "pinn_dyn.app.dataset",
+    "dataset": "pinn_dyn.app.build",
     "evaluate": "pinn_dyn.app.evaluation",
     "fit": "pinn_dyn.app.fit",
     "load": "pinn_dyn.app.run_folder",

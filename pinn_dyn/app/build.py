@@ -8,9 +8,7 @@ import pkgutil
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.loggers import Logger
-
-from pinn_dyn.app.config import ConfigError, build_part
+from pinn_dyn.app.config import ConfigError, build_part, composed
 from pinn_dyn.app.run import ModelBuilder
 from pinn_dyn.app.trainer import tensorboard
 from pinn_dyn.control import Controller, Reference
@@ -24,6 +22,17 @@ def build_source(config: dict[str, Any]) -> DataSource:
     if "cache" in inspect.signature(pkgutil.resolve_name(part["_target_"])).parameters:
         part = {"cache": os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn"), **part}
     return build_part("dataset", part)
+
+
+def dataset(name: str, **settings: Any) -> DataSource:
+    """Build a data set of ``conf/dataset``, such as ``dataset("soft_arm_1", duration=4.0)``.
+
+    Args:
+        name: file name without suffix.
+        settings: arguments of its class that replace those of the file.
+    """
+    overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
+    return build_source(composed("train", overrides))
 
 
 def model_builder(config: dict[str, Any]) -> ModelBuilder:
@@ -51,16 +60,14 @@ def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
             for name, part in config["callbacks"].items()
             if part is not None
         ],
-        "loggers": [_logger(name, part, folder) for name, part in config["logger"].items()],
+        "loggers": [
+            tensorboard(folder)
+            if name == "tensorboard"
+            else build_part(f"logger.{name}", part, save_dir=str(folder))
+            for name, part in config["logger"].items()
+        ],
         **{name: config[name] for name in ("seed", "ensemble", "compile", "threads")},
     }
-
-
-def _logger(name: str, config: dict[str, Any], folder: Path) -> Logger:
-    """Build a logger that writes to the run folder."""
-    if name == "tensorboard":
-        return tensorboard(folder)
-    return build_part(f"logger.{name}", config, save_dir=str(folder))
 
 
 def build_reference(config: dict[str, Any], robot: MechanicalSystem) -> Reference:

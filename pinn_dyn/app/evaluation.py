@@ -5,14 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 
+from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.run import Run
-from pinn_dyn.app.shared_data import (
-    require_fitting_test,
-    require_same_test,
-    training_sources,
-)
-from pinn_dyn.data import DataSource
+from pinn_dyn.app.run_folder import check_data, flattened
+from pinn_dyn.data import DataSource, LogSource, data_changes
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
@@ -59,12 +56,14 @@ def evaluate(
             if the settings do not fit the data.
     """
     runs = [runs] if isinstance(runs, Run) else list(runs)
-    sources = training_sources(runs)
+    shared: dict[str, DataSource] = {}
+    sources = [shared.setdefault(str(run.config["dataset"]), run.source) for run in runs]
     for run, trained_on in zip(runs, sources, strict=True):
+        check_data(run, trained_on)
         if source is None:
-            require_same_test(run, runs[0], split)
+            _require_same_test(run, runs[0], split)
         else:
-            require_fitting_test(run, trained_on, source)
+            _require_fitting_test(run, trained_on, source)
     source = source or sources[0]
     splits = {item: item.load() for item in {*sources, source}}
     motions = getattr(splits[source], split)
@@ -123,3 +122,28 @@ def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
         if len(set(names)) < len(names):
             names = [f"{name} {suffix}" for name, suffix in zip(names, suffixes, strict=True)]
     return names
+
+
+def _require_same_test(run: Run, first: Run, split: str) -> None:
+    """Refuse a run whose data of a split differ from those of the first run."""
+    ours, theirs = ({split: x.data[split]} if x.data else {} for x in (run, first))
+    if data_changes(theirs, ours):
+        settings = flattened(run.config["dataset"]).items()
+        before = flattened(first.config["dataset"])
+        differences = {key: x for key, x in settings if before.get(key) != x}
+        raise ConfigError(
+            f"runs: {run.folder} has another data set in {split} than {first.folder}: "
+            f"{differences}: evaluate them separately"
+        )
+
+
+def _require_fitting_test(run: Run, trained_on: DataSource, source: DataSource) -> None:
+    """Refuse a data set to test on that has other coordinates or inputs than that of a run."""
+    sizes, expected = ((len(x.labels), len(x.input_labels)) for x in (source, trained_on))
+    if sizes != expected:
+        raise ConfigError(
+            f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, "
+            f"{run.folder} was trained on {expected[0]} and {expected[1]}"
+        )
+    if run.log and isinstance(source, LogSource) and run.log.steps != source.steps:
+        log.warning("%s was trained with other steps than those of %s", run.folder, source.name)

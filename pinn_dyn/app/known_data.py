@@ -43,16 +43,11 @@ def check_known(model: Predictor, source: DataSource) -> None:
 def check_structure(path: str, structure: Structure, source: DataSource) -> None:
     """Refuse rigid bodies whose joints are not the data's.
 
-    If the columns do not name the joints, their order counts, and is logged.
-
-    Args:
-        path: key of the structure in the configuration.
-        structure: rigid bodies.
-        source: the data.
+    If the columns do not name the joints, their order counts, and is logged. ``path`` is the key of
+    the structure in the configuration.
 
     Raises:
-        ConfigError: if the number of columns is not that of the joints, or names or units of the
-            columns show another order.
+        ConfigError: if number, order or units of the columns are not those of the joints.
     """
     joints, signals = structure.joint_names, _signals(source)
     for key, units in signals:
@@ -88,22 +83,19 @@ def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
     """Return the keys of q, v and u, each with names and units of its columns; "" if unknown."""
     if not isinstance(source, LogSource):
         labels = {"dataset.labels": source.labels, "dataset.input_labels": source.input_labels}
-        return [
-            (key, {name: unit for name, _, unit in (x.rstrip("]").partition(" [") for x in texts)})
-            for key, texts in labels.items()
-        ]
-    signals = {"q": source.q, "v": source.v, "u": source.u}
-    return [
-        (
-            f"dataset.{key}.columns",
-            {
-                name: "" if in_file == "1" else in_file if unit == "1" else unit
-                for name, unit, in_file in zip(x.columns, x.units, x.unit, strict=True)
-            },
-        )
-        for key, x in signals.items()
-        if x is not None
-    ]
+        pairs = {
+            k: [x.rstrip("]").partition(" [")[::2] for x in texts] for k, texts in labels.items()
+        }
+        return [(key, dict(texts)) for key, texts in pairs.items()]
+    signals = []
+    for key, x in {"q": source.q, "v": source.v, "u": source.u}.items():
+        if x is not None:
+            units = [
+                "" if f == "1" else f if u == "1" else u
+                for u, f in zip(x.units, x.unit, strict=True)
+            ]
+            signals.append((f"dataset.{key}.columns", dict(zip(x.columns, units, strict=True))))
+    return signals
 
 
 def _joint_of(column: str, joints: Sequence[str]) -> int | None:

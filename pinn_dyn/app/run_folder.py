@@ -164,7 +164,7 @@ def finish(folder: Path, record: dict[str, Any]) -> None:
         path = folder / CHECKPOINTS / f"{name}.ckpt"
         saved = torch.load(path, map_location="cpu", weights_only=True)
         WholeCheckpoints().save_checkpoint({**saved, RECORD: record, FINISHED: True}, path)
-    _write_json(folder / METRICS, record)
+    write_whole(folder / METRICS, json.dumps(record, indent=2))
 
 
 def check_data(run: Run, source: DataSource) -> None:
@@ -192,10 +192,6 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
     write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
 
 
-def _write_json(path: Path, values: Mapping[str, Any]) -> None:
-    write_whole(path, json.dumps(values, indent=2))
-
-
 @contextlib.contextmanager
 def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None, dict[str, Any]]]:
     """Lock a run folder for a configuration; yield path and content of its newest checkpoint.
@@ -214,7 +210,7 @@ def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None,
                 _require_same_config(folder, saved["hyper_parameters"]["config"], config)
             write_config(folder, config)
             if saved.get(FINISHED):
-                _write_json(folder / METRICS, saved[RECORD])
+                write_whole(folder / METRICS, json.dumps(saved[RECORD], indent=2))
             yield path, saved
     except Timeout as error:
         raise ConfigError(f"{folder} is in use: another process trains there") from error

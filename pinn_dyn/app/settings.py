@@ -15,7 +15,7 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.validation import SET_BY_PROGRAM, STAND_INS, Seed
+from pinn_dyn.app.validation import STAND_INS, Seed
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.evaluation import RolloutValidator
@@ -67,12 +67,6 @@ class TrainerArguments:
 
 
 STAND_INS[L.Trainer] = TrainerArguments
-SET_BY_PROGRAM.update(
-    {
-        *("data.batches_per_epoch", "data.source", "plant.system", "optimizer.maximize"),
-        *("optimizer.params", "scheduler.optimizer", "scheduler.total_steps"),
-    }
-)
 
 
 @dataclass(kw_only=True)

@@ -58,11 +58,10 @@ def train(cfg: DictConfig) -> float:
     except KeyboardInterrupt as interrupt:
         if not isinstance(stop := interrupt.__cause__, SystemExit):
             raise
-        if HydraConfig.get().mode == RunMode.RUN:
-            log.warning("interrupted; resume with: python train.py resume=%s", folder)
-        else:
-            sweep = HydraConfig.get().sweep.dir
-            log.warning("interrupted; go on with the same command and hydra.sweep.dir=%s", sweep)
+        job, way = HydraConfig.get(), f"resume with: python train.py resume={folder}"
+        if job.mode == RunMode.MULTIRUN:
+            way = f"go on with the same command and hydra.sweep.dir={job.sweep.dir}"
+        log.warning("interrupted; %s", way)
         raise SystemExit(stop.code or 128 + signal.SIGTERM) from interrupt
     return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +22,6 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.progress import EpochLines
 from pinn_dyn.app.run import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -36,6 +37,8 @@ from pinn_dyn.training import (
     WholeCheckpoints,
     WindowLoss,
 )
+
+log = logging.getLogger(__name__)
 
 LONGEST_EPOCH = 1000
 """Largest number of steps between two writes of the last checkpoint."""
@@ -138,6 +141,20 @@ class _MovableCheckpoint(ModelCheckpoint):
         super().load_state_dict({**state_dict, **changes})
 
 
+class _EpochLines(L.Callback):
+    """Log of every epoch, for a training without a terminal."""
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Log the training loss, and the validation error of validated epochs."""
+        epoch, metrics = trainer.current_epoch + 1, trainer.callback_metrics
+        text = f"training loss {metrics.get('train/loss', math.nan):.4g}"
+        if epoch % (trainer.check_val_every_n_epoch or 1) == 0 and VALIDATION_ERROR in metrics:
+            text += f", validation error {metrics[VALIDATION_ERROR]:.4g}"
+        if trainer.is_global_zero:
+            steps = trainer.global_step
+            log.info("epoch %d of %s, step %d: %s", epoch, trainer.max_epochs, steps, text)
+
+
 def build_trainer(
     folder: Path,
     settings: Mapping[str, Any],
@@ -166,7 +183,7 @@ def build_trainer(
             *callbacks,
             _MovableCheckpoint(filename="best", monitor=BEST_BY, **files),
             _MovableCheckpoint(filename="last", save_on_train_epoch_end=True, **files),
-            TQDMProgressBar() if bar else EpochLines(VALIDATION_ERROR),
+            TQDMProgressBar() if bar else _EpochLines(),
             *([LearningRateMonitor()] if loggers else []),
         ],
         "logger": list(loggers),

@@ -18,7 +18,7 @@ from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pydantic
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, NonNegativeFloat, PositiveFloat, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
 _CONFIG = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
@@ -30,20 +30,16 @@ _LISTS = (
     collections.abc.Collection,
 )
 _MAPPINGS = (dict, collections.abc.Mapping, collections.abc.MutableMapping)
-_PLAIN = (bool, int, float, str, type(None), Any)
-_Share = Annotated[float, Field(ge=0, lt=1)]
-# The optimizers of PyTorch state no limits.
-_OPTIMIZER = {
-    "lr": pydantic.PositiveFloat,
-    "weight_decay": pydantic.NonNegativeFloat,
-    "eps": pydantic.PositiveFloat,
-    "betas": tuple[_Share, _Share],
-}
+_PLAIN = (bool, int, float, str, type(None), Any)  # The optimizers of PyTorch state no limits.
+_OPTIMIZER = {"lr": PositiveFloat, "weight_decay": NonNegativeFloat, "eps": PositiveFloat}
 
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 STAND_INS: dict[Any, type] = {}
 """Classes of other packages, and dataclasses whose fields are the arguments to accept for them."""
-SET_BY_PROGRAM: set[str] = set()
+SET_BY_PROGRAM = {
+    *("data.batches_per_epoch", "data.source", "plant.system", "optimizer.maximize"),
+    *("optimizer.params", "scheduler.optimizer", "scheduler.total_steps"),
+}
 """Keys of arguments that the program sets itself."""
 
 

@@ -44,7 +44,6 @@ MISTAKES = {
         data.stride=-1
         data.coverage=2
         data.batch_size=0
-        optimizer.betas=[2, 3]
         optimizer.eps=-1
         optimizer.maximize=true
         optimizer.params=[1]
