@@ -220,9 +220,9 @@ def _require_same_config(folder: Path, before: dict[str, Any], now: dict[str, An
     ours, theirs = flattened(now), flattened(before)
     ours.pop("dataset.cache", None)
     differences = [
-        f"{key}={ours.get(key, 'absent')} (there {theirs.get(key, 'absent')})"
+        f"{key}={ours.get(key)} (there {theirs.get(key)})"
         for key in dict.fromkeys([*ours, *theirs])
-        if ours.get(key, "absent") != theirs.get(key, "absent")
+        if ours.get(key) != theirs.get(key)
     ]
     if differences:
         text = ", ".join(differences[:5])

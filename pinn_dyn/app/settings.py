@@ -38,7 +38,6 @@ class TrainSettings:
     start_from: str | None = None
     resume: str | None = None
     trust: Names | None = None
-    search: Mapping[Literal["draw"], NonNegativeInt] | None = None
     dataset: DataSource
     data: DynamicsData | Callable[..., DynamicsData]
     model: Predictor | Callable[..., Predictor]

@@ -22,7 +22,6 @@ from pinn_dyn.app.run_folder import (
     newest_checkpoint,
     read_checkpoint,
 )
-from pinn_dyn.app.search import with_draw
 from pinn_dyn.app.trust import check_name, packages, require_trusted
 
 log = logging.getLogger(__name__)
@@ -45,8 +44,6 @@ def train(cfg: DictConfig) -> float:
         config = checked("train", cfg)
         check_name("model_name", config["model_name"])  # files are named by it
         check_name("dataset.name", config["dataset"].get("name", "data"))
-        if config.get("search"):
-            config = with_draw(config, config["search"]["draw"])
     start = config.get("start_from")
     try:
         run = training.train(

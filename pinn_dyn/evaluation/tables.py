@@ -20,7 +20,7 @@ SEEDS_COLUMNS = {
     "error_worst": "worst trajectory ± std over seeds",
 }
 _LOWER_IS_BETTER = r".*(error_(mean|median|worst|\w+_half)|diverged|torque_(error|share))"
-_NAMES = ["dataset.name", "model_name", "search.draw"]
+_NAMES = ["dataset.name", "model_name"]
 _WINDOW = r"window_(.*)s_error_mean"
 _HEADERS = {
     "run": "run",
@@ -44,7 +44,7 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return the settings in which runs differ, one row per run and one dotted column per setting.
 
     Left out are keys that follow the seed or an earlier key, and keys that the names of the model
-    and of the data set, or the draw of a search, determine.
+    and of the data set determine.
     """
     settings = pd.json_normalize(list(configs))
     text = settings.map(str)

@@ -194,7 +194,7 @@ def test_what_the_tests_compose_faster_is_what_hydra_composes(tmp_path, kept_com
     """:mod:`tests.support.compositions` replaces parts of Hydra; a copy of this process has all."""
     choices = [
         ["experiment=ur10e", "optimizer.rollouts=false", "~callbacks.figures"],
-        ["model=hnn", "model.integrator.substeps=2", "search=equal", "search.draw=3"],
+        ["model=hnn", "model.integrator.substeps=2"],
     ]
     choices = [[*words, "model_name=any"] for words in choices]
     found = tmp_path / "found.json"

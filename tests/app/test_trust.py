@@ -65,7 +65,7 @@ def test_everything_that_conf_names_may_be_built():
     """So a run of our own configurations is never refused."""
     texts = [path.read_text() for path in CONF.rglob("*.yaml")]
     names = {x for text in texts for x in re.findall(r"_target_: ([\w.]+)", text)}
-    # In no run's configuration: one of Hydra, and a search, of which a run keeps the draw alone.
+    # In no run's configuration: one of Hydra.
     names -= {"pinn_dyn.app.sweep.SweepCallback"}
     names = {x for x in names if not x.startswith("hydra")}
     assert len(names) > 50

@@ -74,7 +74,7 @@ def _choices(word):
     if parsed.is_interval_sweep():
         return [f"{word.split('=')[0]}={parsed.value().start}"]
     values = list(parsed.sweep_string_iterator())
-    if word.startswith(("seed=", "search.draw=")):
+    if word.startswith("seed="):
         values = values[:1]
     return [f"{word.split('=')[0]}={value}" for value in values]
 
