@@ -22,13 +22,7 @@ _FRAMES_PER_SECOND = 20
 def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> None:
     """Write a GIF of one run in real time, up to its end or stop, which is shown for a second.
 
-    The reference is grey, the path of the tip red.
-
-    Args:
-        record: K runs.
-        run: index of the run.
-        robot: a system that gives its lines.
-        path: the GIF.
+    The reference is grey, the path of the tip red. ``run`` is an index of the K runs.
     """
     end = samples_before_stop(record, run)
     shape, goal = (robot.lines(q[run, :end].double()) for q in (record.q, record.reference.q))

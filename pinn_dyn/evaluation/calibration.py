@@ -102,28 +102,23 @@ def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
 
 
 def calibration_figure(runs: Mapping[str, Mapping[float, Calibration]], *, title: str) -> Figure:
-    """Draw the coverage of intervals over their nominal level, one panel per window.
+    """Draw the coverage of intervals over their nominal level, for the longest window of each run.
 
     An interval on the diagonal has the nominal coverage; below the diagonal it is too narrow.
     """
-    windows = sorted({window for item in runs.values() for window in item})
-    size = (max(3.6 * len(windows) + 0.6, 6.0), 4.2 + 0.25 * len(runs))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(1, len(windows), sharey=True, squeeze=False)[0]
-    for ax, window in zip(axes, windows, strict=True):
-        ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label="nominal")
-        for index, (run, items) in enumerate(runs.items()):
-            if window not in items:
-                continue
-            item, color = items[window], model_style(index)["color"]
-            ax.plot(100 * item.level, 100 * item.share, "o-", color=color, markersize=4, label=run)
-            if item.corrected is not None:
-                label = f"{run}, width from validation"
-                ax.plot(100 * item.level, 100 * item.corrected, "--", color=color, label=label)
-        ax.set_title(f"reset every {window:g} s", fontsize="medium")
-        ax.set(xlabel="nominal level [%]", xlim=(0, 100), ylim=(0, 101))
-        ax.grid(True, alpha=0.3)
-    axes[0].set_ylabel("errors within the interval [%]")
-    legend_below(figure, columns=2, fontsize="small")
+    figure = Figure(figsize=(6.0, 4.4 + 0.25 * len(runs)), layout="constrained")
+    ax = figure.subplots()
+    ax.plot([0, 100], [0, 100], color="black", linewidth=0.8, label="nominal")
+    for index, (run, items) in enumerate(runs.items()):
+        window, color = max(items), model_style(index)["color"]
+        item, label = items[window], f"{run}, reset every {window:g} s"
+        ax.plot(100 * item.level, 100 * item.share, "o-", color=color, markersize=4, label=label)
+        if item.corrected is not None:
+            label = f"{run}, width from validation"
+            ax.plot(100 * item.level, 100 * item.corrected, "--", color=color, label=label)
+    ax.set(xlabel="nominal level [%]", xlim=(0, 100), ylim=(0, 101))
+    ax.set_ylabel("errors within the interval [%]")
+    ax.grid(True, alpha=0.3)
+    legend_below(figure, columns=1, fontsize="small")
     figure.suptitle(title)
     return figure

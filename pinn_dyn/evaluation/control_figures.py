@@ -101,27 +101,17 @@ def tip_path_figure(
 ) -> Figure:
     """Draw the path of the end effector in space, and its distance to the reference over time.
 
-    Args:
-        t: times, ``(T,)``, s.
-        paths: names of laws and positions, ``(T, 3)`` each, m; NaN after a stop.
-        reference: reference positions, ``(T, 3)``, m.
-        title: title of the figure.
+    The times t are ``(T,)`` in s, ``reference`` and the path of each law ``(T, 3)`` in m, NaN after
+    a stop.
     """
     figure = Figure(figsize=(11, 5), layout="constrained")
-    space = figure.add_subplot(1, 2, 1, projection="3d")
-    ax = figure.add_subplot(1, 2, 2)
+    space, ax = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
     space.plot(*reference.T.numpy(), color=TRUTH, linewidth=5, label="reference")
     for index, (name, path) in enumerate(paths.items()):
-        color = COLORS[index % len(COLORS)]
-        space.plot(*path.T.numpy(), color=color, linewidth=1.3, label=name)
-        distance = 1e3 * (path - reference).norm(dim=-1)
-        ax.plot(t, distance, color=color, linewidth=1.3)
-        end = int(torch.isfinite(distance).sum()) - 1
-        if 0 <= end < len(t) - 1:
-            ax.plot(t[end], distance[end], "x", color=color, markersize=8, label=f"{name} stopped")
-    space.scatter(*reference[0].numpy(), color="black", s=25, label="start")
-    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    space.set_aspect("equal")
+        style = model_style(index) | {"linewidth": 1.3}
+        space.plot(*path.T.numpy(), label=name, **style)
+        ax.plot(t, 1e3 * (path - reference).norm(dim=-1), **style)
+    space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
     space.locator_params(nbins=4)
     ax.set(xlabel="time [s]", ylabel="distance to the reference position [mm]")
     ax.set(xlim=(float(t[0]), float(t[-1])), ylim=(0, None))
@@ -136,13 +126,8 @@ def steady_state_figure(
 ) -> Figure:
     """Draw the steady-state error of each set point against its predicted bound, on log axes.
 
-    The bound holds below the diagonal. Set points without a finite bound or error are counted in
-    the title.
-
-    Args:
-        bound, measured: predicted bounds and errors, ``(K,)``, in the units of q.
-        title: title of the figure.
-        label: name and unit of the error.
+    The bound holds below the diagonal. Both are ``(K,)`` in the units of q; values that are not
+    finite are not drawn. ``label`` is the name and unit of the error.
     """
     drawn = torch.isfinite(bound) & torch.isfinite(measured)
     x, y = (values[drawn].double().clamp(min=1e-12) for values in (bound, measured))  # log axes
@@ -160,7 +145,5 @@ def steady_state_figure(
     ax.set(xlabel=f"predicted bound on {label}", ylabel=f"measured {label}")
     ax.legend(loc="lower right", fontsize="small")
     title += f"\n{int((~above).sum())} of {int(bound.isfinite().sum())} bounds hold"
-    if not drawn.all():
-        title += f"\nnot drawn: {int((~drawn).sum())} without a finite bound or error"
     figure.suptitle(title, fontsize="medium")
     return figure

@@ -152,15 +152,10 @@ def _annotate(ax: Axes, matrix: Tensor, digits: int) -> None:
 
 
 def sweep_figure(runs: pd.DataFrame, *, x: str, lines: Sequence[str], y: str) -> Figure:
-    """Draw an error against a setting: a dot for each run, a line through the means over seeds.
+    """Draw an error y against a setting x: a dot for each run, a line through the means over seeds.
 
+    All three name columns of ``runs``. Combinations of the columns ``lines`` are separate lines.
     Diverged runs with an infinite error are not drawn; the legend counts them.
-
-    Args:
-        runs: one row per run.
-        x: column of the horizontal axis, categorical unless its values are numbers.
-        lines: columns whose combinations are drawn as separate lines.
-        y: column of the error.
     """
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     ax = figure.subplots()

@@ -24,13 +24,7 @@ OPEN = 0.5
 
 
 class Direction(NamedTuple):
-    """A direction of P parameters.
-
-    Attributes:
-        parameter: index of the parameter that only this direction of a basis contains.
-        direction: unit vector, ``(P,)``.
-        text: the largest entries with their names.
-    """
+    """A unit vector of P parameters, in words; ``parameter`` is in no other of its basis."""
 
     parameter: int
     direction: np.ndarray

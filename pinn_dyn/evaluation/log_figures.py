@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from pinn_dyn.data.logs import Cleaned
-from pinn_dyn.evaluation.plots import COLORS, TRUTH, default_labels, legend_below, panels
+from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels
 
 
 def cleaning_figure(
@@ -15,15 +15,9 @@ def cleaning_figure(
 ) -> Figure:
     """Draw raw samples as dots and cleaned signals as lines: a column each for q, v and u.
 
-    Args:
-        cleaned: the stretch, one of ``LogSource.cleaned``.
-        title: data set; the name of the run is appended.
-        labels, input_labels: name and unit of each coordinate and input.
+    ``cleaned`` is one of ``LogSource.cleaned``. The labels are names and units of q and u.
     """
     raw = cleaned.raw
-    inputs = [raw, *cleaned.clean][-1].u.shape[1]
-    labels = default_labels(labels, "q", raw.q.shape[1])
-    input_labels = default_labels(input_labels, "u", inputs)
     speeds = [f"d/dt {label.replace(']', '/s]')}" for label in labels]
     title = f"{title}: {raw.run}, {cleaned.split}"
     figure, axes = panels([labels, speeds, input_labels], raw.t, title=title)

@@ -33,7 +33,6 @@ class RolloutMetrics:
         error_worst: largest mean of e over one trajectory; infinite if any diverged.
         worst_trajectory: index of that trajectory, the first diverged one if any.
         squared_error_mean, squared_error_variance: mean and (population) variance of e^2.
-        error_first_half, error_second_half: mean of e over either half of the horizon.
         valid_time: for each named threshold the first time in s at which e exceeds it, the horizon
             if it never does; mean over all trajectories.
     """
@@ -48,8 +47,6 @@ class RolloutMetrics:
     worst_trajectory: int
     squared_error_mean: float
     squared_error_variance: float
-    error_first_half: float
-    error_second_half: float
     valid_time: dict[str, float]
 
     def to_dict(self) -> dict[str, float]:
@@ -74,7 +71,7 @@ def rollout_metrics(
     t = t.double() - t[0].double()
     prediction = Prediction(t, q_hat.double(), q.double())
     error, diverged = prediction.error(), diverged_trajectories(prediction)
-    valid, second_half = error[~diverged], t > t[-1] / 2
+    valid = error[~diverged]
     per_trajectory = torch.where(diverged, torch.inf, error.mean(dim=1))
     worst = int(per_trajectory.argmax())
     above = {name: ~(error <= value) for name, value in thresholds.items()}  # NaN is above all
@@ -89,8 +86,6 @@ def rollout_metrics(
         worst_trajectory=worst,
         squared_error_mean=_mean(valid.square()),
         squared_error_variance=_variance(valid.square()),
-        error_first_half=_mean(valid[:, ~second_half]),
-        error_second_half=_mean(valid[:, second_half]),
         valid_time={
             name: float(torch.where(mask.any(1), t[mask.int().argmax(1)], t[-1]).mean())
             for name, mask in above.items()

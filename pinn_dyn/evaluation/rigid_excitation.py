@@ -68,12 +68,11 @@ def rigid_excitation(
 
         Y(q, v, a) pi + r a + d v + c sign(v) - o = tau
 
-    with inertial parameters pi, armatures r, viscous and dry friction d and c, and offsets o. Base
-    parameters are the columns that are independent at random states. The condition number is that
-    of these columns, each of unit norm, on the filtered motion without joints at rest. Directions
-    with less than a hundredth of the largest singular value are not determined. Sources: Gautier
-    and Khalil 1992, "Exciting trajectories for the identification of base inertial parameters of
-    robots"; Swevers et al. 1997, "Optimal robot excitation and identification".
+    with inertial parameters pi, armatures r, viscous and dry friction d and c, and offsets o. The
+    columns that are independent at random states are scaled to unit norm on the filtered motion.
+    Directions with less than a hundredth of the largest singular value are not determined. Sources:
+    Gautier and Khalil 1992, "Exciting trajectories for the identification of base inertial
+    parameters of robots"; Swevers et al. 1997, "Optimal robot excitation and identification".
 
     Args:
         structure, trajectories: kinematics and motions.

@@ -19,7 +19,7 @@ SEEDS_COLUMNS = {
     "error_mean": "mean error ± std over seeds",
     "error_worst": "worst trajectory ± std over seeds",
 }
-_LOWER_IS_BETTER = r".*(error_(mean|median|worst|\w+_half)|diverged|torque_(error|share))"
+_LOWER_IS_BETTER = r".*(error_(mean|median|worst)|diverged|torque_(error|share))"
 _NAMES = ["dataset.name", "model_name"]
 _WINDOW = r"window_(.*)s_error_mean"
 _HEADERS = {

@@ -167,11 +167,9 @@ def test_the_tip_path_shows_the_distance_in_millimetres():
     short = helix + 0.02 * t[:, None] * torch.tensor([0.0, 0.0, 1.0])
     short[30:] = torch.nan
     _, ax = tip_path_figure(t, {"near": near, "short": short}, helix, title="t").axes
-    near_line, short_line, cross = ax.lines
+    near_line, short_line = ax.lines
     np.testing.assert_allclose(near_line.get_ydata(), 7.0)
     np.testing.assert_allclose(short_line.get_ydata()[:30], 20 * t[:30])
-    assert cross.get_label() == "short stopped"
-    assert cross.get_xdata()[0] == t[29]
 
 
 def test_bounds_that_fail_are_counted_and_drawn_as_crosses():
@@ -182,9 +180,8 @@ def test_bounds_that_fail_are_counted_and_drawn_as_crosses():
     below, above = (np.asarray(points.get_offsets()) for points in figure.axes[0].collections)
     np.testing.assert_allclose(below, [[1e-2, 1e-3], [1e-2, 1e-2]])
     np.testing.assert_allclose(above, [[1e-3, 2e-3], [1e-12, 1e-6]])
-    _, counts, left_out = figure.get_suptitle().splitlines()
+    _, counts = figure.get_suptitle().splitlines()
     assert counts == "2 of 5 bounds hold"
-    assert left_out == "not drawn: 2 without a finite bound or error"
 
 
 def test_a_sweep_has_a_line_through_the_means_over_seeds():

@@ -62,8 +62,6 @@ def test_metrics_of_a_case_computed_by_hand():
             "worst_trajectory": 0,
             "squared_error_mean": 40 / 8,
             "squared_error_variance": (81 + 625 + 1 + 16 + 1) / 8 - 25,
-            "error_first_half": 4 / 4,
-            "error_second_half": 8 / 4,
             "valid_time_low": 1.0,
             "valid_time_mid": (1.0 + 2.0) / 2,
             "valid_time_high": 3.0,
@@ -80,7 +78,6 @@ def test_a_diverged_trajectory_is_counted_and_left_out(bad):
     found = rollout_metrics(q_hat, q, t, thresholds={"wide": 0.6})
     assert found.diverged == 1
     assert found.error_mean == pytest.approx(0.5)
-    assert found.error_second_half == pytest.approx(0.5)
     assert (found.error_worst, found.worst_trajectory) == (math.inf, 1)
     # The diverged one is valid until t = 0.75, the others up to the horizon.
     assert found.valid_time["wide"] == pytest.approx((1 + 0.75 + 1) / 3)
@@ -92,7 +89,7 @@ def test_all_diverged_gives_infinity_and_never_nan():
     figures = rollout_metrics(q * math.nan, q, t, thresholds={"x": 0.1}).to_dict()
     assert not any(math.isnan(value) for value in figures.values())
     assert figures["diverged"] == 2
-    for name in ("mean", "std", "median", "worst", "first_half", "second_half"):
+    for name in ("mean", "std", "median", "worst"):
         assert figures[f"error_{name}"] == math.inf
     assert figures["squared_error_mean"] == figures["squared_error_variance"] == math.inf
     assert figures["valid_time_x"] == 0

@@ -52,11 +52,9 @@ def _rigid(check: LogCheck) -> list[Section]:
     if check.rigid is None:
         return []
     text = (
-        f"The torques are linear in {check.rigid.count} base parameters of bodies and drives. The "
-        "regressor of the training motions, each column of unit norm, has the condition number "
-        f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. Directions with "
-        "less than a hundredth of the largest singular value are not determined: "
-        f"{check.rigid.undetermined}."
+        f"The regressor of {check.rigid.count} base parameters has the condition number "
+        f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. "
+        f"Not determined: {check.rigid.undetermined}."
     )
     return [Section("Rigid bodies", [paragraph(text), table(check.rigid.joints)])]
 

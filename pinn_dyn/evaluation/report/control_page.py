@@ -48,14 +48,7 @@ def control_report(
 ) -> str:
     """Return the page as HTML text.
 
-    Args:
-        title: heading of the page.
-        result: closed loops of the laws.
-        figures: names and figures to show.
-        labels: name and unit of each coordinate.
-        animation: GIF of the first law, or None.
-        stability: stability report in Markdown, or None.
-        origin: origin of the numbers.
+    ``animation`` is a GIF of the first law, ``stability`` a report in Markdown, or None.
     """
     sections = [
         Section("Summary", _summary(result, labels)),
@@ -81,7 +74,9 @@ def _summary(result: ControlResult, labels: Sequence[str]) -> list[Markup]:
     summary, unit = result.table, units(labels)
     text = "The error is q_ref − q in the units of q" + (f" ({unit})" if unit else "")
     parts = [
-        paragraph(f"{text}. Means are over the runs that were not stopped."),
+        paragraph(
+            f"{text}. Means are over runs that were not stopped. All columns are in summary.csv."
+        ),
         table(summary, headers=shown_columns(summary)),
     ]
     stops = [
@@ -92,10 +87,8 @@ def _summary(result: ControlResult, labels: Sequence[str]) -> list[Markup]:
     ]
     if stops:
         parts += [paragraph("Stopped runs:"), table(pd.DataFrame(stops))]
-    columns = summary.set_index("controller").T.rename_axis(None, axis=1)
     return [
         *parts,
-        details("All columns (summary.csv)", table(columns.reset_index(names="figure"))),
         details("Per coordinate (coordinates.csv)", table(result.coordinates)),
         details("Per input (inputs.csv)", table(result.inputs)),
     ]

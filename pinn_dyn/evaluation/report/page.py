@@ -145,8 +145,3 @@ def table(frame: pd.DataFrame, *, headers: Mapping[str, str] | None = None) -> M
         }
     )
     return Markup('<div class="table">{}</div>').format(Markup(styler.to_html()))
-
-
-def turned(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Return a table with rows and columns exchanged, under headings from the column ``name``."""
-    return frame.set_index(name).T.rename_axis(None, axis=1).reset_index(names="figure")

@@ -21,7 +21,6 @@ from pinn_dyn.evaluation.report.page import (
     page,
     paragraph,
     table,
-    turned,
 )
 from pinn_dyn.evaluation.tables import SEEDS_COLUMNS, summary_columns, unbeaten_baselines
 
@@ -41,13 +40,7 @@ _PARTS = (
 def prediction_report(
     evaluation: Evaluation, figures: Mapping[str, Figure], trajectory: int
 ) -> str:
-    """Return the page as HTML text.
-
-    Args:
-        evaluation: the results.
-        figures: its figures by name, see :meth:`Evaluation.figures`.
-        trajectory: index of the trajectory that the page shows at first.
-    """
+    """Return the page as HTML text, with its figures by name; it first shows ``trajectory``."""
     item = evaluation
     sections = {
         "Summary": _summary(item),
@@ -72,13 +65,12 @@ def _summary(item: Evaluation) -> Iterator[Markup]:
         f"The error is {with_unit(ERROR, item.source.labels)}. Each rollout starts from the true "
         "initial state and gets the true input. Means are over all times and all trajectories that "
         "did not diverge. Baselines are in brackets. The best model of a column is bold if it is "
-        "better than all baselines."
+        "better than all baselines. All columns are in summary.csv."
     )
     yield table(item.summary, headers=summary_columns(item.summary))
     yield from map(paragraph, unbeaten_baselines(item.summary))
     if len(item.by_model) < len(item.summary):
         yield table(item.by_model, headers=SEEDS_COLUMNS)
-    yield details("All columns (summary.csv)", table(turned(item.summary, "run")))
 
 
 def _trajectories(item: Evaluation, first: int) -> Iterator[Markup]:
