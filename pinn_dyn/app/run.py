@@ -29,7 +29,7 @@ VALIDATION_ERROR = "val/error_mean"
 """Metric that summarizes a training; sweeps minimize it."""
 BEST_BY = "val/error_windowed"
 """Metric that chooses the best checkpoint. A long roll-out may err least before it learns."""
-TRAJECTORIES = "trajectories.npz"
+TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
 
 Values = ArrayLike | Tensor

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.data.whole import whole
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.mechanics.signal import Interpolation
 
 
 @dataclass(eq=False)
@@ -36,47 +33,38 @@ class StoredSource(DataSource):
     angles: Sequence[int] = ()
 
     def load(self) -> Splits:
-        arrays = self._read()
+        content = self._read()
 
-        def unpack(split: str, k: int, interpolation: Interpolation) -> Trajectory:
-            keys = {key: f"{split}_{k}_{key}" for key in ("t", "q", "v", "u", "past")}
-            item = {k: torch.from_numpy(arrays[name]) for k, name in keys.items() if name in arrays}
-            signal = Signal(item["t"], item["u"], interpolation)
-            return Trajectory(item["q"], item["v"], signal, past=item.get("past"))
+        def unpack(t: Any, q: Any, v: Any, u: Any, past: Any, interpolation: Any) -> Trajectory:
+            return Trajectory(q, v, Signal(t, u, interpolation), past=past)
 
-        return Splits(
-            **{
-                split: [unpack(split, k, kind) for k, kind in enumerate(arrays[split].tolist())]
-                for split in SPLITS
-            }
-        )
+        return Splits(**{split: [unpack(**item) for item in content[split]] for split in SPLITS})
 
     def names(self) -> dict[str, list[str]]:
-        arrays = self._read()
-        return {split: arrays[f"{split}_names"].tolist() for split in SPLITS}
+        names: dict[str, list[str]] = self._read()["names"]
+        return names
 
-    def _read(self) -> dict[str, np.ndarray]:
+    def _read(self) -> dict[str, Any]:
         try:
-            with np.load(Path(self.path).expanduser(), allow_pickle=False) as file:
-                return dict(file)
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            content: dict[str, Any] = torch.load(Path(self.path).expanduser(), weights_only=True)
+        except Exception as error:  # a damaged file raises nearly anything
             raise ValueError(
                 f"{self.path}, the data that the run was trained on, cannot be read: {error}"
             ) from error
+        return content
 
 
 def store(source: DataSource, path: Path) -> None:
     """Write the trajectories of a source to a file."""
-    arrays: dict[str, Any] = {}
-    splits, names = source.load(), source.names()
-    for split in SPLITS:
-        trajectories: list[Trajectory] = getattr(splits, split)
-        arrays[split] = [item.input.interpolation for item in trajectories]
-        arrays[f"{split}_names"] = names[split]
-        for k, item in enumerate(trajectories):
-            values = {"t": item.t, "q": item.q, "v": item.v, "u": item.u, "past": item.past}
-            for key, value in values.items():
-                if value is not None:
-                    arrays[f"{split}_{k}_{key}"] = value.numpy()
-    with whole(path) as partial, partial.open("wb") as file:
-        np.savez(file, **arrays)
+    content: dict[str, Any] = {"names": source.names()}
+    for split, trajectories in vars(source.load()).items():
+        content[split] = [
+            {
+                **{key: getattr(x, key).clone() for key in "tqvu"},
+                "past": x.past,
+                "interpolation": x.input.interpolation,
+            }
+            for x in trajectories
+        ]
+    with whole(path) as partial:
+        torch.save(content, partial)

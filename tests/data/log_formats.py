@@ -1,7 +1,5 @@
 """The motion of the oscillator in every format, written without a robot's software."""
 
-import json
-
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -88,21 +86,18 @@ def write_hdf5(path, table):
 
 def write_npz(path, table, **more):
     signals = {name: table[[f"{name}1", f"{name}2"]].to_numpy() for name in "qvu"}
-    np.savez(path, t=table["t"].to_numpy(), **signals, **more)
+    np.savez(path, t=table["t"].to_numpy(), **{**signals, **more})
 
 
 def write_lerobot(folder, table, episodes=3):
-    """A LeRobot folder of episodes in one Parquet file, with named entries."""
+    """A LeRobot folder of episodes in one Parquet file."""
     rows = [table.assign(q1=table["q1"] + 0.01 * k) for k in range(episodes)]
     data = {
         "timestamp": np.concatenate([x["t"] for x in rows]),
         "episode_index": np.repeat(np.arange(episodes), len(table)),
-        "observation.state": [[r.q2, r.q1] for x in rows for r in x.itertuples()],
-        "action": [[r.u2, r.u1] for x in rows for r in x.itertuples()],
+        "observation.state": [[r.q1, r.q2] for x in rows for r in x.itertuples()],
+        "action": [[r.u1, r.u2] for x in rows for r in x.itertuples()],
     }
     place = folder / "data" / "chunk-000"
     place.mkdir(parents=True)
     pq.write_table(pa.table(data), place / "file-000.parquet")
-    (folder / "meta").mkdir()
-    features = {"observation.state": {"names": JOINTS}, "action": {"names": JOINTS}}
-    (folder / "meta" / "info.json").write_text(json.dumps({"features": features}))

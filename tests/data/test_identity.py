@@ -87,8 +87,8 @@ def test_trajectories_that_came_went_or_were_cut_are_named():
 
 
 def test_stored_data_have_the_identity_of_their_source(tmp_path):
-    store(Swings(), tmp_path / "data.npz")
-    stored = StoredSource(str(tmp_path / "data.npz"), "swings", ["q [rad]"], ["u [Nm]"])
+    store(Swings(), tmp_path / "data.pt")
+    stored = StoredSource(str(tmp_path / "data.pt"), "swings", ["q [rad]"], ["u [Nm]"])
     assert data_changes(data_identity(Swings()), data_identity(stored)) == []
 
 

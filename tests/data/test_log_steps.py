@@ -251,7 +251,7 @@ def test_windows_in_time_are_those_of_so_many_samples(in_time, in_samples):
     ids=str,
 )
 def test_impossible_settings_are_refused(step):
-    with pytest.raises(ValueError, match=r"expected|before it|off a clock"):
+    with pytest.raises(ValueError, match=r"expected|before it|off a clock|broadcast"):
         step.apply(recording(NOISE))
 
 

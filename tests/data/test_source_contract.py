@@ -157,7 +157,7 @@ class TestStoredSource(DataSourceContract):
     """It stands for the source whose trajectories it keeps."""
 
     def make(self, source, folder):
-        path = folder / f"{source.rate}.npz"
+        path = folder / f"{source.rate}.pt"
         store(source, path)
         return StoredSource(str(path), source.name, source.labels, source.input_labels)
 
@@ -183,7 +183,7 @@ class TestStoredSource(DataSourceContract):
     def test_a_file_that_is_cut_short_or_gone_is_named(self, source):
         content = Path(source.path).read_bytes()
         Path(source.path).write_bytes(content[: len(content) // 2])
-        with pytest.raises(ValueError, match=r"2\.0\.npz, the data .*, cannot be read"):
+        with pytest.raises(ValueError, match=r"2\.0\.pt, the data .*, cannot be read"):
             source.load()
         Path(source.path).unlink()
         with pytest.raises(ValueError, match=r"No such file"):

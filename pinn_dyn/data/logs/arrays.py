@@ -1,4 +1,4 @@
-"""Files of named arrays as tables: MATLAB, HDF5 and NPZ.
+"""Files of named arrays as tables: MATLAB, HDF5, NPZ and Parquet.
 
 An array with as many rows as the time is a column; a matrix is the columns ``name_1``, ``name_2``
 and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5.
@@ -6,7 +6,6 @@ and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -59,13 +58,23 @@ def read_hdf5(path: Path, request: Request) -> pd.DataFrame:
 
 
 def read_npz(path: Path, request: Request) -> pd.DataFrame:
-    """Read an NPZ file; Python objects are left out and never unpickled."""
-    variables: dict[str, Any] = {}
+    """Read an NPZ file. One with Python objects is refused, never unpickled."""
     with np.load(path, allow_pickle=False) as file:
-        for name in file.files:
-            with contextlib.suppress(ValueError):
-                variables[name] = file[name]
-    return _table(path, request.time, variables)
+        return _table(path, request.time, file)
+
+
+def read_parquet(path: Path, request: Request) -> pd.DataFrame:
+    """Read a Parquet file, such as one of LeRobot; a column of vectors is a matrix."""
+    optional("pyarrow", path)
+    content = pd.read_parquet(path, engine="pyarrow")
+    columns: dict[str, Any] = {}
+    for name, column in content.items():
+        if column.dtype != object or not isinstance(column.iloc[0], np.ndarray):
+            columns[str(name)] = column.to_numpy()
+        elif column.map(np.size).nunique() == 1:
+            vectors = np.stack(column.to_list()).T
+            columns |= {f"{name}_{k}": values for k, values in enumerate(vectors, start=1)}
+    return pd.DataFrame(columns, index=pd.RangeIndex(1, len(content) + 1))
 
 
 def _table(path: Path, time: str, variables: Mapping[str, Any]) -> pd.DataFrame:

@@ -27,13 +27,8 @@ def described(kind: type[_Described], name: str, value: _Described | Mapping[str
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
-        mistakes = []
-        for item in error.errors(include_url=False):
-            # Without the names of alternative types.
-            keys = [str(x) for x in item["loc"] if isinstance(x, int) or x.isidentifier()]
-            key, message = ".".join([name, *keys]), item["msg"].removeprefix("Value error, ")
-            mistakes.append(f"{key}: {message}")
-        raise LogError("; ".join(mistakes)) from error
+        mistakes = [f"{'.'.join(map(str, [name, *x['loc']]))}: {x['msg']}" for x in error.errors()]
+        raise LogError("; ".join(mistakes).replace("Value error, ", "")) from error
 
 
 def _as_list(value: Any) -> Any:

@@ -94,20 +94,18 @@ class RemoveJumps(Step):
         return [f"jumps of {signal}" for signal in self.signals]
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        jumps: list[str] = []
         window = window_samples(self.window, recording, 3, odd=True)
 
         def repair(x: np.ndarray) -> np.ndarray:
             frame = pd.DataFrame(x)
             distance = (frame - frame.rolling(window, center=True).median()).abs()
             bad = distance > np.asarray(self.threshold)
-            for k in np.flatnonzero(bad.any(axis=1)):
-                jumps.append(f"{recording.t[k]:.6g} s ({distance.iloc[k].max():.2g})")
             return frame.mask(bad).interpolate(limit_direction="both").to_numpy()
 
         repaired = recording.change(self.signals, repair)
-        text = f"{len(jumps)} of {len(recording)} samples replaced"
-        return [repaired], f"{text}, at (distance): {listed(jumps)}" if jumps else text
+        changed = recording.t[(repaired.values() != recording.values()).any(axis=1)]
+        text = f"{len(changed)} of {len(recording)} samples replaced"
+        return [repaired], text + (f", at {listed(changed)} s" if len(changed) else "")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 
 SIGNALS: tuple[Literal["q", "v", "u"], ...] = ("q", "v", "u")
-_SINCE_1970 = 1e8  # s; later times count from 1970
 _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
@@ -85,13 +84,6 @@ class Recording:
                 f"with rate={1 / step:.3g} and max_gap={max(float(np.diff(t).max()), step):.2g}"
             )
         return step
-
-
-def since_start(t: np.ndarray) -> tuple[np.ndarray, str]:
-    """Count stamps since 1970 from the first; return the times, s, and a remark or ""."""
-    if t[0] < _SINCE_1970:
-        return t, ""
-    return t - t[0], f"; t from the stamp {t[0]:.6f} s"
 
 
 @dataclass

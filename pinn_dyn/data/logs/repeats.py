@@ -15,27 +15,18 @@ from pinn_dyn.data.logs.recording import Recording
 _SAME = 0.05  # distance of a repeated motion, as a share of its spread
 
 
-def check_copies(parts: Mapping[str, list[Recording]]) -> list[Measurement]:
-    """Warn of stretches with the same numbers in one split.
-
-    Raises:
-        LogError: if they are in two splits: the test would measure training motions.
-    """
-    first: dict[int, tuple[str, Recording]] = {}
-    results = []
+def refuse_copies(parts: Mapping[str, list[Recording]]) -> None:
+    """Raise a LogError on the same numbers in two splits: the test would measure the training."""
+    first: dict[int, tuple[str, str]] = {}
     for split, recordings in parts.items():
         for item in recordings:
             content = hash((item.q.tobytes(), item.u.tobytes()))
-            split_of_first, original = first.setdefault(content, (split, item))
+            split_of_first, run = first.setdefault(content, (split, item.run))
             if split_of_first != split:
                 raise LogError(
-                    f"{item.run}, in {split}, is a copy of {original.run}, in {split_of_first}, "
-                    "number by number: leave one of them out, or put both into one split"
+                    f"{item.run}, in {split}, is a copy of {run}, in {split_of_first}, number by "
+                    "number: leave one of them out, or put both into one split"
                 )
-            text = f"{item.run} is a copy of {original.run}, number by number (both {split})"
-            if original is not item:
-                results.append(judged("copy of a run", item.run, 1, "0", True, text))
-    return results
 
 
 def check_repeats(

@@ -22,8 +22,8 @@ from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
 from pinn_dyn.data.logs.readers import find_files, read_table, run_name
-from pinn_dyn.data.logs.recording import Recording, Report, since_start
-from pinn_dyn.data.logs.repeats import check_copies, check_repeats
+from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.repeats import check_repeats, refuse_copies
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.table import Request, Table
@@ -32,6 +32,8 @@ from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
 log = logging.getLogger(__name__)
+
+_SINCE_1970 = 1e8  # s; later times count from 1970, and are counted from the first
 
 
 class _Loaded(NamedTuple):
@@ -201,7 +203,7 @@ class LogSource(DataSource):
             times = {item.run: item.t for item in recordings}
             self.validation, self.test, self.guard = default_split(times, self.seed)
         parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
-        measurements += check_copies(parts)
+        refuse_copies(parts)
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
         cleaned = self._long_enough("splitting", cleaned, report)
         cleaned = self._clean(cleaned, report, drop=True)
@@ -271,14 +273,15 @@ class LogSource(DataSource):
         recordings = []
         for run, rows in runs.items():
             part = table.select(rows)
-            t, remark = since_start(times[rows])
+            t = times[rows]
+            t = t - t[0] if t[0] > _SINCE_1970 else t
             check_clock(t, part, clock, self._repairs)
             signals = {signal: x[rows] for signal, x in values.items()}
             for signal, x in signals.items():
                 columns = self._signals[signal]
                 report.measurements += check_rows(part, t, signal, columns, x, self._repairs)
             recordings.append(Recording(run, t, signals["q"], signals.get("v"), signals["u"]))
-            text = f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {Path(table.name).name}{remark}"
+            text = f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {Path(table.name).name}"
             report.add("Read", run, text)
         return recordings
 
