@@ -65,11 +65,11 @@ class RigidChain(MechanicalSystem):
     Attributes:
         joint_names, body_names: N names each; a body is a link with everything fixed to it.
         turning: true for a joint that turns, false for a joint that slides.
+        limits: position, speed and effort of the joints, see :class:`~pinn_dyn.systems.urdf.Tree`.
         inertia: pseudo-inertias of the URDF, ``(N, 4, 4)``, in the frames of the joints.
 
     Raises:
-        FileNotFoundError: if there is no such URDF.
-        ValueError: on a URDF that is no such robot (:func:`~pinn_dyn.systems.urdf.read_urdf`).
+        FileNotFoundError, ValueError: as :func:`~pinn_dyn.systems.urdf.read_urdf`.
     """
 
     z_is_down = False
@@ -104,6 +104,7 @@ class RigidChain(MechanicalSystem):
         self.joint_names, self.body_names = tree.joints, tree.bodies
         self.turning = tree.turning
         self.parents = tuple(tree.parents)
+        self.limits = tree.limits
         # The pose of a joint is F0 + s F1 + c F2, with s = sin q and c = 1 - cos q (Rodrigues'
         # formula), or s = q and c = 0 where it slides.
         turning = torch.tensor(tree.turning)
@@ -167,6 +168,8 @@ class RigidChain(MechanicalSystem):
         bias = self._force(at, self._accelerations(at, v, None, self._gravity), bodies)
         return self._mass(at, bodies), bias
 
+    _mass_and_bias = mass_and_bias
+
     def rigid_force(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None, gravity: bool = True
     ) -> Tensor:
@@ -201,8 +204,7 @@ class RigidChain(MechanicalSystem):
             dtau_j/dq_i = <xi_j, 2 d_i H_m + E_i Jc_m>  (+ <xi_j, xi_i F_i + F_i xi_i^T> if i > j)
             dtau_j/dv_i = 2 <xi_j, xi_i H_m + d_i Jc_m>
 
-        The same derivatives by spatial vectors: Carpentier and Mansard 2018, "Analytical
-        derivatives of rigid body dynamics algorithms".
+        The same derivatives by spatial vectors: Carpentier and Mansard 2018.
         """
         at = self.kinematics(q)
         twists, bodies = at.twists, self._in_world(at, inertia)
@@ -297,9 +299,6 @@ class RigidChain(MechanicalSystem):
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         return self.rigid_force(q, v, a, gravity=False)
-
-    def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        return self.mass_and_bias(q, v)
 
     def _in_world(self, at: Kinematics, inertia: Tensor | None) -> Tensor:
         return at.poses @ (self.inertia if inertia is None else inertia) @ at.poses.mT

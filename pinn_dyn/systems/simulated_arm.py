@@ -14,7 +14,6 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
 from pinn_dyn.systems.rigid_chain import RigidChain
-from pinn_dyn.systems.urdf import read_urdf
 
 
 class SimulatedArm(RigidChain, abc.ABC):
@@ -37,7 +36,6 @@ class SimulatedArm(RigidChain, abc.ABC):
         angles: indices of the joints that turn.
 
     Raises:
-        FileNotFoundError: if there is no such URDF.
         ValueError: as :class:`RigidChain`, or on a joint without limits or a body without mass.
     """
 
@@ -62,22 +60,19 @@ class SimulatedArm(RigidChain, abc.ABC):
             mass_scale=mass_scale,
             payload=payload,
         )
-        tree = read_urdf(urdf, locked_joints=locked_joints, tip=tip)
-        self.q_low, self.q_high, self.v_max, self.u_max = tree.limits.T.copy()
-        if not (self.q_low < self.q_high).all():
-            raise ValueError(
-                f"{tree.path}: the limits of the joints {', '.join(tree.joints)} are "
-                f"{self.q_low.tolist()} to {self.q_high.tolist()}, expected lower < upper: set "
-                "them, lock the joint, or make it continuous"
-            )
-        if not (self.inertia[:, 3, 3] > 0).all():
-            raise ValueError(
-                f"{tree.path}: the masses of {', '.join(tree.bodies)} are "
-                f"{self.inertia[:, 3, 3].tolist()} kg, expected positive masses of links that move"
-            )
+        self.q_low, self.q_high, self.v_max, self.u_max = self.limits.T.copy()
+        for joint, low, high in zip(self.joint_names, self.q_low, self.q_high, strict=True):
+            if not low < high:
+                raise ValueError(
+                    f"joint {joint!r} has the limits {low} to {high}, expected lower < upper: set "
+                    "them in the URDF, lock the joint, or make it continuous"
+                )
+        for body, mass in zip(self.body_names, self.inertia[:, 3, 3].tolist(), strict=True):
+            if not mass > 0:
+                raise ValueError(f"link {body!r} moves with a mass of {mass} kg, expected more")
         self.gravity = tuple(float(g) for g in gravity)
         self.text = self.to_urdf()
-        self.angles = tuple(k for k, turns in enumerate(tree.turning) if turns)
+        self.angles = tuple(k for k, turns in enumerate(self.turning) if turns)
 
     def import_simulator(self) -> None:
         """Import the simulator, to refuse an arm where it is not installed."""

@@ -126,13 +126,9 @@ class SoftArm(MechanicalSystem):
             columns += [-angular[..., 0, :], -angular[..., 1, :], linear[..., 2, :]]
         return torch.stack(columns, dim=-1)
 
-    def tip_positions(self, q: Tensor) -> Tensor:
-        """Return the world position of each segment's tip, ``(*batch, n, 3)``, m."""
-        return self.backbone(q, q.new_ones(1)).squeeze(-2)
-
     def tip_position(self, q: Tensor) -> Tensor:
         """Return the world position of the arm's tip, ``(*batch, 3)``, m."""
-        return self.tip_positions(q)[..., -1, :]
+        return self.backbone(q, q.new_ones(1))[..., -1, 0, :]
 
     def lines(self, q: Tensor) -> Tensor:
         """Return the backbone, a line of 21 points per segment, ``(*batch, n, 21, 3)``, m."""
@@ -165,10 +161,10 @@ class SoftArm(MechanicalSystem):
 
     def _acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
         jacobian, bias, _ = self._chain(q, v)
-        conservative = self._coriolis_force_of(jacobian, bias) + self._potential_force_of(
-            q, jacobian
+        force = force - (
+            self._coriolis_force_of(jacobian, bias) + self._potential_force_of(q, jacobian)
         )
-        return spd_solve(self._gram(jacobian), force - conservative)
+        return spd_solve(self._gram(jacobian), force)
 
     def _point_masses(self, like: Tensor) -> Tensor:
         return torch.outer(self.mass.to(like), self._weights.to(like)).flatten()
