@@ -31,9 +31,8 @@ def load_or_make(
 ) -> Arrays:
     """Load the arrays of a description from the cache, or make and store them.
 
-    A file is ``<name>-<key>.npz``: plain arrays without pickle, with their description. A reader
-    never sees half a file. One process makes the file while others wait. A damaged file is reported
-    and made again. A read-only folder is only read.
+    A file is ``<name>-<key>.npz``, without pickle. A reader never sees half a file. One process
+    makes it while others wait. A damaged file is made again. A read-only folder is only read.
 
     Args:
         folder: the cache folder, made if missing.
@@ -55,13 +54,12 @@ def load_or_make(
         for partial in folder.glob(f"{glob.escape(path.name)}.*.partial"):
             partial.unlink(missing_ok=True)
         arrays = make()
-        text = np.array(json.dumps(description))
         with whole(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, description=text, names=list(arrays), **arrays)
+            np.savez(file, allow_pickle=False, **arrays)
     return arrays
 
 
 def _read(path: Path) -> Arrays:
     # numpy reads each member to its end, where zipfile compares the checksum.
     with np.load(path, allow_pickle=False) as archive:
-        return {str(name): archive[str(name)] for name in archive["names"]}
+        return dict(archive)

@@ -31,8 +31,7 @@ class DynamicsData(L.LightningDataModule):
         batch_size: windows in a batch.
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
-        coverage: evenness of the windows over the configurations, 0 to 1; see
-            :func:`~pinn_dyn.data.windows.draw_windows`.
+        coverage: evenness of the windows over the configurations, see :func:`draw_windows`.
         history: time before a window over which the input is kept, for models of a delay, s.
     """
 
@@ -90,8 +89,7 @@ class DynamicsData(L.LightningDataModule):
         )
         if self.batch_size > len(windows):
             raise ValueError(
-                f"batch_size is {self.batch_size}, expected at most the number of pairs, "
-                f"{len(windows)}"
+                f"batch_size is {self.batch_size}, expected at most the pairs, {len(windows)}"
             )
         return windows
 

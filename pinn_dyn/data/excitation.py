@@ -169,10 +169,8 @@ class Mixture(Excitation):
 
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
         """Draw ``count`` signals, shared out among the parts in turn."""
-        kinds = len(self.parts)
-        sizes = [len(range(k, count, kinds)) for k in range(kinds)]
+        kinds, index = len(self.parts), np.arange(count)
         signals = [
-            part.draw(size, duration, rng) for part, size in zip(self.parts, sizes, strict=True)
+            part.draw(len(index[k::kinds]), duration, rng) for k, part in enumerate(self.parts)
         ]
-        index = np.arange(count)
         return joined(signals, index % kinds, index // kinds)

@@ -16,10 +16,9 @@ _ROUNDING = 1e-6
 
 
 def data_identity(source: DataSource) -> dict[str, dict[str, Any]]:
-    """Return what identifies the data of a source, for a checkpoint.
+    """Return the ``names``, ``lengths``, ``hashes`` and ``moments`` of the trajectories by split.
 
-    Each split has the ``names``, ``lengths`` and ``hashes`` of its K trajectories, and their
-    ``moments`` ``(K, 2, 2N + M)``: mean and standard deviation of q, v and u.
+    The moments ``(K, 2, 2N + M)`` are the mean and standard deviation of q, v and u.
     """
     splits, names = source.load(), source.names()
     identity = {}

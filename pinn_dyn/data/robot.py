@@ -32,14 +32,10 @@ class RobotSource(DataSource):
 
     Samples are q, v and the motor torque u, clipped to the robot's limits and without the joints'
     friction. The simulator steps semi-implicitly, v_k+1 = v_k + h a_k and q_k+1 = q_k + h v_k+1:
-    the velocity that it reports with q_k belongs to half a step earlier, as in the leapfrog
-    method (Hairer, Lubich, Wanner 2006, section I.3.1). Samples hold the velocity at the time of
-    q_k, with an error of second order in h::
+    the velocity that it reports with q_k belongs to half a step earlier (leapfrog; Hairer, Lubich,
+    Wanner 2006, section I.3.1). Samples hold v(t_k) = (v_k + v_k+1) / 2, of second order in h.
 
-        v(t_k) = (v_k + v_k+1) / 2
-
-    Each trajectory has its own random generator, seeded by the split and its number. A trajectory
-    that reaches a position or velocity limit is drawn anew.
+    A trajectory that reaches a position or velocity limit is drawn anew.
 
     Args:
         name: short name of the data set.
@@ -100,20 +96,13 @@ class RobotSource(DataSource):
 
     def describe(self) -> dict[str, object]:
         """Return the settings that the trajectories depend on: the key of the cache."""
-        return {
-            "version": _VERSION,
-            "robot": describe(self.system),
-            "excitations": describe(self.excitations),
-            "duration": self.duration,
-            "step": self.step,
-            "counts": {split: getattr(self, split) for split in SPLITS},
-            "seed": self.seed,
-        }
+        keys = ("excitations", "duration", "step", "seed")
+        settings = {key: describe(getattr(self, key)) for key in keys}
+        counts = {split: getattr(self, split) for split in SPLITS}
+        return {"version": _VERSION, "robot": describe(self.system), "counts": counts, **settings}
 
     def simulate(self) -> Arrays:
         """Record all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T + 1, .)``.
-
-        They are as the simulator gives them, one sample longer than those of :meth:`load`.
 
         Raises:
             SimulationError: if no draw of a trajectory stays within the limits.
@@ -142,8 +131,8 @@ class RobotSource(DataSource):
                 )
         arrays = {"t": t}
         for index, name in enumerate(SPLITS):
-            chosen = [task[0] == index for task in tasks]
-            arrays |= {f"{name}_{key}": x[chosen] for key, x in zip("qvu", (q, v, u), strict=True)}
+            rows = [i for i, task in enumerate(tasks) if task[0] == index]
+            arrays |= {f"{name}_q": q[rows], f"{name}_v": v[rows], f"{name}_u": u[rows]}
         return arrays
 
     def _record(self, plan: Plan, t: np.ndarray) -> np.ndarray:

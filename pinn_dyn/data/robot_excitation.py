@@ -44,13 +44,11 @@ class TrackedMultiSine(RobotExcitation):
         r_i(t) = centre_i + amplitude_i sum_h w_ih sin(2 pi f_ih t + phi_ih),   sum_h w_ih = 1
         u = M(q) (d2r/dt2 + 2 w (dr/dt - v) + w^2 (r - q)) + C v + G + D v,   w = bandwidth
 
-    The robot starts on the reference. Small amplitudes make fast motions, from which inertia is
-    learned, large ones see more of gravity. A joint's frequencies are lowered until its peak speed
-    is within ``speed``, and all frequencies until the torque along the reference is within
-    ``torque``.
+    The robot starts on the reference. A joint's frequencies are lowered until its peak speed is
+    within ``speed``, and all frequencies until the torque along the reference is within ``torque``.
 
-    Source: Swevers et al. 1997 (IEEE Trans. Robotics and Automation 13(5)), excitation by sums of
-    sines; computed torque: Murray, Li, Sastry 1994, eq. (4.51).
+    Source: sums of sines: Swevers et al. 1997 (IEEE Trans. Robotics and Automation 13(5)); computed
+    torque: Murray, Li, Sastry 1994, eq. (4.51).
 
     Args:
         frequency: [low, high] in Hz; f_ih is uniform in its logarithm.
@@ -114,7 +112,7 @@ class TrackedMultiSine(RobotExcitation):
         joint = int(use.argmax())
         raise ValueError(
             f"TrackedMultiSine: even a slow reference takes {use[joint]:.2f} of the torque allowed "
-            f"at joint {robot.joint_names[joint]!r}: raise torque, lower reach, or check the URDF"
+            f"at joint {robot.joint_names[joint]!r}: raise torque or lower reach"
         )
 
 
@@ -134,11 +132,10 @@ class TorqueMultiSine(RobotExcitation):
 
         u_i = G_i(q) + k_i (centre_i - q_i) - c_i v_i + s_i(t)
 
-    s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit. A constant s_i at
-    its peak would move the spring k_i by ``reach`` of the way from the centre to the nearer limit;
-    c_i damps it critically for the inertia M_ii(centre). The centre is drawn from the middle half
-    of the range. The robot starts at rest where spring and torque balance, without a jump in the
-    acceleration.
+    s_i is a multi-sine with a peak of up to ``amplitude`` of the torque limit, which would move the
+    spring k_i by ``reach`` of the way from the centre to the nearer limit; c_i damps it critically
+    for M_ii(centre). The centre is drawn from the middle half of the range. The robot starts at
+    rest where spring and torque balance.
 
     Args:
         frequency: [low, high] of the sines in Hz, uniform in the logarithm.

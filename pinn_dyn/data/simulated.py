@@ -41,9 +41,8 @@ class _Draw(NamedTuple):
 class SimulatedSource(DataSource):
     """Trajectories of a known system, simulated once and cached on disk.
 
-    Validation and test trajectories each have an initial state and an input that no training
-    trajectory has. A motion that leaves ``q_limits`` is drawn anew, both its initial state and its
-    input: the k-th motion of a split is the first within them of a sequence of draws.
+    Validation and test trajectories have initial states and inputs that no training trajectory
+    has. A motion that leaves ``q_limits`` is drawn anew, both its initial state and its input.
 
     Args:
         name: short name of the data set.
@@ -56,10 +55,8 @@ class SimulatedSource(DataSource):
         keep_every: keep every n-th sample, for a lower rate from the same simulation.
         train_initial_states: number of initial states for training.
         train_inputs: number of inputs for training.
-        pairing: ``"product"`` trains on every combination of these, ``"matched"`` gives each
-            initial state its own input.
-        q_limits: lower and upper limits of the configuration, ``(2, N)``, which no motion leaves;
-            they need ``pairing="matched"``. None: no limits.
+        pairing: ``"product"`` of these, or ``"matched"``: each initial state has its own input.
+        q_limits: limits of q, ``(2, N)``, which no motion leaves; for matched pairs. None: none.
         validation, test: number of trajectories.
         seed: seed of all initial states and inputs.
         rtol, atol: tolerances of the solver.
@@ -99,10 +96,11 @@ class SimulatedSource(DataSource):
 
     def __post_init__(self) -> None:
         self.test_duration = self.test_duration or self.duration
-        if not self.keep_every * self.step <= self.test_duration <= self.duration:
+        shortest = self.keep_every * self.step
+        if not shortest <= self.test_duration <= self.duration:
             raise ValueError(
                 f"{self.name}: test_duration is {self.test_duration} s, expected from keep_every * "
-                f"step = {self.keep_every * self.step:g} to duration = {self.duration} s"
+                f"step = {shortest:g} to duration = {self.duration} s"
             )
         matched = self.pairing == "matched" and self.train_initial_states == self.train_inputs
         if not matched and (self.pairing == "matched" or self.q_limits is not None):
@@ -116,12 +114,9 @@ class SimulatedSource(DataSource):
             ("initial_states", states.q_low, size),
             ("labels", self.labels, size),
             ("input_labels", self.input_labels, self.system.num_inputs),
-            *((f"configurations.{key}", q, size) for key, q in self.configurations.items()),
         ):
             if len(values) != expected:
-                raise ValueError(
-                    f"{self.name}: {key} has {len(values)} entries, the system needs {expected}"
-                )
+                raise ValueError(f"{self.name}: {key} has {len(values)} entries, not {expected}")
         if isinstance(self.system, HasDomain):
             self.system.check_domain(*np.array(self.q_limits or [states.q_low, states.q_high]))
         self.angles = tuple(getattr(self.system, "angles", ()))
@@ -133,23 +128,18 @@ class SimulatedSource(DataSource):
         t = torch.from_numpy(arrays["t"][:: self.keep_every])
         splits: dict[str, list[Trajectory]] = {}
         for split in SPLITS:
-            q, v, u = (
-                torch.from_numpy(arrays[f"{split}_{key}"][:, :: self.keep_every]) for key in "qvu"
-            )
+            arrays_of_split = (arrays[f"{split}_{key}"][:, :: self.keep_every] for key in "qvu")
             splits[split] = [
-                Trajectory(a, b, Signal(t[: len(c)], c), momentum=partial(momentum, self.system))
-                for a, b, c in zip(q, v, u, strict=True)
+                Trajectory(q, v, Signal(t[: len(u)], u), momentum=partial(momentum, self.system))
+                for q, v, u in zip(*map(torch.from_numpy, arrays_of_split), strict=True)
             ]
         return Splits(**splits)
 
     @property
     def counts(self) -> dict[str, tuple[int, int]]:
         """Number of initial states and of inputs of each split."""
-        return {
-            "train": (self.train_initial_states, self.train_inputs),
-            "validation": (self.validation, self.validation),
-            "test": (self.test, self.test),
-        }
+        train = (self.train_initial_states, self.train_inputs)
+        return {"train": train, **{key: (getattr(self, key),) * 2 for key in SPLITS[1:]}}
 
     def describe(self) -> dict[str, object]:
         """Return the settings that the simulation depends on: the key of the cache."""
@@ -229,10 +219,7 @@ class SimulatedSource(DataSource):
         return q, v, signal(t)
 
     def _replace(
-        self,
-        motions: Sequence[np.ndarray],
-        rngs: Mapping[str, np.random.Generator],
-        t: np.ndarray,
+        self, motions: Sequence[np.ndarray], rngs: Mapping[str, np.random.Generator], t: np.ndarray
     ) -> None:
         """Replace the motions that leave the limits by new draws that stay within them."""
         low, high = np.array(self.q_limits, dtype=float)
@@ -246,8 +233,7 @@ class SimulatedSource(DataSource):
                 passed = ((q[left] < low) | (q[left] > high)).any((0, 1))
                 raise SimulationError(
                     f"{self.name}: {left.size} of {len(q)} motions leave q_limits of "
-                    f"{', '.join(np.array(self.labels)[passed])} in each of {drawn} draws: reduce "
-                    "the excitation or the initial states, or widen q_limits"
+                    f"{', '.join(np.array(self.labels)[passed])} in each of {drawn} draws"
                 )
             draws = [self._draw(rngs) for _ in range(_AT_ONCE)]
             drawn += _AT_ONCE

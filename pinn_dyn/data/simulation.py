@@ -52,9 +52,9 @@ def simulate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve the equation of motion for K trajectories in one batch.
 
-    The solver is SciPy's DOP853 (Runge-Kutta of order 8 with a dense output of order 7; Hairer,
-    Norsett, Wanner 1993); all trajectories share its steps, whose error is controlled in the
-    root mean square over the batch, and the samples come from its dense output.
+    The solver is SciPy's DOP853 (Hairer, Norsett, Wanner 1993). All trajectories share its steps,
+    whose error is controlled in the root mean square over the batch; the samples come from its
+    dense output.
 
     Args:
         system: the system that moves.
@@ -62,17 +62,16 @@ def simulate(
         signal: inputs as a function of time, ``(T,) -> (K, T, M)``; must be smooth.
         t: increasing sample times, ``(T,)``, s.
         rtol, atol: tolerances of the solver.
-        compile: compile the equation of motion first; takes half a minute, and pays for a long
-            simulation of a small batch. Ignored with a warning without a C++ compiler.
-        q_limits: lower and upper limits of q, ``(2, N)``; a motion that leaves them is held there,
-            and its later samples are NaN. None: no limits.
+        compile: compile the equation of motion first, in half a minute, for long simulations of
+            small batches. Ignored with a warning without a C++ compiler.
+        q_limits: limits of q, ``(2, N)``; samples of a motion that has left them are NaN.
         progress: label of a progress bar; no bar if None.
 
     Returns:
         q and v, both ``(K, T, N)``.
 
     Raises:
-        SimulationError: if the solver fails or the motion leaves the finite numbers; says when.
+        SimulationError: if the solver fails or the motion is not finite; says when.
     """
     x0 = np.concatenate([q0, v0], axis=-1)
     count, size = x0.shape
@@ -100,8 +99,8 @@ def simulate(
     def give_up(time: float) -> SimulationError:
         return SimulationError(
             f"the simulation stopped at t = {time:.4g} s of {t[-1]:.4g} s: the mass matrix is no "
-            "longer positive definite (an arm of length zero, say), or the input is not finite; "
-            f"reduce the input or the initial states, or loosen rtol = {rtol:g}, atol = {atol:g}"
+            "longer positive definite, or the input is not finite; reduce the input or the initial "
+            f"states, or loosen rtol = {rtol:g}, atol = {atol:g}"
         )
 
     if not np.isfinite(derivative(t[0], x0.ravel())).all():

@@ -142,11 +142,10 @@ def draw_windows(
 ) -> Windows:
     """Draw windows at random starts, over all starts of all trajectories.
 
-    With ``coverage`` c = 0 all starts are equally likely. With c > 0 the starts are drawn from
-    candidates (the larger of 400,000 and ten times ``count``) with probabilities ~ (d_k)^(c N),
-    where d_k is the distance from a candidate's q, ``(N,)`` in units of its spread, to its tenth
-    nearest neighbor: as 1/d_k^N estimates the density (Loftsgaarden and Quesenberry 1965), c = 1
-    spreads the windows evenly over all configurations that were visited.
+    With ``coverage`` c = 0 all starts are equally likely. With c > 0 their probabilities are
+    ~ (d_k)^(c N), where d_k is the distance from q ``(N,)`` in units of its spread to its tenth
+    nearest neighbor. As 1/d_k^N estimates the density (Loftsgaarden and Quesenberry 1965), c = 1
+    spreads the windows evenly over the configurations.
 
     Args:
         trajectories: the training trajectories, each ``(T, N)``, with one sample time.
@@ -166,8 +165,7 @@ def draw_windows(
     for k, item in enumerate(trajectories):
         if (item.t.diff() - sample).abs().max() > 1e-6 * sample:
             raise ValueError(
-                f"training trajectory {k} has sample times that differ from {sample:g} s, those of "
-                "the first: resample it"
+                f"training trajectory {k} has sample times other than {sample:g} s: resample it"
             )
     if history and trajectories[0].input.interpolation == "hold":
         raise ValueError(
@@ -180,9 +178,8 @@ def draw_windows(
     count = max(total, 1) if count is None else count
     if total < count:
         raise ValueError(
-            f"{count} windows of {span + past} samples ({(span + past) * sample:g} s) do not fit: "
-            f"the training trajectories have only {total} starts: take fewer pairs, a shorter "
-            "window or more data"
+            f"{count} windows of {span + past} samples do not fit, the training trajectories have "
+            f"only {total} starts: take fewer pairs, a shorter window or more data"
         )
     generator = torch.Generator().manual_seed(seed)
     if coverage > 0:
@@ -197,12 +194,9 @@ def draw_windows(
     offset = past + flat - (ends - starts)[number]
 
     knots = torch.arange(steps + 1) * stride
-    q = torch.stack([trajectories[i].q[k + knots] for i, k in zip(number, offset, strict=True)])
-    v = torch.stack([trajectories[i].v[k + knots] for i, k in zip(number, offset, strict=True)])
-    inputs = [
-        trajectories[i].input.part(slice(k - past, k + span + 1))
-        for i, k in zip(number, offset, strict=True)
-    ]
+    origins = [(trajectories[i], k) for i, k in zip(number, offset, strict=True)]
+    q, v = (torch.stack([getattr(x, key)[k + knots] for x, k in origins]) for key in "qv")
+    inputs = [x.input.part(slice(k - past, k + span + 1)) for x, k in origins]
     t = torch.arange(-past, span + 1, dtype=torch.float64) * sample
     momentum = trajectories[0].momentum
     p = q.new_zeros((count, steps + 1, 0)) if momentum is None else momentum(q, v)
@@ -240,14 +234,12 @@ def _spread_out(q: Tensor, count: int, power: float, generator: torch.Generator)
 
 
 PICKED = 16_384
-"""Approximate number of windows that are picked at once."""
+"""Approximate number of windows that one operation picks, for many small batches."""
 
 
 @dataclass(eq=False)
 class WindowLoader:
     """Loader of batches from windows in the memory of a device.
-
-    Many small batches are picked by one operation, of which each is a view.
 
     Attributes:
         windows: all windows, on the device that trains.
@@ -272,10 +264,7 @@ class WindowLoader:
 
 @dataclass(eq=False)
 class BatchSampler(Sampler[Tensor]):
-    """Batches of an epoch, from as many shuffled passes as they need.
-
-    The order depends on the seed and the epoch alone, so a resumed training sees the batches of an
-    uninterrupted one.
+    """Batches of an epoch; their order depends on the seed and the epoch alone.
 
     Attributes:
         size: number of windows.

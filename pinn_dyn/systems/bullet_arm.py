@@ -22,8 +22,8 @@ class BulletArm(SimulatedArm):
     q ``(*batch, N)`` rad, v rad/s, u motor torques ``(*batch, N)`` Nm. Arguments, attributes and
     errors: :class:`~pinn_dyn.systems.simulated_arm.SimulatedArm`.
 
-    Each process opens a PyBullet client on first use. Arms of the same URDF and gravity share its
-    state: to move several in turn, set the state of each before its steps.
+    Arms of the same URDF and gravity share a state in a process: to move several in turn, set the
+    state of each before its steps.
 
     Raises:
         ImportError: without PyBullet.

@@ -17,11 +17,9 @@ from pinn_dyn.systems.urdf import read_urdf
 
 
 class Kinematics(NamedTuple):
-    """Poses of the N bodies in the world, and the twists of the N joints about its origin.
+    """Poses T of the N bodies in the world, and twists xi of the N joints, ``(*batch, N, 4, 4)``.
 
-    ``poses`` T ``(*batch, N, 4, 4)`` maps a body's frame to the world's. ``twists`` xi
-    ``(*batch, N, 4, 4)`` is the velocity field of a joint at unit speed: a point x = (x, y, z, 1)
-    that the joint moves has the velocity xi x.
+    A point x = (x, y, z, 1) that a joint moves at unit speed has the velocity xi x.
     """
 
     poses: Tensor
@@ -43,13 +41,12 @@ class RigidChain(MechanicalSystem):
         Xi'_k = sum over j <= k of xi_j a_j + (Xi_j xi_j - xi_j Xi_j) v_j
         tau_j = <xi_j, sum over k >= j of (Xi'_k + Xi_k^2 - Gamma) J_k>
 
-    where Gamma holds gravity in its last column: the recursive Newton-Euler algorithm. The sums
-    over the tree are products with one constant matrix, so only the poses need a loop over the
-    chain. J enters linearly, and so do the ten inertial parameters of each body
-    (:meth:`regressor`). Functions take another ``inertia`` than the URDF's, which a model learns.
+    where Gamma holds gravity in its last column: the recursive Newton-Euler algorithm. J enters
+    linearly, and so do the ten inertial parameters of each body (:meth:`regressor`). Functions take
+    another ``inertia`` than the URDF's, which a model learns.
 
-    Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; the 4 x 4 matrices are
-    those of Legnani et al. 1996, "A homogeneous matrix approach to 3D kinematics and dynamics".
+    Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; Legnani et al. 1996, "A
+    homogeneous matrix approach to 3D kinematics and dynamics".
 
     Args:
         urdf: path of the URDF, one that ships with PyBullet (``franka_panda/panda.urdf``), or the
@@ -57,8 +54,7 @@ class RigidChain(MechanicalSystem):
         locked_joints: names of joints that are held at zero.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
         gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
-        tip: link at the end of the arm, which carries the payload; None for the last link of the
-            file without a joint behind it.
+        tip: link that carries the payload; None for the last of the file without a joint behind it.
         mass_scale: factor of all masses and inertias.
         payload: point mass at the origin of the tip's frame, kg, which is not scaled.
 
@@ -138,8 +134,7 @@ class RigidChain(MechanicalSystem):
         smallest = float(torch.linalg.eigvalsh(self.mass_matrix(torch.zeros(size).double()))[0])
         if not smallest > 0:
             raise ValueError(
-                f"{urdf[:80]}: M has the eigenvalue {smallest:g} at q = 0, expected positive ones: "
-                "give the moving links mass and inertia"
+                f"{urdf[:80]}: M has the eigenvalue {smallest:g} at q = 0, expected positive ones"
             )
 
     def kinematics(self, q: Tensor) -> Kinematics:
@@ -240,9 +235,8 @@ class RigidChain(MechanicalSystem):
     def generic_inertia(self, density: float = 1000.0) -> Tensor:
         """Return pseudo-inertias ``(N, 4, 4)`` from the kinematics alone: a rod for each body.
 
-        A rod leads to the farthest next joint, or, at the end of the chain and where that is nearer
-        than half the mean distance, along the joint's axis by the mean distance (0.1 m if there is
-        none). Its radius is a sixth of that mean.
+        A rod leads to the farthest next joint, or, where that is nearer than half the mean
+        distance, along the joint's axis by the mean distance. Its radius is a sixth of that mean.
         """
         starts = self._placements[0, :, :3, 3].double()
         behind = [

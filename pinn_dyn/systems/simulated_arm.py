@@ -19,9 +19,8 @@ from pinn_dyn.systems.rigid_chain import RigidChain
 class SimulatedArm(RigidChain, abc.ABC):
     """A rigid chain with joint limits that a simulator moves in time steps of its own.
 
-    A subclass gives :meth:`set_state` and :meth:`step`. The simulator loads :meth:`to_urdf`, which
-    holds the bodies and joints of the chain, payload and mass scale included. It must not add joint
-    motors, damping, friction, joint limits or contacts.
+    A subclass gives :meth:`set_state` and :meth:`step`. The simulator loads :meth:`to_urdf`, and
+    must not add joint motors, damping, friction, joint limits or contacts.
 
     Args:
         urdf, locked_joints, gravity, tip, mass_scale, payload: arguments of :class:`RigidChain`.

@@ -33,7 +33,7 @@ class SoftArm(MechanicalSystem):
                             its own frame: two bending torques in Nm and an axial force in N
 
     The integrals are Gauss-Legendre sums; Stumpff functions take the place of every division by
-    theta, so the straight arm is no special case. Bending up to theta = 2 pi per segment.
+    theta. Bending up to theta = 2 pi per segment.
 
     Source: paper, section Simulation Results, in the parametrization of Della Santina, Bicchi and
     Rus 2020 (IEEE RA-L 5(2)); the constants reproduce the paper's tables.
@@ -98,8 +98,8 @@ class SoftArm(MechanicalSystem):
             if not (shortest > 0 and bend < 2 * np.pi):
                 raise ValueError(
                     f"segment {k + 1} shortens to {shortest:.3g} m and bends by up to {bend:.3g} "
-                    f"rad, where the equation of motion does not hold: keep q[{3 * k + 2}] above "
-                    f"{-self.length:g} and the bending below 2 pi"
+                    "rad, where the equation of motion does not hold: expected a positive length "
+                    "and less than 2 pi"
                 )
 
     def mass_matrix(self, q: Tensor) -> Tensor:

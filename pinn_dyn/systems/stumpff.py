@@ -19,9 +19,7 @@ def stumpff(x: Tensor) -> tuple[Tensor, ...]:
         c_0 = cos(theta),  c_1 = sin(theta)/theta,  c_2 = (1 - cos(theta))/theta^2
         c_k = 1/k! - x c_{k+2},    dc_k/dx = (k c_{k+2} - c_{k+1}) / 2
 
-    They replace every division by theta in constant-curvature kinematics. The series of c_5 and
-    c_6 plus the recursion downwards are exact to double precision for theta <= 2 pi (a full
-    circle), and have no special case at zero.
+    The series of c_5 and c_6 plus the recursion downwards are exact to double precision.
 
     Source: Stumpff 1959, Himmelsmechanik I; Danby 1988, Fundamentals of Celestial Mechanics.
     """

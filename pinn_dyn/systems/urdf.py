@@ -70,16 +70,13 @@ def read_urdf(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: on text that is no URDF of a tree of links, an unknown locked joint or tip, a
-            joint that is neither revolute, continuous, prismatic nor fixed, a mimic joint, no
-            joint that moves, or a mass or inertia that no body has.
+        ValueError: on text that is no URDF of a tree of links, an unknown locked joint or tip, no
+            joint that moves, another kind of joint, or a mass or inertia that no body has.
     """
     file = _UrdfFile(*_open(urdf))
     if unknown := set(locked_joints) - file.joints.keys():
-        raise ValueError(
-            f"{file.path} has no joints {sorted(unknown)} to lock: its joints are "
-            f"{list(file.joints)}"
-        )
+        names = list(file.joints)
+        raise ValueError(f"{file.path} has no joints {sorted(unknown)} to lock, only {names}")
     children = [_end(joint, "child") for joint in file.joints.values()]
     if tip is None:
         inner = {_end(joint, "parent") for joint in file.joints.values()}

@@ -238,19 +238,6 @@ def test_a_value_that_stands_for_none_in_many_rows(tmp_path, column, value):
     )
 
 
-@pytest.mark.parametrize(
-    ("run", "split", "factor", "ratio"),
-    [("b", "validation", -1, "-1"), ("c", "test", 180 / np.pi, "0.01745"), ("d", "train", 0, "0")],
-)
-def test_velocities_of_one_run_have_another_unit_or_sign(tmp_path, run, split, factor, ratio):
-    table = motion(phase=3.3)
-    table["v2"] *= factor
-    text = warned_of_runs(tmp_path, {run: table})
-    assert f"{run} ({split}), columns 'q2' and 'v2': " in text
-    assert f"is {ratio} times v" in text
-    assert "and 'v1'" not in text
-
-
 def test_copies_of_runs(tmp_path):
     with pytest.raises(LogError, match=r"c, in test, is a copy of b, in validation"):
         warned_of_runs(tmp_path, {"c": motion(phase=1.0)})

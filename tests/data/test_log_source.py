@@ -177,6 +177,21 @@ def test_named_runs_and_the_end_of_the_others(runs):
     assert "1 s are dropped" in mixed.report
 
 
+@pytest.mark.parametrize(
+    ("validation", "test", "message"),
+    [
+        (["run_33"], ["run_1"], r"validation.runs: no run 'run_33'.*run_3.* The runs are run_0"),
+        (["run_3"], ["run_1", "run_3"], "run 'run_3' is in validation and in test"),
+        (["run_3"], 7, "7 runs to choose from, expected more than 7"),
+        (4, 4, "8 runs to choose from, expected more than 8"),
+    ],
+)
+def test_runs_that_cannot_be_split_are_refused_by_name(runs, validation, test, message):
+    parts = dict(validation=dict(runs=validation, piece=1.0), test=dict(runs=test, piece=1.0))
+    with pytest.raises(LogError, match=message):
+        source(runs, **parts).load()
+
+
 def test_a_column_tells_runs_apart(tmp_path):
     tables = [motion(2.0, phase=k).assign(id=k) for k in range(4)]
     write(tmp_path, pd.concat(tables))

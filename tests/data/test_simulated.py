@@ -193,13 +193,12 @@ def test_motions_within_limits_obey_the_equation_of_motion(limited):
     torch.testing.assert_close(q, found, rtol=0, atol=0.01)
 
 
-def test_limits_that_every_motion_leaves_are_refused_with_advice(tmp_path):
+def test_limits_that_every_motion_leaves_are_refused(tmp_path):
     narrow = dict(q_limits=[[-4, -4, 0.2499], [4, 4, 0.2501]])
     box = InitialStates([-1.0, -1.0, 0.25], [1.0, 1.0, 0.25], [1.0, 1.0, 0.1])
     source = make_source(tmp_path, **SIX, **narrow, initial_states=box, duration=0.05)
-    with pytest.raises(SimulationError, match=r"motions leave q_limits of l in each") as caught:
+    with pytest.raises(SimulationError, match=r"motions leave q_limits of l in each"):
         source.load()
-    assert "widen q_limits" in str(caught.value)
     assert not list(tmp_path.glob("*.npz"))
 
 
@@ -296,10 +295,9 @@ def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
             dict(**SIX, q_limits=[[-2, -2, -0.3], [2, 2, 1]]),
             "segment 1 shortens to -0.1 m",
         ),
-        (dict(labels=["x", "y"]), "labels has 2 entries, the system needs 3"),
-        (dict(input_labels=["a"]), "input_labels has 1 entries, the system needs 3"),
-        (dict(configurations={"odd": [1.0]}), "configurations.odd has 1 entries"),
-        (dict(system=SoftArm(segments=2)), "initial_states has 3 entries, the system needs 6"),
+        (dict(labels=["x", "y"]), "labels has 2 entries, not 3"),
+        (dict(input_labels=["a"]), "input_labels has 1 entries, not 3"),
+        (dict(system=SoftArm(segments=2)), "initial_states has 3 entries, not 6"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(tmp_path, change, message):

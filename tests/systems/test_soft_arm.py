@@ -238,7 +238,7 @@ def test_one_mass_or_one_for_each_segment():
 @pytest.mark.parametrize(
     ("low", "high", "message"),
     [
-        ([0, 0, 0, 0, 0, -0.2], [1, 1, 1, 1, 1, 1], r"segment 2 .*to 0 m.* keep q\[5\] above -0.2"),
+        ([0, 0, 0, 0, 0, -0.2], [1, 1, 1, 1, 1, 1], r"segment 2 .*to 0 m.* positive length"),
         ([0, 0, 0, -5, -3, 0], [1, 1, 1, 1, 4, 1], r"segment 2 .* bends by up to 6.4 rad"),
     ],
 )

@@ -17,7 +17,7 @@ from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.readers import READERS
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.source import LogSource
-from pinn_dyn.data.logs.splits import Part, default_split
+from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.step import Step, window_samples
 from pinn_dyn.data.logs.table import Request, Table
 from pinn_dyn.data.logs.units import UNITS
@@ -45,7 +45,6 @@ __all__ = [
     "SplitGaps",
     "Step",
     "Table",
-    "default_split",
     "input_delays",
     "window_samples",
 ]

@@ -1,12 +1,9 @@
 """Bags of ROS 1 and ROS 2, MCAP included, as tables; decoded by rosbags, without ROS.
 
-A column is ``<topic>/<field>``, as ``/joint_states/position/panda_joint1``: an entry of an array is
-picked by the joint's name, where the message has names, or by its number from 0, as in
-``/commands/data/2``. ``<topic>/t`` is the time of a message, s: that of its header, or where it has
-none, when the bag received it.
-
-The topic of the time column has the rows. Of every other topic a row takes the last message that is
-not later than it, and not older than ``max_age``; rows without such a message are dropped.
+A column is ``<topic>/<field>``, as ``/joint_states/position/panda_joint1`` or ``/commands/data/2``.
+``<topic>/t`` is the time of a message, s: that of its header, or when the bag received it. The
+topic of the time column has the rows. Of other topics a row takes the last message before it that
+is not older than ``max_age``; rows without such a message are dropped.
 """
 
 from __future__ import annotations
@@ -135,8 +132,7 @@ def _merge(path: Path, topics: dict[str, pd.DataFrame], request: Request) -> pd.
     rows = frame.dropna()
     dropped = (
         f"{len(frame) - len(rows)} of {len(frame)} messages of {clock} are dropped: they lack an "
-        f"entry, or have none of {listed(topics) or 'another topic'} in the {request.max_age:g} s "
-        "before them"
+        f"entry, or a message of {listed(topics)} in the {request.max_age:g} s before them"
     )
     if not len(rows):
         raise LogError(f"{path}: no row is left: {dropped}")

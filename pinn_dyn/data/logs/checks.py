@@ -1,7 +1,4 @@
-"""Checks of a log as it is read: its clock, and single rows that no robot can have.
-
-Errors name a row and a step that repairs the log. Warnings are measurements.
-"""
+"""Checks of a log as it is read: its clock, and single rows that no robot can have."""
 
 from __future__ import annotations
 
@@ -39,7 +36,7 @@ def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[st
 
     Raises:
         LogError: on an implausible sample time, and on times that go back, repeat or jump unless a
-            step repairs this (:attr:`Step.repairs`); names the row and the step.
+            step repairs this; names the row and the step.
     """
     spacing = np.diff(t)
     if not (spacing > 0).any():
@@ -58,7 +55,7 @@ def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[st
     ) * (burst_share(t) > BURSTS)
     split = (
         "if a new run starts there, name its column in 'trajectory' (run=... of pinn_dyn.fit) or "
-        "add a SplitGaps step; otherwise repair the log"
+        "add a SplitGaps step"
     )
     once = f"{row_clock}add a Deduplicate step, which keeps the first row"
     fill = f"{row_clock}add a SplitGaps step, or Resample to interpolate over short gaps"
@@ -95,7 +92,7 @@ def check_rows(
         row, k = np.argwhere(large)[0]
         raise LogError(
             f"{table.place(row, columns.columns[k], signal)}: the value {values[row, k]:.4g} is no "
-            f"measurement, it stands for 'no value' ({int(large.sum())} such values): remove them"
+            f"measurement, it stands for 'no value' ({int(large.sum())} such values)"
         )
     if len(t) < 2 * _NEIGHBORS:
         return []

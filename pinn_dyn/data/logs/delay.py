@@ -1,7 +1,6 @@
 """Delay between an input and its motion, estimated from the equation of motion.
 
-A correlation of q with u includes the lag of the robot itself. Here a candidate d is judged by the
-share that an equation of motion leaves unexplained:
+A candidate d is judged by the share that an equation of motion leaves unexplained:
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
     rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if f has no answer
@@ -9,9 +8,8 @@ share that an equation of motion leaves unexplained:
     acceleration        a = f(q, v) + B(u(t - d)),      robots with more inputs
 
 f and B are linear in their parameters (least squares). All signals are averaged by one Gaussian
-kernel g, whose slopes give the derivatives: g * a = g'' * q. A linear equation then stays true, the
-delay included, without a derivative of noise. The form and width count whose estimate varies least
-when tenths of the data are left out in turn (jackknife).
+kernel g, whose slopes give the derivatives: g * a = g'' * q. The form and width count whose
+estimate varies least when tenths of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
@@ -140,15 +138,11 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
     spread = float(np.sqrt((BLOCKS - 1) * minima.var()))
     reason = ""
     if residual[best] > _UNEXPLAINED:
-        share = 100 * residual[best]
-        reason = f"the equation of motion leaves {share:.0f} % unexplained at any delay"
+        reason = f"the equation leaves {100 * residual[best]:.0f} % unexplained at any delay"
     elif not residual[best] < _DEPTH * np.median(residual):
         reason = "the residual is all but the same at every delay"
     elif spread > _SPREAD * max(gap, 0.01):
-        reason = (
-            f"parts of the data disagree by {1e3 * spread:.0f} ms: the motion is too slow, too "
-            "regular or too noisy"
-        )
+        reason = f"parts of the data disagree by {1e3 * spread:.0f} ms: too little or noisy motion"
     elif best >= len(candidates) - 2:
         reason = f"the residual still falls at the longest delay, {candidates[-1]:.3g} s"
     elif best == 0:

@@ -2,17 +2,11 @@
 
 from collections.abc import Iterable
 
-_MOST_LETTERS, _MOST_NAMES = 80, 30
+_MOST_NAMES = 30
 
 
 class LogError(ValueError):
     """A log or its description cannot be used; the message names the place and what to do."""
-
-
-def shown(value: object) -> str:
-    """Return a value for a message, shortened: an open quote makes a cell of a whole file."""
-    text = repr(value)
-    return text if len(text) <= _MOST_LETTERS else f"{text[:_MOST_LETTERS]}..."
 
 
 def listed(names: Iterable[object]) -> str:

@@ -76,8 +76,8 @@ class RemoveJumps(Step):
     """Replace samples far from the median of their neighbors, such as jumps of a marker.
 
     A sample is a jump where |x_k - median(x_{k-h}, ..., x_{k+h})| > threshold, h = (window - 1)/2.
-    The straight line between the good samples around it replaces it. A jump that lasts longer than
-    h samples is not detected. The first and last h samples are not judged.
+    The line between the good samples around it replaces it. A jump of more than h samples is not
+    detected. The first and last h samples are not judged.
 
     Args:
         threshold: largest distance that is no jump, SI units; one value, or one per column.
@@ -130,8 +130,7 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
 
     v_k depends on q up to half a window later, and so does a prediction that starts there. With
     ``causal`` the polynomial goes through the sample and the ``window`` - 1 samples before it,
-    except for the first ``window`` - 1 samples. It carries more noise, so a shorter window and a
-    lower order suit it.
+    except for the first ``window`` - 1 samples. It carries more noise.
 
     Args:
         window: number of samples, odd, or a time, such as ``"50 ms"``.
@@ -144,26 +143,25 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         if recording.v is not None:
             raise LogError("the log has a velocity already: leave out SavitzkyGolayVelocity, or v")
-        v, window, step = self._slope(recording, recording.q)
+        q = recording.q
+        v, window, step = self._slope(recording, q)
+        text = f"v from q in windows of {window * step:.3g} s"
         if self.causal:
-            v = self._causal_slope(recording.q, window, step)
-        past = ", from the past alone" if self.causal else ""
-        return [replace(recording, v=v)], f"v from q in windows of {window * step:.3g} s{past}"
-
-    def _causal_slope(self, q: np.ndarray, window: int, step: float) -> np.ndarray:
-        weights = [
-            savgol_coeffs(window, self.order, deriv=1, delta=step, pos=k, use="dot")
-            for k in range(window)
-        ]
-        start = [w @ q[:window] for w in weights[:-1]]
-        return np.vstack([*start, sliding_window_view(q, window, axis=0) @ weights[-1]])
+            weights = [
+                savgol_coeffs(window, self.order, deriv=1, delta=step, pos=k, use="dot")
+                for k in range(window)
+            ]
+            start = [w @ q[:window] for w in weights[:-1]]
+            v = np.vstack([*start, sliding_window_view(q, window, axis=0) @ weights[-1]])
+            text += ", from the past alone"
+        return [replace(recording, v=v)], text
 
 
 @dataclass(frozen=True)
 class InputRates(_SavitzkyGolaySlope):
     """Append the rates of the inputs: u becomes (u, du/dt), 2 M columns.
 
-    For inputs that are positions: a tendon that pulls like a spring and a damper has the force
+    For inputs that are positions: a tendon like a spring and a damper has the force
     k (u - q) + c (du/dt - dq/dt). The rate is the slope of the polynomial through ``window``
     samples of u around each sample, so it looks half a window ahead.
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
-import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from pinn_dyn.data.logs.checks import BURSTS, burst_share
@@ -15,7 +14,6 @@ from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 
 _FACTORS = (0.8, 1.25)  # range of dq/dt over v without a warning
-_FACTORS_OF_A_RUN = (0.5, 2.0)  # the same beside most runs; noise in v makes the factor smaller
 _CLEAR = 0.8  # correlation from which the factor is determined
 _AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and of a stop
 _STILL = 1e-12  # range of a coordinate that does not move, m or rad
@@ -84,16 +82,14 @@ def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
 
 
 def check_velocities(
-    parts: Mapping[str, list[Recording]], q: Columns, v: Columns, step: float
+    training: list[Recording], q: Columns, v: Columns, step: float
 ) -> list[Measurement]:
-    """Measure the factor k between dq/dt and v, of the training and of each run.
+    """Measure the factor k between dq/dt and v in the training.
 
     Δq_j = k ∫ v dt over stretches of 10, 100 and 1000 samples, by least squares; integrals are less
     noisy than derivatives. The stretches count over which the two agree best.
     """
-    training = parts["train"]
     correlations, factors = _agreement(training, step)
-    runs = _factors_of_runs(parts, step)
     low, high = _FACTORS
     results = []
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
@@ -114,32 +110,7 @@ def check_velocities(
         )
         expected = f"{low} to {high}"
         results.append(judged("dq/dt over v", f"{a}, {b}", factor, expected, bool(cause), text))
-        usual = runs[k].median() or np.nan
-        low_of_run, high_of_run = _FACTORS_OF_A_RUN
-        for run, factor in runs[k].items():
-            text = (
-                f"{run}, columns {a!r} and {b!r}: the derivative of q is {factor:.4g} times v (0: "
-                f"v is zero), and {usual:.4g} times in most runs: has it other units or signs?"
-            )
-            if factor / usual < low_of_run or factor / usual > high_of_run:
-                measured = ("dq/dt over v", f"{run}, {a}, {b}", factor, f"{usual:.3g}")
-                results.append(judged(*measured, True, text))
     return results
-
-
-def _factors_of_runs(parts: Mapping[str, list[Recording]], step: float) -> pd.DataFrame:
-    """Return a row of N factors per run, NaN where v does not determine a factor."""
-    runs: dict[str, list[Recording]] = {}
-    for split, stretches in parts.items():
-        for item in stretches:
-            runs.setdefault(f"{item.run} ({split})", []).append(item)
-    rows = []
-    for stretches in runs.values():
-        correlations, factors = _agreement(stretches, step)
-        v = np.vstack([x.v for x in stretches if x.v is not None])
-        dead = [not x.any() and moves(stretches, k) for k, x in enumerate(v.T)]
-        rows.append(np.where((np.diag(correlations) >= _CLEAR) | dead, factors, np.nan))
-    return pd.DataFrame(rows, index=list(runs))
 
 
 def moves(recordings: Sequence[Recording], k: int) -> bool:

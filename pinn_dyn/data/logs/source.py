@@ -47,8 +47,8 @@ class LogSource(DataSource):
     """Trajectories from logs: CSV, MATLAB, HDF5, NPZ, Parquet, bags of ROS, or data frames.
 
     Runs are split, or cut with a guard, before the steps: no filter sees both sides of a border.
-    Every trajectory starts at t = 0. Without a velocity, :class:`SavitzkyGolayVelocity` derives it.
-    Columns and parts may be mappings, as ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
+    Without a velocity, :class:`SavitzkyGolayVelocity` derives it. Columns and parts may be
+    mappings, as ``q={"columns": ["q1", "q2"], "unit": "deg"}``.
 
     Args:
         name: short name, for tables and titles.
@@ -137,11 +137,7 @@ class LogSource(DataSource):
             raise LogError(f"column {names[names.duplicated()][0]!r} is in two of q, v and u")
 
     def load(self) -> Splits:
-        """Return the cleaned trajectories.
-
-        Raises:
-            LogError: on a file that cannot be used; names the place and what to do.
-        """
+        """Return the cleaned trajectories, or raise a LogError on a file that cannot be used."""
         return self._loaded.splits
 
     def names(self) -> dict[str, list[str]]:
@@ -169,8 +165,6 @@ class LogSource(DataSource):
 
     def recordings(self, frame: pd.DataFrame) -> list[tuple[np.ndarray, Recording, Recording]]:
         """Read the runs of a frame with the columns and units of the log, and clean each alone.
-
-        A frame without the column of the trajectory is one run.
 
         Returns:
             For each run the positions of its rows in the frame, these rows in SI units, and the
@@ -214,7 +208,7 @@ class LogSource(DataSource):
         training = stretches["train"]
         step = one_sample_time([item for items in stretches.values() for item in items])
         if self.v is not None:
-            measurements += plausibility.check_velocities(stretches, self.q, self.v, step)
+            measurements += plausibility.check_velocities(training, self.q, self.v, step)
         measurements += plausibility.check_force_signs(training, self.u, step)
         measurements += plausibility.check_inputs(training, self.u)
         measurements += plausibility.check_rest(training, self.q)
@@ -227,10 +221,11 @@ class LogSource(DataSource):
         for text in report.warnings:
             log.warning("%s: %s", self.name, text)
         names = {name: [item.place for item in items] for name, items in pieces.items()}
-        splits = (
-            [trajectory(item, step, self.interpolation) for item in pieces[name]] for name in SPLITS
-        )
-        return _Loaded(Splits(*splits), names, cleaned, report)
+        splits = {
+            name: [trajectory(item, step, self.interpolation) for item in items]
+            for name, items in pieces.items()
+        }
+        return _Loaded(Splits(**splits), names, cleaned, report)
 
     def _read(self, report: Report) -> list[Recording]:
         recordings: list[Recording] = []

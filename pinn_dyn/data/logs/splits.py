@@ -51,9 +51,9 @@ class Part:
 def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part, float]:
     """Choose validation, test and guard (s) of a log from the times of its runs, s.
 
-    Of five runs or more, 15 % are the test and as many the validation: whole runs, drawn by the
-    seed among the runs of at least the median length. Of fewer runs, the last 15 % of each are the
-    test and the 15 % before them the validation. Both are cut into pieces of at most 5 s.
+    Of five runs or more, 15 % are the test and as many the validation, drawn by the seed among the
+    runs of at least the median length. Of fewer runs, the last 15 % of each are the test and the
+    15 % before them the validation. Both are cut into pieces of at most 5 s.
     """
     spacing = np.concatenate([np.diff(t) for t in runs.values()])
     step = float(np.median(spacing[spacing > 0]))
@@ -92,10 +92,8 @@ def split(
                 raise LogError(f"run {run!r} is in {splits[run]} and in {name}, expected in one")
             splits[run] = name
     free = [run for run in names if run not in splits]
-    counts = {
-        name: part.runs if isinstance(part.runs, int) else 0
-        for name, part in (("test", test), ("validation", validation))
-    }
+    drawn_parts = {"test": test.runs, "validation": validation.runs}
+    counts = {name: runs if isinstance(runs, int) else 0 for name, runs in drawn_parts.items()}
     if (count := sum(counts.values())) >= len(free):
         raise LogError(
             f"{len(free)} runs to choose from, expected more than {count}, or a split by 'seconds'"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.logs.errors import LogError, listed, shown
+from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.spelling import did_you_mean
 
 
@@ -75,8 +75,8 @@ class Table:
             raise LogError(f"{self.name}: {count} columns have the name {name!r}")
         if not count:
             hint = did_you_mean(name, map(str, self.frame.columns)) or "."
-            text = f"{self.name}: no column {name!r}, which {signal} reads{hint} The log has"
-            raise LogError(f"{text} {listed(self.frame.columns)}")
+            names = f"{hint} The log has {listed(self.frame.columns)}"
+            raise LogError(f"{self.name}: no column {name!r}, which {signal} reads{names}")
         return self.frame[name]
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
@@ -89,23 +89,18 @@ class Table:
         bad = ~np.isfinite(values)
         if bad.any():
             k = int(bad.argmax())
-            text = "empty or NaN" if pd.isna(raw.iloc[k]) else shown(str(raw.iloc[k]))
+            text = "empty or NaN" if pd.isna(raw.iloc[k]) else repr(str(raw.iloc[k]))[:80]
             text += f", expected a number with a decimal point ({int(bad.sum())} such rows)"
             raise LogError(f"{self.place(k, name, signal)}: the value is {text}")
         return values
 
     def runs(self, column: str | None, name: str) -> dict[str, np.ndarray]:
-        """Return the rows of each run, masks ``(T,)``, in order of appearance.
-
-        Args:
-            column: column that names the runs; None if the table is one run.
-            name: name of a single run.
-        """
+        """Return the rows of each run, masks ``(T,)``; of one ``name`` without column."""
         if column is None:
             return {name: np.ones(len(self), dtype=bool)}
         names = self.column(column, "trajectory")
         if names.isna().any():
-            row = int(names.isna().to_numpy().argmax())
-            raise LogError(f"{self.place(row, column, 'trajectory')}: expected the name of a run")
+            place = self.place(int(names.isna().to_numpy().argmax()), column, "trajectory")
+            raise LogError(f"{place}: expected the name of a run")
         names = names.astype(str)
         return {run: (names == run).to_numpy() for run in names.unique()}
