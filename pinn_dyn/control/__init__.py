@@ -5,7 +5,6 @@ from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.export import export_law, load_law
-from pinn_dyn.control.factor import fit_factor
 from pinn_dyn.control.helix import Helix
 from pinn_dyn.control.laws import (
     ComputedTorque,
@@ -24,7 +23,7 @@ from pinn_dyn.control.references import (
     Sines,
 )
 from pinn_dyn.control.region import DataRegion, Guarded
-from pinn_dyn.control.stability import certify, term_conditions
+from pinn_dyn.control.stability import certify, fit_factor, term_conditions
 from pinn_dyn.control.stability_report import stability_report
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pinn_dyn.control.contracts import Controller
-from pinn_dyn.control.laws import ModelBasedLaw, StateFeedback
+from pinn_dyn.control.laws import ModelBasedLaw
 from pinn_dyn.data.whole import write_whole
 
 INPUTS = ("q", "v", "q_ref", "v_ref", "a_ref")
@@ -67,8 +67,8 @@ def export_law(controller: Controller, path: str | Path) -> Path:
         RuntimeError: if the law cannot be compiled (a C++ compiler is needed), or the file does
             not repeat the law to 1e-5.
     """
-    if not isinstance(controller, StateFeedback):
-        raise TypeError(f"{type(controller).__name__} has a memory: only laws without one compile")
+    if not isinstance(controller, ModelBasedLaw):
+        raise TypeError(f"{type(controller).__name__} is no law of a model without memory")
     path = Path(path)
     generator = torch.Generator().manual_seed(0)
     shape = (_CHECKS, len(INPUTS), controller.num_coordinates)
@@ -141,11 +141,11 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
 class _LawModule(nn.Module):
     """The formula of a law as a module for torch.export."""
 
-    def __init__(self, controller: StateFeedback):
+    def __init__(self, controller: ModelBasedLaw):
         super().__init__()
         self.law = controller.law
-        # Registered here, the model's weights become constants of the compiled file.
-        self.model = controller.model if isinstance(controller, ModelBasedLaw) else None
+        # Registered, so that the model's weights become constants of the compiled file.
+        self.model = controller.model
 
     def forward(self, *state: Tensor) -> Tensor:
         return self.law(*state)

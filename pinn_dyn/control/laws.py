@@ -18,47 +18,10 @@ Gain = float | Sequence[float] | Tensor
 """One positive number for all coordinates, or N of them."""
 
 
-class StateFeedback(Controller):
-    """A law without memory, u = law(q, v, q_ref, v_ref, a_ref), with diagonal gains.
+class ModelBasedLaw(Controller):
+    """A law u = law(q, v, q_ref, v_ref, a_ref) on the terms of a model, without memory.
 
-    Attributes:
-        position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``, float64.
-
-    Raises:
-        ValueError: on gains that are not positive, or not 1 or N of them.
-    """
-
-    def __init__(
-        self, num_coordinates: int, num_inputs: int, position_gain: Gain, velocity_gain: Gain
-    ):
-        super().__init__(num_coordinates, num_inputs)
-        self.position_gain = diagonal_gain("position_gain", position_gain, num_coordinates)
-        self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, num_coordinates)
-
-    @abc.abstractmethod
-    def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
-        """Return u ``(*batch, M)`` by the formula alone, without checks and side effects."""
-
-    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
-        self._check(q, v, reference)
-        with torch.no_grad():
-            return self.law(q, v, *reference)
-
-    def _check(self, q: Tensor, v: Tensor, reference: Motion) -> None:
-        require_last_dim("q", q, self.num_coordinates, "N")
-        require_last_dim("v", v, self.num_coordinates, "N")
-        for name, value in zip(reference._fields, reference, strict=True):
-            require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
-
-    def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
-        K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
-        return K_P * (reference.q - q) + K_D * (reference.v - v)
-
-
-class ModelBasedLaw(StateFeedback):
-    """A law on the terms of a model, with A^+(q), the pseudo-inverse of its input matrix.
+    The gains are diagonal, and A^+(q) is the pseudo-inverse of the input matrix of the model.
 
     - Fully actuated, M = N: A^+ is the inverse, and A A^+ tau = tau.
     - Under-actuated, M < N: A A^+ tau is the orthogonal projection of tau on the range of A.
@@ -70,6 +33,9 @@ class ModelBasedLaw(StateFeedback):
         model: the mechanical system whose terms the law uses, in float64.
         position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
         max_condition: largest condition number of A(q) that is no fault.
+
+    Attributes:
+        position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``, float64.
 
     Raises:
         TypeError: on a model that is no mechanical system.
@@ -104,9 +70,11 @@ class ModelBasedLaw(StateFeedback):
         if model.has_residual:
             raise ValueError(
                 f"{type(self).__name__}: the law cannot invert the model's residual force: train "
-                "with model/residual=none"
+                "with ~model/residual"
             )
-        super().__init__(model.num_coordinates, model.num_inputs, position_gain, velocity_gain)
+        super().__init__(model.num_coordinates, model.num_inputs)
+        self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
+        self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)
         self.model = model
         self.max_condition = float(max_condition)
         self._condition: Tensor | None = None
@@ -116,18 +84,27 @@ class ModelBasedLaw(StateFeedback):
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
-        self._check(q, v, reference)
+        require_last_dim("q", q, self.num_coordinates, "N")
+        require_last_dim("v", v, self.num_coordinates, "N")
+        for name, value in zip(reference._fields, reference, strict=True):
+            require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
         with torch.no_grad():
             A = self.model.input_matrix(q)
             self._condition = condition_number(A)
             return self._input(A, q, v, reference)
 
     def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
+        """Return u ``(*batch, M)`` by the formula alone, without checks and side effects."""
         return self._input(self.model.input_matrix(q), q, v, Motion(q_ref, v_ref, a_ref))
 
     @abc.abstractmethod
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u by the formula of the law, given A(q) ``(*batch, N, M)``."""
+
+    def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        """Return K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
+        K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
+        return K_P * (reference.q - q) + K_D * (reference.v - v)
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return ``input_condition``, the condition number of A(q), ``(*batch,)``."""

@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from pinn_dyn.control.factor import fit_factor
+from pinn_dyn.control.stability import fit_factor
 from pinn_dyn.data import DataSource
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Terms, double_copy
 
@@ -22,7 +22,7 @@ class TermComparison:
         names: K names of configurations.
         q: configurations, ``(K, N)``.
         true, learned: M, D, G, A of the true system and of the model.
-        P: best-fit factor, ``(K, N, N)``, see :func:`pinn_dyn.control.factor.fit_factor`.
+        P: best-fit factor, ``(K, N, N)``, see :func:`pinn_dyn.control.stability.fit_factor`.
         of_inverse_mass: the equations of the model, in (q, p), contain the inverse of M.
     """
 

@@ -16,7 +16,7 @@ from pinn_dyn.models.friction import (
     Stribeck,
 )
 from pinn_dyn.models.hamiltonian import HamiltonianNetwork
-from pinn_dyn.models.initial_velocity import InitialVelocity, LearnedVelocity, MeasuredVelocity
+from pinn_dyn.models.initial_velocity import LearnedVelocity
 from pinn_dyn.models.input_matrix import (
     ConstantInput,
     FixedInput,
@@ -33,7 +33,7 @@ from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.mlp import MLP
 from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
-from pinn_dyn.models.residual import NetworkResidual, NoResidual, Residual
+from pinn_dyn.models.residual import NetworkResidual
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
@@ -53,7 +53,6 @@ __all__ = [
     "Friction",
     "HamiltonianNetwork",
     "HasConstants",
-    "InitialVelocity",
     "InputMatrix",
     "KnownAndNetwork",
     "KnownMechanics",
@@ -62,7 +61,6 @@ __all__ = [
     "LearnedConstants",
     "LearnedDelay",
     "LearnedVelocity",
-    "MeasuredVelocity",
     "NetworkCholesky",
     "NetworkInput",
     "NetworkPotential",
@@ -71,11 +69,9 @@ __all__ = [
     "NoDelay",
     "NoFriction",
     "NoInput",
-    "NoResidual",
     "NonlinearInput",
     "Positive",
     "Positivity",
-    "Residual",
     "Scales",
     "Statistics",
     "Stribeck",

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, Predictor, Signal
 from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
-from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
+from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
@@ -86,7 +86,7 @@ class AccelerationMLP(DelayedPredictor):
         activation: Activation = "softplus",
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
-        initial_velocity: InitialVelocityHead = MeasuredVelocity,
+        initial_velocity: InitialVelocityHead | None = None,
         delay: Delay | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
@@ -95,14 +95,13 @@ class AccelerationMLP(DelayedPredictor):
         mean, std = statistics.network_input(repeat_input=1)
         self.network = MLP(2 * size + inputs, size, hidden, activation, mean, std, angles)
         self.register_buffer("scale", statistics.acceleration.float())
-        self.initial_velocity = initial_velocity(
-            Scales(statistics, statistics.v_std, tuple(angles))
-        )
-        self.learns_initial_state = self.initial_velocity.learned
+        scales = Scales(statistics, statistics.v_std, tuple(angles))
+        self.initial_velocity = initial_velocity and initial_velocity(scales)
+        self.learns_initial_state = initial_velocity is not None
         self.delay = delay or NoDelay()
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        return self.initial_velocity.initial_state(x0, u0)
+        return start_of(self.initial_velocity, x0, u0)
 
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         v = x[..., self.num_coordinates :]

@@ -13,7 +13,6 @@ from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
 from pinn_dyn.models.delay import Delay
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.residual import NoResidual
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.triangular import lower_solve, upper_solve
 
@@ -59,7 +58,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         state: State = "qp",
         delay: Delay | None = None,
     ):
-        heads = potential, damping, friction, input, NoResidual
+        heads = potential, damping, friction, input, None
         super().__init__(statistics, state, *heads, angles, integrator, delay)
         if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std

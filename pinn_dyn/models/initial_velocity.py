@@ -1,8 +1,7 @@
-"""Heads for the initial velocity of a roll-out: measured, or with a learned correction."""
+"""The head for a learned initial velocity of a roll-out."""
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Callable, Sequence
 
 import torch
@@ -13,38 +12,7 @@ from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
 
-class InitialVelocity(nn.Module, abc.ABC):
-    """Initial velocity v_0 ``(*batch, N)`` of a roll-out, ``learned`` or measured."""
-
-    learned: bool
-
-    @abc.abstractmethod
-    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return v_0 at the measured q, v ``(*batch, N)`` and the input u ``(*batch, M)``."""
-
-    def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """Return (q, v_0), ``(*batch, 2N)``, at the measured x0 = (q, v) and the input u0."""
-        q, v = x0.chunk(2, dim=-1)
-        return torch.cat([q, self(q, v, u0)], dim=-1)
-
-
-InitialVelocityHead = Callable[[Scales], InitialVelocity]
-"""Builder of a head for the initial velocity."""
-
-
-class MeasuredVelocity(InitialVelocity):
-    """v_0 = v, the measured velocity."""
-
-    learned = False
-
-    def __init__(self, scales: Scales):
-        super().__init__()
-
-    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return v
-
-
-class LearnedVelocity(InitialVelocity):
+class LearnedVelocity(nn.Module):
     """v_0 = v + s_v * network(q, v, u), for velocities that are estimated instead of measured.
 
     Velocities derived from a few samples of q are noisy, and strongly damped dynamics cannot
@@ -57,7 +25,6 @@ class LearnedVelocity(InitialVelocity):
         hidden, activation: widths and activation of the hidden layers.
     """
 
-    learned = True
     scale: Tensor
 
     def __init__(
@@ -75,4 +42,17 @@ class LearnedVelocity(InitialVelocity):
         self.register_buffer("scale", scales.value.float().clone())
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return v_0, ``(*batch, N)``, at the measured q and v and the input u ``(*batch, M)``."""
         return v + self.scale * self.network(torch.cat([q, v, u], dim=-1))
+
+
+InitialVelocityHead = Callable[[Scales], LearnedVelocity]
+"""Builder of a head for the initial velocity."""
+
+
+def start_of(head: LearnedVelocity | None, x0: Tensor, u0: Tensor) -> Tensor:
+    """Return (q, v_0), ``(*batch, 2N)``, at the measured x0 = (q, v) and the input u0."""
+    if head is None:
+        return x0
+    q, v = x0.chunk(2, dim=-1)
+    return torch.cat([q, head(q, v, u0)], dim=-1)

@@ -11,7 +11,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, Sum
 from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.lagrangian import LagrangianNetwork
-from pinn_dyn.models.residual import NoResidual, ResidualHead
+from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.statistics import Statistics
 
@@ -45,7 +45,7 @@ class KnownAndNetwork(Sum):
         statistics: Statistics,
         known: Callable[..., KnownMechanics],
         network: Callable[..., LagrangianNetwork],
-        residual: ResidualHead = NoResidual,
+        residual: ResidualHead | None = None,
         weight: NonNegativeFloat = 0.01,
         integrator: Integrator | None = None,
     ):
@@ -67,8 +67,8 @@ class KnownAndNetwork(Sum):
         force = forces.u_rms
         self.register_buffer("force", force.float().clone())
         self.force: Tensor
-        self.residual = residual(Scales(statistics, force, second.angles))
-        self.has_residual = self.residual.learned
+        self.residual = residual and residual(Scales(statistics, force, second.angles))
+        self.has_residual = residual is not None
         self.penalized = True
 
     @property
@@ -83,11 +83,12 @@ class KnownAndNetwork(Sum):
         network = self.parts["network"]
         assert isinstance(network, LagrangianNetwork)
         share = network.inverse_dynamics(q, v, a) / self.force
-        return self.weight * share.square().mean() + self.residual.penalty(q, v, u)
+        penalty = self.weight * share.square().mean()
+        return penalty if self.residual is None else penalty + self.residual.penalty(q, v, u)
 
     def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         force = super()._applied_force(q, v, u)
-        return force + self.residual(q, v, u) if self.has_residual else force
+        return force if self.residual is None else force + self.residual(q, v, u)
 
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return self.residual(q, v, u)
+        return v.new_zeros(v.shape) if self.residual is None else self.residual(q, v, u)

@@ -13,9 +13,9 @@ from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
 from pinn_dyn.models.delay import Delay
 from pinn_dyn.models.friction import NoFriction
-from pinn_dyn.models.initial_velocity import InitialVelocityHead, MeasuredVelocity
+from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import Tape
-from pinn_dyn.models.residual import NoResidual, ResidualHead
+from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.triangular import lower_solve, upper_solve
 
@@ -50,8 +50,8 @@ class LagrangianNetwork(structured.StructuredNetwork):
         damping: structured.CholeskyHead = structured.DAMPING,
         input: structured.InputHead = structured.INPUT,
         friction: structured.FrictionHead = NoFriction,
-        residual: ResidualHead = NoResidual,
-        initial_velocity: InitialVelocityHead = MeasuredVelocity,
+        residual: ResidualHead | None = None,
+        initial_velocity: InitialVelocityHead | None = None,
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         delay: Delay | None = None,
@@ -65,12 +65,12 @@ class LagrangianNetwork(structured.StructuredNetwork):
                 "mass.chain is true and mass.transposed is false, expected both true: columns of L "
                 "depend on later joints alone in M = L^T L only"
             )
-
-        self.initial_velocity = initial_velocity(self._scales(statistics, statistics.v_std))
-        self.learns_initial_state = self.initial_velocity.learned
+        scales = self._scales(statistics, statistics.v_std)
+        self.initial_velocity = initial_velocity and initial_velocity(scales)
+        self.learns_initial_state = initial_velocity is not None
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        return self.initial_velocity.initial_state(x0, u0)
+        return start_of(self.initial_velocity, x0, u0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         return self.mass.matrix(q)

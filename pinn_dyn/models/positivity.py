@@ -1,8 +1,11 @@
-"""Maps from free numbers to the entries of a Cholesky factor with a positive diagonal."""
+"""Maps from free numbers y to the entries of a Cholesky factor with a positive diagonal.
+
+``diagonal`` returns L_ii and its slope in y_ii, ``lower`` the same of L_ij, i > j, both at y of any
+shape and in units of the scale. ``start`` is the initial y of the diagonal entries.
+"""
 
 from __future__ import annotations
 
-import abc
 import math
 from dataclasses import dataclass
 
@@ -12,22 +15,8 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 
-class Positivity(abc.ABC):
-    """Map from free numbers y to the entries of a triangular factor, in units of their scale."""
-
-    start: float  # initial y of the diagonal entries
-
-    @abc.abstractmethod
-    def diagonal(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return L_ii and its slope in y_ii, at y of any shape."""
-
-    @abc.abstractmethod
-    def lower(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return L_ij, i > j, and its slope in y_ij."""
-
-
 @dataclass(frozen=True)
-class Positive(Positivity):
+class Positive:
     """L_ii = softplus(y_ii) + floor,   L_ij = y_ij.
 
     Args:
@@ -39,7 +28,7 @@ class Positive(Positivity):
     initial: PositiveFloat = 1.0
 
     @property
-    def start(self) -> float:  # type: ignore[override]
+    def start(self) -> float:
         """Inverse of the softplus at ``initial``."""
         return math.log(math.expm1(self.initial))
 
@@ -51,7 +40,7 @@ class Positive(Positivity):
 
 
 @dataclass(frozen=True)
-class Bounded(Positivity):
+class Bounded:
     """L_ii = b sigmoid(y_ii) + floor,   L_ij = b (2 sigmoid(y_ij) - 1),   b the limit.
 
     This is the scaled sigmoid of the paper for a real arm. The initial diagonal is 0.63 b.
@@ -72,3 +61,6 @@ class Bounded(Positivity):
     def lower(self, y: Tensor) -> tuple[Tensor, Tensor]:
         share = torch.sigmoid(y)
         return self.limit * (2 * share - 1), 2 * self.limit * share * (1 - share)
+
+
+Positivity = Positive | Bounded

@@ -1,8 +1,7 @@
-"""Heads for a residual force: none, or a network of q, v and u."""
+"""The head for a residual force, a network of q, v and u."""
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Callable, Sequence
 
 import torch
@@ -13,50 +12,15 @@ from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
 
 
-class Residual(nn.Module, abc.ABC):
-    """Generalized force r(q, v, u) ``(*batch, N)`` of effects that are not mechanical.
-
-    ``learned`` is false if the force is zero.
-    """
-
-    learned: bool
-
-    @abc.abstractmethod
-    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return r, ``(*batch, N)``, at q, v ``(*batch, N)`` and u ``(*batch, M)``."""
-
-    @abc.abstractmethod
-    def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        """Return the penalty of r at states ``(B, N)`` and inputs ``(B, M)``, a scalar."""
-
-
-ResidualHead = Callable[[Scales], Residual]
-"""Builder of a residual head. The value of its scales is a force."""
-
-
-class NoResidual(Residual):
-    """r = 0, as in the paper."""
-
-    learned = False
-
-    def __init__(self, scales: Scales):
-        super().__init__()
-
-    def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return torch.zeros_like(v)
-
-    def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return v.new_zeros(())
-
-
-class NetworkResidual(Residual):
-    """Residual force r_i = f_i network_i(q, v, u), initially zero, with a penalty::
+class NetworkResidual(nn.Module):
+    """Residual force r_i = f_i network_i(q, v, u) of effects that are not mechanical::
 
         penalty = w mean over the batch and i of (r_i / f_i)^2
 
-    f is a typical generalized force. Due to the penalty, r only represents effects that the other
-    heads cannot represent, such as hysteresis. The force is not passive, but bounded: the input of
-    the network saturates outside the range of q, and three standard deviations of v and u.
+    f is a typical generalized force. r is initially zero. Due to the penalty, r only represents
+    effects that the other heads cannot represent, such as hysteresis. The force is not passive, but
+    bounded: the input of the network saturates outside the range of q, and three standard
+    deviations of v and u.
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
@@ -64,7 +28,6 @@ class NetworkResidual(Residual):
         weight: w. The initial loss of the prediction is near one.
     """
 
-    learned = True
     scale: Tensor
 
     def __init__(
@@ -88,7 +51,13 @@ class NetworkResidual(Residual):
         self.register_buffer("scale", scales.value.float())
 
     def forward(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return r, ``(*batch, N)``, at q, v ``(*batch, N)`` and u ``(*batch, M)``."""
         return self.scale * self.network.linearize(torch.cat([q, v, u], dim=-1))[0]
 
     def penalty(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return the penalty of r at states ``(B, N)`` and inputs ``(B, M)``, a scalar."""
         return self.weight * (self(q, v, u) / self.scale).square().mean()
+
+
+ResidualHead = Callable[[Scales], NetworkResidual]
+"""Builder of a residual head. The value of its scales is a force."""

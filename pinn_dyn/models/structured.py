@@ -46,7 +46,7 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         damping: CholeskyHead,
         friction: FrictionHead,
         input: InputHead,
-        residual: ResidualHead,
+        residual: ResidualHead | None,
         angles: Sequence[int],
         integrator: Integrator | None,
         delay: Delay | None,
@@ -63,8 +63,8 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
         self.friction = friction(self._scales(statistics, force))
         self.input_affine = self.input.affine
-        self.residual = residual(self._scales(statistics, force))
-        self.has_residual = self.penalized = self.residual.learned
+        self.residual = residual and residual(self._scales(statistics, force))
+        self.has_residual = self.penalized = residual is not None
 
     def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
         return Scales(statistics, value, self.angles)
@@ -91,10 +91,10 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return self.input.force(q, u)
 
     def _residual_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
-        return self.residual(q, v, u)
+        return v.new_zeros(v.shape) if self.residual is None else self.residual(q, v, u)
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        return self.residual.penalty(q, v, u)
+        return v.new_zeros(()) if self.residual is None else self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return self.potential.gradient(q)

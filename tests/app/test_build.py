@@ -42,9 +42,9 @@ def test_a_gpu_needs_triton_too(compiler, monkeypatch):
 
 
 def test_arguments_of_a_part_and_of_the_parts_in_it_are_checked():
-    head = {"_target_": "pinn_dyn.models.MeasuredVelocity", "hidden": [8], "_partial_": True}
-    model = {"_target_": "pinn_dyn.models.LagrangianNetwork", "initial_velocity": head}
-    with pytest.raises(ConfigError, match=r"no key 'part\.initial_velocity\.hidden'"):
+    head = {"_target_": "pinn_dyn.models.NoFriction", "hidden": [8], "_partial_": True}
+    model = {"_target_": "pinn_dyn.models.LagrangianNetwork", "friction": head}
+    with pytest.raises(ConfigError, match=r"no key 'part\.friction\.hidden'"):
         build_part("part", model)
 
 

@@ -7,8 +7,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from pinn_dyn.control.factor import fit_factor
-from pinn_dyn.control.stability import certify, factor_bounds
+from pinn_dyn.control.stability import certify, factor_bounds, fit_factor
 from pinn_dyn.control.stability_report import stability_report
 from pinn_dyn.control.steady_state import predict_steady_state, required_gain
 from pinn_dyn.mechanics import MechanicalSystem

@@ -17,14 +17,12 @@ from pinn_dyn.models import (
     FixedInput,
     HamiltonianNetwork,
     LagrangianNetwork,
-    MeasuredVelocity,
     NetworkCholesky,
     NetworkInput,
     NetworkPotential,
     NextStateMLP,
     NoFriction,
     NonlinearInput,
-    NoResidual,
     Positive,
     Scales,
     Statistics,
@@ -140,10 +138,8 @@ def make_structured(
     }
     statistics = statistics or make_statistics(n, m)
     if kind == "lnn":
-        start = initial_velocity or MeasuredVelocity
-        residual = residual or NoResidual
         model = LagrangianNetwork(
-            statistics, mass, initial_velocity=start, residual=residual, **heads
+            statistics, mass, initial_velocity=initial_velocity, residual=residual, **heads
         )
     else:
         model = HamiltonianNetwork(statistics, mass, state=state or "qp", **heads)

@@ -13,7 +13,6 @@ from pinn_dyn.models import (
     NetworkPotential,
     NetworkResidual,
     NonlinearInput,
-    NoResidual,
 )
 from pinn_dyn.testing import (
     InputMatrixContract,
@@ -63,11 +62,7 @@ class TestInput(InputMatrixContract):
         return make(INPUTS[name], [0.5, 3.0])
 
 
-RESIDUALS = {"none": NoResidual, "network": partial(NetworkResidual, hidden=[5])}
-
-
-@pytest.mark.parametrize("name", RESIDUALS)
 class TestResidual(ResidualContract):
     @pytest.fixture
-    def head(self, name):
-        return make(RESIDUALS[name], FORCE)
+    def head(self):
+        return make(partial(NetworkResidual, hidden=[5]), FORCE)

@@ -9,7 +9,7 @@ from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import Signal, Trajectory, stack
-from pinn_dyn.models import NetworkResidual, NoResidual
+from pinn_dyn.models import NetworkResidual
 from pinn_dyn.testing import assert_near
 from pinn_dyn.training import IncrementLoss, Penalized
 from tests.models.builders import make_statistics, make_structured, random_batch
@@ -80,4 +80,4 @@ def test_its_share_of_the_force_is_reported():
     assert residual_share(model, truth) == pytest.approx(expected)
     validate = RolloutValidator(horizon=0.5, training_step=0.02)
     assert 0 < validate(model, truth)["residual_share"] < 1
-    assert "residual_share" not in validate(structured(residual=NoResidual), truth)
+    assert "residual_share" not in validate(structured(residual=None), truth)
