@@ -60,7 +60,7 @@ class ModelBasedLaw(Controller):
             raise ValueError(
                 f"{type(self).__name__}: the model has a learned input delay "
                 f"({model.learned_figures()}), which the law ignores: train with ~model/delay, or "
-                "set model.delay = pinn_dyn.models.NoDelay() and lower the gains"
+                "set model.delay = None and lower the gains"
             )
         if not model.input_affine:
             raise ValueError(

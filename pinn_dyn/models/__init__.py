@@ -7,7 +7,7 @@ from pinn_dyn.models.cholesky import (
     FixedCholesky,
     NetworkCholesky,
 )
-from pinn_dyn.models.delay import Delay, LearnedDelay, NoDelay
+from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
     CoulombFriction,
@@ -27,7 +27,7 @@ from pinn_dyn.models.input_matrix import (
 )
 from pinn_dyn.models.known import KnownMechanics
 from pinn_dyn.models.known_and_network import KnownAndNetwork
-from pinn_dyn.models.known_system import HasConstants, KnownSystem
+from pinn_dyn.models.known_system import KnownSystem
 from pinn_dyn.models.lagrangian import LagrangianNetwork
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.mlp import MLP
@@ -47,12 +47,10 @@ __all__ = [
     "ConstantCholesky",
     "ConstantInput",
     "CoulombFriction",
-    "Delay",
     "FixedCholesky",
     "FixedInput",
     "Friction",
     "HamiltonianNetwork",
-    "HasConstants",
     "InputMatrix",
     "KnownAndNetwork",
     "KnownMechanics",
@@ -66,7 +64,6 @@ __all__ = [
     "NetworkPotential",
     "NetworkResidual",
     "NextStateMLP",
-    "NoDelay",
     "NoFriction",
     "NoInput",
     "NonlinearInput",

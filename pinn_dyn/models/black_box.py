@@ -9,7 +9,7 @@ from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, Predictor, Signal
-from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
+from pinn_dyn.models.delay import DelayedPredictor, LearnedDelay
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
@@ -87,7 +87,7 @@ class AccelerationMLP(DelayedPredictor):
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         initial_velocity: InitialVelocityHead | None = None,
-        delay: Delay | None = None,
+        delay: LearnedDelay | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
@@ -98,7 +98,7 @@ class AccelerationMLP(DelayedPredictor):
         scales = Scales(statistics, statistics.v_std, tuple(angles))
         self.initial_velocity = initial_velocity and initial_velocity(scales)
         self.learns_initial_state = initial_velocity is not None
-        self.delay = delay or NoDelay()
+        self.delay = delay
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
         return start_of(self.initial_velocity, x0, u0)

@@ -1,8 +1,6 @@
-"""Delays between a logged or commanded input and its action: none, or learned."""
+"""A learned delay between a logged or commanded input and its action."""
 
 from __future__ import annotations
-
-import abc
 
 import torch
 from pydantic import NonNegativeFloat, PositiveFloat
@@ -11,30 +9,7 @@ from torch import Tensor, nn
 from pinn_dyn.mechanics import ContinuousPredictor, Signal
 
 
-class Delay(nn.Module, abc.ABC):
-    """Delay d >= 0 of all inputs, u(t - d), at most ``longest`` s."""
-
-    longest: float
-
-    @abc.abstractmethod
-    def forward(self, input: Signal) -> Signal:
-        """Return u(t - d)."""
-
-    def figures(self) -> dict[str, float]:
-        """Return learned numbers by name. The default has none."""
-        return {}
-
-
-class NoDelay(Delay):
-    """d = 0."""
-
-    longest = 0.0
-
-    def forward(self, input: Signal) -> Signal:
-        return input
-
-
-class LearnedDelay(Delay):
+class LearnedDelay(nn.Module):
     """A learned delay of all inputs, trained together with the dynamics::
 
         d = longest * clamp(z, 0, 1),      dL/dd = -sum over stages of dL/du . du/dt
@@ -64,24 +39,24 @@ class LearnedDelay(Delay):
         return self.longest * (self.share + (inside - self.share).detach())
 
     def forward(self, input: Signal) -> Signal:
+        """Return u(t - d)."""
         return input.delayed(self.seconds())
-
-    def figures(self) -> dict[str, float]:
-        return {"input_delay_seconds": float(self.seconds().detach())}
 
 
 class DelayedPredictor(ContinuousPredictor):
-    """Predictor with a head for the delay of its input."""
+    """Predictor with an optional head for the delay of its input."""
 
-    delay: Delay
+    delay: LearnedDelay | None
 
     @property
     def input_history(self) -> float:  # type: ignore[override]
         """Longest delay, s."""
-        return self.delay.longest
+        return 0.0 if self.delay is None else self.delay.longest
 
     def acting_input(self, input: Signal) -> Signal:
-        return self.delay(input)
+        return input if self.delay is None else self.delay(input)
 
     def learned_figures(self) -> dict[str, float]:
-        return self.delay.figures()
+        if self.delay is None:
+            return {}
+        return {"input_delay_seconds": float(self.delay.seconds().detach())}

@@ -11,7 +11,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
-from pinn_dyn.models.delay import Delay
+from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.triangular import lower_solve, upper_solve
@@ -56,7 +56,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         state: State = "qp",
-        delay: Delay | None = None,
+        delay: LearnedDelay | None = None,
     ):
         heads = potential, damping, friction, input, None
         super().__init__(statistics, state, *heads, angles, integrator, delay)

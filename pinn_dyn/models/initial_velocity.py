@@ -52,7 +52,5 @@ InitialVelocityHead = Callable[[Scales], LearnedVelocity]
 
 def start_of(head: LearnedVelocity | None, x0: Tensor, u0: Tensor) -> Tensor:
     """Return (q, v_0), ``(*batch, 2N)``, at the measured x0 = (q, v) and the input u0."""
-    if head is None:
-        return x0
     q, v = x0.chunk(2, dim=-1)
-    return torch.cat([q, head(q, v, u0)], dim=-1)
+    return torch.cat([q, v if head is None else head(q, v, u0)], dim=-1)

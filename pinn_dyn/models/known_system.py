@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from pydantic import PositiveFloat
@@ -14,13 +14,6 @@ from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem
 from pinn_dyn.models.known_constants import PositiveConstants
 from pinn_dyn.models.learned_constants import Called, LearnedConstants
 from pinn_dyn.models.statistics import Statistics
-
-
-@runtime_checkable
-class HasConstants(Protocol):
-    """Mechanical system with the units of each buffer that is a constant: {"mass": ["kg"]}."""
-
-    constants: dict[str, list[str]]
 
 
 def _term(system: MechanicalSystem, name: str, *values: Tensor) -> Tensor:
@@ -44,8 +37,9 @@ class KnownSystem(LearnedConstants):
 
     Args:
         statistics: scales of the data.
-        structure: a :class:`HasConstants`, such as :class:`~pinn_dyn.systems.SoftArm`. Its
-            constants are the initial guesses of the fit.
+        structure: a system such as :class:`~pinn_dyn.systems.SoftArm`, whose attribute
+            ``constants`` has the units of each buffer to fit, as in ``{"mass": ["kg"]}``. The
+            buffers are the initial guesses.
         spread: prior standard deviation of log c: 1.5 if a guess may be off by a factor of ten,
             0.3 for a data sheet.
         integrator: the integration method.
@@ -106,17 +100,12 @@ class KnownSystem(LearnedConstants):
 
 
 def _units_of(structure: MechanicalSystem) -> dict[str, list[str]]:
-    kind = type(structure).__name__
-    if not isinstance(structure, HasConstants) or not structure.constants:
-        raise ValueError(
-            f"structure {kind} names no constants to learn: add an attribute constants with the "
-            "units of each buffer, such as {'mass': ['kg']}, or use model=known for rigid chains"
-        )
+    constants = getattr(structure, "constants", {})
     sizes = {name: buffer.numel() for name, buffer in structure.named_buffers()}
-    for name, units in structure.constants.items():
-        if sizes.get(name) != len(units):
-            raise ValueError(
-                f"structure {kind}: constants has {len(units)} units of {name}, expected one for "
-                f"each entry of a buffer; the buffers have the sizes {sizes}"
-            )
-    return structure.constants
+    if not constants or any(sizes.get(name) != len(units) for name, units in constants.items()):
+        raise ValueError(
+            f"structure {type(structure).__name__} has the constants {constants}, expected a unit "
+            "for each entry of buffers, such as {'mass': ['kg']}; the buffers have the sizes "
+            f"{sizes}; use model=known for rigid chains"
+        )
+    return constants

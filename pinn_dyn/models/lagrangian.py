@@ -11,7 +11,7 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
-from pinn_dyn.models.delay import Delay
+from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import Tape
@@ -54,7 +54,7 @@ class LagrangianNetwork(structured.StructuredNetwork):
         initial_velocity: InitialVelocityHead | None = None,
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
-        delay: Delay | None = None,
+        delay: LearnedDelay | None = None,
     ):
         heads = potential, damping, friction, input, residual
         super().__init__(statistics, "qv", *heads, angles, integrator, delay)

@@ -77,16 +77,15 @@ class Statistics:
         """Build from the result of :meth:`to_dict`.
 
         Raises:
-            ValueError: if a field is missing, or is not finite or positive.
+            ValueError: if a number is not finite, or a scale is not positive.
         """
         names = [item.name for item in fields(cls)]
-        if missing := [name for name in names if name not in values]:
-            raise ValueError(f"statistics has no {', '.join(missing)}")
         read = {name: torch.tensor(values[name], dtype=torch.float64) for name in names}
         for name, value in read.items():
             positive = name.endswith("_std") or name == "step"
             if not (value.isfinite() & (value > 0 if positive else True)).all():
-                kind = "positive" if positive else "finite"
-                raise ValueError(f"statistics.{name} is {value.tolist()}, expected {kind} numbers")
+                raise ValueError(
+                    f"statistics.{name} is {value.tolist()}, expected finite numbers, and a positive scale"
+                )
         step = float(read.pop("step"))
         return cls(**read, step=step)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
 from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky
-from pinn_dyn.models.delay import Delay, DelayedPredictor, NoDelay
+from pinn_dyn.models.delay import DelayedPredictor, LearnedDelay
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput
 from pinn_dyn.models.positivity import Positive
@@ -49,11 +49,11 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         residual: ResidualHead | None,
         angles: Sequence[int],
         integrator: Integrator | None,
-        delay: Delay | None,
+        delay: LearnedDelay | None,
     ):
         super().__init__(statistics.num_coordinates, statistics.num_inputs, state)
         self.integrator = integrator or RK4()
-        self.delay = delay or NoDelay()
+        self.delay = delay
         self.angles = tuple(angles)
         u_rms = statistics.u_rms
         self.input = input(self._scales(statistics, u_rms.square().mean().sqrt() / u_rms))

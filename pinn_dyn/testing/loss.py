@@ -71,13 +71,6 @@ class WindowLossContract:
         alone = [loss(model, windows[torch.tensor([k])]) for k in range(6)]
         torch.testing.assert_close(value, torch.stack(alone).mean())
 
-    def test_loss_grows_with_the_error(self, loss, model):
-        windows = random_windows(6)
-        shifted = [replace(windows, dv=windows.dv + shift) for shift in (1.0, 10.0, 100.0)]
-        values = [float(loss(model, item).detach()) for item in shifted]
-        assert values == sorted(values)
-        assert values[2] > 3 * values[1]
-
     def test_stacked_members_have_their_own_losses(self, loss):
         members = [small_model(seed) for seed in range(3)]
         batches = [random_windows(4, seed) for seed in range(3)]

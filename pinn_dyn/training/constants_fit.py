@@ -11,8 +11,6 @@ from torch import Tensor
 
 _FAR = 3.0
 """Prior standard deviations from which a constant is reported."""
-_CHECKS = {"drive gain": "units and sign", "torque offset": "sign", "force offset": "sign"}
-"""Properties of an input to check, by the kind of the constant."""
 
 
 class Prior(NamedTuple):
@@ -70,13 +68,9 @@ def far_from_start(names: Sequence[str], z: Tensor, prior: Prior) -> list[str]:
     """Describe the parameters z ``(P,)`` that are very unlikely under the prior, five at most."""
     spread = torch.linalg.inv(prior.root).norm(dim=1)
     deviation = ((z - prior.mean) / spread).abs()
-    lines = []
-    for k in deviation.argsort(descending=True).tolist()[:5]:
-        if deviation[k] > _FAR:
-            checks = [x for kind, x in _CHECKS.items() if names[k].startswith(kind)]
-            advice = f"{checks[0]} of its input" if checks else "the units of the columns"
-            lines.append(
-                f"{names[k]} is {float(deviation[k]):.1f} prior standard deviations from its "
-                f"start: check {advice}"
-            )
-    return lines
+    return [
+        f"{names[k]} is {float(deviation[k]):.1f} prior standard deviations from its start: check "
+        "the units of the columns and the sign of its input"
+        for k in deviation.argsort(descending=True).tolist()[:5]
+        if deviation[k] > _FAR
+    ]

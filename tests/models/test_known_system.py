@@ -115,9 +115,9 @@ class Unmeasured(SoftArm):
 @pytest.mark.parametrize(
     ("structure", "message"),
     [
-        (Unnamed(), r"structure Unnamed names no constants .* \{'mass': \['kg'\]\}"),
-        (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain names no constants"),
-        (Unmeasured(), "constants has 1 units of stiffness, expected one for each entry"),
+        (Unnamed(), r"structure Unnamed has the constants \{\}, expected a unit"),
+        (RigidChain(TREE, locked_joints=["wrist", "turn"]), "RigidChain has the constants"),
+        (Unmeasured(), "Unmeasured has the constants .*stiffness.*expected a unit for each entry"),
         (SoftArm(stiffness=0.0), r"stiffness 1: start is .* expected positive"),
         (SoftArm(2), "the data have 3 coordinates and 3 inputs, the structure SoftArm has 6 and 6"),
         (CartPole(), "the structure CartPole has 2 and 1"),
