@@ -84,8 +84,7 @@ class Statistics:
         for name, value in read.items():
             positive = name.endswith("_std") or name == "step"
             if not (value.isfinite() & (value > 0 if positive else True)).all():
-                raise ValueError(
-                    f"statistics.{name} is {value.tolist()}, expected finite numbers, and a positive scale"
-                )
+                kind = "positive" if positive else "finite"
+                raise ValueError(f"statistics.{name} is {value.tolist()}, expected {kind} numbers")
         step = float(read.pop("step"))
         return cls(**read, step=step)
