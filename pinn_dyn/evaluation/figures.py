@@ -51,9 +51,8 @@ def trajectory_figure(
         predictions: model names and their rollouts; the order of the names fixes their colors.
         trajectory: index of the trajectory.
         title: title of the figure.
-        labels: name and unit of each coordinate; None takes q1 ... qN.
-        input_labels: name and unit of each input; None takes u1 ... uM.
-        baselines: names of baselines and their rollouts, drawn in thin grey lines.
+        labels, input_labels: names and units of q and u; None takes q1 ... qN and u1 ... uM.
+        baselines: names and rollouts of baselines, in grey.
     """
     labels = default_labels(labels, "q", truth.q.shape[-1])
     input_labels = default_labels(input_labels, "u", truth.u.shape[-1])

@@ -45,11 +45,7 @@ def constants_table(
 
     No interval extends below the lower limit of a constant, such as zero for a mass. ``start`` is
     the center of the prior, and ``known`` the part of the prior variance that the data removed.
-
-    Args:
-        model: the fitted model.
-        fit: the result of the fit.
-        input_units: units of the inputs, for the drive gains; without, their unit is ``Nm/u``.
+    With ``input_units`` the units of drive gains are complete; without, they are ``Nm/u``.
     """
     model = double_copy(model)
     constants = model.physical_constants()

@@ -75,8 +75,7 @@ def compare_terms(
     """Compare the terms of a learned model with the true terms, in float64.
 
     Args:
-        model: the learned system.
-        truth: the true system, with the same N and M.
+        model, truth: the learned and the true system, with the same N and M.
         q: configurations, ``(K, N)``.
         names: K names of the configurations; None numbers them.
     """

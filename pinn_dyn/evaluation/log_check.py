@@ -150,7 +150,14 @@ def check(
         cutoff = min(max(4 * highest, 1.0, 3.01 / longest), 0.4 / step)
         still = (coordinates["noise / range"] > _STILL).tolist()
         excitation = rigid_excitation(structure, splits.train, cutoff=cutoff, still=still)
-        measurements.append(_excitation(excitation))
+        condition, open_joints = excitation.condition, ", ".join(excitation.open_joints)
+        text = (
+            f"the rigid-body regressor has the condition number {condition:.3g}: these motions do "
+            f"not determine constants of {open_joints}; use more frequencies, poses and speeds"
+        )
+        name = f"condition number of {excitation.count} base parameters"
+        bad, expected = condition > MOST, f"below {MOST:g}"
+        measurements.append(_judged(name, "training", condition, expected, bad, text))
     u = np.vstack([item.u for item in training])
     table = {
         "input": source.input_labels[:inputs],
@@ -225,18 +232,6 @@ def _measured(coordinates: pd.DataFrame, explained: float) -> list[Measurement]:
     name, expected = "share of the motion that inputs add to (1, q, v)", f"at least {_EXPLAINED}"
     bad = explained < _EXPLAINED
     return [*results, _judged(name, "inputs", explained, expected, bad, text, "stop")]
-
-
-def _excitation(excitation: RigidExcitation) -> Measurement:
-    """Return the condition number of the base parameters of a rigid robot."""
-    condition = excitation.condition
-    text = (
-        f"the rigid-body regressor has the condition number {condition:.3g}, expected less than "
-        f"{MOST:g}: these motions do not determine constants of "
-        f"{', '.join(excitation.open_joints)}; excite them by more frequencies, poses and speeds"
-    )
-    name = f"condition number of {excitation.count} base parameters"
-    return _judged(name, "training", condition, f"below {MOST:g}", condition > MOST, text)
 
 
 def _filter(

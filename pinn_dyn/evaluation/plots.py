@@ -136,7 +136,7 @@ def mean_error_figure(
 
     Args:
         models, baselines: names and errors.
-        title, note, label: titles of the figure and of the legend, name and unit of the error.
+        title, note, label: titles of figure and legend, name and unit of the error.
         lost: word for excluded trajectories, such as "diverged", which the legend counts.
     """
     figure = Figure(figsize=(8, 4.8), layout="constrained")

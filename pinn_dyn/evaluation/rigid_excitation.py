@@ -77,7 +77,7 @@ def rigid_excitation(
     Args:
         structure, trajectories: kinematics and motions.
         cutoff: frequency of the filter, Hz: above the motion, below the noise.
-        still: true for joints that move by no more than their noise; they count as at rest.
+        still: true for joints that move by no more than their noise.
 
     Raises:
         ValueError: if all trajectories are too short for the filter.

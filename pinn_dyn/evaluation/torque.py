@@ -50,10 +50,7 @@ def torque_error(
     by local polynomials of degree 3 (Savitzky and Golay 1964), fitted to 0.05 s or 5 samples,
     whichever is longer.
 
-    Args:
-        model: the learned system.
-        truth: K trajectories stacked, q ``(K, T, N)``.
-        system: the true system, or None for measured data.
+    ``truth`` is K trajectories stacked, q ``(K, T, N)``; ``system`` is None for measured data.
     """
     learned = double_copy(model)
     with torch.no_grad():

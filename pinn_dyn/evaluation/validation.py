@@ -122,9 +122,7 @@ class RolloutValidator:
 class RolloutFigures(L.Callback):
     """Figures of a validation rollout, its error and the learned terms in the training log.
 
-    Args:
-        every_n_validations: number of validations between two drawings; the end of the training
-            is always drawn.
+    They are drawn at every n-th validation and at the end of the training.
     """
 
     def __init__(self, *, every_n_validations: PositiveInt = 4):

@@ -54,8 +54,7 @@ def prediction_report(
     }
     pages = [Section(title, [*parts]) for title, parts in sections.items()]
     pages = [section for section in pages if section.parts]
-    if item.origin is not None:
-        pages.append(item.origin.section())
+    pages += [] if item.origin is None else [item.origin.section()]
     title = f"{item.source.name}: trained models on unseen motions"
     return page(title, item.trajectories, pages)
 
