@@ -54,21 +54,16 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
-def check(command: str, config: dict[str, Any]) -> None:
-    """Check the configuration of a command.
+def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a command as plain values, without mistakes.
 
     Raises:
         ConfigError: with a line for each key that is missing or unknown, or has a wrong value.
     """
     from pinn_dyn.app.settings import SETTINGS  # imports PyTorch, which --help does not need
 
+    config = cfg if isinstance(cfg, dict) else plain(cfg)
     check_arguments(SETTINGS[command], config)
-
-
-def checked(command: str, cfg: DictConfig) -> dict[str, Any]:
-    """Convert the configuration of a command to plain values, and check them."""
-    config = plain(cfg)
-    check(command, config)
     return config
 
 
@@ -77,10 +72,8 @@ def composed(
 ) -> dict[str, Any]:
     """Compose and check the configuration of a command; of a sweep the first value counts.
 
-    ``config_dir`` is a folder with further options of groups.
-
-    Raises:
-        ConfigError: as :func:`check`, or with the message of Hydra.
+    ``config_dir`` is a folder with further options of groups. A ConfigError is that of
+    :func:`checked`, or has the message of Hydra.
     """
     search_path = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
     folder, before = str(config_folder(command)), HydraConfig.instance().cfg
@@ -131,10 +124,8 @@ def build_part(
 ) -> Any:
     """Build the object that a part of the configuration describes; ``name`` is its path.
 
-    The program adds ``arguments`` and ``extra``, or takes a factory with ``partial_``.
-
-    Raises:
-        ConfigError: if an argument does not fit, or with the message of the constructor.
+    The program adds ``arguments`` and ``extra``, or takes a factory with ``partial_``. A
+    ConfigError names the argument that does not fit, or has the message of the constructor.
     """
     check_value(name, config)
     try:

@@ -19,7 +19,6 @@ from pinn_dyn.training import Fit
 log = logging.getLogger(__name__)
 
 _CONSTANTS = "constants.csv"
-_UNDETERMINED = "undetermined.md"
 _SHOWN = 2  # directions in the log
 
 
@@ -32,7 +31,7 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
     log.info("constants and their intervals are in %s", path)
     lines = undetermined(model, result)
     head = f"{len(lines)} of {len(table)} directions of the constants are held by the prior"
-    path = folder / _UNDETERMINED
+    path = folder / "undetermined.md"
     write_whole(path, f"{head}, not by the data.\n\n" + "".join(f"- {x}\n" for x in lines))
     if lines:
         log.warning("%s, not by the data, see %s: %s ...", head, path, "; ".join(lines[:_SHOWN]))
@@ -40,9 +39,8 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
 
 def read_constants(folders: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
     """Read the constants of runs by their names; earlier versions wrote fewer columns."""
-    paths = {name: folder / _CONSTANTS for name, folder in folders.items()}
     return {
         name: pd.read_csv(path).reindex(columns=COLUMNS)
-        for name, path in paths.items()
-        if path.is_file()
+        for name, folder in folders.items()
+        if (path := folder / _CONSTANTS).is_file()
     }

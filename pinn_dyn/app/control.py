@@ -38,12 +38,7 @@ _REGION_SAMPLES = 200  # states per trajectory that a region of training data is
 
 
 def control(cfg: DictConfig) -> float:
-    """Close the loop of each controller; return the RMS error of the first controller.
-
-    Raises:
-        ConfigError: on a run without a mechanical model or a simulated robot, or a part that does
-            not fit the robot.
-    """
+    """Close the loop of each controller; return the RMS error of the first controller."""
     config = checked("control", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
@@ -70,9 +65,10 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     threshold = config["guard"].get("threshold")
-    if "learned" not in laws and (config["stability"] or threshold):
-        raise ConfigError("stability and guard need the controller 'learned'")
-    _export(laws.get("learned"), config)
+    if "learned" not in laws and (config["stability"] or threshold or config["export"]):
+        raise ConfigError("stability, guard and export need the controller 'learned'")
+    if config["export"]:
+        _export(laws["learned"], config)
     if threshold is not None:
         laws["learned"] = _guarded(laws["learned"], config, source)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
@@ -101,7 +97,8 @@ def _without_robot(
     learned: MechanicalSystem, source: DataSource, config: dict[str, Any], folder: Path
 ) -> float:
     """Export the law on a model of measured data, and write how well it is conditioned."""
-    _export(build_law(config, "learned", learned, learned), config)
+    if config["export"]:
+        _export(build_law(config, "learned", learned, learned), config)
     q = torch.cat([_thinned(item.q) for item in source.load().train])
     table = term_conditions(learned, q)
     table.to_csv(folder / "conditions.csv", index=False)
@@ -115,11 +112,7 @@ def _without_robot(
     return float("nan")
 
 
-def _export(law: Controller | None, config: dict[str, Any]) -> None:
-    if config["export"] is None:
-        return
-    if law is None:
-        raise ConfigError("export needs the controller 'learned'")
+def _export(law: Controller, config: dict[str, Any]) -> None:
     path = export_law(law, Path(config["export"]))
     log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
 

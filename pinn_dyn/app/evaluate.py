@@ -20,9 +20,7 @@ from pinn_dyn.app.trust import packages
 def main(cfg: DictConfig) -> float:
     """Evaluate the runs of a configuration, write the results, and return the smallest mean error.
 
-    Raises:
-        ConfigError: on settings that do not fit the data. Runs that cannot be loaded are left out
-            and named at the end.
+    Runs that cannot be loaded are left out and named at the end.
     """
     config = checked("evaluate", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)

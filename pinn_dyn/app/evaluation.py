@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.run import Run
-from pinn_dyn.app.run_folder import check_data, flattened
-from pinn_dyn.data import DataSource, LogSource, data_changes
+from pinn_dyn.app.run_folder import flattened, require_same_data
+from pinn_dyn.data import DataSource, LogSource, data_changes, data_identity
 from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
@@ -59,7 +59,7 @@ def evaluate(
     shared: dict[str, DataSource] = {}
     sources = [shared.setdefault(str(run.config["dataset"]), run.source) for run in runs]
     for run, trained_on in zip(runs, sources, strict=True):
-        check_data(run, trained_on)
+        require_same_data(run.folder, run.data, trained_on.name, data_identity(trained_on))
         if source is None:
             _require_same_test(run, runs[0], split)
         else:

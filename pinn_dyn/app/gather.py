@@ -51,11 +51,7 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
 
 
 def read_test_errors(folders: Sequence[str], patterns: Sequence[str]) -> pd.DataFrame:
-    """Return the test errors of runs, indexed by folder, from folders of evaluate.py or globs.
-
-    Raises:
-        ConfigError: if the evaluations have different horizons, so that errors do not compare.
-    """
+    """Return the test errors of runs, indexed by folder, from folders of evaluate.py or globs."""
     paths = [path for x in patterns for p in glob.glob(x) for path in Path(p).glob("summary.csv")]
     tables = [pd.read_csv(x) for x in sorted(paths, key=lambda path: -path.stat().st_mtime)]
     table = pd.concat([x[x["folder"].isin(folders)] for x in tables]) if tables else pd.DataFrame()

@@ -16,11 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def check_known(model: Predictor, source: DataSource) -> None:
-    """Refuse known mechanics whose joints are not the data's, or whose inputs are no forces.
-
-    Raises:
-        ConfigError: as :func:`check_structure`, or if inputs such as currents have no drive gains.
-    """
+    """Refuse known mechanics of other joints, or for inputs such as currents without gains."""
     model = model.known if isinstance(model, KnownAndNetwork) else model
     if not isinstance(model, KnownMechanics):
         return

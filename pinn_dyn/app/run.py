@@ -145,12 +145,12 @@ class Run:
     def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...
 
     @overload
-    def predict(self, start: Values, u: Values | Signal, t: Values | None = None) -> np.ndarray: ...
+    def predict(self, start: Values, u: Values, t: Values) -> np.ndarray: ...
 
     def predict(
         self,
         start: pd.DataFrame | Values,
-        u: Values | Signal | None = None,
+        u: Values | None = None,
         t: Values | None = None,
     ) -> pd.DataFrame | np.ndarray:
         """Predict the motion from a start under an input, or along a data frame.
@@ -165,13 +165,13 @@ class Run:
 
         Args:
             start: (q, v), ``(*batch, 2N)``, or (q, p) if ``model.state`` is ``"qp"``; or a frame.
-            u: inputs at the times t, ``(*batch, T, M)``, or a :class:`~pinn_dyn.Signal`.
-            t: increasing times, ``(T,)``, s; None uses those of a Signal.
+            u: inputs at the times t, ``(*batch, T, M)``.
+            t: increasing times, ``(T,)``, s.
 
         Raises:
             TypeError: if the input is missing.
-            ValueError: on shapes that do not fit the model, values that are not finite, times
-                outside the input, or a frame without the columns of the log.
+            ValueError: on shapes that do not fit the model, values that are not finite, or a
+                frame without the columns of the log.
         """
         if isinstance(start, pd.DataFrame):
             if self.log is None:
@@ -183,8 +183,8 @@ class Run:
     def predict_interval(
         self,
         start: Values,
-        u: Values | Signal,
-        t: Values | None = None,
+        u: Values,
+        t: Values,
         level: float = 0.95,
         factor: float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -214,27 +214,19 @@ class Run:
         return (mean - reach).numpy(), (mean + reach).numpy()
 
     def _motion(
-        self, start: Values, u: Values | Signal | None, t: Values | None
+        self, start: Values, u: Values | None, t: Values | None
     ) -> tuple[Tensor, Tensor, Signal]:
         """Return start, times and input of a prediction, in one batch."""
         x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
-        size = self.model.num_inputs
-        if isinstance(u, Signal):
-            self._array("u", u.u, size, "M")
-            signal = u.to("cpu", torch.float64)
-            times = signal.t if t is None else _tensor("t", t)
-            first, last = float(signal.t[0]), float(signal.t[-1])
-            if times.min() < first - 1e-9 or times.max() > last + 1e-9:
-                raise ValueError(f"t leaves the times of the input, {first:g} to {last:g} s")
-        elif u is None or t is None:
+        if u is None or t is None:
             raise TypeError("the input is missing: expected predict(start, u, t)")
-        else:
-            times, samples = _tensor("t", t), self._array("u", u, size, "M")
-            if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
-                shapes = f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}"
-                raise ValueError(f"{shapes}, expected (*batch, T, {size}) and (T,)")
-            part = self.config.get("log") or self.config["dataset"]
-            signal = Signal(times, samples, part.get("interpolation", "linear"))
+        size = self.model.num_inputs
+        times, samples = _tensor("t", t), self._array("u", u, size, "M")
+        if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
+            shapes = f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}"
+            raise ValueError(f"{shapes}, expected (*batch, T, {size}) and (T,)")
+        part = self.config.get("log") or self.config["dataset"]
+        signal = Signal(times, samples, part.get("interpolation", "linear"))
         batch = torch.broadcast_shapes(x0.shape[:-1], signal.batch)
         signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
         return x0.expand(*batch, -1), times, signal

@@ -1,8 +1,4 @@
-"""Run folders: lock, checkpoints, and loading of trained models.
-
-A checkpoint holds everything about a run: configuration, statistics, weights, metrics and the
-identity of the data. ``config.yaml`` and ``metrics.json`` are copies for people and for tables.
-"""
+"""Run folders. A checkpoint holds all about a run; YAML and JSON files are copies for people."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ from pinn_dyn import __version__
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import ModelBuilder, Run
 from pinn_dyn.app.trust import require_trusted
-from pinn_dyn.data import DataSource, data_changes, data_identity
+from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
@@ -122,11 +118,7 @@ def in_one_line(error: Exception) -> str:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint: tensors and plain values, no code.
-
-    Raises:
-        ConfigError: if it is missing, damaged, or no checkpoint of this program.
-    """
+    """Read a checkpoint: tensors and plain values, no code; refuse a damaged file."""
     if not path.is_file():
         names = ", ".join(sorted(file.stem for file in path.parent.glob("*.ckpt")))
         kind = f"{path.parent} has {names}" if names else "this is no run folder"
@@ -167,19 +159,10 @@ def finish(folder: Path, record: dict[str, Any]) -> None:
     write_whole(folder / METRICS, json.dumps(record, indent=2))
 
 
-def check_data(run: Run, source: DataSource) -> None:
-    """Refuse data that have changed since a run was trained on them: test motions may have moved.
-
-    Raises:
-        ConfigError: with what has changed.
-    """
-    require_same_data(run.folder, run.data, source.name, data_identity(source))
-
-
 def require_same_data(
     folder: Path, before: Mapping[str, Any], name: str, now: Mapping[str, Any]
 ) -> None:
-    """Refuse data of another identity than a checkpoint of the folder has."""
+    """Refuse data that have changed since a training: test motions may have moved."""
     if changes := data_changes(before, now) if before else []:
         more = [f"and {len(changes) - 10} more"] if len(changes) > 10 else []
         text = "\n  ".join([*changes[:10], *more])
@@ -196,9 +179,7 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None, dict[str, Any]]]:
     """Lock a run folder for a configuration; yield path and content of its newest checkpoint.
 
-    Raises:
-        ConfigError: if another process works in the folder, or it holds a training of another
-            configuration; names the keys that differ.
+    Refuse a folder that another process locks, or with a training of another configuration.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:

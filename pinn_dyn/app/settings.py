@@ -1,7 +1,4 @@
-"""Keys of the programs, annotated with the classes of the objects that they describe.
-
-``X | Callable[..., X]`` is an object that takes further arguments from the program.
-"""
+"""Keys of the programs; ``X | Callable[..., X]`` takes further arguments from the program."""
 
 from __future__ import annotations
 
@@ -19,7 +16,8 @@ from pinn_dyn.app.validation import STAND_INS, Seed
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.mechanics import MechanicalSystem, Predictor
+from pinn_dyn.mechanics import Predictor
+from pinn_dyn.models.known import Structure
 from pinn_dyn.training import LeastSquares, WindowLoss
 
 Names = str | Sequence[str]
@@ -155,7 +153,7 @@ class ControlSettings:
 class Kinematics:
     """Known structure of the robot, before a model is chosen."""
 
-    structure: MechanicalSystem | None = None
+    structure: Structure | None = None
 
 
 @dataclass(kw_only=True)

@@ -27,9 +27,8 @@ ERROR = "error.txt"
 class SweepCallback(Callback):
     """Records the errors of jobs, wherever the launcher runs them.
 
-    A job that fails leaves its error in ``error.txt``. In a sweep it counts as one of infinite
-    error, so that the other jobs run and a search goes on. After the last job the program ends with
-    a list of the failures and a non-zero status.
+    A job of a sweep that fails counts as one of infinite error, so that a search goes on. After the
+    last job the program ends with a list of the failures and a non-zero status.
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app import training
 from pinn_dyn.app.build import training_arguments
-from pinn_dyn.app.config import ConfigError, check, checked
+from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.run import VALIDATION_ERROR
 from pinn_dyn.app.run_folder import (
     CHECKPOINTS,
@@ -75,5 +75,4 @@ def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:
         saved = read_checkpoint(path := folder / CHECKPOINTS / "last.ckpt")  # says what is wrong
     config = saved["hyper_parameters"]["config"]
     require_trusted(config, str(path), trust)
-    check("train", config)
-    return config
+    return checked("train", config)

@@ -94,9 +94,6 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
 
     An epoch is a number of steps that divides the steps between two validations, so that the
     training ends with a validation.
-
-    Raises:
-        ConfigError: unless ``steps`` is a multiple of ``validations``.
     """
     between, remainder = divmod(steps, validations)
     if remainder or not between:
@@ -110,11 +107,7 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
 
 
 def compiles(compile: bool | Literal["auto"], steps: int, trainer: Mapping[str, Any]) -> bool:
-    """Return whether to compile the dynamics: with ``"auto"`` in long trainings.
-
-    Raises:
-        ConfigError: if compilation is demanded and there is no compiler.
-    """
+    """Return whether to compile the dynamics: with ``"auto"`` in long trainings."""
     accelerator = trainer.get("accelerator", "auto")
     on_gpu = torch.cuda.is_available() if accelerator == "auto" else accelerator != "cpu"
     missing = "" if has_cpp_compiler() else "C++ compiler (g++ or clang++) on the path"
@@ -165,10 +158,7 @@ def build_trainer(
     """Build the trainer with its callbacks and loggers, all writing to ``folder``.
 
     ``settings`` are arguments of :class:`lightning.Trainer`, ``length`` is that of :func:`epochs`.
-
-    Raises:
-        ConfigError: if an argument does not fit, or the strategy starts the program again on each
-            device.
+    A strategy that starts the program again on each device is refused.
     """
     # A resumed training finds its checkpoints by these names.
     files: dict[str, Any] = {"dirpath": str(folder / CHECKPOINTS), "enable_version_counter": False}

@@ -1,9 +1,4 @@
-"""Trust in configurations of run folders: the classes that they may build.
-
-A ``_target_`` names code that is run: ``os.system`` as readily as a network of this package. So the
-configuration of a run folder, which may come from anyone, is searched before anything is built. It
-may name the classes below, and those of packages that the user trusts by ``trust=my_package``.
-"""
+"""Trust in configurations of run folders, which may come from anyone: what they may build."""
 
 from __future__ import annotations
 
@@ -50,15 +45,9 @@ def packages(trust: str | list[str] | None) -> tuple[str, ...]:
 
 
 def require_trusted(config: dict[str, Any], source: str, trust: tuple[str, ...] = ()) -> None:
-    """Refuse a configuration that names code other than the allowed classes.
+    """Refuse a configuration of a file that names code other than the allowed classes.
 
-    Args:
-        config: plain values.
-        source: file of the configuration, for messages.
-        trust: packages whose classes are allowed too.
-
-    Raises:
-        ConfigError: naming the key.
+    Classes of the packages ``trust`` are allowed too. A ConfigError names the key.
     """
     for path, value in places(config):
         key = f"{source}: {path or 'the configuration'}"
@@ -127,10 +116,6 @@ def _is_trusted(target: Any, trust: tuple[str, ...]) -> bool:
 
 
 def check_name(path: str, name: Any) -> None:
-    """Refuse a name of a file that would lead out of its folder.
-
-    Raises:
-        ConfigError: naming the key.
-    """
+    """Refuse a name of a file that would lead out of its folder."""
     if not isinstance(name, str) or set(name) & set("/\\\0\n") or name in ("", ".", ".."):
         raise ConfigError(f"{path} is {name!r}, expected a name of a file, without separators")

@@ -1,8 +1,4 @@
-"""Checks of configurations against the signatures of the classes that they name.
-
-A configuration describes an object by ``_target_``, the name of its class, and the arguments of its
-constructor. The annotations are the types, ``Annotated[float, Field(gt=0)]`` adds limits.
-"""
+"""Checks of configurations against the signatures of the classes that ``_target_`` names."""
 
 from __future__ import annotations
 
@@ -48,11 +44,7 @@ class ConfigError(ValueError):
 
 
 def check_arguments(target: Callable[..., Any], values: Mapping[str, Any]) -> None:
-    """Check that values are arguments of a class or function, and that none is missing.
-
-    Raises:
-        ConfigError: with a line for each mistake.
-    """
+    """Check that values are arguments of a target and none is missing; report all mistakes."""
     paths = dict(places(values))
     if clashes := SET_BY_PROGRAM.intersection(paths):
         raise ConfigError(f"set by the program, leave out: {', '.join(sorted(clashes))}")
@@ -64,11 +56,7 @@ def check_arguments(target: Callable[..., Any], values: Mapping[str, Any]) -> No
 
 
 def check_value(path: str, value: Any, annotation: Any = object) -> None:
-    """Check one value against an annotation; by default, the description of an object.
-
-    Raises:
-        ConfigError: with a line for each mistake; ``path`` is the key of the value.
-    """
+    """Check the value of a key against an annotation; by default, that of any object."""
     with _reported(value, path):
         TypeAdapter(_configurable(annotation), config=_CONFIG).validate_python(value)
 

@@ -124,8 +124,6 @@ def test_a_start_and_an_input_are_predicted_as_the_model_does(model):
         model.predict(start, u, t),
         model.predict(x0, torch.tensor(u), torch.tensor(t)),
         model.predict(np.tile(start, (2, 1)), u, t)[1],
-        model.predict(start, signal),
-        np.concatenate([model.predict(start, signal, t[:4]), expected[4:]]),
     ):
         np.testing.assert_allclose(predicted, expected, rtol=1e-9, atol=1e-12)
 
@@ -142,10 +140,6 @@ START, T = np.zeros(6) + 0.1, np.arange(4) * 0.02
         ((START, np.zeros((2, 4, 3)), T[::-1]), "t must increase"),
         ((START * np.nan, np.zeros((4, 3)), T), "start has 6 non-finite entries"),
         ((START, np.zeros((4, 3)), pd.to_timedelta(T, unit="s")), "t holds dates or durations"),
-        (
-            (START, pinn_dyn.Signal(torch.tensor(T), torch.zeros(4, 3)), T + 0.02),
-            "t leaves the times",
-        ),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(model, arguments, message):

@@ -8,7 +8,8 @@ import torch
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.run_folder import check_data, load_run
+from pinn_dyn.app.run_folder import load_run, require_same_data
+from pinn_dyn.data import data_identity
 from tests.app.entry import NO_FIGURES, ROOT, TINY_TRAINING, refused_text, run_script
 from tests.support.foreign_runs import foreign
 
@@ -37,7 +38,8 @@ def run(trained, tmp_path):
 
 def check(folder):
     run = load_run(folder)
-    check_data(run, build_source(run.config))
+    source = build_source(run.config)
+    require_same_data(run.folder, run.data, source.name, data_identity(source))
 
 
 def change_a_number(log):
