@@ -40,7 +40,7 @@ def test_a_log_gets_a_verdict_a_page_and_a_step_to_copy(tmp_path, capsys):
     page = (tmp_path / "out" / "check.html").read_text()
     assert "Inputs and their delays" in page
     assert "delay: 0.05" in page
-    assert page.count("<img") == 3
+    assert page.count("<img") == 2
 
 
 def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):
