@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 
-from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.build import model_builder
+from pinn_dyn.app.config import ConfigError, build_part
 from pinn_dyn.app.constants import read_constants
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import flattened, require_same_data
@@ -14,7 +15,7 @@ from pinn_dyn.data.fastest_motion import too_long_for
 from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_models
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
-from pinn_dyn.mechanics import stack_until
+from pinn_dyn.mechanics import Predictor, stack_until
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +101,11 @@ def evaluate(
     training = splits[sources[0]]
     predictors = build_baselines(training.train, training.validation, step=grid)
     baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
+    for model, run, trained_on, own_step in zip(models, runs, sources, steps, strict=True):
+        name = f"identification of {model}"
+        if _is_rolled_out(run) and name not in {entry.run for entry in baselines}:
+            identified = _identified(run, trained_on)
+            baselines.append(Entry(name, identified, splits[trained_on], own_step, name))
     evaluation = evaluate_models(
         entries,
         baselines,
@@ -113,6 +119,20 @@ def evaluate(
     folders = {name: run.folder for name, run in zip(names, runs, strict=True)}
     evaluation.constants = read_constants(folders)
     return evaluation
+
+
+def _is_rolled_out(run: Run) -> bool:
+    """Check whether a run fitted constants by roll-outs, after their identification."""
+    fitted = run.covariance is not None and run.config.get("start_from") is None
+    return fitted and run.config["optimizer"].get("rollouts", True)
+
+
+def _identified(run: Run, source: DataSource) -> Predictor:
+    """Repeat the first stage of a fit: identification by inverse dynamics, without roll-outs."""
+    model = model_builder(run.config)(statistics=run.statistics)
+    solver = build_part("optimizer", {**run.config["optimizer"], "rollouts": False})
+    solver.fit(model, source.load().train)
+    return model
 
 
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:

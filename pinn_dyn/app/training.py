@@ -348,7 +348,7 @@ def _fit(
         if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
             trainer.validate(learner, data, verbose=False)
     except SystemExit as stop:  # Lightning's end of an interrupted training
-        if solver:
+        if solver and solver.result is not None:
             trainer.save_checkpoint(last)
         raise KeyboardInterrupt from stop
     if solver and solver.result is not None:

@@ -1,7 +1,7 @@
 """Training: LightningModules, losses, gradient engines, optimizers and schedules."""
 
 from pinn_dyn.training.checkpoints import WholeCheckpoints
-from pinn_dyn.training.constants_fit import Fit
+from pinn_dyn.training.constants_fit import Fit, StoppedFit
 from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
 from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
@@ -23,6 +23,7 @@ __all__ = [
     "NonFiniteLossError",
     "ParameterVector",
     "Penalized",
+    "StoppedFit",
     "WholeCheckpoints",
     "WindowLoss",
     "one_cycle",

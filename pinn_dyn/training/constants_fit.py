@@ -30,6 +30,7 @@ class Fit:
         prior: prior of z.
         residual: root mean square of the normalized data residuals.
         iterations: number of Gauss-Newton steps.
+        stopped_in: stage in which the fit was interrupted, or None if it is finished.
     """
 
     covariance: Tensor
@@ -37,6 +38,7 @@ class Fit:
     prior: Prior
     residual: float
     iterations: int
+    stopped_in: int | None = None
 
     def state(self) -> dict[str, Any]:
         """Convert to tensors and numbers for a checkpoint."""
@@ -46,11 +48,19 @@ class Fit:
     @classmethod
     def from_state(cls, state: Any, count: int) -> Fit:
         """Build the fit of ``count`` parameters from a checkpoint."""
-        values = {key: value for key, value in state.items() if key != "stopped_in"}
+        values = dict(state)
         if getattr(values.get("covariance"), "shape", None) != (count, count):
             raise ValueError(f"the checkpoint has no fit of the model's {count} constants")
         prior = Prior(values.pop("mean"), values.pop("root"))
         return cls(prior=prior, **values)
+
+
+class StoppedFit(KeyboardInterrupt):
+    """Interrupt of a fit, with the result so far. The model has the best constants so far."""
+
+    def __init__(self, fit: Fit):
+        super().__init__()
+        self.fit = fit
 
 
 def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:

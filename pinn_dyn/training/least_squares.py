@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -17,7 +18,13 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
-from pinn_dyn.training.constants_fit import Fit, Prior, far_from_start, posterior_covariance
+from pinn_dyn.training.constants_fit import (
+    Fit,
+    Prior,
+    StoppedFit,
+    far_from_start,
+    posterior_covariance,
+)
 from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
 from pinn_dyn.training.sensitivity import rollout_slopes
 
@@ -85,28 +92,32 @@ class LeastSquares:
         self,
         model: LearnedConstants,
         trajectories: Sequence[Trajectory],
-        windows: Windows,
+        windows: Windows | None = None,
         covariance: Tensor | None = None,
+        stopped: Fit | None = None,
     ) -> Fit:
-        """Fit the model in place. Its precision does not change. An interrupt undoes the fit.
+        """Fit the model in place. Its precision does not change.
 
         Args:
             model: the model to fit.
             trajectories: training trajectories for the inverse dynamics.
-            windows: training windows for the roll-outs.
+            windows: training windows for the roll-outs; not needed if ``rollouts`` is false.
             covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
+            stopped: interrupted result of this fit, to continue from the present z.
 
         Raises:
             ValueError: if trajectories are too short for the filter, there are fewer residuals than
                 parameters, the covariance does not fit the model, or changed bodies are unknown.
+            StoppedFit: on an interrupt. The model then has the best z so far.
         """
-        start = parameters_to_vector(model.parameters()).detach().clone()
-        count = len(start)
+        count = sum(p.numel() for p in model.parameters())
+        precision = next(model.parameters()).dtype
         model.double()
-        prior = self._prior(model, covariance)
+        prior = stopped.prior if stopped else self._prior(model, covariance)
         earlier = covariance is not None
         stages = [partial(self._identify, model, prior, trajectories, earlier)]
         if self.rollouts:
+            assert windows is not None
             windows = windows.to(torch.device("cpu"), torch.float64)
             steps, size = len(windows.t) - 1, len(windows) * model.num_coordinates
             source = f"{len(windows)} windows of {steps} steps"
@@ -118,14 +129,19 @@ class LeastSquares:
             enough = size * _informative_blocks(short) * short >= count
             for length in [short, steps] if enough and short < steps else [steps]:
                 stages.append(partial(self._roll_out, model, prior, windows.first(length)))
+        result, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         try:
-            for stage in stages:
-                result = stage()
-        except KeyboardInterrupt:
-            vector_to_parameters(start.double(), model.parameters())
-            raise
+            while number < len(stages):
+                result = stages[number]()
+                number += 1
+        except KeyboardInterrupt as interrupt:
+            zero = torch.zeros_like(prior.root)
+            covariance = posterior_covariance(zero, prior.root)
+            partial_fit = result or Fit(covariance, zero, prior, float("nan"), 0)
+            raise StoppedFit(replace(partial_fit, stopped_in=number)) from interrupt
         finally:
-            model.to(start.dtype)
+            model.to(precision)
+        assert result is not None
         z = parameters_to_vector(model.parameters()).detach().to(prior.mean)
         for line in far_from_start(model.parameter_names(), z, prior):
             log.warning("least squares: %s", line)
@@ -216,19 +232,29 @@ class LeastSquares:
             return max(float(np.sqrt(square)), np.finfo(float).eps)
 
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
+        best = np.inf, z.numpy()
         for _ in range(2):
             weight = 1 / (noise * group**0.5)
+            best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
+                nonlocal best
                 data = weight * _evaluate(model, at, residuals, False)
-                return np.concatenate([data, root @ (at - mean)])
+                errors = np.concatenate([data, root @ (at - mean)])
+                if (cost := float(errors @ errors)) < best[0]:
+                    best = cost, at.copy()
+                return errors
 
             def slope(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
                 return np.concatenate([data, root])
 
             limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
-            solution = least_squares(value, z.numpy(), slope, **limit)
+            try:
+                solution = least_squares(value, z.numpy(), slope, **limit)
+            except KeyboardInterrupt:
+                vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
+                raise
             z = torch.from_numpy(solution.x)
             noise = spread(solution.x)
             steps += int(solution.njev)

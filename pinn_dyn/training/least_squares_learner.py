@@ -17,7 +17,7 @@ from torch.optim import SGD
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.statistics import Statistics
-from pinn_dyn.training.constants_fit import Fit
+from pinn_dyn.training.constants_fit import Fit, StoppedFit
 from pinn_dyn.training.learner import DynamicsLearner, Validator
 from pinn_dyn.training.least_squares import LeastSquares
 from pinn_dyn.training.losses import WindowLoss
@@ -31,7 +31,7 @@ class LeastSquaresLearner(DynamicsLearner):
     """LightningModule that fits a model by least squares in a single training step.
 
     The trainer has ``steps: 1`` and ``validations: 1``, and one batch contains all windows. SIGTERM
-    and Ctrl-C interrupt a fit at any time. It starts again when the training is resumed.
+    and Ctrl-C interrupt a fit at any time. It continues from the checkpoint that is then written.
 
     Args:
         model, solver: the model to fit, and the least-squares solver.
@@ -39,7 +39,7 @@ class LeastSquaresLearner(DynamicsLearner):
         loss, validator, config, statistics: see :class:`DynamicsLearner`.
 
     Attributes:
-        result: result of the fit, once it is finished.
+        result: result of the fit, once it is finished or interrupted.
 
     Raises:
         TypeError: if the parameters of the model are not physical constants.
@@ -79,15 +79,16 @@ class LeastSquaresLearner(DynamicsLearner):
         """Fit the model on all training trajectories and windows, in double precision."""
         data = self.trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(self.model, LearnedConstants)
-        if self.result is None:
+        if self.result is None or self.result.stopped_in is not None:
             try:
                 with _sigterm_interrupts():
                     self.result = self.solver.fit(
-                        self.model, data.splits.train, data.windows, self.covariance
+                        self.model, data.splits.train, data.windows, self.covariance, self.result
                     )
-            except KeyboardInterrupt as interrupt:
+            except StoppedFit as stopped:
+                self.result = stopped.fit
                 if self.trainer.received_sigterm:
-                    raise SIGTERMException from interrupt
+                    raise SIGTERMException from stopped
                 raise
         self.log_losses(torch.tensor(self.result.residual**2))
         self.optimizers().step()  # type: ignore[union-attr]  # only counts the step
@@ -99,8 +100,8 @@ class LeastSquaresLearner(DynamicsLearner):
             checkpoint[_FIT] = self.result.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take the fit of the checkpoint, if it is finished."""
-        if _FIT in checkpoint and checkpoint[_FIT].get("stopped_in") is None:
+        """Continue the fit of the checkpoint, if any."""
+        if _FIT in checkpoint:
             count = sum(p.numel() for p in self.model.parameters())
             self.result = Fit.from_state(checkpoint[_FIT], count)
 
@@ -115,7 +116,7 @@ def _sigterm_interrupts() -> Iterator[None]:
     before = signal.getsignal(signal.SIGTERM)
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, before)  # once
+        signal.signal(signal.SIGTERM, before)  # once, since the result is then being saved
         if callable(before):
             before(number, frame)  # the handler of the trainer
         raise KeyboardInterrupt

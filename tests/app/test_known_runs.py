@@ -121,6 +121,23 @@ def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
     assert (middle[1:] < high[1:]).all()
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path):
+    short = ["optimizer.evaluations=2", "optimizer.samples=200"]
+    for name, words in {"rolled": WINDOWS, "alone": SMALL}.items():
+        run_script("train.py", *KNOWN, *words, *short, f"hydra.run.dir={tmp_path / name}")
+    folders = ",".join(str(tmp_path / name) for name in ("rolled", "alone"))
+    words = ["windows=[0.1]", "horizon=0.2", f"hydra.run.dir={tmp_path / 'both'}"]
+    run_script("evaluate.py", f"runs=[{folders}]", *words)
+    summary = pd.read_csv(tmp_path / "both" / "summary.csv")
+    rolled, alone = summary[~summary["baseline"]].to_dict("records")
+    (identified,) = summary[summary["run"].str.startswith("identification")].to_dict("records")
+    for column in ("error_mean", "error_worst", "window_0.1s_error_mean", "torque_share"):
+        assert identified[column] == pytest.approx(alone[column], rel=1e-5)
+    assert identified["baseline"]
+    assert identified["error_mean"] != rolled["error_mean"]
+
+
 FORGED = {
     "none": (lambda c: None, "has no covariance of its constants"),
     "of another": (lambda c: c[:3, :3], "the earlier fit has 3 constants, this model"),
@@ -153,7 +170,7 @@ def test_a_fit_that_the_data_refuse_ends_in_a_sentence(tmp_path, capsys, words, 
     assert re.search(message, refused_text(capsys, "train.py", *arguments))
 
 
-def test_a_stopped_fit_ends_at_once_and_starts_again(tmp_path, monkeypatch):
+def test_a_stopped_fit_ends_at_once_and_goes_on(tmp_path, monkeypatch):
     folder, begun, log = tmp_path / "run", tmp_path / "begun", tmp_path / "log.txt"
 
     def endless(*_):
@@ -177,6 +194,8 @@ def test_a_stopped_fit_ends_at_once_and_starts_again(tmp_path, monkeypatch):
     assert f"train.py resume={folder}" in text
     assert not (folder / "constants.csv").exists()
     assert not (folder / "metrics.json").exists()
+    kept = constants(folder)
+    assert max(float(value.abs().max()) for value in kept.values()) > 0.1
     run_script("train.py", f"resume={folder}")
     assert (folder / "constants.csv").exists()
     assert (folder / "metrics.json").exists()

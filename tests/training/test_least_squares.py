@@ -13,8 +13,8 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction
-from pinn_dyn.training import LeastSquares, least_squares
-from pinn_dyn.training.constants_fit import Prior, far_from_start
+from pinn_dyn.training import LeastSquares, StoppedFit, least_squares
+from pinn_dyn.training.constants_fit import Fit, Prior, far_from_start
 from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
 from tests.support.known import known_model, motion, motions
 from tests.support.rigid_chains import joint, link, robot
@@ -183,21 +183,49 @@ def test_data_that_do_not_fit_the_filter_are_refused(runs):
         filtered_motion(runs, 0.5, samples=10)
 
 
-def test_an_interrupted_fit_leaves_the_model_as_it_was(runs, monkeypatch):
+@pytest.fixture
+def solved(monkeypatch):
+    """The minimizations that were begun: two of the identification, then short and long ones."""
+    begun, solve = [], LeastSquares._solve
+
+    def recorded(self, stage, *arguments, **settings):
+        begun.append(stage)
+        return solve(self, stage, *arguments, **settings)
+
+    monkeypatch.setattr(LeastSquares, "_solve", recorded)
+    return begun
+
+
+@pytest.mark.parametrize(("minimization", "evaluation"), [(1, 2), (1, 8), (4, 4)])
+def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
+    truth, runs, unseen, solved, monkeypatch, minimization, evaluation
+):
     windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
-    model = robot_model("generic")
-    before = parameters_to_vector(model.parameters()).clone()
+    solver, model = LeastSquares(cutoff=20.0), robot_model("generic")
+    before = held_out_error(model, truth, unseen)
     evaluate, calls = least_squares._evaluate, itertools.count(1)
 
-    def interrupted(*arguments):
-        if next(calls) == 8:
+    def interrupted(model, z, *others):
+        found = evaluate(model, z, *others)
+        if len(solved) == minimization and next(calls) == evaluation:
+            vector_to_parameters(torch.from_numpy(z + 3), model.parameters())  # a step too far
             raise KeyboardInterrupt
-        return evaluate(*arguments)
+        return found
 
-    monkeypatch.setattr(least_squares, "_evaluate", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        LeastSquares(cutoff=20.0).fit(model, runs, windows)
-    assert torch.equal(parameters_to_vector(model.parameters()), before)
+    with monkeypatch.context() as patch:
+        patch.setattr(least_squares, "_evaluate", interrupted)
+        with pytest.raises(StoppedFit) as stopped:
+            solver.fit(model, runs, windows)
+    count = sum(p.numel() for p in model.parameters())
+    fit = Fit.from_state(stopped.value.fit.state(), count)
+    assert fit.stopped_in == (0 if minimization == 1 else 2)
+    assert held_out_error(model, truth, unseen) < (1.001 if evaluation == 2 else 0.9) * before
+    solved.clear()
+    found = solver.fit(model, runs, windows, stopped=fit)
+    assert found.stopped_in is None
+    assert len(solved) == (4 if minimization == 1 else 1)  # what was finished is not done again
+    assert held_out_error(model, truth, unseen) < 0.01
+    assert not found.prior.mean.any()
 
 
 def test_fewer_residuals_than_constants_are_refused(runs, caplog):
