@@ -3,7 +3,6 @@
 from pinn_dyn.data.datamodule import DynamicsData
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
 from pinn_dyn.data.identity import data_changes, data_identity
-from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.logs import Cleaned, LogError, LogSource
 from pinn_dyn.data.robot import RobotSource
 from pinn_dyn.data.robot_excitation import (
@@ -11,7 +10,7 @@ from pinn_dyn.data.robot_excitation import (
     TorqueMultiSine,
     TrackedMultiSine,
 )
-from pinn_dyn.data.simulated import SimulatedSource
+from pinn_dyn.data.simulated import InitialStates, SimulatedSource
 from pinn_dyn.data.simulation import SimulationError, simulate
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.data.stored import StoredSource, store

@@ -7,7 +7,7 @@ import hashlib
 import marshal
 import sys
 import types
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,6 @@ def describe(value: object) -> Any:
         return value.tolist()
     if isinstance(value, Mapping):
         return {str(key): describe(item) for key, item in value.items()}
-    if isinstance(value, Set):
-        return sorted(map(describe, value), key=str)
     if isinstance(value, Sequence):
         return [describe(item) for item in value]
     if isinstance(value, (type, types.FunctionType)):

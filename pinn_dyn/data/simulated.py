@@ -10,13 +10,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.excitation import Excitation, joined
 from pinn_dyn.data.excitation import Signal as InputSignal
 from pinn_dyn.data.fingerprint import describe
-from pinn_dyn.data.initial_states import InitialStates
 from pinn_dyn.data.simulation import SimulationError, momentum, simulate
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
@@ -27,6 +26,30 @@ _VERSION = 3
 # Within limits: largest number of draws of a motion, and draws that are simulated at once.
 _DRAWS = 40
 _AT_ONCE = 3
+
+
+@dataclass(frozen=True)
+class InitialStates:
+    """A box from which initial states are drawn uniformly.
+
+    Args:
+        q_low, q_high: bounds of the configuration, ``(N,)``.
+        v_max: bound of the speed of each coordinate, ``(N,)``.
+    """
+
+    q_low: Sequence[float]
+    q_high: Sequence[float]
+    v_max: Sequence[NonNegativeFloat]
+
+    def __post_init__(self) -> None:
+        if (np.subtract(self.q_high, self.q_low) < 0).any():
+            raise ValueError(f"q_low = {self.q_low} exceeds q_high = {self.q_high}")
+
+    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw ``count`` initial configurations and velocities, both ``(count, N)``."""
+        v_max = np.asarray(self.v_max, dtype=float)
+        shape = (count, len(v_max))
+        return rng.uniform(self.q_low, self.q_high, shape), rng.uniform(-v_max, v_max, shape)
 
 
 class _Draw(NamedTuple):

@@ -186,7 +186,13 @@ def draw_windows(
         flat = _distinct(total, min(max(10 * count, 400_000), total), generator)
         parts = [item.q[past:][:n] for item, n in zip(trajectories, starts, strict=True)]
         q = torch.cat(parts)[flat]
-        flat = flat[_spread_out(q, count, coverage * q.shape[-1], generator)]
+        z = (q / q.std(0).clamp(min=1e-12)).numpy()
+        # The nearest neighbor is the row itself.
+        distance = torch.from_numpy(cKDTree(z).query(z, k=min(11, len(z)))[0][:, -1])
+        # Rows with the largest log(uniform)/weight: Efraimidis and Spirakis (2006).
+        uniform = torch.rand(len(z), generator=generator, dtype=torch.float64)
+        weight = distance.clamp(min=1e-12) ** (coverage * q.shape[-1])
+        flat = flat[torch.topk(uniform.log() / weight, count).indices]
     else:
         flat = _distinct(total, count, generator)
     ends = starts.cumsum(0)
@@ -221,16 +227,6 @@ def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
         more = torch.randint(total, (count,), generator=generator)
         numbers = torch.unique(torch.cat([numbers, more]))
     return numbers[torch.randperm(numbers.shape[0], generator=generator)[:count]]
-
-
-def _spread_out(q: Tensor, count: int, power: float, generator: torch.Generator) -> Tensor:
-    """Draw positions of ``count`` rows without repetition, with weights (d_k)^power."""
-    z = (q / q.std(0).clamp(min=1e-12)).numpy()
-    neighbours = min(11, z.shape[0])  # the nearest is the row itself
-    distance = torch.from_numpy(cKDTree(z).query(z, k=neighbours)[0][:, -1])
-    # Rows with the largest log(uniform)/weight: Efraimidis and Spirakis (2006).
-    uniform = torch.rand(z.shape[0], generator=generator, dtype=torch.float64)
-    return torch.topk(uniform.log() / distance.clamp(min=1e-12) ** power, count).indices
 
 
 PICKED = 16_384

@@ -1,7 +1,7 @@
 """Logs of robots: readers, columns, units, cleaning steps, checks and the data source."""
 
-from pinn_dyn.data.logs.clock import Deduplicate, Resample, SplitGaps
-from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.clock import Deduplicate, InputDelay, Resample, SplitGaps
+from pinn_dyn.data.logs.columns import UNITS, Columns
 from pinn_dyn.data.logs.delay import DelayCurve, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
@@ -11,7 +11,6 @@ from pinn_dyn.data.logs.filters import (
     RemoveJumps,
     SavitzkyGolayVelocity,
 )
-from pinn_dyn.data.logs.input_delay import InputDelay
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.readers import READERS
@@ -20,7 +19,6 @@ from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.step import Step, window_samples
 from pinn_dyn.data.logs.table import Request, Table
-from pinn_dyn.data.logs.units import UNITS
 
 __all__ = [
     "READERS",

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.io import loadmat
 
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.table import Request, optional
@@ -20,27 +19,19 @@ from pinn_dyn.spelling import did_you_mean
 
 
 def read_mat(path: Path, request: Request) -> pd.DataFrame:
-    """Read a MATLAB file; version 7.3, which is HDF5, by pymatreader."""
-    try:
-        content = loadmat(path, squeeze_me=False, struct_as_record=True)
-    except NotImplementedError:
-        content = optional("pymatreader", path).read_mat(str(path))
+    """Read a MATLAB file; the fields of a struct are ``name.field``."""
+    content = optional("pymatreader", path).read_mat(str(path))
     variables: dict[str, Any] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            _flatten(name, value, variables)
+
+    def visit(prefix: str, values: Mapping[str, Any]) -> None:
+        for name, value in values.items():
+            if isinstance(value, Mapping):
+                visit(f"{prefix}{name}.", value)
+            else:
+                variables[f"{prefix}{name}"] = value
+
+    visit("", content)
     return _table(path, request.time, variables)
-
-
-def _flatten(name: str, value: Any, variables: dict[str, Any]) -> None:
-    """Add a variable, or the fields of a struct as ``name.field``."""
-    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
-        value = {field: value.flat[0][field] for field in value.dtype.names}
-    if isinstance(value, Mapping):
-        for field, content in value.items():
-            _flatten(f"{name}.{field}", content, variables)
-    else:
-        variables[name] = value
 
 
 def read_hdf5(path: Path, request: Request) -> pd.DataFrame:

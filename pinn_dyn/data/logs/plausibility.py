@@ -26,8 +26,7 @@ def check_stamps(recordings: list[Recording], repairs: Collection[str]) -> list[
     share, run = max((burst_share(item.t), item.run) for item in recordings)
     text = (
         f"{run}: stamps come in bursts, most rows follow the row before within a fifth of the mean "
-        "sample time: if no row is missing, take the time from the row number, by the step "
-        "examples.cleaning_steps.RowClock"
+        "sample time: if no row is missing, use the step examples.cleaning_steps.RowClock"
     )
     bad = share > BURSTS and "bursts" not in repairs
     return [judged("share of rows in bursts", run, share, f"below {BURSTS}", bad, text)]
@@ -52,9 +51,8 @@ def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
             f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two turns: "
             f"is it in degrees? Its unit is configured as {q.unit[k]!r}"
         )
-        bad, section = angle > 4 * math.pi, "csv_logs.md#columns"
         measured = ("largest angle [rad]", q.columns[k], angle, "below 4 pi")
-        results.append(judged(*measured, bad, text, section=section))
+        results.append(judged(*measured, angle > 4 * math.pi, text))
     return results
 
 
@@ -75,10 +73,9 @@ def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
         f"the robot is at rest for {100 * share:.0f} % of the training samples: windows drawn "
         "there teach little; use data.coverage, or cut the rest out"
     )
-    bad = share > _AT_REST
     verdict: Verdict = "stop" if share > _ALL_AT_REST else "warning"
-    name, expected = "share at rest", f"below {_AT_REST}"
-    return [*results, judged(name, "training", share, expected, bad, text, verdict)]
+    measured = ("share at rest", "training", share, f"below {_AT_REST}", share > _AT_REST)
+    return [*results, judged(*measured, text, verdict)]
 
 
 def check_velocities(
@@ -165,7 +162,6 @@ def check_force_signs(training: list[Recording], u: Columns, step: float) -> lis
             f"coordinate {k + 1} by {correlation:.2f} once position, velocity and other inputs "
             "are accounted for: is its sign reversed?"
         )
-        title, expected = "correlation of force and acceleration", f"above {_REVERSED}"
-        bad = correlation < _REVERSED
-        results.append(judged(title, name, correlation, expected, bad, text))
+        measured = ("correlation of force and acceleration", name, correlation)
+        results.append(judged(*measured, f"above {_REVERSED}", correlation < _REVERSED, text))
     return results

@@ -44,7 +44,7 @@ def check_repeats(
     for (run, original), count in pairs.items():
         text = (
             f"{name}: {count} of the motions of {run} repeat one of {original}, which is in the "
-            "training: errors on them say little of new motions; keep such runs in one split"
+            "training: keep such runs in one split"
         )
         results.append(judged(title, run, count, "0", True, text, section="csv_logs.md#splits"))
     return results or [judged(title, name, 0, "0", False, "")]

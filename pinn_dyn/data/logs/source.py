@@ -16,7 +16,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from pinn_dyn.data.logs import plausibility
 from pinn_dyn.data.logs.checks import check_clock, check_rows
-from pinn_dyn.data.logs.columns import Columns, described
+from pinn_dyn.data.logs.columns import UNITS, Columns, described
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.measurement import Measurement
@@ -27,7 +27,6 @@ from pinn_dyn.data.logs.repeats import check_repeats, refuse_copies
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.table import Request, Table
-from pinn_dyn.data.logs.units import UNITS
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
