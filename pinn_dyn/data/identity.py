@@ -36,10 +36,9 @@ def data_identity(source: DataSource) -> dict[str, dict[str, Any]]:
 
 
 def _hash(item: Trajectory) -> str:
-    content = hashlib.sha256()
-    for value in (item.t, item.q, item.v, item.u):
-        content.update(f"{tuple(value.shape)}".encode() + value.contiguous().numpy().tobytes())
-    return content.hexdigest()[:16]
+    values = (item.t, item.q, item.v, item.u)
+    content = b"".join(f"{tuple(x.shape)}".encode() + x.numpy().tobytes() for x in values)
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def data_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

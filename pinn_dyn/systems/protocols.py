@@ -1,7 +1,4 @@
-"""Protocols of what a robot may offer beyond its equation of motion.
-
-References, plants, limits and animations ask for these and for no class.
-"""
+"""Protocols of what a robot may offer beyond its equation of motion."""
 
 from __future__ import annotations
 

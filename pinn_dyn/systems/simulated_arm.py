@@ -82,11 +82,9 @@ class SimulatedArm(RigidChain, abc.ABC):
 
     @abc.abstractmethod
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Move the arm by one time step; return q and v after it, ``(N,)`` each.
+        """Return q and v, ``(N,)`` each, after ``step`` s under the motor torque ``(N,)``, Nm.
 
-        Args:
-            torque: motor torque, ``(N,)``, Nm, held over the step; the joints' damping is added.
-            step: time step, s.
+        The joints' damping is added.
         """
 
     def motor_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -111,8 +109,7 @@ class SimulatedArm(RigidChain, abc.ABC):
     def to_urdf(self) -> str:
         """Return a URDF with one link per body and without shapes, limits and friction.
 
-        At q = 0 all frames have the axes of the base, so no joint is rotated; each inertia is given
-        in its principal axes, because PyBullet diagonalizes an inertia to six digits only.
+        Each inertia is given in its principal axes: PyBullet diagonalizes one to six digits only.
         """
         poses = self.kinematics(torch.zeros(self.num_coordinates, dtype=torch.float64)).poses
         weightless = '<mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'

@@ -11,8 +11,15 @@ from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import matvec, spd_solve
-from pinn_dyn.systems.segment_frames import Tip, in_world, tip_rotation, turning_bias
-from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
+from pinn_dyn.systems.segment_frames import (
+    Tip,
+    first_slopes,
+    in_world,
+    second_slopes,
+    stumpff,
+    tip_rotation,
+    turning_bias,
+)
 
 
 class SoftArm(MechanicalSystem):
@@ -148,8 +155,7 @@ class SoftArm(MechanicalSystem):
             rotation = rotation @ turn
         return torch.stack(segments, dim=-3)
 
-    # Closed formulas in place of automatic differentiation: for point masses
-    # C(q, v) v = sum m J^T (dJ/dt) v, which needs no derivative of M.
+    # For point masses C(q, v) v = sum m J^T (dJ/dt) v, which needs no derivative of M.
 
     def _potential_force(self, q: Tensor) -> Tensor:
         jacobian, _, _ = self._chain(q)
@@ -180,8 +186,6 @@ class SoftArm(MechanicalSystem):
     def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
         lift = (jacobian[..., 2, :] * self._point_masses(q)[:, None]).sum(-2)
         return self.stiffness.to(q) * q - self.gravity * lift
-
-    # Kinematics of the chain.
 
     def _chain(
         self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None

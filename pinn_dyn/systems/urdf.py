@@ -111,9 +111,8 @@ def read_urdf(
 
     visit(file.root, -1, np.eye(4))
     if unreached := file.links.keys() - visited.keys():
-        raise ValueError(
-            f"{file.path}: no joints lead from the base {file.root!r} to {sorted(unreached)}"
-        )
+        links = sorted(unreached)
+        raise ValueError(f"{file.path}: no joints lead from the base {file.root!r} to {links}")
     if not joints:
         raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked_joints)})")
     return Tree(
@@ -156,10 +155,9 @@ class _UrdfFile:
         joint = self.joints[name]
         mimic, kind = joint.find("mimic") is not None, joint.get("type")
         if mimic or kind not in (*_TURNING, "prismatic"):
-            raise ValueError(
-                f"{self.path}: joint {name!r} is {'a mimic joint' if mimic else repr(kind)}, "
-                "expected revolute, continuous, prismatic or fixed: add it to locked_joints"
-            )
+            kind = "a mimic joint" if mimic else repr(kind)
+            expected = "revolute, continuous, prismatic or fixed: add it to locked_joints"
+            raise ValueError(f"{self.path}: joint {name!r} is {kind}, expected {expected}")
         axis = self._numbers(joint, "axis", "xyz", 3, "1 0 0")
         return axis / np.linalg.norm(axis)
 

@@ -172,7 +172,7 @@ SUSPICIOUS = {
     "exchanged v": (dict(v1=SWAPPED["v1"], v2=SWAPPED["v2"]), "'v2' fits it.*\n.*'v1' fits it"),
     "noisy v": (dict(v1=motion()["v1"] + 0.5 * motion()["v1"].std() * NOISE[0]), "^$"),
     "still": (dict(q1=0.3, v1=0.0), r"^column 'q1' \(q\): moves no more than its noise"),
-    "only noise": (dict(q1=1e-3 * NOISE[0], v1=NOISE[1]), r"no more than its noise .* 0.000997"),
+    "only noise": (dict(q1=1e-3 * NOISE[0], v1=NOISE[1]), r"no more than its noise, 0.000997"),
     "degrees": (dict(q2=DEGREES["q2"], v2=DEGREES["v2"]), "^run, column 'q2': an angle of [^\n]*$"),
     "inputs": (dict(u1=1.0, u2=0.0), "'u1' is constant.*\n.*'u2' is constant"),
     "pushed": (PUSHED, "^((?!line).)*$"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.systems.stumpff import first_slopes, second_slopes, stumpff
+from pinn_dyn.systems.segment_frames import first_slopes, second_slopes, stumpff
 from pinn_dyn.testing import slope
 
 FULL_CIRCLE = 4 * math.pi**2

@@ -9,7 +9,6 @@ is not older than ``max_age``; rows without such a message are dropped.
 from __future__ import annotations
 
 import os
-from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -55,24 +54,23 @@ def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
     store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
     with highlevel.AnyReader([path], default_typestore=store) as reader:
         fields = _fields_of_topics(path, reader, columns)
-        numbers = {topic: array("d") for topic in fields}
+        numbers: dict[str, list[list[float]]] = {topic: [] for topic in fields}
         connections = [item for item in reader.connections if item.topic in fields]
         for connection, stamp, raw in reader.messages(connections):
             message = reader.deserialize(raw, connection.msgtype)
             time = _time(message, stamp)
             topic = f"{path}, topic {connection.topic}"
-            numbers[connection.topic].append(time)
-            numbers[connection.topic].extend(
+            values = [
                 time if field == "t" else _number(message, field, topic)
                 for field in fields[connection.topic].values()
-            )
+            ]
+            numbers[connection.topic].append([time, *values])
     topics = {}
     for topic, names in fields.items():
-        values = np.frombuffer(numbers[topic]).reshape(-1, 1 + len(names))
-        topics[topic] = pd.DataFrame(values[:, 1:], index=values[:, 0], columns=list(names))
-        for column in topics[topic]:
-            if topics[topic][column].isna().all():
-                raise LogError(f"{path}: no message has a value of {column!r}")
+        frame = pd.DataFrame(numbers[topic], columns=["", *names], dtype=float).set_index("")
+        if (empty := frame.isna().all()).any():
+            raise LogError(f"{path}: no message has a value of {empty.idxmax()!r}")
+        topics[topic] = frame
     return topics
 
 

@@ -61,10 +61,7 @@ def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
     results = []
     for k, name in enumerate(q.columns):
         spread = np.concatenate([item.q[:, k] for item in training]).std()
-        text = (
-            f"column {name!r} (q): moves no more than its noise in the training runs, "
-            f"{spread:.3g} {q.units[k]}"
-        )
+        text = f"column {name!r} (q): moves no more than its noise, {spread:.3g} {q.units[k]}"
         measured = ("spread of q in the training", name, spread, "above noise")
         results.append(judged(*measured, not moves(training, k), text))
     steps = np.vstack([np.abs(np.diff(item.q, axis=0)) for item in training])
@@ -74,8 +71,8 @@ def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
         "there teach little; use data.coverage, or cut the rest out"
     )
     verdict: Verdict = "stop" if share > _ALL_AT_REST else "warning"
-    measured = ("share at rest", "training", share, f"below {_AT_REST}", share > _AT_REST)
-    return [*results, judged(*measured, text, verdict)]
+    expected, bad = f"below {_AT_REST}", share > _AT_REST
+    return [*results, judged("share at rest", "training", share, expected, bad, text, verdict)]
 
 
 def check_velocities(
@@ -158,9 +155,8 @@ def check_force_signs(training: list[Recording], u: Columns, step: float) -> lis
         norm = np.linalg.norm(remainders, axis=0).prod()
         correlation = float(remainders[:, 0] @ remainders[:, 1]) / norm if norm > 0 else 0.0
         text = (
-            f"input {name!r} seems to push backwards: it correlates with the acceleration of "
-            f"coordinate {k + 1} by {correlation:.2f} once position, velocity and other inputs "
-            "are accounted for: is its sign reversed?"
+            f"input {name!r} seems to push backwards: it correlates by {correlation:.2f} with what "
+            f"else moves coordinate {k + 1}: is its sign reversed?"
         )
         measured = ("correlation of force and acceleration", name, correlation)
         results.append(judged(*measured, f"above {_REVERSED}", correlation < _REVERSED, text))

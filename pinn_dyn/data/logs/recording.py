@@ -66,11 +66,7 @@ class Recording:
         return replace(self, **changed)
 
     def sample_time(self, user: str) -> float:
-        """Return the sample time of a uniform clock, s, for a ``user`` that messages name.
-
-        Raises:
-            LogError: if there are fewer than two samples, or the clock is not uniform.
-        """
+        """Return the sample time of a uniform clock, s, or raise a LogError that names ``user``."""
         t = self.t
         if len(t) < 2:
             raise LogError(f"{self.run}: {user} needs at least 2 samples, got {len(t)}")
@@ -80,8 +76,7 @@ class Recording:
         if not step > 0 or error[k] > _CLOCK_TOLERANCE * step:
             raise LogError(
                 f"{self.place}: {user} needs a uniform clock, but near t = {t[k]:.6g} s the time "
-                f"is {error[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it, "
-                f"with rate={1 / step:.3g} and max_gap={max(float(np.diff(t).max()), step):.2g}"
+                f"is {error[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it"
             )
         return step
 

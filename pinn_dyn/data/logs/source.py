@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -298,15 +297,15 @@ class LogSource(DataSource):
         result = []
         for part in cleaned:
             limit = limits[part.split]
-            # Half a sample: times are rounded.
-            long = [
-                len(item) > 1 and item.duration >= limit - 0.5 * (item.t[1] - item.t[0])
-                for item in part.clean
-            ]
-            for item in itertools.compress(part.clean, np.logical_not(long)):
+            clean = []
+            for item in part.clean:
+                # Half a sample: times are rounded.
+                if len(item) > 1 and item.duration >= limit - 0.5 * (item.t[1] - item.t[0]):
+                    clean.append(item)
+                    continue
                 text = f"{item.duration:.4g} s, shorter than {limit:g} s (piece or shortest)"
                 report.warn("length", f"{part.split} {item.place} after {name}: {text}: dropped")
-            result.append(replace(part, clean=list(itertools.compress(part.clean, long))))
+            result.append(replace(part, clean=clean))
         for key in limits.keys() - {part.split for part in result if part.clean}:
             raise LogError(
                 f"{key}: after {name} no stretch lasts {limits[key]:g} s: lower piece or shortest"

@@ -21,10 +21,9 @@ class Step(abc.ABC):
 
     @property
     def repairs(self) -> Collection[str]:
-        """Faults of a log that the step repairs, and that are then no errors.
+        """Faults that the step repairs, and that are then no errors.
 
-        ``"gaps"``, ``"repeated times"``, ``"backward times"``, ``"bursts"``, ``"jumps of q"`` (v,
-        u).
+        ``"gaps"``, ``"repeated times"``, ``"backward times"``, ``"bursts"``, ``"jumps of q"``.
         """
         return ()
 
@@ -51,8 +50,6 @@ def window_samples(window: Length, recording: Recording, minimum: int, *, odd: b
         count = seconds_of("window", window) / float(np.median(np.diff(recording.t)))
         return max(2 * round((count - 1) / 2) + 1 if odd else round(count), minimum)
     if window < minimum or (odd and window % 2 == 0):
-        raise LogError(
-            f"a window is {window}, expected {'an odd' if odd else 'a'} number of samples, at "
-            f"least {minimum}, or a time, such as '0.1 s'"
-        )
+        kind = "an odd" if odd else "a"
+        raise LogError(f"window is {window}, expected {kind} number of at least {minimum} samples")
     return window
