@@ -40,8 +40,7 @@ def joined(signals: Sequence[Signal], which: np.ndarray, row: np.ndarray) -> Sig
 class Excitation(abc.ABC):
     """A family of random input signals, drawn with a seed.
 
-    Each drawn signal moves about ``offset`` with a peak drawn uniformly from
-    ``[amplitude/3, amplitude]``, separately for each input.
+    A signal moves about ``offset`` with a peak drawn uniformly from ``[amplitude/3, amplitude]``.
     """
 
     @abc.abstractmethod

@@ -15,8 +15,7 @@ _SAMPLES = 8  # smallest number of steps in a period
 def periods(trajectories: Sequence[Trajectory]) -> Tensor:
     """Return the typical period of each coordinate, ``(N,)``, s; infinite without motion.
 
-    It is the median of the power of v over the frequency: the power of v is mostly noise where v is
-    derived from a measured q, and that of q mostly drift.
+    It is the median of the power of v over the frequency.
     """
     frequencies, powers = [], []
     for item in trajectories[:: -(-len(trajectories) // 30)]:

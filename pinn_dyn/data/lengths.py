@@ -19,8 +19,5 @@ def seconds_of(name: str, length: str) -> float:
     units = "|".join(_SECONDS)
     match = re.fullmatch(rf"\s*(\d+\.?\d*(?:e-?\d+)?|\.\d+)\s*({units})\s*", length)
     if match is None or not float(match[1]) > 0:
-        raise ValueError(
-            f"{name} is {length!r}, expected a number of samples, such as 5, or a time with its "
-            f"unit ({', '.join(_SECONDS)}), such as '20 ms'"
-        )
+        raise ValueError(f"{name} is {length!r}, expected samples, such as 5, or such as '20 ms'")
     return float(match[1]) * _SECONDS[match[2]]

@@ -86,11 +86,11 @@ class RobotSource(DataSource):
         t = torch.from_numpy(arrays["t"][:-1])
         splits: dict[str, list[Trajectory]] = {}
         for split in SPLITS:
-            q, v, u = (torch.from_numpy(arrays[f"{split}_{key}"]) for key in "qvu")
-            q, v, u = q[:, :-1], (v[:, :-1] + v[:, 1:]) / 2, u[:, :-1]
+            motions = zip(*(torch.from_numpy(arrays[f"{split}_{x}"]) for x in "qvu"), strict=True)
+            p = partial(momentum, self.system)
             splits[split] = [
-                Trajectory(q[k], v[k], Signal(t, u[k]), momentum=partial(momentum, self.system))
-                for k in range(len(q))
+                Trajectory(q[:-1], (v[:-1] + v[1:]) / 2, Signal(t, u[:-1]), momentum=p)
+                for q, v, u in motions
             ]
         return Splits(**splits)
 

@@ -129,10 +129,7 @@ def motion_shares(basis: np.ndarray, data: Smoothed, motion: np.ndarray) -> np.n
 def _remainders(
     basis: np.ndarray, x: np.ndarray, block: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inner products of x without its known part, ``(B + 1, C, C)``, and squares of x.
-
-    The first entry is of all data, each of the next leaves a tenth of the data out.
-    """
+    """Return inner products of x without its known part, ``(B + 1, C, C)``, and squares of x."""
     basis = basis / np.sqrt((basis**2).mean(axis=0)).clip(min=1e-300)
     values, vectors = np.linalg.eigh(basis.T @ basis / len(basis))
     large = values > 1e-9 * values[-1]

@@ -50,8 +50,6 @@ def pieces_of(
 ) -> tuple[list[Recording], str]:
     """Cut the cleaned stretches of a split into roll-outs; return them and a note.
 
-    A stretch that lasts one sample less than n pieces still has n of them, which overlap.
-
     Raises:
         LogError: if a piece is no multiple of the sample time, or longer than every stretch.
     """
