@@ -56,22 +56,16 @@ class ModelBasedLaw(Controller):
                 f"{type(self).__name__}: model is a {type(model).__name__}, expected a mechanical "
                 "system with terms M, G and A, such as model=lnn or model=hnn"
             )
-        if model.input_history:
-            raise ValueError(
-                f"{type(self).__name__}: the model has a learned input delay "
-                f"({model.learned_figures()}), which the law ignores: train with ~model/delay, or "
-                "set model.delay = None and lower the gains"
-            )
-        if not model.input_affine:
-            raise ValueError(
-                f"{type(self).__name__}: the model has a force that is not linear in the input "
-                "(model/input=nonlinear), and the law inverts A(q): train with model/input=network"
-            )
-        if model.has_residual:
-            raise ValueError(
-                f"{type(self).__name__}: the law cannot invert the model's residual force: train "
-                "with ~model/residual"
-            )
+        for present, problem, remedy in (
+            (model.input_history, "a learned input delay", "~model/delay"),
+            (not model.input_affine, "a force not linear in the input", "model/input=network"),
+            (model.has_residual, "a residual force", "~model/residual"),
+        ):
+            if present:
+                raise ValueError(
+                    f"{type(self).__name__}: the model has {problem}, which a law cannot invert: "
+                    f"train with {remedy}"
+                )
         super().__init__(model.num_coordinates, model.num_inputs)
         self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
         self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)

@@ -21,9 +21,6 @@ from pinn_dyn.models.structured import FrictionHead
 INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the ten inertial parameters of a body."""
 
-Start = Literal["generic", "prior"]
-"""Initial bodies: plausible rods along the links, or the bodies of the description."""
-
 
 @runtime_checkable
 class Structure(Protocol):
@@ -85,7 +82,7 @@ class KnownMechanics(LearnedConstants):
         self,
         statistics: Statistics,
         structure: Structure,
-        start: Start = "generic",
+        start: Literal["generic", "prior"] = "generic",
         spread: PositiveFloat = 3.0,
         friction: FrictionHead = NoFriction,
         drive_gain: PositiveFloat | Sequence[PositiveFloat] = 1.0,

@@ -155,7 +155,7 @@ def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
 def test_a_force_that_is_not_linear_in_the_input_is_refused(tmp_path, capsys):
     run = train(tmp_path / "run", "model=lnn", "model/input=nonlinear", NO_FIGURES)
     text = refused(capsys, run)
-    assert "not linear in the input" in text
+    assert "force not linear in the input" in text
     assert "model/input=network" in text
 
 
