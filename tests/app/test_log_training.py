@@ -115,7 +115,7 @@ def test_runs_whose_inputs_were_prepared_differently_are_refused(run, tmp_path, 
     runs = [f"runs=[{run},{tmp_path / 'late'}]", f"hydra.run.dir={tmp_path / 'out'}"]
     text = said(fails("evaluate.py", *runs), capsys)
     assert "late has another data set in test than" in text
-    assert "steps.delay.delay=0.04 (None)" in text
+    assert "'steps.delay.delay': 0.04" in text
     data = ["dataset=example_log", f"dataset.root='{run.parent}'", "horizon=1", "windows=[]"]
     run_script("evaluate.py", *runs, *data)
     log = (tmp_path / "out" / "evaluate.log").read_text()
