@@ -32,7 +32,9 @@ class SweepCallback(Callback):
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Let processes of joblib end with this one."""
+        """Name the folder of the sweep, and let processes of joblib end with this one."""
+        text = "after an interrupt, go on with the same command and hydra.sweep.dir=%s"
+        log.info(text, config.hydra.sweep.dir)
         if "joblib" in config.hydra.launcher._target_:
             from joblib.parallel import BACKENDS, register_parallel_backend
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import KW_ONLY, dataclass
 from typing import Annotated, Literal
 
 import lightning as L
@@ -19,7 +18,6 @@ from pinn_dyn.mechanics import Trajectory, samples_of, stack_until
 from pinn_dyn.models.statistics import Statistics
 
 
-@dataclass(eq=False)
 class DynamicsData(L.LightningDataModule):
     """Training pairs from a data source, drawn from its training trajectories alone.
 
@@ -35,19 +33,23 @@ class DynamicsData(L.LightningDataModule):
         history: time before a window over which the input is kept, for models of a delay, s.
     """
 
-    source: DataSource
-    _: KW_ONLY
-    pairs: PositiveInt | Literal["all"] = 8000
-    steps: PositiveInt = 1
-    stride: PositiveInt | str = 10
-    batch_size: PositiveInt = 256
-    batches_per_epoch: PositiveInt
-    seed: NonNegativeInt
-    coverage: Annotated[float, Field(ge=0, le=1)] = 0.0
-    history: NonNegativeFloat = 0.0
-
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        source: DataSource,
+        *,
+        pairs: PositiveInt | Literal["all"] = 8000,
+        steps: PositiveInt = 1,
+        stride: PositiveInt | str = 10,
+        batch_size: PositiveInt = 256,
+        batches_per_epoch: PositiveInt,
+        seed: NonNegativeInt,
+        coverage: Annotated[float, Field(ge=0, le=1)] = 0.0,
+        history: NonNegativeFloat = 0.0,
+    ):
         super().__init__()
+        self.source, self.pairs, self.steps, self.stride = source, pairs, steps, stride
+        self.batch_size, self.batches_per_epoch, self.seed = batch_size, batches_per_epoch, seed
+        self.coverage, self.history = coverage, history
 
     def prepare_data(self) -> None:
         """Simulate or convert the data once, before other processes read them."""
