@@ -61,6 +61,9 @@ class TrainerArguments:
     gradient_clip_val: PositiveFloat | None = None
     gradient_clip_algorithm: Literal["norm", "value"] | None = None
     enable_progress_bar: bool = True
+    deterministic: bool | Literal["warn"] = False
+    detect_anomaly: bool = False
+    profiler: Literal["simple", "advanced"] | None = None
 
 
 STAND_INS[L.Trainer] = TrainerArguments

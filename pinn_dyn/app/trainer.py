@@ -23,7 +23,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import BEST_BY, VALIDATION_ERROR
-from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD
+from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, flattened
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble, EnsembleLearner
 from pinn_dyn.evaluation import RolloutValidator
@@ -42,6 +42,8 @@ log = logging.getLogger(__name__)
 
 LONGEST_EPOCH = 1000
 """Largest number of steps between two writes of the last checkpoint."""
+_COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
+"""Beginnings of the settings that TensorBoard shows beside the validation error."""
 CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")
 """Arguments of the trainer that the learner takes instead."""
 
@@ -232,3 +234,11 @@ class Recorder(L.Callback):
         """Add the record and the identity."""
         checkpoint[RECORD] = self.record(trainer, pl_module, trainer.global_step)
         checkpoint[DATA] = self.identity
+
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Log settings and the validation error for the tab HPARAMS of TensorBoard."""
+        config, error = pl_module.hparams["config"], trainer.callback_metrics.get(VALIDATION_ERROR)
+        settings = {key: x for key, x in flattened(config).items() if key.startswith(_COMPARED)}
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger) and error is not None:
+                logger.log_hyperparams(settings, {"hp/validation_error": float(error)})

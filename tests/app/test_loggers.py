@@ -1,6 +1,10 @@
 """What TensorBoard is told about a run, read back from what it stores."""
 
+import json
+
+import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}
 
@@ -10,3 +14,14 @@ def test_figures_are_logged_at_the_step_of_the_errors_that_they_explain(hnn_run)
     assert set(log.Tags()["images"]) == FIGURES
     (last,) = {log.Images(tag)[-1].step for tag in FIGURES}
     assert last == log.Scalars("val/error_mean")[-1].step == 3
+
+
+def test_settings_are_logged_beside_the_validation_error(hnn_run):
+    log = EventAccumulator(str(hnn_run / "tensorboard")).Reload()
+    content = log.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    start = HParamsPluginData.FromString(content).session_start_info
+    assert start.hparams["model_name"].string_value == "hnn"
+    assert start.hparams["data.pairs"].number_value == 64
+    (error,) = (item.value for item in log.Scalars("hp/validation_error"))
+    record = json.loads((hnn_run / "metrics.json").read_text())
+    assert error == pytest.approx(record["validation"]["val/error_mean"], rel=1e-6)
