@@ -25,8 +25,7 @@ from pinn_dyn.app.sweep import write_error
 def main(command: str) -> None:
     """Run ``pinn_dyn.app.<command>`` on the configuration that the command line describes.
 
-    The configuration is checked before anything is written. An error that the user can mend ends
-    the program with one line, without a traceback.
+    It is checked before anything is written. An error of the user ends without a traceback.
     """
     flags = get_args_parser().parse_intermixed_args(sys.argv[1:])
     options = [word for word in sys.argv[1:] if word not in flags.overrides]

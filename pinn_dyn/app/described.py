@@ -18,10 +18,6 @@ def described(value: Any) -> Any:
 
     A class or a ``functools.partial`` gets ``_partial_: true``. An object is described by the
     attributes that have the names of its constructor's arguments.
-
-    Raises:
-        TypeError: on a value that no configuration can build, such as a lambda.
-        AttributeError: on an object without such attributes.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value

@@ -24,11 +24,9 @@ _TEST = ("error_mean", "error_median", "error_worst", "diverged")
 
 
 def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[str, str]]:
-    """Read all runs in folders and below them; ``patterns`` are folders or globs.
+    """Return a row and the configuration of each finished run in or below folders or globs.
 
-    Returns:
-        One row per finished run (folder, seed, ``val/`` errors, training time and sizes), its
-        configuration, and the problems of the jobs without a result by folder.
+    The third value holds the problems of the jobs without a result, by folder.
     """
     roots = [path for x in patterns for path in glob.glob(str(Path(x).expanduser()))]
     files = [f for root in roots for name in (CONFIG, ERROR) for f in Path(root).rglob(name)]

@@ -40,10 +40,7 @@ def predict_frame(model: Predictor, source: LogSource, frame: pd.DataFrame) -> p
 def _along(
     model: Predictor, source: LogSource, runs: list[Recording], step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Predict along K cleaned runs of S samples, ``step`` s apart.
-
-    Returns the clock ``(S,)``, the times of the prediction ``(T,)``, s, and states ``(K, T, 2N)``.
-    """
+    """Return clock ``(S,)`` s, times ``(T,)`` s and predicted states ``(K, T, 2N)`` of K runs."""
     samples = (model.fixed_step or step) / step
     if round(samples) < 1 or abs(samples - round(samples)) > 1e-3 * samples:
         raise ValueError(

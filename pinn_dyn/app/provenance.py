@@ -49,10 +49,7 @@ def write_provenance(
     beside: dict[str, Any],
     folder: Path,
 ) -> Origin:
-    """Write ``provenance.json`` with the contents ``config`` and ``beside``, and return an origin.
-
-    The runs go by their names in the tables; ``source`` has the data of the test.
-    """
+    """Write ``provenance.json``, and return the origin of results for a report."""
     record = {"command": command_line(), "data_hash": data_hash(data_identity(source))}
     record |= provenance()
     rows = [
