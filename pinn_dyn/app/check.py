@@ -33,7 +33,6 @@ def check(cfg: DictConfig) -> None:
         report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
-    page = report.save(folder, command_line())
-    print(f"\n{report}\n\nthe page is {page}")
+    print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")

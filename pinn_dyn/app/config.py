@@ -115,8 +115,7 @@ def explained(error: HydraException | OmegaConfBaseException) -> str:
         options = ", ".join(error.options)
         hint = did_you_mean(option, error.options)
         return f"'{group}/{option}' does not exist{hint or '.'} Options of {group}: {options}"
-    text = str(error).partition("Config search path")[0]
-    return " ".join(text.split())
+    return " ".join(str(error).partition("Config search path")[0].split())
 
 
 def build_part(
@@ -137,7 +136,6 @@ def build_part(
 
 
 def _built(part: Any) -> Any:
-    """Build the objects that plain values describe."""
     if isinstance(part, list):
         return [_built(item) for item in part]
     if not isinstance(part, dict):

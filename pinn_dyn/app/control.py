@@ -136,18 +136,15 @@ def _learned_system(run: Run, config: dict[str, Any]) -> MechanicalSystem:
 
 
 def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | None]:
-    """Draw q0 and v0, ``(K, N)`` each, from a box; None without a box."""
     if config["initial_states"] is None:
         return None, None
     # A different stream from that of the set points, with the same seed.
     rng = np.random.default_rng([config["seed"], 1])
-    box = build_part("initial_states", config["initial_states"])
-    q0, v0 = box.draw(config["runs"], rng)
+    q0, v0 = build_part("initial_states", config["initial_states"]).draw(config["runs"], rng)
     return torch.from_numpy(q0), torch.from_numpy(v0)
 
 
 def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
-    """Return the learned law with a guard on its distance from the training data."""
     if not isinstance(law, ModelBasedLaw):
         raise ConfigError("guard.threshold needs a law without an observer: leave one of them out")
     train = source.load().train

@@ -122,7 +122,6 @@ def evaluate(
 
 
 def _is_rolled_out(run: Run) -> bool:
-    """Check whether a run fitted constants by roll-outs, after their identification."""
     fitted = run.covariance is not None and run.config.get("start_from") is None
     return fitted and run.config["optimizer"].get("rollouts", True)
 
@@ -136,7 +135,6 @@ def _identified(run: Run, source: DataSource) -> Predictor:
 
 
 def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
-    """Return short names: the model, with seed and folder where these tell runs apart."""
     names, seeds = list(models), [f"seed {run.config['seed']}" for run in runs]
     for suffixes in (seeds, [run.folder.name for run in runs]):
         if len(set(names)) < len(names):
@@ -145,7 +143,6 @@ def _run_names(runs: Sequence[Run], models: Sequence[str]) -> list[str]:
 
 
 def _require_same_test(run: Run, first: Run, split: str) -> None:
-    """Refuse a run whose data of a split differ from those of the first run."""
     ours, theirs = ({split: x.data[split]} if x.data else {} for x in (run, first))
     if data_changes(theirs, ours):
         settings = flattened(run.config["dataset"]).items()
@@ -158,7 +155,6 @@ def _require_same_test(run: Run, first: Run, split: str) -> None:
 
 
 def _require_fitting_test(run: Run, trained_on: DataSource, source: DataSource) -> None:
-    """Refuse a data set to test on that has other coordinates or inputs than that of a run."""
     sizes, expected = ((len(x.labels), len(x.input_labels)) for x in (source, trained_on))
     if sizes != expected:
         raise ConfigError(

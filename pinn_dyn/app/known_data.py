@@ -39,8 +39,7 @@ def check_known(model: Predictor, source: DataSource) -> None:
 def check_structure(path: str, structure: Structure, source: DataSource) -> None:
     """Refuse rigid bodies whose joints are not the data's.
 
-    If the columns do not name the joints, their order counts, and is logged. ``path`` is the key of
-    the structure in the configuration.
+    If the columns do not name the joints, their order counts. ``path`` is the structure's key.
 
     Raises:
         ConfigError: if number, order or units of the columns are not those of the joints.

@@ -76,7 +76,6 @@ def write_provenance(
 
 
 def _git(*arguments: str) -> str:
-    """Return the output of git on the code; empty if there is no repository."""
     command = ["git", "-C", str(Path(__file__).parent), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 

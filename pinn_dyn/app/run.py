@@ -216,7 +216,6 @@ class Run:
     def _motion(
         self, start: Values, u: Values | None, t: Values | None
     ) -> tuple[Tensor, Tensor, Signal]:
-        """Return start, times and input of a prediction, in one batch."""
         x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
         if u is None or t is None:
             raise TypeError("the input is missing: expected predict(start, u, t)")
@@ -241,8 +240,7 @@ class Run:
 
     def terms(self, q: Values) -> TermArrays:
         """Return M, D ``(*batch, N, N)``, G ``(*batch, N)`` and A ``(*batch, N, M)`` at q."""
-        terms = self.system.terms(self._coordinates("q", q))
-        return TermArrays(*(term.numpy() for term in terms))
+        return TermArrays(*(x.numpy() for x in self.system.terms(self._coordinates("q", q))))
 
     def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
         """Return tau = M a + C v + G + D v + F, ``(*batch, N)``."""
@@ -272,7 +270,6 @@ class Run:
 
 
 def _tensor(name: str, value: Values) -> Tensor:
-    """Return finite numbers in float64."""
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().double()
     else:

@@ -64,7 +64,6 @@ def train(cfg: DictConfig) -> float:
 
 
 def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:
-    """Return the configuration of a training that is resumed."""
     overrides = HydraConfig.get().overrides.task
     if ignored := [word for word in overrides if not word.lstrip("+").startswith(_RESUME)]:
         raise ConfigError(

@@ -94,8 +94,7 @@ def even_validations(steps: int, limit: int) -> int:
 def epochs(steps: int, validations: int) -> tuple[int, int, int]:
     """Return the epochs of a training, steps in an epoch, and epochs between two validations.
 
-    An epoch is a number of steps that divides the steps between two validations, so that the
-    training ends with a validation.
+    The steps in an epoch divide those between two validations: the training ends with one.
     """
     between, remainder = divmod(steps, validations)
     if remainder or not between:
@@ -137,8 +136,6 @@ class _MovableCheckpoint(ModelCheckpoint):
 
 
 class _EpochLines(L.Callback):
-    """Log of every epoch, for a training without a terminal."""
-
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Log the training loss, and the validation error of validated epochs."""
         epoch, metrics = trainer.current_epoch + 1, trainer.callback_metrics

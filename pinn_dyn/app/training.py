@@ -317,7 +317,6 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
 
 
 def _take_weights(model: Predictor, run: Run) -> None:
-    """Give the model the trained weights, and the scales, of another run."""
     trained = copy.deepcopy(run.model)
     set_output_limits(trained, {})
     if isinstance(model, KnownAndNetwork) and isinstance(trained, KnownMechanics):
@@ -339,7 +338,6 @@ def _fit(
     source: DataSource,
     recorder: Recorder,
 ) -> dict[str, Any]:
-    """Run the trainer; write and return the record of the training."""
     solver = learner if isinstance(learner, LeastSquaresLearner) else None
     last = folder / CHECKPOINTS / "last.ckpt"
     try:

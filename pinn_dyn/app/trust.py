@@ -99,7 +99,6 @@ def may_build(target: Any, trust: tuple[str, ...]) -> bool:
 
 
 def _has_own_examples() -> bool:
-    """Return whether ``examples`` is the folder beside this package."""
     spec = importlib.util.find_spec("examples")  # does not import it
     folders = [] if spec is None else list(spec.submodule_search_locations or [])
     beside = Path(__file__).resolve().parents[2] / "examples"

@@ -63,7 +63,6 @@ def check_value(path: str, value: Any, annotation: Any = object) -> None:
 
 @contextlib.contextmanager
 def _reported(value: Any, path: str = "") -> Iterator[None]:
-    """Turn the mistakes that pydantic reports into one line each."""
     try:
         yield
     except ValidationError as error:
@@ -72,7 +71,6 @@ def _reported(value: Any, path: str = "") -> Iterator[None]:
 
 
 def _line(mistake: Mapping[str, Any], root: Any, path: str) -> str:
-    """Describe a mistake: path, value, expected value."""
     for step in mistake["loc"]:
         path += f"[{step}]" if isinstance(step, int) else f".{step}" if path else str(step)
     kind, value = mistake["type"], mistake["input"]
@@ -165,7 +163,6 @@ def _is_array(hint: Any) -> bool:
 
 
 def _is_object(hint: Any) -> bool:
-    """Return true for a class or a factory, which a configuration describes by ``_target_``."""
     if get_origin(hint) is not None:
         return get_origin(hint) is collections.abc.Callable
     simple = hint in (*_PLAIN, *_LISTS, *_MAPPINGS, Path) or _is_array(hint)
@@ -238,7 +235,6 @@ def _object(hints: Sequence[Any], short: bool = False) -> Any:
 
 
 def _maker(name: Any, kinds: Sequence[Any], title: str) -> Any:
-    """Return the class or function of a name, if it makes an object of one of the kinds."""
     try:
         maker = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
@@ -251,7 +247,6 @@ def _maker(name: Any, kinds: Sequence[Any], title: str) -> Any:
 
 
 def _validate_arguments(target: Any, values: Mapping[str, Any], required: bool = False) -> None:
-    """Validate arguments, and add the valid keys to the mistake of an unknown key."""
     model = arguments_model(target, required)
     try:
         model.model_validate(dict(values))
@@ -269,7 +264,6 @@ def _mistake(key: str, value: Any, message: str) -> ValidationError:
 
 
 def _error(mistakes: Sequence[Mapping[str, Any]]) -> ValidationError:
-    """Return the error that reports mistakes at their paths below that of a value."""
     details: list[Any] = [
         {**x, "type": PydanticCustomError(x["type"], x["msg"], x.get("ctx"))} for x in mistakes
     ]

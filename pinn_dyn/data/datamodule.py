@@ -67,7 +67,6 @@ class DynamicsData(L.LightningDataModule):
         return self._samples() * float(t[1] - t[0])
 
     def _samples(self) -> int:
-        """Return the number of samples in a step."""
         if isinstance(self.stride, str):
             length = seconds_of("stride", self.stride)
             return samples_of("stride", length, self.splits.train[0].t)

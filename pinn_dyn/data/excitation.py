@@ -141,8 +141,7 @@ class Steps(_Bounded):
     def draw(self, count: int, duration: float, rng: np.random.Generator) -> Signal:
         """Draw ``count`` sequences of levels that cover ``duration`` s."""
         peak = self._peaks(count, rng)
-        number = int(np.ceil(duration / self.hold[0])) + 1
-        shape = (*peak.shape, number)
+        shape = (*peak.shape, int(np.ceil(duration / self.hold[0])) + 1)
         level = rng.uniform(-1, 1, shape)
         start = np.cumsum(rng.uniform(self.hold[0], self.hold[1], shape), axis=-1)
         rows, _, columns = np.ix_(range(count), range(1), range(peak.shape[1]))
@@ -154,8 +153,7 @@ class Steps(_Bounded):
             before = level[rows, columns, last]
             ramp = np.clip((t[:, None] - start[rows, columns, last]) / self.rise_time, 0.0, 1.0)
             smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
-            step = level[rows, columns, last + 1] - before
-            return self._scaled(before + step * smooth, peak)
+            return self._scaled(before + (level[rows, columns, last + 1] - before) * smooth, peak)
 
         return signal
 

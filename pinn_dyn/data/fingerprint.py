@@ -60,7 +60,6 @@ def _definition(item: type | types.FunctionType) -> str:
 
 
 def _source(item: type | types.FunctionType) -> bytes:
-    """Return the file that defines a class or function; in a session, its compiled methods."""
     path = getattr(sys.modules.get(item.__module__), "__file__", None)
     if path is not None and item.__module__ != "__main__":
         return Path(path).read_bytes()

@@ -65,11 +65,9 @@ def data_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
 
 
 def _by_name(identity: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
-    """Return split, length, hash and moments of each trajectory."""
     entries: dict[str, tuple[Any, ...]] = {}
     for split, part in identity.items():
         columns = (part[key] for key in ("names", "lengths", "hashes", "moments"))
         for name, *values in zip(*columns, strict=True):
-            unique = name if name not in entries else f"{name}, in {split}"
-            entries[unique] = (split, *values)
+            entries[name if name not in entries else f"{name}, in {split}"] = (split, *values)
     return entries

@@ -149,7 +149,6 @@ class RobotSource(DataSource):
         return motions
 
     def _inside(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Tell which joints stay within their limits in q and v ``(..., T, N)``, ``(N,)``."""
         arm = self.system
         inside = (q >= arm.q_low) & (q <= arm.q_high) & (np.abs(v) <= arm.v_max)
         return np.asarray(inside.reshape(-1, inside.shape[-1]).all(0))

@@ -160,8 +160,7 @@ class TorqueMultiSine(RobotExcitation):
         ]
         offset, signal = (np.stack(values) for values in zip(*draws, strict=True))
         centre = (robot.q_low + robot.q_high) / 2 + offset
-        way = self.reach * np.minimum(centre - robot.q_low, robot.q_high - centre)
-        stiffness = peak / way
+        stiffness = peak / (self.reach * np.minimum(centre - robot.q_low, robot.q_high - centre))
         inertia = robot.mass_matrix(torch.from_numpy(centre)).diagonal(dim1=-2, dim2=-1).numpy()
         friction = 2 * np.sqrt(stiffness * inertia)
         zero = np.zeros_like(centre)

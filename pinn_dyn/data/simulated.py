@@ -168,8 +168,7 @@ class SimulatedSource(DataSource):
         """Return the settings that the simulation depends on: the key of the cache."""
         keys = "system excitation initial_states duration test_duration step counts pairing seed"
         keys += " rtol atol" if self.q_limits is None else " rtol atol q_limits"
-        settings = {key: describe(getattr(self, key)) for key in keys.split()}
-        return {"version": _VERSION, **settings}
+        return {"version": _VERSION} | {k: describe(getattr(self, k)) for k in keys.split()}
 
     def simulate(self) -> Arrays:
         """Simulate all trajectories anew: arrays ``<split>_<q, v, u>``, each ``(K, T, .)``."""
@@ -209,7 +208,6 @@ class SimulatedSource(DataSource):
         return np.tile(np.arange(states)[:, None], 2)
 
     def _draw(self, rngs: Mapping[str, np.random.Generator]) -> _Draw:
-        """Draw an initial state and an input for each motion of some splits."""
         starts, signals, rows = [], [], []
         for index, (split, rng) in enumerate(rngs.items()):
             states, inputs = self.counts[split]
@@ -223,7 +221,6 @@ class SimulatedSource(DataSource):
     def _move(
         self, draws: Sequence[_Draw], rows: np.ndarray, t: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulate q, v and u of some motions: ``rows`` of the concatenated draws."""
         q0, v0, signals = zip(*draws, strict=True)
         size = len(q0[0])
         signal = joined(signals, rows // size, rows % size)

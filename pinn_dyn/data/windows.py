@@ -74,7 +74,6 @@ class Windows:
         return replace(moved, t=self.t.to(device, dtype), input=self.input.to(device, dtype))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Windows:
-        """Apply a change to every tensor that has one row per window."""
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in _ROWS}
         return replace(self, **changed, input=self.input.mapped(change))
 
@@ -220,7 +219,6 @@ def draw_windows(
 
 
 def _distinct(total: int, count: int, generator: torch.Generator) -> Tensor:
-    """Draw ``count`` different numbers below ``total``, in random order."""
     # Works also for a total that is too large for a permutation.
     numbers = torch.unique(torch.randint(total, (count,), generator=generator))
     while numbers.shape[0] < count:

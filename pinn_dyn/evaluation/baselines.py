@@ -26,8 +26,7 @@ class ConstantVelocity(Predictor):
     """q(t) = q(0) + v(0) t, which is hard to beat over a short time."""
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        v = x0[..., None, self.num_coordinates :]
-        distance = v * (t - t[0]).to(x0)[:, None]
+        distance = x0[..., None, self.num_coordinates :] * (t - t[0]).to(x0)[:, None]
         return torch.cat([distance, torch.zeros_like(distance)], dim=-1)
 
 

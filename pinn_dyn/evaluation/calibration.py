@@ -68,8 +68,7 @@ def standardized_errors(prediction: Prediction) -> Tensor:
     deviation = deviation * (1 + 1 / len(prediction.members)) ** 0.5
     error = (prediction.q - prediction.q_hat).abs()[:, 1:]
     ratio = torch.where(error > 0, error / deviation, 0.0).nan_to_num(torch.inf, posinf=torch.inf)
-    diverged = diverged_trajectories(prediction)
-    return torch.where(diverged[:, None, None], torch.inf, ratio)
+    return torch.where(diverged_trajectories(prediction)[:, None, None], torch.inf, ratio)
 
 
 def calibration(held_out: Prediction, validation: Prediction | None) -> Calibration:
@@ -96,7 +95,6 @@ def calibration(held_out: Prediction, validation: Prediction | None) -> Calibrat
 
 
 def _within(errors: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return the share of errors up to each width; infinite errors are never within."""
     finite = np.sort(errors[np.isfinite(errors)])
     return np.searchsorted(finite, width, side="right") / max(len(errors), 1)
 

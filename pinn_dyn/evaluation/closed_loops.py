@@ -170,7 +170,6 @@ def close_loops(
 def _check_reference(
     reference: Reference, robot: MechanicalSystem, q0: Tensor, duration: float
 ) -> None:
-    """Check that a reference fits a robot and stays within its limits and its domain."""
     sizes = reference.num_coordinates, robot.num_coordinates
     if sizes[0] != sizes[1]:
         raise ValueError(f"the reference has {sizes[0]} coordinates, the robot {sizes[1]}")

@@ -169,14 +169,11 @@ def _step(record: ClosedLoopRecord) -> Tensor | None:
 
 
 def _settling_times(norm: Tensor, t: Tensor, bound: Tensor) -> Tensor:
-    """Return the time after the last sample outside the bound; infinite if that is the end."""
-    outside = ~(norm <= bound[:, None])
-    last = torch.where(outside, torch.arange(len(t)), -1).amax(dim=1)
+    last = torch.where(~(norm <= bound[:, None]), torch.arange(len(t)), -1).amax(dim=1)
     return torch.cat([t, t.new_full((1,), math.inf)])[last + 1]
 
 
 def _nanmax(values: Tensor) -> Tensor:
-    """Return the largest value over the first dimension; NaN only where all values are NaN."""
     largest = values.nan_to_num(-1.0, posinf=math.inf).amax(dim=0)
     return torch.where(values.isnan().all(dim=0), torch.nan, largest)
 

@@ -119,8 +119,7 @@ class Evaluation:
     @property
     def trajectories(self) -> str:
         """Number and kind of the trajectories, for titles."""
-        horizon = f"{self.truth.duration:g} s open loop"
-        return f"{len(self.truth.q)} {SPLITS[self.split]}, {horizon}"
+        return f"{len(self.truth.q)} {SPLITS[self.split]}, {self.truth.duration:g} s open loop"
 
     def __str__(self) -> str:
         lines = [
@@ -182,7 +181,6 @@ class Evaluation:
 
 
 def _stem(run: str) -> str:
-    """Return a part of a file name."""
     return "".join(c if c.isalnum() or c in "-.=" else "_" for c in run)
 
 
@@ -263,8 +261,6 @@ def evaluate_models(
 def _predict(
     entry: Entry, truth: Trajectory, stride: int, window: float | None = None
 ) -> Prediction:
-    """Roll out a model and its members, and return every ``stride``-th sample."""
-
     def rollout(model: Predictor) -> Prediction:
         if window is None:
             prediction = predict_trajectories(model, truth, step=entry.step)

@@ -140,7 +140,6 @@ def terms_figure(comparison: TermComparison, *, configuration: int, title: str) 
 
 
 def _annotate(ax: Axes, matrix: Tensor, digits: int) -> None:
-    """Write each entry into its cell; entries at the level of rounding errors are 0."""
     ax.set(xticks=[], yticks=[])
     smallest = 1e-6 * float(matrix.abs().max())
     for i, row in enumerate(matrix.tolist()):

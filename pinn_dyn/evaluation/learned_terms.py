@@ -96,7 +96,6 @@ def compare_with_source(model: Predictor, source: DataSource) -> TermComparison 
 
 
 def _inverse(matrix: Tensor) -> Tensor:
-    """Return the inverse, infinite for a singular matrix."""
     inverse, info = torch.linalg.inv_ex(matrix)
     return torch.where((info > 0)[..., None, None], torch.inf, inverse)
 

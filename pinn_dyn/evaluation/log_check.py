@@ -219,7 +219,6 @@ def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
 
 
 def _measured(coordinates: pd.DataFrame, explained: float) -> list[Measurement]:
-    """Measure noise, coverage of the test, and the share of the motion that inputs explain."""
     results = []
     for name, limit, text in _LIMITS:
         for label, value in zip(coordinates["coordinate"], coordinates[name], strict=True):
@@ -241,7 +240,6 @@ def _filter(
     noise: np.ndarray,
     highest: float,
 ) -> list[str]:
-    """Return the low-pass between motion and noise, where noise matters and no step filters."""
     v = np.vstack([np.diff(item.q, axis=0) / step for item in training])
     share = float((2**0.5 * noise / step / v.std(axis=0).clip(min=1e-300)).max())
     cutoff = float(f"{max(4 * highest, 1.0):.2g}")
@@ -256,7 +254,6 @@ def _filter(
 
 
 def _delay(delays: Sequence[logs.DelayCurve], step: float) -> list[str]:
-    """Return the step that shifts the inputs by their measured delays."""
     shifts = [round(round((curve.delay or 0.0) / step) * step, 6) for curve in delays]
     value = shifts[0] if len(set(shifts)) == 1 else shifts
     text = f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"

@@ -63,8 +63,7 @@ def panels(
     ``columns`` has the label of the vertical axis of each panel, for each column.
     """
     rows = max(map(len, columns))
-    size = (5.8 * len(columns), 1.55 * rows + 1.3)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(5.8 * len(columns), 1.55 * rows + 1.3), layout="constrained")
     grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
     axes = [list(column[: len(labels)]) for column, labels in zip(grid.T, columns, strict=True)]
     for column, used, labels in zip(grid.T, axes, columns, strict=True):

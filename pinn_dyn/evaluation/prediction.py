@@ -173,7 +173,6 @@ def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
 
 @torch.no_grad()
 def _velocities(model: Predictor, states: Tensor) -> Tensor | None:
-    """Return v ``(B, T, N)`` of a single model's states ``(1, B, T, 2N)``; None for an ensemble."""
     if isinstance(model, Ensemble):
         return None
     q, v_or_p = states[0].split(model.num_coordinates, dim=-1)

@@ -184,7 +184,6 @@ def _competing(frame: pd.DataFrame, name: str) -> pd.Series:
 
 
 def _diverged(name: str) -> str:
-    """Return the column that counts the diverged trajectories of an error, or an empty name."""
     prefix, separator, _ = name.rpartition("error_")
     return f"{prefix}diverged" if separator else ""
 

@@ -107,7 +107,6 @@ def _samples(model: MechanicalSystem, truth: Trajectory, limit: int) -> list[Ten
 
 
 def _thinned(values: Tensor, limit: int) -> Tensor:
-    """Return every n-th of the samples ``(K, T, .)`` of all trajectories."""
     return values.flatten(0, 1)[:: -(-values.shape[:2].numel() // limit)]
 
 
@@ -116,7 +115,6 @@ def _rms(force: Tensor) -> float:
 
 
 def _acceleration(truth: Trajectory) -> Tensor:
-    """Return dv/dt, ``(K, T, N)``."""
     steps = truth.t.double().diff()
     step = float(steps.mean())
     if len(truth.t) < 5 or float((steps - step).abs().max()) > 1e-3 * step:

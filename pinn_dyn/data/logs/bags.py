@@ -47,7 +47,6 @@ def read_bag(path: Path, request: Request) -> Table:
 
 
 def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
-    """Return the columns of each topic, with the time of each message as the index, s."""
     highlevel = optional("rosbags.highlevel", path)
     stores = optional("rosbags.typesys", path)
     # Old bags hold no definitions of their messages: the common ones are known.
@@ -75,7 +74,6 @@ def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
 
 
 def _fields_of_topics(path: Path, reader: Any, columns: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return for each topic its columns and their fields in a message."""
     topics = sorted(reader.topics, key=len, reverse=True)
     fields: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -117,7 +115,6 @@ def _number(message: Any, field: str, topic: str) -> float:
 
 
 def _merge(path: Path, topics: dict[str, pd.DataFrame], request: Request) -> pd.DataFrame:
-    """Return all columns at the times of the topic that has the time."""
     clock = next(topic for topic, frame in topics.items() if request.time in frame)
     frame = topics.pop(clock)
     times = frame[request.time].to_numpy()

@@ -108,7 +108,6 @@ def check_rows(
 
 
 def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.ndarray) -> None:
-    """Refuse angles that wrap, and rows that alternate between two motions."""
     wraps = np.flatnonzero(in_step & (np.abs(np.abs(np.diff(q)) - 2 * math.pi) < 0.3))
     if unit == "rad" and len(wraps):
         row = int(wraps[0])
@@ -127,7 +126,6 @@ def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.
 def _jumps(
     table: Table, signal: str, name: str, x: np.ndarray, unit: str, in_step: np.ndarray
 ) -> str:
-    """Return a warning of jumps of q, or spikes of v and u; "" without."""
     steps = signal == "q"
     value = np.where(in_step, np.diff(x), 0.0) if steps else x - np.median(x)
     smooth = median_filter(value, _NEIGHBORS, mode="nearest")

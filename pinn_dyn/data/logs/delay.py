@@ -111,7 +111,6 @@ def _rank(curve: DelayCurve) -> tuple[bool, float]:
 
 
 def _is_sine(x: np.ndarray) -> bool:
-    """Tell whether nearly all power of a signal is in one spectral line."""
     power = np.abs(np.fft.rfft((x - x.mean()) * np.hanning(len(x)))) ** 2
     peak = int(power.argmax())
     return bool(power[max(peak - 2, 0) : peak + 3].sum() >= _ONE_LINE * power.sum())
@@ -152,7 +151,6 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
 
 
 def _minimum(candidates: np.ndarray, residual: np.ndarray) -> float:
-    """Return the minimum of a parabola through the smallest value and its neighbors."""
     k = int(np.clip(np.argmin(residual), 1, len(residual) - 2))
     before, at, after = residual[k - 1 : k + 2]
     bend = before - 2 * at + after

@@ -110,13 +110,10 @@ class RemoveJumps(Step):
 
 @dataclass(frozen=True)
 class _SavitzkyGolaySlope(Step):
-    """Base class of steps that use the slope of a polynomial through the samples around each."""
-
     window: Length = 11
     order: PositiveInt = 3
 
     def _slope(self, recording: Recording, values: np.ndarray) -> tuple[np.ndarray, int, float]:
-        """Return the slope of each column of ``values``, the window in samples, the sample time."""
         step = recording.sample_time(type(self).__name__)
         # The shortest odd window that determines the polynomial.
         window = window_samples(self.window, recording, self.order + 1 + self.order % 2, odd=True)

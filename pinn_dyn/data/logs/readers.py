@@ -63,7 +63,6 @@ READERS: dict[str, Reader] = {
 
 
 def _is_bag(path: Path) -> bool:
-    """Return True for the folder of a ROS 2 bag."""
     return (path / "metadata.yaml").is_file()
 
 

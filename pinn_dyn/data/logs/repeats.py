@@ -51,7 +51,6 @@ def check_repeats(
 
 
 def _is_in(piece: Recording, item: Recording) -> bool:
-    """Tell whether a training stretch repeats a motion that is not cut out of it."""
     cut_out = piece.run == item.run and item.t[0] <= piece.t[0] <= item.t[-1]
     if cut_out or len(item) < len(piece):
         return False

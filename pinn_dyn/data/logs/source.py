@@ -124,7 +124,6 @@ class LogSource(DataSource):
             self.input_labels = step.input_labels(self.input_labels)
 
     def _check_units(self) -> None:
-        """Check the units of the signals, and that no column is in two of them."""
         self.time.check_units("time", ["s"])
         self.q.check_units("q", ["rad", "m", "1"])
         self.u.check_units("u", sorted({unit for unit, _ in UNITS.values()} - {"s"}))
@@ -172,8 +171,7 @@ class LogSource(DataSource):
             LogError: as :meth:`load`, or if the steps do not leave one stretch of each run.
         """
         table, report = Table(frame, "the frame"), Report(self.name)
-        column = self.trajectory if self.trajectory in frame else None
-        runs = table.runs(column, "the frame")
+        runs = table.runs(self.trajectory if self.trajectory in frame else None, "the frame")
         raws = self._recordings(table, runs, report)
         cleaned = self._clean([Cleaned("", raw, [raw]) for raw in raws], report)
         for part in cleaned:
@@ -238,7 +236,6 @@ class LogSource(DataSource):
         return recordings
 
     def _tables(self) -> dict[str, Table]:
-        """Return the frames in memory, or read the files, by the name of their run."""
         if isinstance(self.files, Mapping):
             return {name: Table(frame, name) for name, frame in self.files.items()}
         signals = [self.time, *self._signals.values()]
@@ -281,7 +278,6 @@ class LogSource(DataSource):
     def _clean(
         self, cleaned: list[Cleaned], report: Report, *, drop: bool = False
     ) -> list[Cleaned]:
-        """Apply the steps in order; with ``drop``, drop stretches that are too short."""
         for name, step in self.steps.items():
             cleaned = _apply(name, step, cleaned, report)
             if drop:

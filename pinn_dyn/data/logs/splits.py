@@ -115,7 +115,6 @@ def split(
 def _cut(
     recording: Recording, validation: Part, test: Part, guard: float
 ) -> list[tuple[str, Recording]]:
-    """Return training, validation and test stretches of one run."""
     t, stretches = recording.t, []
     end, last = t[-1], len(t)
     parts = {"test": test.seconds, "validation": validation.seconds}

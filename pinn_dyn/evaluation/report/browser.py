@@ -123,6 +123,5 @@ def trajectory_browser(
 
 
 def _thinned(values: Tensor) -> np.ndarray:
-    """Return at most 400 equally spaced samples in single precision; a gap where they overflow."""
     samples = values.detach()[:: -(-len(values) // _POINTS)].double().numpy()
     return np.where(np.abs(samples) < 1e6, samples, np.nan).astype(np.float32)

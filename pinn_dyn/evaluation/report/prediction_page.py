@@ -107,7 +107,6 @@ def _constants(constants: Mapping[str, pd.DataFrame]) -> Iterator[Markup]:
 
 
 def _table(frame: pd.DataFrame, text: str) -> Iterator[Markup]:
-    """Yield a text and a table, unless the table is empty."""
     if len(frame):
         yield paragraph(text)
         frame = frame[["run", *frame.columns.drop("run")]]
