@@ -27,9 +27,7 @@ def build_source(config: dict[str, Any]) -> DataSource:
 def dataset(name: str, **settings: Any) -> DataSource:
     """Build a data set of ``conf/dataset``, such as ``dataset("soft_arm_1", duration=4.0)``.
 
-    Args:
-        name: file name without suffix.
-        settings: arguments of its class that replace those of the file.
+    ``settings`` replace arguments of the file ``<name>.yaml``.
     """
     overrides = [f"dataset={name}", *(f"dataset.{key}={x}" for key, x in settings.items())]
     return build_source(composed("train", overrides))

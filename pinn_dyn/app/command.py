@@ -23,10 +23,7 @@ from pinn_dyn.app.sweep import write_error
 
 
 def main(command: str) -> None:
-    """Run ``pinn_dyn.app.<command>`` on the configuration that the command line describes.
-
-    It is checked before anything is written. An error of the user ends without a traceback.
-    """
+    """Run ``pinn_dyn.app.<command>`` on the configuration that the command line describes."""
     flags = get_args_parser().parse_intermixed_args(sys.argv[1:])
     options = [word for word in sys.argv[1:] if word not in flags.overrides]
     shows = flags.help or flags.hydra_help or flags.cfg or flags.info or flags.shell_completion

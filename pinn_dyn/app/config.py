@@ -32,10 +32,7 @@ def config_folder(command: str) -> Path:
 
 
 def completed(command: str, overrides: Sequence[str]) -> list[str]:
-    """Put ``++`` before every override of a value, so that keys in no YAML can be set as well.
-
-    Unknown keys are refused later, by the signatures of the classes: see :mod:`validation`.
-    """
+    """Put ``++`` before every override of a value, so that keys in no YAML can be set as well."""
     folder = config_folder(command)
     matches = [re.match(r"(?!hydra\.)([A-Za-z]\w*(?:\.\w+)*)=", text) for text in overrides]
     return [

@@ -44,9 +44,8 @@ def fit(
     """Train a model on a data frame with one row per sample, and return the run.
 
     The frame is read, checked, split and cleaned like a log file, see
-    :class:`~pinn_dyn.data.logs.LogSource`. Of five runs or more, 15 % are for validation and 15 %
-    for the test. Of fewer runs, the last 15 % of each are the test and the 15 % before them the
-    validation. For other splits, call :func:`~pinn_dyn.train` on a ``LogSource``.
+    :class:`~pinn_dyn.data.logs.LogSource`; 15 % are for validation and 15 % for the test. For
+    other splits, call :func:`~pinn_dyn.train` on a ``LogSource``.
 
     Args:
         frame: the log.

@@ -159,9 +159,8 @@ class Run:
         its samples is interpolated as in the training data.
 
         ``predict(frame)`` returns q and v in the columns, units and index of a log, whose columns
-        the frame needs. It is cleaned by the same steps. Every run starts from its first row; later
-        values of q and v are not used. Without measured velocities the columns of v are named
-        ``dq1/dt``. Rows that the cleaning drops at an end are NaN.
+        the frame needs. It is cleaned by the same steps. Every run starts from its first row.
+        Without measured velocities the columns of v are ``dq1/dt``. Rows dropped at an end are NaN.
 
         Args:
             start: (q, v), ``(*batch, 2N)``, or (q, p) if ``model.state`` is ``"qp"``; or a frame.
@@ -170,8 +169,7 @@ class Run:
 
         Raises:
             TypeError: if the input is missing.
-            ValueError: on shapes that do not fit the model, values that are not finite, or a
-                frame without the columns of the log.
+            ValueError: on wrong shapes, values that are not finite, or a frame without the columns.
         """
         if isinstance(start, pd.DataFrame):
             if self.log is None:

@@ -200,10 +200,7 @@ def tensorboard(folder: Path) -> TensorBoardLogger:
 
 
 class Recorder(L.Callback):
-    """Run time of a training, its metrics and the identity of its data, for its checkpoints.
-
-    The run time of a resumed training includes the time before the checkpoint.
-    """
+    """Run time of a training, its metrics and the identity of its data, for its checkpoints."""
 
     def __init__(self, facts: dict[str, Any], identity: Mapping[str, Any]):
         self.facts, self.identity = facts, identity

@@ -113,8 +113,7 @@ def train(
 ) -> Run:
     """Train a model on the data of a source, and return the run with the best checkpoint.
 
-    Some arguments are builders: classes, or :func:`functools.partial` of a class with keyword
-    arguments. The training adds the arguments that depend on the data, for example::
+    Builders are classes or :func:`functools.partial` of them, without the arguments of the data::
 
         model=partial(LagrangianNetwork, mass=partial(NetworkCholesky, hidden=[64, 64]))
         data=partial(DynamicsData, steps=10, stride="20 ms", pairs=4000)

@@ -199,10 +199,7 @@ def _merge_alternatives(value: Any, validate: Callable[[Any], Any]) -> Any:
 
 
 def _object(hints: Sequence[Any], short: bool = False) -> Any:
-    """Return the type of a mapping that describes an object of classes or factories.
-
-    If ``short``, the arguments of the first class are accepted without a ``_target_``.
-    """
+    """Return the type of a mapping that describes an object of classes or factories."""
     classes = [hint for hint in hints if isinstance(hint, type) and get_origin(hint) is None]
     factories = [(*get_args(hint), Any)[1] for hint in hints if hint not in classes]
     either = object in classes or bool(classes and factories)

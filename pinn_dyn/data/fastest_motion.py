@@ -13,10 +13,7 @@ _SAMPLES = 8  # smallest number of steps in a period
 
 
 def periods(trajectories: Sequence[Trajectory]) -> Tensor:
-    """Return the typical period of each coordinate, ``(N,)``, s; infinite without motion.
-
-    It is the median of the power of v over the frequency.
-    """
+    """Return the period at the median of the power of v, ``(N,)``, s; infinite without motion."""
     frequencies, powers = [], []
     for item in trajectories[:: -(-len(trajectories) // 30)]:
         v, sample = item.v.double(), float(item.t[1] - item.t[0])

@@ -42,10 +42,7 @@ def _hash(item: Trajectory) -> str:
 
 
 def data_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """List the differences between two identities, a sentence each.
-
-    Data that differ by rounding alone, as those of another machine do, are the same.
-    """
+    """List the differences between two identities beyond rounding, a sentence each."""
     earlier, present = _by_name(before), _by_name(now)
     changes = [f"{name} is no longer in {earlier[name][0]}" for name in earlier.keys() - present]
     changes += [f"{name} is new in {present[name][0]}" for name in present.keys() - earlier]

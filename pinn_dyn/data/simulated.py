@@ -90,8 +90,7 @@ class SimulatedSource(DataSource):
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
 
     Raises:
-        ValueError: on durations, counts or sizes that do not match, or ranges of q beyond the
-            domain of the system's equation.
+        ValueError: on settings that do not match, or ranges of q beyond the system's domain.
     """
 
     name: str

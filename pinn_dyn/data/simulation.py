@@ -57,13 +57,11 @@ def simulate(
     dense output.
 
     Args:
-        system: the system that moves.
         q0, v0: initial configurations and velocities, ``(K, N)``.
         signal: inputs as a function of time, ``(T,) -> (K, T, M)``; must be smooth.
         t: increasing sample times, ``(T,)``, s.
         rtol, atol: tolerances of the solver.
-        compile: compile the equation of motion first, in half a minute, for long simulations of
-            small batches. Ignored with a warning without a C++ compiler.
+        compile: compile the equation of motion first, if there is a C++ compiler.
         q_limits: limits of q, ``(2, N)``; samples of a motion that has left them are NaN.
         progress: label of a progress bar; no bar if None.
 

@@ -237,8 +237,7 @@ class WindowLoader:
 
     Attributes:
         windows: all windows, on the device that trains.
-        sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble;
-            the trainer tells it the epoch.
+        sampler: positions of each batch, ``(B,)``, or ``(E, B)`` for the members of an ensemble.
     """
 
     windows: Windows

@@ -37,7 +37,7 @@ def build_baselines(
 
     The linear models of step ``step`` in s are fitted to the training trajectories, q ``(T, N)``
     each. The validation trajectories select their number of lags. A linear model that cannot be
-    fitted, because the trajectories are too short or unevenly sampled, is left out with a warning.
+    fitted is left out with a warning.
     """
     size, inputs = train[0].q.shape[-1], train[0].u.shape[-1]
     baselines: dict[str, Predictor] = {

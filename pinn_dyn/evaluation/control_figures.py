@@ -48,7 +48,6 @@ def closed_loop_figure(
     Args:
         laws: names of laws and K runs of each.
         run: index of the run.
-        title: title of the figure.
         labels, input_labels: names and units; None takes q1 ... qN and u1 ... uM.
         held: the input is constant between two control instants.
     """

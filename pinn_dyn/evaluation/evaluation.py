@@ -277,10 +277,7 @@ def _predict(
 def _calibration(
     entry: Entry, held_out: Prediction, stride: int, window: float | None
 ) -> Calibration:
-    """Return the calibration of intervals, corrected on the validation data if there is a window.
-
-    The validation motions selected the checkpoint, but no weights were fitted to them.
-    """
+    """Return the calibration of intervals, corrected on the validation data with a window."""
     motions = stack_until(entry.training.validation)
     if window is None or motions.duration < window:
         return calibration(held_out, None)

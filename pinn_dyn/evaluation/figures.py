@@ -50,7 +50,6 @@ def trajectory_figure(
         truth: K trajectories stacked, q ``(K, T, N)``.
         predictions: model names and their rollouts; the order of the names fixes their colors.
         trajectory: index of the trajectory.
-        title: title of the figure.
         labels, input_labels: names and units of q and u; None takes q1 ... qN and u1 ... uM.
         baselines: names and rollouts of baselines, in grey.
     """
@@ -108,7 +107,6 @@ def terms_figure(comparison: TermComparison, *, configuration: int, title: str) 
 
     The inverse of M replaces M where the model's equations contain the inverse. The three matrices
     of a term share one color scale. The color follows the square root of an entry.
-    ``configuration`` is an index.
     """
     matrices = comparison.matrices()
     matrices.pop("M" if comparison.of_inverse_mass else "M_inverse")

@@ -110,9 +110,8 @@ def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
 def named_directions(space: np.ndarray, names: Sequence[str]) -> list[Direction]:
     """Return directions that span the orthonormal rows of ``space`` ``(D, P)``, with their names.
 
-    In this basis each direction contains a parameter that no other direction contains, so that a
-    single undetermined parameter is named alone. The directions are in the order of these
-    parameters.
+    Each direction contains a parameter that no other direction contains, so that a single
+    undetermined parameter is named alone.
     """
     if not len(space):
         return []

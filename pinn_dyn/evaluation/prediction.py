@@ -78,8 +78,7 @@ def predict_trajectories(
 ) -> Prediction:
     """Roll out a model in float64 from each true initial state under the true input.
 
-    If a trajectory breaks down (the mass matrix is no longer positive definite), its q_hat is NaN
-    from there on.
+    If a trajectory breaks down (mass matrix not positive definite), its q_hat is NaN from there on.
 
     Args:
         model: predictor with N coordinates and M inputs.
@@ -112,8 +111,7 @@ def predict_windows(
 ) -> Prediction:
     """Roll out a model as :func:`predict_trajectories` does, with resets to the true state.
 
-    At the time of a reset the prediction is the end of the window before. The last window is
-    left out if the trajectory ends within it.
+    At a reset the prediction is the end of the window before. An incomplete window is left out.
 
     Args:
         model: predictor with N coordinates and M inputs.
@@ -208,8 +206,7 @@ def common_stride(steps: Sequence[float], t: Tensor) -> int:
     """Return the number of samples between the common times of rollouts with different steps in s.
 
     Raises:
-        ValueError: if a step is no multiple of the sample time of t, ``(T,)``, or the rollouts have
-            only their start in common.
+        ValueError: if a step is no multiple of that of t, ``(T,)``, or only the start is common.
     """
     stride = math.lcm(*(samples_of("step", step, t) for step in set(steps)))
     if stride > len(t) - 1:

@@ -43,8 +43,7 @@ _HEADERS = {
 def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return the settings in which runs differ, one row per run and one dotted column per setting.
 
-    Left out are keys that follow the seed or an earlier key, and keys that the names of the model
-    and of the data set determine.
+    Keys that follow the seed, an earlier key or the names of model and data set are left out.
     """
     settings = pd.json_normalize(list(configs))
     text = settings.map(str)
@@ -63,10 +62,7 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def model_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a name for each run: its model, and the settings in which runs of this model differ.
-
-    Runs whose configurations differ in the seed only have equal names.
-    """
+    """Return a name for each run: its model, and the settings in which its runs differ."""
     settings = varied_settings(configs)
     labels = []
     for name, (_, row) in zip(names, settings.iterrows(), strict=True):

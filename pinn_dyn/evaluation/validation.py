@@ -120,10 +120,7 @@ class RolloutValidator:
 
 
 class RolloutFigures(L.Callback):
-    """Figures of a validation rollout, its error and the learned terms in the training log.
-
-    They are drawn at every n-th validation and at the end of the training.
-    """
+    """Figures of a validation rollout, its error and the learned terms in the training log."""
 
     def __init__(self, *, every_n_validations: PositiveInt = 4):
         self.every_n_validations = every_n_validations

@@ -69,11 +69,7 @@ def read_parquet(path: Path, request: Request) -> pd.DataFrame:
 
 
 def _table(path: Path, time: str, variables: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the real vectors and matrices that have as many rows or columns as the time.
-
-    Raises:
-        LogError: if there is no such time.
-    """
+    """Return the real vectors and matrices that have as many rows or columns as the time."""
     arrays = {}
     for name, value in variables.items():
         if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):

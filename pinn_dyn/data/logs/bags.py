@@ -26,10 +26,7 @@ _NAMES = ("name", "joint_names")
 
 
 def read_bag(path: Path, request: Request) -> Table:
-    """Read columns of a bag, one row per message of the topic of the time.
-
-    The rows are kept as a Parquet file in the cache, since decoding takes 20 µs a message.
-    """
+    """Read columns of a bag, one row per message of the topic of the time."""
     optional("pyarrow", path)
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]

@@ -164,8 +164,7 @@ class LogSource(DataSource):
         """Read the runs of a frame with the columns and units of the log, and clean each alone.
 
         Returns:
-            For each run the positions of its rows in the frame, these rows in SI units, and the
-            run after the cleaning.
+            For each run the rows in the frame, these in SI units, and the run after the cleaning.
 
         Raises:
             LogError: as :meth:`load`, or if the steps do not leave one stretch of each run.

@@ -27,11 +27,9 @@ class Part:
     """Validation or test data: whole runs, or seconds of the other runs.
 
     Args:
-        piece: length of the roll-outs that it is cut into, s; ``"whole"``: each stretch is one
-            roll-out.
+        piece: length of the roll-outs, s; ``"whole"``: each stretch is one roll-out.
         runs: number of runs, drawn by the seed, or the names of the runs.
-        seconds: duration at the end of every run that is not selected as a whole, s. Expects
-            either this or ``runs``.
+        seconds: duration at the end of every other run, s; either this or ``runs``.
     """
 
     piece: PositiveFloat | Literal["whole"]

@@ -44,8 +44,7 @@ def trajectory_browser(
 ) -> go.Figure:
     """Return a figure of one trajectory at a time: configuration, error and input over time.
 
-    A slider selects one of the ``trajectories``; the first is shown at first. The truth, K
-    trajectories stacked, sets the range of the panels of the configuration.
+    A slider selects one of the ``trajectories``. The truth, K trajectories stacked, sets the range.
     """
     rollouts = {**predictions, **baselines}
     styles = {}

@@ -90,10 +90,7 @@ def details(summary: str, *content: Markup) -> Markup:
 
 
 def from_markdown(text: str) -> Markup:
-    """Convert a Markdown report with tables; its headings start at the third level.
-
-    HTML and links remain plain text, since names in a report come from files of other people.
-    """
+    """Convert a Markdown report with tables; its headings start at the third level."""
     reader = markdown.Markdown(
         extensions=["tables", "toc"], extension_configs={"toc": {"baselevel": 3}}
     )
