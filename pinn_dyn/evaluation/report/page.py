@@ -90,7 +90,7 @@ def details(summary: str, *content: Markup) -> Markup:
 
 
 def from_markdown(text: str) -> Markup:
-    """Convert a Markdown report with tables; its headings start at the third level."""
+    """Convert a Markdown report: headings from the third level on, HTML and links as text."""
     reader = markdown.Markdown(
         extensions=["tables", "toc"], extension_configs={"toc": {"baselevel": 3}}
     )
