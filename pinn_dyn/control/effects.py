@@ -51,11 +51,7 @@ class Actuator:
         return u.clamp(_like(low, u), _like(high, u))
 
     def __call__(self, u: Tensor, interval: float) -> tuple[Tensor, Tensor]:
-        """Limit u ``(*batch, M)``, the input ``interval`` s after the previous call.
-
-        Returns:
-            The limited input, and a mask of the entries that were changed.
-        """
+        """Limit u ``(*batch, M)``, ``interval`` s after the previous call; also mask changes."""
         applied = u
         if self.rate is not None:
             change = interval * _like(self.rate, u)

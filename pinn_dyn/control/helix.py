@@ -90,9 +90,8 @@ class Helix(Reference):
         self.path_error = float(errors.max())
         if not self.path_error < _MAX_PATH_ERROR:
             raise ValueError(
-                f"the tip misses the helix by {self.path_error:.3g} m at phi = "
-                f"{between[errors.argmax()]:.3g} rad, near a singular configuration: take another "
-                "posture, or a smaller radius or pitch"
+                f"near phi = {between[errors.argmax()]:.3g} rad the tip misses the helix by "
+                f"{self.path_error:.3g} m: take a smaller radius or pitch, or another posture"
             )
 
     def path(self, t: float) -> np.ndarray:
@@ -139,8 +138,7 @@ class Helix(Reference):
             q = q + change * min(1.0, _LONGEST_STEP / max(length, _CLOSE))
         raise ValueError(
             f"the arm cannot follow the helix: at phi = {phi:.3g} rad its tip stays "
-            f"{np.linalg.norm(error):.3g} m from {np.round(target, 4).tolist()} m: take a smaller "
-            "radius or pitch, fewer turns, or another posture"
+            f"{np.linalg.norm(error):.3g} m away: take a smaller radius or another posture"
         )
 
 
@@ -149,7 +147,6 @@ def _tip(arm: HasTip, q: np.ndarray) -> np.ndarray:
 
 
 def _tip_and_jacobian(arm: HasTip, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tip's position ``(3,)`` and its derivative with respect to q, ``(3, N)``."""
     with torch.enable_grad():
         x = torch.from_numpy(q).requires_grad_()
         tip = arm.tip_position(x)

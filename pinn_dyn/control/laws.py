@@ -53,8 +53,7 @@ class ModelBasedLaw(Controller):
     ):
         if not isinstance(model, MechanicalSystem):
             raise TypeError(
-                f"{type(self).__name__}: model is a {type(model).__name__}, expected a mechanical "
-                "system with terms M, G and A, such as model=lnn or model=hnn"
+                f"model is a {type(model).__name__}, expected terms M, G and A (model=lnn or hnn)"
             )
         for present, problem, remedy in (
             (model.input_history, "a learned input delay", "~model/delay"),
@@ -63,8 +62,7 @@ class ModelBasedLaw(Controller):
         ):
             if present:
                 raise ValueError(
-                    f"{type(self).__name__}: the model has {problem}, which a law cannot invert: "
-                    f"train with {remedy}"
+                    f"the model has {problem}, which a law cannot invert: train with {remedy}"
                 )
         super().__init__(model.num_coordinates, model.num_inputs)
         self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
@@ -96,7 +94,6 @@ class ModelBasedLaw(Controller):
         """Return u by the formula of the law, given A(q) ``(*batch, N, M)``."""
 
     def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return K_P (q_ref - q) + K_D (v_ref - v), ``(*batch, N)``."""
         K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
         return K_P * (reference.q - q) + K_D * (reference.v - v)
 

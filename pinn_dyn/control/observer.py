@@ -16,8 +16,6 @@ from pinn_dyn.mechanics.arrays import matvec
 
 
 class _Memory(NamedTuple):
-    """Quantities of the previous call."""
-
     t: float
     momentum: Tensor
     force: Tensor

@@ -121,10 +121,8 @@ def factor_bounds(P: Tensor, true: Terms, learned: Terms) -> dict[str, Tensor]:
 def term_conditions(model: MechanicalSystem, q: Tensor) -> pd.DataFrame:
     """Return the conditioning of the terms of a model at configurations q ``(K, N)``, a row each.
 
-    The truth is not needed. Next to ``q1`` to ``qN`` there are ``mass_min`` and ``damping_min``,
-    the smallest eigenvalues of M and D, and ``mass_condition`` and ``input_condition``, the
-    condition numbers of M and A in the 2-norm. A law that inverts A turns a small error of G into a
-    large error of u where ``input_condition`` is large.
+    Next to ``q1`` to ``qN`` there are ``mass_min`` and ``damping_min``, the smallest eigenvalues of
+    M and D, and ``mass_condition`` and ``input_condition``, condition numbers in the 2-norm.
     """
     with torch.no_grad():
         terms = double_copy(model, q.device).terms(q.double())

@@ -85,8 +85,7 @@ def required_gain(
 
         kappa = L_w + |w(q_ref)| / error,     w(q) = K_P h(q) = (A A_L^T)^-1 Delta_all
 
-    with L_w the largest |dw/dq| over the ball of radius 1.05 ``error`` around q_ref. This is the
-    "kappa high enough" of Proposition 1.
+    with L_w the largest |dw/dq| over the ball of radius 1.05 ``error`` around q_ref.
     """
     model, truth, q_ref = prepare(model, truth, q_ref)
     w = partial(_input_error, model, truth)
@@ -130,7 +129,6 @@ def _largest_slope(
 
 
 def _sphere(q: Tensor) -> Tensor:
-    """Return points of the unit sphere, ``(16, 1, N)``, the same in each call."""
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(_SPHERE_POINTS, 1, q.shape[-1], generator=generator, dtype=q.dtype)
     return (points / torch.linalg.vector_norm(points, dim=-1, keepdim=True)).to(q.device)
@@ -163,13 +161,11 @@ def _poles(
 
 
 def _jacobian(function: Callable[[Tensor], Tensor], q: Tensor) -> Tensor:
-    """Return df/dq ``(K, N, N)`` by central differences."""
     steps = _DIFFERENCE * torch.eye(q.shape[-1], dtype=q.dtype, device=q.device)
     ahead, behind = function(q.unsqueeze(-2) + steps), function(q.unsqueeze(-2) - steps)
     return (ahead - behind).mT / (2 * _DIFFERENCE)
 
 
 def _spectral_norm(matrix: Tensor) -> Tensor:
-    """Return the largest singular value, infinite where an entry is not finite."""
     finite = torch.isfinite(matrix).all(-1).all(-1)
     return torch.where(finite, torch.linalg.matrix_norm(matrix.nan_to_num(), 2), torch.inf)

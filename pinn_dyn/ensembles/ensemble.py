@@ -76,6 +76,5 @@ class Ensemble(Predictor):
             buffers = free_weights(dict(member.named_buffers()))
             if any(not torch.equal(value, scales[name]) for name, value in buffers.items()):
                 raise ValueError(
-                    f"member {k} has other scales (buffers) than member 0: build all members from "
-                    "the same statistics"
+                    f"member {k} has other scales than member 0: build all from one Statistics"
                 )

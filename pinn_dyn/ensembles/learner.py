@@ -58,10 +58,6 @@ class EnsembleLearner(DynamicsLearner):
 
 
 class MemberSOAP(SOAP):
-    """SOAP on parameters ``(E, ...)`` with preconditioners for each of the E members.
-
-    Rounding chooses a part of the bases of matrices that are not square, so a member may be trained
-    differently, but equally well, than a single model of the same seed.
-    """
+    """SOAP on parameters ``(E, ...)`` with preconditioners for each of the E members."""
 
     leading = 1

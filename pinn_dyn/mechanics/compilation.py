@@ -56,8 +56,6 @@ def integrated_by(model: ContinuousPredictor, integrator: Integrator) -> Iterato
 
 
 class _Wrapped(Integrator):
-    """Integrator that takes the steps of an inner integrator."""
-
     def __init__(self, inner: Integrator):
         super().__init__(inner.substeps)
         self.inner = inner
@@ -109,8 +107,7 @@ class CompiledLoop(_Wrapped):
 class RecordedSteps(_Wrapped):
     """Integrator that replays steps from a CUDA graph on a GPU, without gradients.
 
-    Launching a kernel takes longer than its work. Dynamics that wait for the GPU cannot be
-    recorded; they use the inner integrator.
+    Dynamics that wait for the GPU cannot be recorded; they use the inner integrator.
     """
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
@@ -180,8 +177,6 @@ def compile_graph(
 
 
 class _Recorded:
-    """A GPU program as a CUDA graph. Arguments are copied into its memory."""
-
     def __init__(self, program: Callable[..., list[Tensor]], arguments: tuple[Tensor, ...]):
         self._arguments = [value.clone() for value in arguments]
         program(*self._arguments)  # loads the kernels, which is not possible during recording

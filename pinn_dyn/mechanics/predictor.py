@@ -103,10 +103,7 @@ class ContinuousPredictor(Predictor):
         """Return dx/dt, ``(*batch, S)``, of the state x ``(*batch, S)`` under u ``(*batch, M)``."""
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return a function from r to k with (1 - s J) k = r, with J the stiff part of df/dx.
-
-        The default has J = 0.
-        """
+        """Return a function from r to k with (1 - s J) k = r, J the stiff part of df/dx (zero)."""
         return lambda rate: rate
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:

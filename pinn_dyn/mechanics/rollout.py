@@ -77,8 +77,6 @@ def step_grid(t: Tensor, t_input: Tensor, substeps: int) -> Tensor:
 
 @dataclass(frozen=True)
 class _Flow:
-    """Dynamics given by a state derivative only."""
-
     state_derivative: Callable[[Tensor, Tensor], Tensor]
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:

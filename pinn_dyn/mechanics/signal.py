@@ -86,9 +86,8 @@ class Signal:
         """Return u(t - d), for d ``()`` in s, of an input that is not held."""
         if self.interpolation == "hold":
             raise ValueError(
-                "interpolation is 'hold', expected 'linear' or 'cubic': the delay of a held input "
-                "cannot be learned; set dataset.interpolation=linear, or measure the delay by "
-                "check.py and shift the input by the step InputDelay"
+                "the delay of a held input cannot be learned: set dataset.interpolation=linear, or "
+                "measure the delay by check.py and shift the input by the step InputDelay"
             )
         return self._changed(self.t + delay.to(self.t), lambda value: value)
 
@@ -108,7 +107,6 @@ class Signal:
         return self._made(t, change(self.u), None if self.rate is None else change(self.rate))
 
     def _made(self, t: Tensor, u: Tensor, rate: Tensor | None) -> Signal:
-        """Build a signal without checks, by operations that can be traced."""
         made = object.__new__(Signal)
         made.__dict__.update(t=t, u=u, interpolation=self.interpolation, rate=rate)
         return made
@@ -166,7 +164,6 @@ class Signal:
         return None if self.rate is None else self.rate.movedim(-2, 0).contiguous()
 
     def _beside(self, values: Tensor) -> Tensor:
-        """Reshape a number for each sample for products with the samples."""
         return values.reshape(*values.shape, *[1] * (self.u.ndim - 1)).to(self.u)
 
     def _at(self, times: Tensor, index: Tensor) -> Tensor:
@@ -216,7 +213,6 @@ def stacked(signals: Sequence[Signal], t: Tensor) -> Signal:
 
 
 def _rates(t: Tensor, u: Tensor) -> Tensor:
-    """Return du/dt at the samples by differences."""
     if t.shape[0] < 2:
         return torch.zeros_like(u)
     order = 1 if t.shape[0] == 2 else 2

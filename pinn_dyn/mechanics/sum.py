@@ -12,8 +12,6 @@ from pinn_dyn.mechanics.system import MechanicalSystem
 
 
 def _total(name: str) -> Callable[..., Tensor]:
-    """Build a method that adds the results of the parts."""
-
     def method(self: Sum, *values: Tensor) -> Tensor:
         total, *terms = (getattr(part, name)(*values) for part in self._systems())
         for term in terms:
@@ -28,8 +26,7 @@ class Sum(MechanicalSystem):
 
         X = sum over parts k of X_k,     for X = M, V, D, F, A and r
 
-    All parts have the same q and v, so the Coriolis forces add up, too. The sum of passive parts is
-    passive.
+    The Coriolis forces add up, too. The sum of passive parts is passive.
 
     Args:
         parts: the systems by name, all of the same N and M.

@@ -64,11 +64,7 @@ class Trajectory:
         return float(self.t[-1] - self.t[0])
 
     def input_since(self, history: float) -> Signal:
-        """Return u from ``history`` seconds before the start on, a sample time apart.
-
-        Unknown input has the value of the earliest known sample.
-
-        """
+        """Return u from ``history`` s before the start on; unknown input is the earliest sample."""
         step = self.t[1] - self.t[0]
         count = math.ceil(history / float(step) - 1e-6)
         if count < 1:

@@ -14,9 +14,8 @@ class LearnedDelay(nn.Module):
 
         d = longest * clamp(z, 0, 1),      dL/dd = -sum over stages of dL/du . du/dt
 
-    The clamp passes gradients, so that a d at 0 can grow again. Adam needs about 1/lr steps to
-    change d by ``longest``. Inputs with different delays must be shifted before (the cleaning step
-    InputDelay). The data determine d only if the input changes faster than the motion.
+    The clamp passes gradients, so that a d at 0 can grow again. Inputs with different delays must
+    be shifted before (the cleaning step InputDelay).
 
     Args:
         longest: the longest delay that can be learned, s.

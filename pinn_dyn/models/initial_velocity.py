@@ -15,10 +15,8 @@ from pinn_dyn.models.scales import Scales
 class LearnedVelocity(nn.Module):
     """v_0 = v + s_v * network(q, v, u), for velocities that are estimated instead of measured.
 
-    Velocities derived from a few samples of q are noisy, and strongly damped dynamics cannot
-    average over the noise. The head starts at v_0 = v and is trained together with the dynamics.
-    Source: an encoder of the initial state as in Beintema, Schoukens and Toth (2023), "Deep
-    subspace encoders for nonlinear system identification".
+    The head starts at v_0 = v and is trained together with the dynamics. Source: Beintema,
+    Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system identification".
 
     Args:
         scales: scales of the data. The value is s_v, ``(N,)``.

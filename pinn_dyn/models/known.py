@@ -98,9 +98,8 @@ class KnownMechanics(LearnedConstants):
         if (statistics.num_coordinates, statistics.num_inputs) != (size, size):
             raise ValueError(
                 f"the data have {statistics.num_coordinates} coordinates and "
-                f"{statistics.num_inputs} inputs, the structure has the {size} joints "
-                f"{', '.join(structure.joint_names)}: expected one coordinate and one input "
-                "per joint; lock the remaining joints (structure.locked_joints)"
+                f"{statistics.num_inputs} inputs, expected the {size} joints "
+                f"{', '.join(structure.joint_names)}: lock some (structure.locked_joints)"
             )
         super().__init__(size, size)
         self.structure = structure

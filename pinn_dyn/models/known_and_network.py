@@ -22,9 +22,7 @@ class KnownAndNetwork(Sum):
         (M_k + M_n) a + (C_k + C_n) v + G_k + G_n + (D_k + D_n) v + F_k + F_n = A_k u + r
 
     Known terms have the index k, terms of the network n. The network has no input matrix
-    (``input: none``) and small initial terms. Its force is penalized, so that the network only
-    learns forces that the known mechanics cannot represent. With the typical torques f of the
-    drives::
+    (``input: none``) and small initial terms. With the typical torques f of the drives::
 
         penalty = w mean over the batch and i of (tau_i / f_i)^2
         tau = M_n a + C_n v + G_n + D_n v + F_n

@@ -148,9 +148,8 @@ class PhysicalBodies(Constants):
             smallest = float(torch.linalg.eigvalsh(body)[0])
             if not smallest > 0:
                 raise ValueError(
-                    f"body {name!r} has a pseudo-inertia with the eigenvalue {smallest:.3g}: no "
-                    "body has this mass and these moments; correct its <inertial>, or use "
-                    "start='generic'"
+                    f"body {name!r} has a pseudo-inertia with the eigenvalue {smallest:.3g}, "
+                    "expected positive ones: correct its <inertial>, or use start='generic'"
                 )
         parts = ["mass", "x extent", "y extent", "z extent", "xy shear", "xz shear", "yz shear"]
         parts += ["x centre", "y centre", "z centre"]

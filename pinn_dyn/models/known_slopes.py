@@ -49,7 +49,6 @@ class KnownSlopes(Slopes):
         return torch.cat([gain.new_zeros(len(gain), len(self._bodies)), drives], dim=-1)
 
     def _body_slopes(self) -> Tensor:
-        """Return dpi/dz of the bodies, ``(10 n, 10 n)``."""
         z = self.model.bodies.z.detach()
         copies = z.expand(10, *z.shape).clone().requires_grad_()
         with torch.enable_grad():

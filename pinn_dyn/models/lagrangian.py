@@ -115,7 +115,6 @@ class LagrangianNetwork(structured.StructuredNetwork):
         return factor if self.mass.transposed else factor.transpose(-1, -2)
 
     def _energy_gradient(self, tape: Tape, v: Tensor, w: Tensor) -> Tensor:
-        """Return d(|R v|^2 / 2)/dq, with w = R v."""
         left, right = (w, v) if self.mass.transposed else (v, w)
         return self.mass.pullback(tape, left.unsqueeze(-1) * right.unsqueeze(-2))
 

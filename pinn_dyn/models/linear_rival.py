@@ -104,7 +104,6 @@ class LinearRival(Predictor):
         return torch.stack(path, dim=-2)
 
     def _lift(self, state: Tensor) -> Tensor:
-        """Return phi(s), standardized, ``(*batch, F)``."""
         z = (state - self.mean) / self.scale
         if self.degree == 2:
             first, second = torch.triu_indices(z.shape[-1], z.shape[-1], device=z.device)
@@ -119,11 +118,7 @@ def fit_linear_rival(
     step: float,
     degree: Literal[1, 2],
 ) -> LinearRival:
-    """Fit the baseline whose lags and ridge have the smallest mean |q_hat - q| on validation.
-
-    Raises:
-        ValueError: if no number of lags can be fitted, see :class:`LinearRival`.
-    """
+    """Fit the baseline of the smallest mean |q_hat - q| on validation, or raise ValueError."""
     truth = stack_until(validation)
     stride = samples_of("step", step, truth.t)
     truth = truth.until(min(truth.duration, step * _STEPS))
@@ -181,6 +176,5 @@ def _ridge(features: Tensor, target: Tensor, ridge: float) -> tuple[Tensor, Tens
 
 
 def _spread(values: Tensor) -> Tensor:
-    """Return the standard deviations of columns, or 1 for a constant column."""
     spread = values.std(0, correction=0)
     return torch.where(spread > 1e-12 * values.abs().amax(0), spread, 1.0)

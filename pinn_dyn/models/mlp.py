@@ -204,7 +204,6 @@ class MLP(nn.Module):
 
 
 def _side_by_side(weight: Tensor, h: Tensor, dh: Tensor) -> tuple[Tensor, Tensor]:
-    """Return W h and W dh, each ``(n, B)``, by one product."""
     both = weight @ torch.stack([h, dh], dim=1).flatten(1)
     value, tangent = both.unflatten(1, (2, -1)).unbind(1)
     return value, tangent

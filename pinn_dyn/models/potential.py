@@ -28,9 +28,8 @@ class Potential(nn.Module, abc.ABC):
 class NetworkPotential(Potential):
     """V(q) = scale * (network(q) + z^T K z / 2), z = (q - mean)/std, and G = dV/dq.
 
-    K = S S^T is a learned constant, since an elastic or gravity well is mostly quadratic. z has
-    zeros for angles. The input of the network saturates outside the data, so that V is bounded from
-    below.
+    K = S S^T is a learned constant. z has zeros for angles. The input of the network saturates
+    outside the data, so that V is bounded from below.
 
     Args:
         scales: scales of the data. The value is a typical energy, J.
@@ -75,7 +74,6 @@ class NetworkPotential(Potential):
         return self.scale * force
 
     def _lengths(self, q: Tensor) -> Tensor:
-        """Return z, with zeros for angles."""
         z = (q - self.network.mean) / self.network.std
         return z.masked_fill(self.network.is_angle, 0.0)
 

@@ -17,10 +17,8 @@ class NetworkResidual(nn.Module):
 
         penalty = w mean over the batch and i of (r_i / f_i)^2
 
-    f is a typical generalized force. r is initially zero. Due to the penalty, r only represents
-    effects that the other heads cannot represent, such as hysteresis. The force is not passive, but
-    bounded: the input of the network saturates outside the range of q, and three standard
-    deviations of v and u.
+    f is a typical generalized force. r is initially zero. It is not passive, but bounded: the input
+    of the network saturates outside the range of q, and three standard deviations of v and u.
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.

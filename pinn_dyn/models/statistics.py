@@ -74,11 +74,7 @@ class Statistics:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Statistics:
-        """Build from the result of :meth:`to_dict`.
-
-        Raises:
-            ValueError: if a number is not finite, or a scale is not positive.
-        """
+        """Build from :meth:`to_dict`, or raise ValueError on a bad number or scale."""
         names = [item.name for item in fields(cls)]
         read = {name: torch.tensor(values[name], dtype=torch.float64) for name in names}
         for name, value in read.items():

@@ -22,8 +22,7 @@ class BulletArm(SimulatedArm):
     q ``(*batch, N)`` rad, v rad/s, u motor torques ``(*batch, N)`` Nm. Arguments, attributes and
     errors: :class:`~pinn_dyn.systems.simulated_arm.SimulatedArm`.
 
-    Arms of the same URDF and gravity share a state in a process: to move several in turn, set the
-    state of each before its steps.
+    Arms of the same URDF and gravity share a state: set the state of each before its steps.
 
     Raises:
         ImportError: without PyBullet.

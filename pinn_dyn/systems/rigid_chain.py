@@ -323,7 +323,6 @@ class RigidChain(MechanicalSystem):
 
 
 def _bracket(first: Tensor, second: Tensor) -> Tensor:
-    """[A, B] = A B - B A."""
     return first @ second - second @ first
 
 

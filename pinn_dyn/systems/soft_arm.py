@@ -105,8 +105,7 @@ class SoftArm(MechanicalSystem):
             if not (shortest > 0 and bend < 2 * np.pi):
                 raise ValueError(
                     f"segment {k + 1} shortens to {shortest:.3g} m and bends by up to {bend:.3g} "
-                    "rad, where the equation of motion does not hold: expected a positive length "
-                    "and less than 2 pi"
+                    "rad, expected a positive length and less than 2 pi"
                 )
 
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -190,11 +189,7 @@ class SoftArm(MechanicalSystem):
     def _chain(
         self, q: Tensor, v: Tensor | None = None, nodes: Tensor | None = None
     ) -> tuple[Tensor, Tensor, list[Tip]]:
-        """Return the kinematics of the S = segments * nodes points of the chain.
-
-        These are dr/dq ``(*batch, S, 3, N)``, (d/dt dr/dq) v ``(*batch, S, 3)``, zero without v,
-        and the tip frames.
-        """
+        """Return dr/dq ``(*batch, S, 3, N)``, (d/dt dr/dq) v and tip frames, S = points."""
         batch, size = q.shape[:-1], self.num_coordinates
         s = (self._s if nodes is None else nodes).to(q)
         ends = torch.cat([s, s.new_ones(1)])

@@ -191,9 +191,8 @@ class _UrdfFile:
         slack = _TOLERANCE * np.abs(moments).max()
         if mass < 0 or moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
             raise ValueError(
-                f"{self.path}: link {link!r} has mass {mass:g} kg and the principal moments of "
-                f"inertia {moments.tolist()} kg m^2, expected no negative values and no moment "
-                "larger than the sum of the other two"
+                f"{self.path}: link {link!r} has mass {mass:g} kg and moments {moments.tolist()} "
+                "kg m^2, expected no negative values, and none above the sum of the other two"
             )
         pose = self.pose(inertial)
         parameters = torch.tensor([mass, 0.0, 0.0, 0.0, *values], dtype=torch.float64)
@@ -225,7 +224,6 @@ class _UrdfFile:
 
 
 def _end(joint: ET.Element, end: str) -> str:
-    """Return the ``parent`` or ``child`` of a joint, empty if it has none."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
 

@@ -150,7 +150,6 @@ class MechanicalSystemContract:
         assert_near(force, expected, self.difference_tolerance, scale + lost.abs().max())
 
     def _coriolis_scale(self, system, configurations):
-        """Return the size of C v if M changes by its own size over one unit of q."""
         speed = configurations.v.abs().max()
         return system.mass_matrix(configurations.q).abs().max() * (speed + speed**2)
 

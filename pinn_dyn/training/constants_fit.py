@@ -64,10 +64,7 @@ class StoppedFit(KeyboardInterrupt):
 
 
 def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
-    """Return (I + R^T R)^-1, ``(P, P)``, with information I and the root R of the prior precision.
-
-    I + R^T R may be nearly singular.
-    """
+    """Return (I + R^T R)^-1, ``(P, P)``, with information I and prior precision R^T R."""
     back = torch.linalg.inv(root)
     values, vectors = torch.linalg.eigh(back.T @ information @ back)
     half = back @ vectors / (1 + values.clamp(min=0)).sqrt()

@@ -42,9 +42,8 @@ def correlation_length(errors: np.ndarray) -> float:
 def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
     """Return at most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
 
-    Each trajectory is filtered forwards and backwards by a Butterworth filter of fourth order. a is
-    the derivative of the filtered v by differences. Half a period of the cutoff is removed at both
-    ends.
+    The Butterworth filter of fourth order runs forwards and backwards. a is the derivative of the
+    filtered v by differences. Half a period of the cutoff is removed at both ends.
 
     Raises:
         ValueError: if the cutoff is above half the sample rate, or all trajectories are too short.

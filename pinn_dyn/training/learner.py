@@ -43,8 +43,7 @@ class NonFiniteLossError(RuntimeError):
 class DynamicsLearner(L.LightningModule):
     """LightningModule that trains a predictor on windows and validates it by roll-outs.
 
-    A training step of Lightning comprises many optimizer steps, since the calls around a training
-    step take as long as an optimizer step of a small network. It ends if Lightning may have
+    A training step of Lightning comprises many optimizer steps. It ends if Lightning may have
     something to do: around each ``log_every_n_steps`` steps, at a validation, and after half a
     second. With several processes, or a callback that averages weights, it is a single step.
 
@@ -161,13 +160,11 @@ class DynamicsLearner(L.LightningModule):
         return closure
 
     def _refuse_non_finite(self, losses: Tensor, first: int) -> None:
-        """Raise an error if a loss is not finite. Each row is a step, starting at ``first``."""
         for step, loss in enumerate(losses.reshape(len(losses), -1).sum(1).tolist(), first):
             if not math.isfinite(loss):
                 raise NonFiniteLossError(
-                    f"the training loss became {loss} at step {step} (epoch "
-                    f"{self.current_epoch}); earlier checkpoints are kept. Reduce optimizer.lr, or "
-                    "use shorter windows (data.steps, data.stride)"
+                    f"the training loss became {loss} at step {step} (epoch {self.current_epoch}): "
+                    "reduce optimizer.lr, or use shorter windows (data.steps, data.stride)"
                 )
 
     def log_losses(self, losses: Tensor) -> None:

@@ -55,9 +55,8 @@ class LeastSquares:
     ``changed`` since, such as a payload. A fit has two stages:
 
     1. Inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), in units of the spread of the
-       forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. The
-       same filter for q, v, a and u does not change a linear law. Joints at rest are excluded,
-       since dry friction may then have any value up to its level.
+       forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. Joints
+       at rest are excluded, since dry friction may then have any value up to its level.
     2. Roll-outs: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first roll-outs use a quarter of the steps of the windows.
 
@@ -220,10 +219,7 @@ class LeastSquares:
     def _solve(
         self, stage: str, model: LearnedConstants, prior: Prior, residuals: Residuals, group: float
     ) -> Fit:
-        """Fit twice, the second time with the noise level of the first fit; set the model in place.
-
-        A ``group`` of so many correlated residuals is worth one independent residual.
-        """
+        """Fit twice, then with the noise of the first fit; ``group`` residuals count as one."""
         z = parameters_to_vector(model.parameters()).detach()
         mean, root = prior.mean.numpy(), prior.root.numpy()
 
@@ -283,10 +279,7 @@ def _informative_blocks(steps: int) -> int:
 
 
 def _require_enough(count: int, constants: int, source: str, remedy: str, earlier: bool) -> None:
-    """Check that there are at least as many residuals as constants, or warn after an earlier fit.
-
-    Fewer residuals would be fitted exactly, so that the noise seems to be zero.
-    """
+    """Check that residuals are no fewer than constants, or warn after an earlier fit."""
     message = (
         f"least squares: {source} give {count} residuals for {constants} constants, expected at "
         f"least as many: {remedy}"

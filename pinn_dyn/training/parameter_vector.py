@@ -15,16 +15,13 @@ ELEMENTWISE = (Adam, AdamW, NAdam, RAdam, Adamax, Adagrad, Adadelta, RMSprop, SG
 class ParameterVector:
     """The parameters of a model and their gradients as views of two vectors.
 
-    Clipping and elementwise optimizers then need one operation instead of one per parameter.
-
     Args:
         parameters: parameters of one model, or stacked over E members, ``(E, ...)``.
         members: E, or None for a single model.
 
     Attributes:
         parameters: the parameters.
-        values: all numbers of the parameters, ``(P,)`` or ``(E, P)``. Its ``grad`` holds all
-            gradients.
+        values: all numbers of the parameters, ``(P,)`` or ``(E, P)``, with all gradients.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], members: int | None = None):

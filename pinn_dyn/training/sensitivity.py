@@ -17,8 +17,7 @@ def rollout_slopes(model: LearnedConstants, windows: Windows) -> Tensor:
 
         dS/dt = (S_v, -M^-1 (de/dx S + de/dz))
 
-    e is the missing force of :class:`LearnedConstants`, with da/dz = -M^-1 de/dz at fixed q, v and
-    u. RK4 of this equation is the derivative of RK4. The model is in float64.
+    e is the missing force of :class:`LearnedConstants`. The model is in float64.
     """
     size = model.num_coordinates
     count = sum(p.numel() for p in model.parameters())

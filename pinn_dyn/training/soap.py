@@ -213,5 +213,4 @@ class _Layout:
 
 
 def _padded(size: int) -> int:
-    """Return the next power of two, at least ``SMALLEST``."""
     return max(SMALLEST, 1 << (size - 1).bit_length())

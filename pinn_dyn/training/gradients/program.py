@@ -101,8 +101,6 @@ def weighted_sum(weights: list[float], parts: Iterable[Sequence[Tensor]]) -> tup
 
 
 class _Loss(nn.Module):
-    """Loss of a batch as a module, for functional calls."""
-
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor):
         super().__init__()
         self.model = model
@@ -120,5 +118,4 @@ def _call(program: Program, arguments: tuple[Any, ...]) -> list[Tensor]:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return a pool of threads, each with one torch thread."""
     return ThreadPoolExecutor(threads, "windows", torch.set_num_threads, (1,))

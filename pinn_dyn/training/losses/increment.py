@@ -36,14 +36,13 @@ class IncrementLoss(WindowLoss):
     Charbonnier et al. 1997, "Deterministic edge-preserving regularization in computed imaging").
 
     A curriculum ``[k_1, ... k_S]`` divides the training into S equal stages. Stage s only uses the
-    first k_s steps of a window. Short roll-outs are cheap, and an untrained model does not diverge.
+    first k_s steps of a window.
 
     Args:
         statistics: scales of the data.
         model: the model that will be trained.
         curriculum: steps in each stage, increasing to the H of the windows. The default is H.
-        velocity_weight: w of the velocity or momentum half; below 1 if v is smoother than the
-            motion.
+        velocity_weight: w of the velocity or momentum half.
         huber: d in units of the spread of the increments. The default is the squared error.
 
     Raises:

@@ -33,8 +33,7 @@ class MidpointLoss(WindowLoss):
     momenta): 1 % of a for an oscillation of r rad/s with r h = 0.5. A window costs one evaluation
     of the dynamics instead of four by RK4.
 
-    Assumptions: q and v have little noise, since noise in v is divided by a short h. For noisy logs
-    use longer windows and the increment loss.
+    Assumption: q and v have little noise. For noisy logs use longer windows and the increment loss.
 
     Source: direct collocation (Betts 2010, "Practical Methods for Optimal Control and Estimation
     Using Nonlinear Programming"). This loss is not in the paper.
