@@ -16,12 +16,7 @@ from pinn_dyn.control.laws import (
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.control.references import (
-    PointToPoint,
-    RandomSetPoints,
-    SetPoint,
-    Sines,
-)
+from pinn_dyn.control.references import PointToPoint, RandomSetPoints, SetPoint, Sines
 from pinn_dyn.control.region import DataRegion, Guarded
 from pinn_dyn.control.stability import certify, fit_factor, term_conditions
 from pinn_dyn.control.stability_report import stability_report

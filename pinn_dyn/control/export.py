@@ -131,7 +131,7 @@ def load_law(path: str | Path, sha256: str | None = None) -> CompiledLaw:
     error = ((u - expected).norm(dim=-1) / expected.norm(dim=-1)).max()
     if not error <= TOLERANCE:
         raise RuntimeError(
-            f"{path} misses the law it was exported from by {float(error):.1e} (relative): export it "
+            f"{path} misses the law it was exported from by {float(error):.1e}: export it "
             "on the machine that runs it, and check the condition numbers of M(q) and A(q)"
         )
     return law

@@ -53,7 +53,8 @@ class ModelBasedLaw(Controller):
     ):
         if not isinstance(model, MechanicalSystem):
             raise TypeError(
-                f"model is a {type(model).__name__}, expected terms M, G and A (model=lnn or hnn)"
+                f"model is a {type(model).__name__}, expected a system with terms M, G and A, such "
+                "as model=lnn"
             )
         for present, problem, remedy in (
             (model.input_history, "a learned input delay", "~model/delay"),

@@ -98,7 +98,7 @@ class SimulatorPlant(Plant):
         self._x = torch.cat([q0, v0], dim=-1).double()
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-        """Hold the input for a duration that is an integer multiple of the step (else ValueError)."""
+        """Hold the input for an integer multiple of the step, or raise ValueError."""
         steps = round(duration / self._step)
         if steps < 1 or abs(duration / self._step - steps) > 1e-6:
             raise ValueError(

@@ -90,9 +90,8 @@ class Predictor(nn.Module, abc.ABC):
 class ContinuousPredictor(Predictor):
     """Predictor that integrates a state derivative dx/dt = f(x, u).
 
-    The integrated state ``(*batch, S)`` begins with the 2N numbers of (q, v) or (q, p). A model
-    with more states, such as those of actuators, initializes them in :meth:`initial_state`.
-    ``learns_initial_state`` is true if roll-outs start at a learned state.
+    The integrated state ``(*batch, S)`` begins with (q, v) or (q, p). :meth:`initial_state` adds
+    more states. ``learns_initial_state`` is true if roll-outs start at a learned state.
     """
 
     integrator: Integrator = RK4()

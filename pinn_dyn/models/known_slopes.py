@@ -20,8 +20,7 @@ class KnownSlopes(Slopes):
         e = Y(q, v, a) pi(z) + drive force(v, a, u; z)
         de/dz = Y dpi/dz + d(drive force)/dz
 
-    The drive of a joint depends only on the v and the constants of that joint, so one reverse pass
-    through all drives, with a copy of the constants for each sample, gives the second term.
+    One reverse pass through all drives, with copies of the constants, gives the second term.
     """
 
     def __init__(self, model: LearnedConstants):

@@ -298,7 +298,6 @@ class RigidChain(MechanicalSystem):
         return at.poses @ (self.inertia if inertia is None else inertia) @ at.poses.mT
 
     def _tree_sum(self, matrix: Tensor, values: Tensor) -> Tensor:
-        """sum over k of matrix_jk values_k, ``(*batch, N, 4, 4)``."""
         return (matrix @ values.flatten(-2)).unflatten(-1, (4, 4))
 
     def _mass(self, at: Kinematics, bodies: Tensor) -> Tensor:

@@ -46,10 +46,7 @@ def first_slopes(c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
 
 def second_slopes(c: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """d2c_1/dx2, d2c_2/dx2 from the values of :func:`stumpff`."""
-    return (
-        0.25 * (3 * c[5] - 3 * c[4] + c[3]),
-        0.25 * (8 * c[6] - 5 * c[5] + c[4]),
-    )
+    return (0.25 * (3 * c[5] - 3 * c[4] + c[3]), 0.25 * (8 * c[6] - 5 * c[5] + c[4]))
 
 
 class Tip(NamedTuple):

@@ -26,8 +26,7 @@ class SOAP(Optimizer):
 
     with the gradient G, the weight decay d and the eigenvectors Q_L of L and Q_R of R, which are
     updated by one power iteration every ``precondition_frequency`` steps. The first step only
-    initializes them. Vectors use Adam. In a tensor of more than two dimensions, the first is that
-    of the rows. All matrices of a size are padded with zeros and processed as one batch.
+    initializes them. Vectors use Adam. In a larger tensor, the first dimension is that of the rows.
 
     Source: Vyas et al. 2024, "SOAP: Improving and Stabilizing Shampoo using Adam".
 

@@ -27,9 +27,8 @@ _ROWS = {"qv": ("q", "v", "dq", "dv"), "qp": ("q", "p", "dq", "dp")}
 class LossProgram:
     """Compiled program for the loss of windows and its gradient.
 
-    The roll-out, the loss and the gradient are traced as one graph, and compiled for each batch
-    size. Parts of a batch run in parallel threads, or one after another on a GPU. The model of an
-    ensemble is the stack of all members or a single member.
+    They are traced as one graph, and compiled for each batch size. Parts of a batch run in parallel
+    threads, or one after another on a GPU.
     """
 
     def __init__(self, loss: WindowLoss, model: ContinuousPredictor, vector: ParameterVector):
