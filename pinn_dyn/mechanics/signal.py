@@ -86,7 +86,7 @@ class Signal:
         """Return u(t - d), for d ``()`` in s, of an input that is not held."""
         if self.interpolation == "hold":
             raise ValueError(
-                "interpolation is 'hold': its delay cannot be learned; set it to linear, or "
+                "interpolation is 'hold', which hides delays: set dataset.interpolation=linear, or "
                 "measure the delay by check.py and shift the input by the step InputDelay"
             )
         return self._changed(self.t + delay.to(self.t), lambda value: value)

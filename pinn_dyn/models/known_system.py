@@ -60,7 +60,8 @@ class KnownSystem(LearnedConstants):
         if (statistics.num_coordinates, statistics.num_inputs) != (size, inputs):
             raise ValueError(
                 f"the data have {statistics.num_coordinates} coordinates and "
-                f"{statistics.num_inputs} inputs, the structure has {size} and {inputs}"
+                f"{statistics.num_inputs} inputs, the structure {type(structure).__name__} has "
+                f"{size} and {inputs}"
             )
         super().__init__(size, inputs)
         self.integrator = integrator or RK4()
@@ -103,7 +104,7 @@ def _units_of(structure: MechanicalSystem) -> dict[str, list[str]]:
     sizes = {name: buffer.numel() for name, buffer in structure.named_buffers()}
     if not constants or any(sizes.get(name) != len(units) for name, units in constants.items()):
         raise ValueError(
-            f"{type(structure).__name__} has the constants {constants}, expected a unit for each "
-            f"entry of its buffers, of the sizes {sizes}; use model=known for rigid chains"
+            f"structure {type(structure).__name__} has the constants {constants}, expected a unit "
+            f"for each entry of buffers of the sizes {sizes}; use model=known for rigid chains"
         )
     return constants

@@ -50,8 +50,7 @@ class MLP(nn.Module):
     With ``after`` the output y_o depends only on the entries x_i with i > after_o, by masked
     weights W_k (Germain et al. 2015, "MADE").
 
-    :meth:`linearize_along` returns y and J dx, and :meth:`pullback` J^T dy, by operations that can
-    be differentiated again and compiled.
+    :meth:`linearize_along` returns y and J dx, :meth:`pullback` J^T dy. Both are differentiable.
 
     Args:
         inputs, outputs: sizes of x and y.

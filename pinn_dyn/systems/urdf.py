@@ -192,7 +192,7 @@ class _UrdfFile:
         if mass < 0 or moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
             raise ValueError(
                 f"{self.path}: link {link!r} has mass {mass:g} kg and moments {moments.tolist()} "
-                "kg m^2, expected no negative values, and none above the sum of the other two"
+                "kg m^2, expected none negative and no moment larger than the sum of the other two"
             )
         pose = self.pose(inertial)
         parameters = torch.tensor([mass, 0.0, 0.0, 0.0, *values], dtype=torch.float64)
