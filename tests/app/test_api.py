@@ -132,22 +132,6 @@ START, T = np.zeros(6) + 0.1, np.arange(4) * 0.02
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((START[:5], np.zeros((4, 3)), T), r"start has shape \(5,\), expected .* 2N = 6"),
-        ((START, np.zeros((4, 2)), T), r"u has shape \(4, 2\), expected .* M = 3 for torque_x"),
-        ((START, np.zeros((5, 3)), T), r"u has shape \(5, 3\) and t \(4,\)"),
-        ((START, np.zeros((2, 4, 3)), T[::-1]), "t must increase"),
-        ((START * np.nan, np.zeros((4, 3)), T), "start has 6 non-finite entries"),
-        ((START, np.zeros((4, 3)), pd.to_timedelta(T, unit="s")), "t holds dates or durations"),
-    ],
-)
-def test_arguments_that_do_not_fit_are_named(model, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        model.predict(*arguments)
-
-
-@pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda x: x.rename(columns={"bend_x": "bendx"}), "no column 'bend_x'.*mean bendx"),

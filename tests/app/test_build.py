@@ -46,8 +46,3 @@ def test_arguments_of_a_part_and_of_the_parts_in_it_are_checked():
     model = {"_target_": "pinn_dyn.models.LagrangianNetwork", "friction": head}
     with pytest.raises(ConfigError, match=r"no key 'part\.friction\.hidden'"):
         build_part("part", model)
-
-
-def test_a_missing_argument_is_named_with_its_part():
-    with pytest.raises(ConfigError, match=r"part: .*'amplitude'"):
-        build_part("part", {"_target_": "pinn_dyn.data.Chirp", "offset": [0.0]})

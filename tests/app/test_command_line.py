@@ -73,26 +73,6 @@ def test_a_missing_value_is_asked_for_by_name(elsewhere, capsys, words, key):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["dataset.system.mass=-1"], ["dataset.system.mass is -1", "greater than or equal to 0"]),
-        (["data.batch_size=65"], ["data", "batch_size is 65", "64"]),
-        (["validator.step=0.2"], ["validator: ", "step 0.2 s", "horizon 0.1 s"]),
-        (["dataset.system._target_=pinn_dyn.systems.Nothing"], ["dataset", "Nothing"]),
-        (["data.pairs=100000"], ["100000 windows", "starts"]),
-        (["validator.horizon=3"], ["horizon is 3", "lasts only 0.2 s"]),
-        (["validator.window=0.025"], ["validator: window is 0.025 s", "sample time"]),
-    ],
-)
-def test_a_value_that_does_not_fit_is_reported(elsewhere, capsys, overrides, words):
-    text = said(fails("train.py", *TINY, NO_FIGURES, *overrides), capsys)
-    for word in words:
-        assert word in text
-    assert "Traceback" not in text
-    assert not list(elsewhere.rglob("*.ckpt"))
-
-
-@pytest.mark.parametrize(
     ("word", "message"),
     [
         ("compile=true", "compile is true, but there is no C++ compiler"),

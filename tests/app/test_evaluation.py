@@ -129,18 +129,6 @@ def test_runs_of_different_data_sets_are_refused(tmp_path, hnn_run, capsys):
     assert str(other) in text
 
 
-@pytest.mark.parametrize(
-    ("argument", "words"),
-    [
-        ("horizon=3", ["horizon is 3", "lasts only 0.2 s"]),
-        ("split=train", ["split"]),
-    ],
-)
-def test_settings_that_do_not_fit_the_data_are_refused(capsys, mlp_run, argument, words):
-    text = refused(capsys, mlp_run, arguments=[argument])
-    assert all(word in text for word in words)
-
-
 def test_patterns_without_runs_are_refused(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     for pattern in (tmp_path / "nowhere" / "*", tmp_path / "empty"):

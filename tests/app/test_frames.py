@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from examples.cleaning_steps import PolynomialFit, SubtractStart
+from examples.cleaning_steps import SubtractStart
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import LogSource
 from pinn_dyn.data.logs import Deduplicate, InputDelay, InputRates, Resample
@@ -78,11 +78,6 @@ def test_rows_that_the_cleaning_drops_or_moves_are_predicted_all_the_same():
     finer = predicted(frame, steps={"finer": Resample(rate=100, max_gap=0.1)})
     np.testing.assert_allclose(finer.x, predicted(frame).x, atol=5.0)
     assert finer.notna().all(axis=None)
-
-
-def test_a_step_that_no_frame_can_take_is_named():
-    with pytest.raises(ValueError, match=r"the steps leave 3 stretches"):
-        predicted(motion(1), steps={"own": PolynomialFit(degree=3, segment=1.0)})
 
 
 def test_steps_that_change_the_signals_are_applied():

@@ -79,12 +79,6 @@ def test_columns_that_name_no_joint_are_logged_with_their_joints(caplog):
     assert expected in caplog.text  # u names its joints
 
 
-def test_another_number_of_columns_lists_both():
-    message = r"q.columns has the columns q1, q2, .* joints shoulder_pan_joint, .*locked_joints"
-    with pytest.raises(ConfigError, match=message):
-        check(log_of(["q1", "q2"]))
-
-
 def test_a_joint_that_turns_is_not_measured_in_metres():
     text = urdf(["slider", "elbow"]).replace(
         '"slider" type="continuous"', '"slider" type="prismatic"'

@@ -89,24 +89,6 @@ def test_a_sweep_has_one_row_per_choice_with_mean_and_deviation_over_seeds(sweep
     pd.testing.assert_frame_equal(again, table)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["sort=error"], ["sort is 'error'", "val/error_mean"]),
-        (["plot=data.pair"], ["plot is 'data.pair'", "data.pairs"]),
-        (["evaluations=[nowhere]"], ["evaluations", "nowhere"]),
-    ],
-)
-def test_a_wrong_column_is_refused_by_name(sweep, arguments, words):
-    text = refused(f"runs=[{sweep}]", *arguments)
-    assert all(word in text for word in words)
-
-
-def test_a_folder_without_runs_is_refused(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert "nowhere" in refused("runs=[nowhere]")
-
-
 def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
     failed = write_run(sweep / "failed")
     (failed / "error.txt").write_text("ConfigError: data: too many pairs\n\nTraceback ...\n")

@@ -4,7 +4,6 @@ import pytest
 
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run_folder import load_run
-from tests.app.entry import TINY, refused_text
 from tests.attacks.targets import calls
 from tests.support.foreign_runs import foreign
 
@@ -54,23 +53,6 @@ def test_other_keys_of_hydra_are_refused(tmp_path, lnn_run, place, key):
     run = foreign(lnn_run, tmp_path / "run", lambda config: place(config, part))
     with pytest.raises(ConfigError, match="which no configuration of a run has"):
         load_run(run, "best")
-
-
-@pytest.mark.parametrize("command", ["evaluate", "control", "resume", "start_from"])
-def test_every_program_says_why(tmp_path, monkeypatch, capsys, lnn_run, command):
-    monkeypatch.chdir(tmp_path)
-    part = {"_target_": "os.mkdir", "path": str(tmp_path / MARK)}
-    run = foreign(lnn_run, tmp_path / "run", lambda config: as_an_argument(config, part))
-    words = {
-        "evaluate": ["evaluate.py", f"runs=[{run}]"],
-        "control": ["control.py", f"run={run}", "reference.q=[0,0,0]"],
-        "resume": ["train.py", f"resume={run}"],
-        "start_from": ["train.py", "model=lnn", f"start_from={run}", *TINY],
-    }
-    text = " ".join(refused_text(capsys, *words[command], "hydra.run.dir=out").split())
-    assert "dataset.system.mass._target_ is 'os.mkdir'" in text
-    assert "trust=os" in text
-    assert not (tmp_path / MARK).exists()
 
 
 CHANGES = [

@@ -140,24 +140,3 @@ def test_the_plant_gets_the_limited_input():
 
 
 # Bad arguments.
-
-
-class Wide(PD):
-    def __call__(self, t, q, v, reference):
-        return torch.zeros(3, 5)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"q0": Q0[:2]}, r"v0 has sizes \(3, 2\), expected \(2, 2\)"),
-        ({"q0": Q0 * torch.inf}, "q0 has"),
-        ({"duration": 0.41, "rate": 50.0}, "expected a multiple of 0.02 s"),
-        ({"controller": PD(size=3)}, r"controller has sizes \(3, 3\), expected \(2, 2\)"),
-        ({"controller": Wide()}, r"input has shape \(3, 5\), expected \(3, 2\)"),
-        ({"reference": Wave(double([1.0]))}, r"reference has sizes \(1,\), expected \(2,\)"),
-    ],
-)
-def test_bad_arguments_are_named(changes, message):
-    with pytest.raises(ValueError, match=message):
-        sampled(**changes)

@@ -57,8 +57,3 @@ def test_noise_starts_again_after_a_reset_and_goes_on_without():
     assert torch.equal(sensor(zero, zero)[0], first)
     assert not torch.equal(first, second)
     assert not torch.equal(Sensor(q_noise=1.0, seed=2)(zero, zero)[0], first)
-
-
-def test_a_lower_limit_above_the_upper_one_is_refused():
-    with pytest.raises(ValueError, match="low exceeds high"):
-        Actuator(low=1.0, high=[2.0, 0.0])

@@ -210,12 +210,6 @@ def test_the_formula_can_be_exported(law, kind, num_inputs):
 # Errors.
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), [1.0, 0.0], [1.0, 2.0, 3.0]])
-def test_a_bad_gain_is_named(value):
-    with pytest.raises(ValueError, match=r"^position_gain is .*expected 1 or 2 positive numbers"):
-        Regulation(CartPole(), value, 1.0)
-
-
 @pytest.mark.parametrize("kind", ["next_state", "acceleration"])
 def test_a_black_box_has_no_terms_for_a_law(kind):
     with pytest.raises(TypeError, match=r"MLP, expected .* terms M, G and A, such as model=lnn"):

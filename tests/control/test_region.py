@@ -92,14 +92,6 @@ def test_an_angle_may_wind_and_another_coordinate_may_not():
     assert bool((region.distance(q[:, ::50] + turn.flip(0), v[:, ::50]) > 2).all())
 
 
-@pytest.mark.parametrize(
-    "change", [lambda q, v: ([0 * x for x in q], v), lambda q, v: ([q[0][:1]], [v[0][:1]])]
-)
-def test_bad_data_are_refused(change):
-    with pytest.raises(ValueError, match="a region needs two different trajectories"):
-        DataRegion(*change(*comb()))
-
-
 # The guard.
 
 

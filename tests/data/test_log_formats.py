@@ -111,26 +111,6 @@ def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
         source(tmp_path, files="run", max_age=0.005, **formats.BAG).load()
 
 
-@pytest.mark.parametrize(
-    ("column", "said"),
-    [
-        ("/joint_state/position/elbow", "no topic .* /joint_states .sensor_msgs/msg/Joint"),
-        (
-            "/joint_states/position/wrist",
-            "no message has a value of '/joint_states/position/wrist'",
-        ),
-        ("/joint_states/angle/elbow", "no 'angle/elbow' in its messages, which have header, name"),
-        ("/joint_states/header/stamp", "'header/stamp' is a builtin_inter.*'<topic>/t'"),
-        ("/commands/data/7", "no message has a value of '/commands/data/7'"),
-    ],
-)
-def test_missing_parts_of_a_bag_are_named(tmp_path, column, said):
-    formats.write_bag(tmp_path / "run", TABLE)
-    q = dict(columns=[column], unit="rad")
-    with pytest.raises(LogError, match=f"run.*{said}"):
-        source(tmp_path, files="run", **{**formats.BAG, "q": q, "v": None}).load()
-
-
 def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path, expected):
     late = TABLE.assign(t=TABLE["t"] + 1_764_000_000.25)
     formats.write_bag(tmp_path / "run", late)

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.data.logs import UNITS, Butterworth, Columns, InputRates, LogError, SplitGaps
-from pinn_dyn.evaluation.log_figures import cleaning_figure
+from pinn_dyn.data.logs import UNITS, Butterworth, Columns, LogError, SplitGaps
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
 
@@ -225,27 +224,6 @@ def test_short_stretches_are_dropped_and_named(folder):
     assert "2 gaps, after 2.99 s, 3.44 s" in split.report
 
 
-def test_rates_of_the_inputs_arrive_named_and_drawn(folder):
-    table = motion()
-    table["u1"] = table["q1"]  # an input whose rate is known: v1
-    write(folder, table)
-    log = source(folder, v=None, steps={"rates": InputRates(window=5)})
-    (train,) = log.load().train
-    np.testing.assert_allclose(train.u[5:-5, 2], table["v1"][5:596], atol=1e-5)
-    labels = ["u1 [Nm]", "u2 [Nm]", "d/dt u1 [Nm/s]", "d/dt u2 [Nm/s]"]
-    assert log.input_labels == labels
-    part = log.cleaned[0]
-    figure = cleaning_figure(part, title="", labels=log.labels, input_labels=labels)
-    panels = {ax.get_ylabel(): ax.get_lines() for ax in figure.axes if ax.get_lines()}
-    assert {key: len(lines) for key, lines in panels.items()} == {
-        **dict.fromkeys(["q1 [rad]", "q2 [rad]", "u1 [Nm]", "u2 [Nm]"], 2),
-        **dict.fromkeys(["d/dt q1 [rad/s]", "d/dt q2 [rad/s]", *labels[2:]], 1),
-    }
-    raw, clean = panels["q2 [rad]"]
-    np.testing.assert_array_equal(raw.get_ydata(), part.raw.q[:, 1])
-    np.testing.assert_array_equal(clean.get_ydata(), part.clean[0].q[:, 1])
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -308,10 +286,3 @@ def test_frames_in_memory_are_read_as_files(tmp_path, runs):
             for ours, theirs in zip(getattr(first, name), getattr(splits, name), strict=True):
                 torch.testing.assert_close(ours.q, theirs.q, rtol=1e-9, atol=1e-9)
     assert min(map(len, (first.train, first.validation, first.test))) >= 1
-
-
-def test_messages_name_the_rows_of_a_frame_by_its_index(tmp_path):
-    table = motion().set_index(pd.Index([f"row {k}" for k in range(1001)]))
-    table.loc["row 40", "q1"] = np.nan
-    with pytest.raises(LogError, match=r"frame, row row 40, column 'q1' \(q\): .*NaN"):
-        source(tmp_path, files=table).load()

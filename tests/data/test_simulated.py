@@ -283,23 +283,3 @@ def test_constants_in_tensors_are_part_of_the_entry(tmp_path):
 
 
 # Bad arguments.
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(step=0.3), "test_duration is 0.2 s, expected from keep_every . step = 0.3"),
-        (dict(pairing="matched"), "pairing is 'matched' with 3 initial states and 2 inputs"),
-        (dict(q_limits=LIMITS), "expected 'matched' with as many of each, also for q_limits"),
-        (
-            dict(**SIX, q_limits=[[-2, -2, -0.3], [2, 2, 1]]),
-            "segment 1 shortens to -0.1 m",
-        ),
-        (dict(labels=["x", "y"]), "labels has 2 entries, not 3"),
-        (dict(input_labels=["a"]), "input_labels has 1 entries, not 3"),
-        (dict(system=SoftArm(segments=2)), "initial_states has 3 entries, not 6"),
-    ],
-)
-def test_bad_arguments_are_refused_by_name(tmp_path, change, message):
-    with pytest.raises(ValueError, match=message):
-        make_source(tmp_path, **change)

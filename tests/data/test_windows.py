@@ -149,18 +149,6 @@ def test_statistics_are_those_of_the_windows(trajectories):
     assert statistics.step == pytest.approx(3 * STEP)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (dict(count=88), "88 windows of 6 samples .* 87 starts"),
-        (dict(steps=20, stride=2, count=1), "only 0 starts"),
-    ],
-)
-def test_windows_that_cannot_be_drawn_are_refused(trajectories, changes, message):
-    with pytest.raises(ValueError, match=message):
-        draw(trajectories, **changes)
-
-
 @pytest.mark.parametrize("where", ["within", "between"])
 def test_a_clock_that_is_not_uniform_is_refused(trajectories, where):
     odd = make_trajectory(3, step=0.02)

@@ -85,13 +85,6 @@ def test_weights_are_saved_loaded_and_copied_with_one_copy_of_the_scales(kind):
     assert torch.equal(double_copy(ensemble).predict(x0, t, Signal(t, u)), expected)
 
 
-def test_members_of_other_data_are_refused():
-    first, second = members("acceleration", count=2)
-    second.scale *= 2
-    with pytest.raises(ValueError, match="member 1 has other scales"):
-        Ensemble([first, second])
-
-
 def test_members_share_the_widest_of_their_limits():
     alone, q = members("lnn", 2), motion("lnn")[0][:, :2]
     for item in alone:

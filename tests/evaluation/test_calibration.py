@@ -7,7 +7,6 @@ import torch
 
 from pinn_dyn.evaluation import Prediction, calibration
 from pinn_dyn.evaluation.calibration import (
-    calibration_figure,
     half_widths,
     standardized_errors,
 )
@@ -63,11 +62,3 @@ def test_members_that_agree_on_something_else_lie_in_no_interval():
     found = calibration(prediction(1), item)
     assert found.factor == math.inf
     assert found.corrected[-1] == 1.0
-
-
-def test_the_figure_draws_the_shares_of_the_longest_window():
-    wide, corrected = calibration(prediction(0), None), calibration(prediction(0), prediction(1))
-    (ax,) = calibration_figure({"lnn": {0.1: wide, 1.0: corrected}}, title="an arm").axes
-    drawn = {line.get_label(): line.get_ydata() for line in ax.get_lines()}
-    assert drawn["lnn, reset every 1 s"] == pytest.approx(100 * corrected.share)
-    assert drawn["lnn, width from validation"] == pytest.approx(100 * corrected.corrected)

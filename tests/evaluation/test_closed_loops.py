@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pinn_dyn
-from pinn_dyn.control import Actuator, Regulation, Sensor, SetPoint, Sines, Tracking
+from pinn_dyn.control import Actuator, Regulation, SetPoint, Sines, Tracking
 from pinn_dyn.evaluation import close_loops
 from pinn_dyn.systems import SoftArm
 
@@ -40,19 +40,3 @@ def test_limits_and_initial_states_reach_the_loop(rate):
     assert torch.equal(record.q[:, 0], REST)
     assert record.u.abs().max() == 0.5
     assert {"saturated_samples", "step_error_after_0.05_s_mean_percent"} <= set(result.table)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"rate": None, "delay": 1}, "no delay and no sensor noise"),
-        ({"rate": None, "sensor": Sensor(0.1)}, "no delay and no sensor noise"),
-        ({"reference": SetPoint([0.1, 0.2])}, "reference has 2 coordinates, the robot 3"),
-        ({"reference": SetPoint([0.0, 0.0, -0.3])}, "segment 1 shortens"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(settings, message):
-    settings = {"reference": TARGET, "duration": 0.1, "q0": REST, "v0": REST, **settings}
-    reference = settings.pop("reference")
-    with pytest.raises(ValueError, match=message):
-        close_loops({"law": Regulation(SoftArm(), 20.0, 4.0)}, reference, SoftArm(), **settings)

@@ -17,7 +17,6 @@ from pinn_dyn.evaluation import (
     compare_terms,
     error_figure,
     save,
-    steady_state_figure,
     sweep_figure,
     terms_figure,
     tip_path_figure,
@@ -170,18 +169,6 @@ def test_the_tip_path_shows_the_distance_in_millimetres():
     near_line, short_line = ax.lines
     np.testing.assert_allclose(near_line.get_ydata(), 7.0)
     np.testing.assert_allclose(short_line.get_ydata()[:30], 20 * t[:30])
-
-
-def test_bounds_that_fail_are_counted_and_drawn_as_crosses():
-    inf = math.inf
-    bound = torch.tensor([1e-2, 1e-2, 1e-3, 0.0, inf, 1e-2])
-    measured = torch.tensor([1e-3, 1e-2, 2e-3, 1e-6, 1e-3, inf])
-    figure = steady_state_figure(bound, measured, title="t")
-    below, above = (np.asarray(points.get_offsets()) for points in figure.axes[0].collections)
-    np.testing.assert_allclose(below, [[1e-2, 1e-3], [1e-2, 1e-2]])
-    np.testing.assert_allclose(above, [[1e-3, 2e-3], [1e-12, 1e-6]])
-    _, counts = figure.get_suptitle().splitlines()
-    assert counts == "2 of 5 bounds hold"
 
 
 def test_a_sweep_has_a_line_through_the_means_over_seeds():

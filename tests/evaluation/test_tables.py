@@ -125,17 +125,3 @@ def test_a_longer_valid_time_is_better_and_other_columns_have_no_best_entry():
     assert frame["run"][best(frame, "window_1s_error_mean")].tolist() == ["mlp"]
     assert not best(frame, "parameters").any()
     assert unbeaten_baselines(frame) == []
-
-
-def test_the_summary_shows_at_most_nine_columns_with_information():
-    frame = summary({"lnn": 0.2}, BASELINES)
-    assert list(summary_columns(frame)) == ["run", "error_mean"]
-    lost = summary({"lnn": 0.2}, BASELINES, lost=("lnn",))
-    assert "diverged" in summary_columns(lost)
-    names = ["error_worst", "left_data", "valid_time_small", "valid_time_large"]
-    names += ["window_0.1s_error_mean", "window_1s_error_mean", "torque_share", "residual_share"]
-    names += ["spread_over_error", "input_delay_seconds", "pairs", "training_seconds"]
-    columns = summary_columns(lost.assign(**dict.fromkeys(names, 1.0)))
-    assert len(columns) == 9
-    assert columns["window_1s_error_mean"] == "error, reset every 1 s"
-    assert {"valid_time_small", "window_0.1s_error_mean"}.isdisjoint(columns)

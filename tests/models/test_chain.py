@@ -129,11 +129,6 @@ def test_the_masked_passes_are_those_of_automatic_differentiation(angles):
     assert_near(network.pullback(tape, dy), torch.func.vjp(network, x)[1](dy)[0], 1e-12)
 
 
-def test_too_few_units_for_a_chain_are_refused():
-    with pytest.raises(ValueError, match="a layer of 2 units, expected at least 6"):
-        NetworkCholesky(scales(), hidden=[12, 2], chain=True)
-
-
 def test_a_lagrangian_chain_needs_the_transposed_form():
     with pytest.raises(ValueError, match="transposed is false, expected both"):
         make_structured("lnn", **CHAIN["hnn"])

@@ -176,16 +176,3 @@ def test_a_fixed_matrix_is_reproduced_also_if_singular(value, q):
     assert torch.equal(factor, factor.tril())
     expected = torch.tensor(value).expand(40, 3, 3)
     torch.testing.assert_close(head.matrix(q.float()), expected, rtol=0, atol=3e-6)
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        [[1.0, 0.0], [0.0, 1.0]],
-        [[1.0, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]],
-        [[1.0, 2, 0], [2, 1.0, 0], [0, 0, 1.0]],
-    ],
-)
-def test_a_wrong_matrix_is_refused(value):
-    with pytest.raises(ValueError, match="expected a symmetric positive semi-definite"):
-        FixedCholesky(scales(), value=value)

@@ -127,15 +127,3 @@ def test_drives_start_at_the_scales_of_the_data():
     torch.testing.assert_close(model.armature().double(), 0.03 * force / acceleration)
     torch.testing.assert_close(model.viscous().double(), 0.1 * force / scales.v_std)
     torch.testing.assert_close(model.offset.spread.double(), 0.3 * force)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"locked_joints": ()}, "the data have 4 coordinates"),
-    ],
-)
-def test_a_wrong_description_is_refused_by_name(settings, message):
-    locked = settings.pop("locked_joints", ["wrist"])
-    with pytest.raises(ValueError, match=message):
-        KnownMechanics(statistics(4), RigidChain(TREE, locked_joints=locked), **settings)

@@ -88,20 +88,6 @@ def test_a_robot_that_cannot_be_is_refused_by_name(tmp_path, old, new, message):
     assert str(path) in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"locked_joints": ["wirst"]}, r"no joints \['wirst'\] to lock, only .*'elbow'"),
-        ({"tip": "base"}, r"tip is 'base', expected a link behind a joint: .*'lower', 'tool'"),
-    ],
-)
-def test_an_unknown_name_is_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        read_urdf(ARM, **settings)
-    with pytest.raises(FileNotFoundError, match="no_such"):
-        read_urdf("no_such.urdf")
-
-
 TEXTS = ["", "base", "upper", "0", "-1", "1e300", "nan", "0 0 0", "1,2,3", "fixed", "prismatic"]
 
 

@@ -100,20 +100,6 @@ def test_a_payload_is_found_from_seconds_where_all_else_is_known(truth, runs):
     assert torch.linalg.eigvalsh(found.covariance).min() > 0
 
 
-def test_what_has_changed_is_refused_by_name(runs):
-    windows = draw_windows(runs, count=4, steps=1, stride=1, seed=0)
-    solver = LeastSquares(cutoff=20.0, changed=["hand"])
-    model = robot_model("generic")
-    count = sum(p.numel() for p in model.parameters())
-    with pytest.raises(ValueError, match="there is no earlier fit"):
-        solver.fit(model, runs, windows)
-    with pytest.raises(ValueError, match=r"changed names hand, expected some .* rod, tip"):
-        solver.fit(model, runs, windows, torch.eye(count))
-    solver.changed = ["tip"]
-    with pytest.raises(ValueError, match=f"the earlier fit has 3 constants, this model {count}"):
-        solver.fit(model, runs, windows, torch.eye(3))
-
-
 def test_a_fit_that_knew_much_for_certain_can_be_started_from(runs):
     """Standard deviations from 1e-7 of the prior's to all of it, in directions across bodies."""
     model = robot_model("generic")

@@ -43,17 +43,6 @@ def train(tmp_path, model, data, epochs):
     )
 
 
-def test_a_rise_of_exactly_one_step_is_no_error(tmp_path, source):
-    """5 % of 20 steps: torch's one-cycle schedule divides by zero there."""
-    data = data_of(source, 20)
-    model = MODELS["lnn"](data.statistics)
-    before = copy.deepcopy(model.state_dict())
-    train(tmp_path, model, data, epochs=1)
-    after = model.state_dict()
-    assert all(torch.isfinite(value).all() for value in after.values())
-    assert any(not torch.equal(before[name], value) for name, value in after.items())
-
-
 def plain_loop(model, data):
     """AdamW, the one-cycle rate written out, gradients clipped."""
     loss_of = IncrementLoss(data.statistics, model)
