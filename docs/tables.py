@@ -46,8 +46,7 @@ def number(value: float, best: bool = False, digits: int = 2) -> str:
 def task(robot: str, prefix: str = "") -> pd.DataFrame:
     """Return the runs on a robot or on a variant such as "panda, beyond": index (model, seed)."""
     data = pd.read_csv(RESULTS).query("robot == @robot").fillna({"seed": 0})
-    table = data.pivot_table(index=["model", "seed"], columns="metric", values="value")
-    return table.add_prefix(prefix)
+    return data.pivot_table("value", ["model", "seed"], "metric").add_prefix(prefix)
 
 
 def diverged(runs: pd.DataFrame, metric: str = "error_mean") -> str:
@@ -75,7 +74,7 @@ def grid(data: pd.DataFrame, columns: Sequence[str], digits: int = 2, mark=MODEL
 def best_baseline(robot: str) -> tuple[str, float]:
     """Return the baseline with the smallest error among those without diverged roll-outs."""
     errors = task(robot).query("model in @BASELINES and diverged == 0")["error_mean"]
-    return errors.idxmin()[0], float(errors.min())
+    return errors.idxmin()[0], errors.min()
 
 
 def prediction(group: str) -> str:
@@ -169,8 +168,7 @@ def logs() -> str:
     rows = []
     for log in LOGS:
         data = task(log).query("model in @MODELS")
-        runs = data.groupby("model")[LONG]
-        spread = (runs.max() - runs.min()).replace(0, None)
+        spread = data.groupby("model")[LONG].agg(lambda x: x.max() - x.min()).replace(0, None)
         for row in grid(data, [SHORT, LONG, "error_mean", "torque_share"], digits=3):
             row.insert(3, number(spread[row[0].strip("`")]))
             rows.append([log, *row])

@@ -46,10 +46,9 @@ def stability_report(
     farthest = conditions.nlargest(3, "rest_error")[[*coordinates, "rest_error"]]
     sections = [
         f"# {title}",
-        f"Proposition 1 of the paper at {len(conditions)} configurations; nothing is checked "
-        "between them. docs/stability.md explains the numbers. The eigenvalues must be positive, "
-        "and condition 2 below 1. P is the factor that fits M, D, G and A together; with "
-        "P = A_L A^-1, condition 2 is 0 everywhere.",
+        f"Proposition 1 of the paper at {len(conditions)} configurations, and not between them. "
+        "docs/stability.md explains the numbers. The eigenvalues must be positive, condition 2 "
+        "below 1. P fits M, D, G and A together; with P = A_L A^-1, condition 2 is 0 everywhere.",
         _table(["", "median", "worst", "holds at"], rows),
         "Configurations with the largest `rest_error`, the distance from the set point at rest:",
         _table(list(farthest), farthest.to_numpy().tolist()),
@@ -65,9 +64,8 @@ def stability_report(
         ]
     sections += [
         "## Limits of this report",
-        "- L carries a margin, not a proof.\n"
-        "- The bound is on the resting position near the set point. The report does not show that "
-        "the arm gets there from far away.\n"
+        "- L carries a margin, not a proof. The bound holds near the set point; the report does "
+        "not show that the arm gets there from far away.\n"
         "- The law is in continuous time, without delay, noise or limits of the input, and the "
         "plant has no dry friction.",
     ]
