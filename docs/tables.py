@@ -168,7 +168,8 @@ def logs() -> str:
     rows = []
     for log in LOGS:
         data = task(log).query("model in @MODELS")
-        spread = data.groupby("model")[LONG].agg(lambda x: x.max() - x.min()).replace(0, None)
+        runs = data.groupby("model")[LONG]
+        spread = (runs.max() - runs.min()).replace(0, None)
         for row in grid(data, [SHORT, LONG, "error_mean", "torque_share"], digits=3):
             row.insert(3, number(spread[row[0].strip("`")]))
             rows.append([log, *row])
