@@ -150,7 +150,7 @@ def _require_same_test(run: Run, first: Run, split: str) -> None:
         differences = {key: x for key, x in settings if before.get(key) != x}
         raise ConfigError(
             f"runs: {run.folder} has another data set in {split} than {first.folder}: "
-            f"{differences}: evaluate them separately"
+            f"{differences}: evaluate them separately, or all on one data set, dataset=<name>"
         )
 
 

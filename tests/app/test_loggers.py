@@ -1,4 +1,4 @@
-"""What TensorBoard is told about a run, read back from what it stores."""
+"""Figures, settings and errors of a run, read back from its TensorBoard log."""
 
 import json
 

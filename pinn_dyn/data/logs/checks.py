@@ -49,10 +49,9 @@ def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[st
             f"{low:g} to {high:g} s: is the unit of the time wrong "
             f"({'ms' if typical > high else 's'}?)"
         )
-    row_clock = (
-        "its stamps come in bursts of rows: take the time from the row number, by the step "
-        "examples.cleaning_steps.RowClock, or "
-    ) * (burst_share(t) > BURSTS)
+    row_clock = ""
+    if burst_share(t) > BURSTS:
+        row_clock = "its stamps come in bursts: use the step examples.cleaning_steps.RowClock, or "
     split = (
         "if a new run starts there, name its column in 'trajectory' (run=... of pinn_dyn.fit) or "
         "add a SplitGaps step"
