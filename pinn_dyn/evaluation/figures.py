@@ -26,6 +26,7 @@ from pinn_dyn.evaluation.plots import (
     with_unit,
 )
 from pinn_dyn.evaluation.prediction import Prediction
+from pinn_dyn.evaluation.tables import number
 from pinn_dyn.mechanics import Trajectory
 
 ERROR = "‖q̂ − q‖₂"
@@ -126,13 +127,14 @@ def terms_figure(comparison: TermComparison, *, configuration: int, title: str) 
             _annotate(ax, matrix, digits=3 if rows <= 4 else 2)
         axes[0, column].set_title(_TERMS[term])
         error = errors.loc[[term]].iloc[configuration]
-        axes[1, column].set_xlabel(f"error {100 * error['relative_error_identity']:.2g} %")
-        axes[2, column].set_xlabel(f"misses {100 * error['relative_error_best_P']:.2g} %")
+        axes[1, column].set_xlabel(f"error {number(100 * error['relative_error_identity'])} %")
+        axes[2, column].set_xlabel(f"error {number(100 * error['relative_error_best_P'])} %")
     for row, kind in enumerate(("true X", "learned $X_L$", "P X, best P")):
         axes[row, 0].set_ylabel(kind)
     numbers = ", ".join(f"{value:.4g}" for value in comparison.q[configuration].tolist())
     figure.suptitle(
-        f"{title}\nq = ({numbers}), error $|X_L - X| / |X|$, P X misses $|X_L - P X| / |X_L|$"
+        f"{title}\nq = ({numbers}), error of $X_L$: $|X_L - X| / |X|$, "
+        "error of $P X$: $|X_L - P X| / |X_L|$"
     )
     return figure
 

@@ -30,7 +30,7 @@ _LIMITS = (
     ("noise / range", _NOISE, "its noise is {:.2g} % of its range"),
     ("test outside", _OUTSIDE, "{:.3g} % of the test is outside the training range"),
 )
-_judged = partial(judged, section="bags_and_other_logs.md#is-the-log-good-enough")
+_judged = partial(judged, section="docs/bags_and_other_logs.md#is-the-log-good-enough")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class LogCheck:
             )
             lines += ["", title, text]
         bad = [x for x in self.measurements if x.verdict != "ok"]
-        lines += [f"\n{x.verdict}: {x.text} (docs/{x.section})" for x in bad]
+        lines += [f"\n{x.verdict}: {x.text} ({x.section})" for x in bad]
         if self.steps:
             lines += ["", "steps:", *(f"  {line}" for line in self.steps)]
         verdict = "no sense" if self.problems else "sense"

@@ -24,7 +24,7 @@ class Measurement:
     expected: str = ""
     verdict: Verdict = "ok"
     text: str = ""
-    section: str = "csv_logs.md#checks-when-a-log-is-read"
+    section: str = "docs/csv_logs.md#checks-when-a-log-is-read"
 
 
 def judged(

@@ -46,7 +46,9 @@ def check_repeats(
             f"{name}: {count} of the motions of {run} repeat one of {original}, which is in the "
             "training: keep such runs in one split"
         )
-        results.append(judged(title, run, count, "0", True, text, section="csv_logs.md#splits"))
+        results.append(
+            judged(title, run, count, "0", True, text, section="docs/csv_logs.md#splits")
+        )
     return results or [judged(title, name, 0, "0", False, "")]
 
 
