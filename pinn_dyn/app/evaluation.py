@@ -16,6 +16,7 @@ from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_mod
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
 from pinn_dyn.mechanics import Predictor, stack_until
+from pinn_dyn.training.least_squares import IDENTIFICATION
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +124,7 @@ def evaluate(
 
 def _is_rolled_out(run: Run) -> bool:
     fitted = run.covariance is not None and run.config.get("start_from") is None
-    return fitted and run.config["optimizer"].get("rollouts", True)
+    return fitted and run.metrics.get("stage") != IDENTIFICATION
 
 
 def _identified(run: Run, source: DataSource) -> Predictor:

@@ -349,6 +349,7 @@ def _fit(
             trainer.save_checkpoint(last)
         raise KeyboardInterrupt from stop
     if solver and solver.result is not None:
+        recorder.facts["stage"] = solver.result.stage
         write_constants(learner.model, solver.result, source, folder)
     # Other processes have counted the steps of theirs.
     record = recorder.record(trainer, learner.model, read_checkpoint(last)["global_step"])

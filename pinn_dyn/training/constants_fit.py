@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -30,6 +31,9 @@ class Fit:
         prior: prior of z.
         residual: root mean square of the normalized data residuals.
         iterations: number of Gauss-Newton steps.
+        z: the fitted z, ``(P,)``.
+        stage: stage of the fit that found z.
+        error: validation error of z, or NaN.
         stopped_in: stage in which the fit was interrupted, or None if it is finished.
     """
 
@@ -38,6 +42,9 @@ class Fit:
     prior: Prior
     residual: float
     iterations: int
+    z: Tensor | None = None
+    stage: str = ""
+    error: float = math.nan
     stopped_in: int | None = None
 
     def state(self) -> dict[str, Any]:

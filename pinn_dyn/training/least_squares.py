@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -39,6 +40,9 @@ _CHUNK = 500  # windows whose derivatives are rolled out at once, to limit the m
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _DIVERGED = 1e4  # residual of a diverged roll-out
+_SILENCE = 10.0  # s, between two lines about a stage that is not finished
+IDENTIFICATION = "inverse dynamics"
+"""Name of the first stage."""
 
 
 Residuals = Callable[[bool], Tensor]
@@ -59,6 +63,8 @@ class LeastSquares:
        at rest are excluded, since dry friction may then have any value up to its level.
     2. Roll-outs: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first roll-outs use a quarter of the steps of the windows.
+
+    The stage with the smallest validation error is kept, or the last stage without validation.
 
     s is the root mean square of the residuals, estimated by repeating each stage. Correlated
     residuals are counted once: successive samples of the motion by :func:`correlation_length`, and
@@ -94,6 +100,7 @@ class LeastSquares:
         windows: Windows | None = None,
         covariance: Tensor | None = None,
         stopped: Fit | None = None,
+        validate: Callable[[LearnedConstants], float] | None = None,
     ) -> Fit:
         """Fit the model in place. Its precision does not change.
 
@@ -103,6 +110,7 @@ class LeastSquares:
             windows: training windows for the roll-outs; not needed if ``rollouts`` is false.
             covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
             stopped: interrupted result of this fit, to continue from the present z.
+            validate: validation error of a model, to compare the stages.
 
         Raises:
             ValueError: if trajectories are too short for the filter, there are fewer residuals than
@@ -114,7 +122,7 @@ class LeastSquares:
         model.double()
         prior = stopped.prior if stopped else self._prior(model, covariance)
         earlier = covariance is not None
-        stages = [partial(self._identify, model, prior, trajectories, earlier)]
+        stages = {IDENTIFICATION: partial(self._identify, model, prior, trajectories, earlier)}
         if self.rollouts:
             assert windows is not None
             windows = windows.to(torch.device("cpu"), torch.float64)
@@ -127,24 +135,34 @@ class LeastSquares:
             short = -(-steps // 4)
             enough = size * _informative_blocks(short) * short >= count
             for length in [short, steps] if enough and short < steps else [steps]:
-                stages.append(partial(self._roll_out, model, prior, windows.first(length)))
-        result, number = stopped, (stopped.stopped_in or 0) if stopped else 0
+                part = windows.first(length)
+                name = f"roll-outs of {float(part.t[-1]):.3g} s"
+                stages[name] = partial(self._roll_out, name, model, prior, part)
+        best, number = stopped, (stopped.stopped_in or 0) if stopped else 0
+        errors = [f"{best.stage} {best.error:.4g}"] if best and best.stage else []
         try:
-            while number < len(stages):
-                result = stages[number]()
+            for stage, solve in list(stages.items())[number:]:
+                result = solve()
+                error = float("nan") if validate is None else validate(model)
+                errors.append(f"{stage} {error:.4g}")
+                if best is None or not best.error <= error:
+                    best = replace(result, stage=stage, error=error)
                 number += 1
         except KeyboardInterrupt as interrupt:
             zero = torch.zeros_like(prior.root)
             covariance = posterior_covariance(zero, prior.root)
-            partial_fit = result or Fit(covariance, zero, prior, float("nan"), 0)
+            partial_fit = best or Fit(covariance, zero, prior, float("nan"), 0)
             raise StoppedFit(replace(partial_fit, stopped_in=number)) from interrupt
         finally:
             model.to(precision)
-        assert result is not None
-        z = parameters_to_vector(model.parameters()).detach().to(prior.mean)
-        for line in far_from_start(model.parameter_names(), z, prior):
+        assert best is not None
+        assert best.z is not None
+        vector_to_parameters(best.z.to(precision), model.parameters())
+        if validate is not None and len(stages) > 1:
+            log.info("least squares keeps %s: validation errors %s", best.stage, ", ".join(errors))
+        for line in far_from_start(model.parameter_names(), best.z, prior):
             log.warning("least squares: %s", line)
-        return result
+        return replace(best, stopped_in=None)
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
         z, names = parameters_to_vector(model.parameters()).detach(), model.parameter_names()
@@ -194,13 +212,13 @@ class LeastSquares:
             by_z = samples.by_parameters() - by_gain
             return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
 
-        self._solve("inverse dynamics", model, prior, residuals, 1.0)
+        self._solve(IDENTIFICATION, model, prior, residuals, 1.0)
         with torch.no_grad():
             correlated = correlation_length((errors() * moves).numpy())
-        stage = f"inverse dynamics, correlation over {correlated:.3g} samples"
+        stage = f"{IDENTIFICATION}, correlation over {correlated:.3g} samples"
         return self._solve(stage, model, prior, residuals, correlated)
 
-    def _roll_out(self, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
+    def _roll_out(self, stage: str, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()
         scale[:, model.num_coordinates :] /= self.velocity_weight**0.5
         x0, measured = windows.start("qv"), windows.increments("qv")
@@ -213,7 +231,6 @@ class LeastSquares:
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
-        stage = f"roll-outs of {float(windows.t[-1]):.3g} s"
         return self._solve(stage, model, prior, residuals, float(measured.shape[1]))
 
     def _solve(
@@ -229,13 +246,16 @@ class LeastSquares:
 
         noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
         best = np.inf, z.numpy()
+        progress = _Progress(stage, 2 * self.evaluations)
         for _ in range(2):
             weight = 1 / (noise * group**0.5)
             best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
                 nonlocal best
-                data = weight * _evaluate(model, at, residuals, False)
+                error = _evaluate(model, at, residuals, False)
+                progress.count(float(np.mean(error**2)) ** 0.5)
+                data = weight * error
                 errors = np.concatenate([data, root @ (at - mean)])
                 if (cost := float(errors @ errors)) < best[0]:
                     best = cost, at.copy()
@@ -258,7 +278,28 @@ class LeastSquares:
         slopes = torch.from_numpy(solution.jac[: -len(z)])
         information = slopes.T @ slopes
         covariance = posterior_covariance(information, prior.root)
-        return Fit(covariance, information, prior, noise, steps)
+        return Fit(covariance, information, prior, noise, steps, z)
+
+
+class _Progress:
+    """Lines about a running stage, ten seconds apart."""
+
+    def __init__(self, stage: str, limit: int):
+        self.stage, self.limit, self.evaluations = stage, limit, 0
+        self.started = self.shown = time.monotonic()
+
+    def count(self, residual: float) -> None:
+        """Count an evaluation of the residuals, and log a line if it is due."""
+        self.evaluations += 1
+        now = time.monotonic()
+        if now - self.shown < _SILENCE:
+            return
+        self.shown = now
+        left = (now - self.started) * (self.limit / self.evaluations - 1)
+        log.info(
+            "least squares, %s: evaluation %d of at most %d, residual %.4f, at most %.0f s left",
+            *(self.stage, self.evaluations, self.limit, residual, left),
+        )
 
 
 def _evaluate(

@@ -83,7 +83,12 @@ class LeastSquaresLearner(DynamicsLearner):
             try:
                 with _sigterm_interrupts():
                     self.result = self.solver.fit(
-                        self.model, data.splits.train, data.windows, self.covariance, self.result
+                        self.model,
+                        data.splits.train,
+                        data.windows,
+                        self.covariance,
+                        self.result,
+                        self._validation_error,
                     )
             except StoppedFit as stopped:
                 self.result = stopped.fit
@@ -92,6 +97,11 @@ class LeastSquaresLearner(DynamicsLearner):
                 raise
         self.log_losses(torch.tensor(self.result.residual**2))
         self.optimizers().step()  # type: ignore[union-attr]  # only counts the step
+
+    def _validation_error(self, model: LearnedConstants) -> float:
+        (truth,) = self.trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]
+        with torch.no_grad():
+            return self.validator(model, truth)["error_windowed"]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the fit, and its covariance for later fits."""

@@ -1,5 +1,6 @@
 """Runs of known mechanics that others start from: a network on top, or the robot with a load."""
 
+import json
 import os
 import re
 import shutil
@@ -123,9 +124,15 @@ def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path):
-    short = ["optimizer.evaluations=2", "optimizer.samples=200"]
-    for name, words in {"rolled": WINDOWS, "alone": SMALL}.items():
-        run_script("train.py", *KNOWN, *words, *short, f"hydra.run.dir={tmp_path / name}")
+    words = ["model/friction=coulomb", "data.steps=5", "validator.horizon=0.5"]
+    words += ["optimizer.samples=500", "optimizer.evaluations=8"]
+    for name, stages in {"rolled": [], "alone": ["optimizer.rollouts=false"]}.items():
+        run_script(
+            "train.py", *KNOWN, *WINDOWS, *words, *stages, f"hydra.run.dir={tmp_path / name}"
+        )
+    assert (
+        json.loads((tmp_path / "rolled" / "metrics.json").read_text())["stage"][:9] == "roll-outs"
+    )
     folders = ",".join(str(tmp_path / name) for name in ("rolled", "alone"))
     words = ["windows=[0.1]", "horizon=0.2", f"hydra.run.dir={tmp_path / 'both'}"]
     run_script("evaluate.py", f"runs=[{folders}]", *words)
@@ -136,6 +143,15 @@ def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path):
         assert identified[column] == pytest.approx(alone[column], rel=1e-5)
     assert identified["baseline"]
     assert identified["error_mean"] != rolled["error_mean"]
+
+
+def test_a_run_that_keeps_its_identification_has_its_constants(tmp_path, fitted):
+    folder = tmp_path / "both"
+    run_script("train.py", *KNOWN, *WINDOWS, f"hydra.run.dir={folder}")
+    assert json.loads((folder / "metrics.json").read_text())["stage"] == "inverse dynamics"
+    expected, table = (pd.read_csv(place / "constants.csv") for place in (fitted, folder))
+    pd.testing.assert_frame_equal(table, expected)
+    torch.testing.assert_close(pinn_dyn.load(folder).covariance, pinn_dyn.load(fitted).covariance)
 
 
 FORGED = {

@@ -1,6 +1,7 @@
 """Least squares finds the constants that made the data, and leaves what no data determine."""
 
 import copy
+import dataclasses
 import itertools
 import re
 
@@ -212,6 +213,58 @@ def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
     assert len(solved) == (4 if minimization == 1 else 1)  # what was finished is not done again
     assert held_out_error(model, truth, unseen) < 0.01
     assert not found.prior.mean.any()
+
+
+@pytest.mark.parametrize("at", [0, 3], ids=["at once", "interrupted"])
+def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
+    """Windows that start at wrong velocities spoil the roll-outs, not the identification."""
+    windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)
+    noise = torch.randn(windows.v.shape, generator=torch.Generator().manual_seed(0)).double()
+    windows = dataclasses.replace(windows, v=windows.v + 0.5 * noise)
+    errors, stopped = [], None
+
+    def validate(model):
+        errors.append(held_out_error(model, truth, unseen))
+        if len(errors) == at:
+            raise KeyboardInterrupt
+        return errors[-1]
+
+    model, alone, solver = robot_model("generic"), robot_model("generic"), LeastSquares(cutoff=20.0)
+    expected = LeastSquares(cutoff=20.0, rollouts=False).fit(alone, runs)
+    if at:
+        with pytest.raises(StoppedFit) as stop:
+            solver.fit(model, runs, windows, validate=validate)
+        stopped = Fit.from_state(stop.value.fit.state(), sum(p.numel() for p in model.parameters()))
+    result = solver.fit(model, runs, windows, stopped=stopped, validate=validate)
+    assert len(errors) == (4 if at else 3)
+    assert errors[-1] > 2 * errors[0]
+    assert (result.stage, result.stopped_in) == ("inverse dynamics", None)
+    assert held_out_error(model, truth, unseen) == pytest.approx(errors[0])
+    assert errors[0] == pytest.approx(held_out_error(alone, truth, unseen))
+    torch.testing.assert_close(result.covariance, expected.covariance)
+
+
+def test_roll_outs_that_validate_better_are_kept(truth, runs, unseen):
+    windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
+    model = robot_model("generic")
+    result = LeastSquares(cutoff=20.0).fit(
+        model, runs, windows, validate=lambda model: held_out_error(model, truth, unseen)
+    )
+    assert result.stage == "roll-outs of 0.04 s"
+    assert held_out_error(model, truth, unseen) < 0.01
+
+
+def test_a_long_stage_logs_its_progress(runs, caplog, monkeypatch):
+    clock = itertools.count(0.0, 3.0)  # each look at the clock is three seconds later
+    monkeypatch.setattr(least_squares.time, "monotonic", lambda: next(clock))
+    with caplog.at_level("INFO"):
+        LeastSquares(cutoff=20.0, rollouts=False).fit(robot_model("generic"), runs)
+    lines = [x for x in caplog.messages if "evaluation" in x]
+    number, limit, left = map(
+        int, re.search(r"evaluation (\d+) of at most (\d+), .* (\d+) s left", lines[1]).groups()
+    )
+    assert (number, limit) == (8, 50)
+    assert left == pytest.approx(3 * (limit - number), rel=0.2)
 
 
 def test_fewer_residuals_than_constants_are_refused(runs, caplog):
