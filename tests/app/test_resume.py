@@ -96,8 +96,12 @@ def cut(run, name="last"):
 def test_a_resumed_training_equals_an_uninterrupted_one(run, tmp_path):
     assert not pinn_dyn.load(run).finished
     assert not (run / "metrics.json").exists()
+    callbacks = checkpoint(run)["callbacks"]
+    callbacks["Recorder"]["wall_seconds"] += 1000  # a long first part
+    change(run, callbacks=callbacks)
     resumed, whole = trained(run), trained(tmp_path / "whole")
     assert resumed.finished
+    assert 1000 < resumed.metrics["training_seconds"] < 1600
     for name in ("best", "last"):
         first, second = (checkpoint(folder, name) for folder in (run, tmp_path / "whole"))
         assert first["global_step"] == second["global_step"]

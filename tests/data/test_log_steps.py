@@ -136,12 +136,13 @@ def test_resample_draws_straight_lines_on_a_uniform_clock():
 
 
 def test_deduplicate_drops_stale_rows_and_equal_times_and_keeps_a_robot_at_rest():
+    """Five repeats of a row are the longest that count as stale, six are a robot at rest."""
     fresh = NOISE[:60]
-    stale = np.repeat(fresh, [3 if k == 20 else 10 if k == 40 else 1 for k in range(60)], axis=0)
+    stale = np.repeat(fresh, [6 if k == 20 else 7 if k == 40 else 1 for k in range(60)], axis=0)
     done, text = only(Deduplicate(longest=5), recording(stale, u=stale[:, :1]))
-    expected = np.repeat(fresh, [10 if k == 40 else 1 for k in range(60)], axis=0)
+    expected = np.repeat(fresh, [7 if k == 40 else 1 for k in range(60)], axis=0)
     np.testing.assert_array_equal(done.q, expected)
-    assert "dropped 2 of 71 rows" in text
+    assert "dropped 5 of 71 rows" in text
     done, _ = only(Deduplicate(), recording([1, 2, 9, 3], t=[0.0, 0.01, 0.01, 0.02]))
     np.testing.assert_array_equal(done.q[:, 0], [1, 2, 3])
 

@@ -2,14 +2,12 @@
 
 import pytest
 import torch
-from torch.nn.utils import clip_grad_norm_
 from torch.optim import LBFGS
 from torch.optim.lr_scheduler import ConstantLR
 
 from pinn_dyn.data.windows import BatchSampler, WindowLoader
 from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
 from pinn_dyn.training import DynamicsLearner, NonFiniteLossError
-from pinn_dyn.training.learner import clipped
 from tests.support.ensembles import learn, make_data, make_models, train
 from tests.support.training import make_trainer
 
@@ -53,28 +51,6 @@ def test_an_ensemble_of_two_ends_with_the_weights_of_two_trainings(tmp_path, kin
     figures = trainer.callback_metrics
     assert float(figures["train/loss"]) == pytest.approx(sum(losses) / 2, rel=1e-4)
     assert float(figures["train/loss_spread"]) > 0
-
-
-def test_each_members_gradient_is_clipped_by_its_own_norm():
-    generator = torch.Generator().manual_seed(0)
-    gradients = [torch.randn(3, *shape, generator=generator) for shape in ((4, 5), (7,), ())]
-    for factor, gradient in zip((0.01, 1.0, 100.0), torch.arange(3), strict=True):
-        for item in gradients:
-            item[gradient] *= factor
-    expected = []
-    for member in range(3):
-        parameters = [torch.nn.Parameter(torch.zeros_like(item[member])) for item in gradients]
-        for parameter, item in zip(parameters, gradients, strict=True):
-            parameter.grad = item[member].clone()
-        clip_grad_norm_(parameters, 0.5)
-        expected.append([parameter.grad for parameter in parameters])
-    found = clipped(torch.cat([item.reshape(3, -1) for item in gradients], -1), 0.5)
-    for member in range(3):
-        wanted = torch.cat([item.flatten() for item in expected[member]])
-        torch.testing.assert_close(found[member], wanted, rtol=1e-6, atol=0)
-    norms = found.norm(dim=-1)
-    assert norms[0] < 0.4
-    assert norms[1] == pytest.approx(0.5, rel=1e-4)
 
 
 def test_an_optimizer_that_would_mix_the_members_is_refused(tmp_path):

@@ -38,6 +38,14 @@ def test_members_that_are_too_sure_are_corrected_on_validation():
     assert found.within_corrected == pytest.approx(0.95, abs=0.02)
 
 
+def test_a_corrected_interval_contains_its_share_of_few_validation_errors():
+    """Of 19 errors 95 % are 18.05, so the interval must contain all of them."""
+    few = prediction(2, shape=(1, 20, 1))
+    found = calibration(few, few)
+    assert (found.corrected >= found.level).all()
+    assert found.within_corrected == 1
+
+
 def test_two_members_have_the_quantiles_of_cauchy():
     assert half_widths(2, 0.5) == pytest.approx(1.0)
     assert half_widths(2, 0.9) == pytest.approx(math.tan(0.45 * math.pi))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.evaluation import torque_error
+from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 
 
@@ -70,6 +71,22 @@ def test_a_common_factor_of_all_terms_does_not_change_the_share():
     )
     assert ten.share == pytest.approx(one.share, rel=1e-9)
     assert ten.mean == pytest.approx(10 * one.mean, rel=1e-9)
+
+
+class Leaky(Pendulum):
+    """Pendulum with the residual force 0.4 v."""
+
+    has_residual = True
+
+    def _residual_force(self, q, v, u):
+        return 0.4 * v
+
+
+def test_the_residual_share_is_relative_to_both_forces():
+    truth, v, u = motion()
+    residual, applied = (x.square().sum(-1).mean().sqrt() for x in (0.4 * v, u))
+    expected = float(residual / (residual + applied))
+    assert residual_share(Leaky(), truth) == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_joint_without_a_motor_has_no_share_but_counts():

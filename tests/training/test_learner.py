@@ -7,12 +7,14 @@ import pytest
 import pytorch_optimizer as library
 import torch
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
+from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import OneCycleLR
 
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.models import AccelerationMLP
 from pinn_dyn.training import SOAP, DynamicsLearner, IncrementLoss, NonFiniteLossError
+from pinn_dyn.training.learner import clipped
 from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
 
@@ -106,6 +108,28 @@ def test_validation_figures_are_logged_by_name(tmp_path, data):
     assert float(trainer.callback_metrics["val/error_mean"]) == 0.25
     assert float(trainer.callback_metrics["val/diverged"]) == 3.0
     assert seen == [(model, (1, 101, 2))]
+
+
+def test_each_members_gradient_is_clipped_by_its_own_norm():
+    generator = torch.Generator().manual_seed(0)
+    gradients = [torch.randn(3, *shape, generator=generator) for shape in ((4, 5), (7,), ())]
+    for factor, gradient in zip((0.01, 1.0, 100.0), torch.arange(3), strict=True):
+        for item in gradients:
+            item[gradient] *= factor
+    expected = []
+    for member in range(3):
+        parameters = [torch.nn.Parameter(torch.zeros_like(item[member])) for item in gradients]
+        for parameter, item in zip(parameters, gradients, strict=True):
+            parameter.grad = item[member].clone()
+        clip_grad_norm_(parameters, 0.5)
+        expected.append([parameter.grad for parameter in parameters])
+    found = clipped(torch.cat([item.reshape(3, -1) for item in gradients], -1), 0.5)
+    for member in range(3):
+        wanted = torch.cat([item.flatten() for item in expected[member]])
+        torch.testing.assert_close(found[member], wanted, rtol=1e-6, atol=0)
+    norms = found.norm(dim=-1)
+    assert norms[0] < 0.4
+    assert norms[1] == pytest.approx(0.5, rel=1e-4)
 
 
 class Breaks(AccelerationMLP):
