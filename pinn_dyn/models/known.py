@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal, Protocol, runtime_checkable
 
@@ -104,6 +105,8 @@ class KnownMechanics(LearnedConstants):
         super().__init__(size, size)
         self.structure = structure
         self.integrator = integrator or RK4()
+        # Rods for the links of an arm. The last body has no link, so a single rod has no size.
+        self._largest_ratio = 5.0 if start == "prior" else 100.0 if size > 1 else math.inf
         gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(size)
         force = gain * statistics.u_rms.double()
         acceleration = statistics.acceleration.double()
@@ -155,6 +158,13 @@ class KnownMechanics(LearnedConstants):
         """Return r a + D v + F(v) - o - k u, ``(*batch, N)``, all terms except Y pi."""
         resistance = self.armature() * a + self.viscous() * v + self.friction(v)
         return resistance - self.offset() - self.drive_gain() * u
+
+    def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
+        """Return the ratio of root mean square forces of bodies and armatures, per input."""
+        fitted = self.structure.rigid_force(q, v, a, self.bodies(), gravity=True)
+        initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
+        ratio = (fitted + self.armature() * a).norm(dim=0) / initial.norm(dim=0)
+        return ratio * self.fixed_gain / self.drive_gain(), self._largest_ratio
 
     def slopes(self) -> KnownSlopes:
         return KnownSlopes(self)

@@ -163,6 +163,10 @@ class PhysicalBodies(Constants):
         self.register_buffer("root", (mass.sqrt() * root).float())
         self.spread = spread
 
+    def start(self) -> Tensor:
+        """Return J_start, ``(n, 4, 4)``."""
+        return self.root @ self.root.mT
+
     def forward(self) -> Tensor:
         """Return J, ``(n, 4, 4)``, or ``(*batch, n, 4, 4)`` for z ``(*batch, n, 10)``."""
         a, d1, d2, d3, s12, s13, s23, t1, t2, t3 = (self.spread * self.z).unbind(-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -53,6 +54,10 @@ class LearnedConstants(MechanicalSystem):
         inertial = (matvec(self.mass_matrix(q), a) / self.drive_gain()).std(0)
         scale = torch.where(driven > 1e-9 * inertial, driven, inertial)
         return torch.where(scale > 0, scale, 1.0)  # no scale for a joint at rest
+
+    def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
+        """Return fitted over initial force at each joint ``(N,)``, and its largest likely value."""
+        return torch.ones(self.num_coordinates), math.inf
 
     def slopes(self) -> Slopes:
         """Return the derivatives of e at the present z."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-_FAR = 3.0
-"""Prior standard deviations from which a constant is reported."""
+_UNEXPLAINED = 0.9
+"""Share of the inputs from which the fit of the median joint explains nothing."""
 
 
 class Prior(NamedTuple):
@@ -78,13 +77,24 @@ def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
     return half @ half.T
 
 
-def far_from_start(names: Sequence[str], z: Tensor, prior: Prior) -> list[str]:
-    """Describe the parameters z ``(P,)`` that are very unlikely under the prior, five at most."""
-    spread = torch.linalg.inv(prior.root).norm(dim=1)
-    deviation = ((z - prior.mean) / spread).abs()
-    return [
-        f"{names[k]} is {float(deviation[k]):.1f} prior standard deviations from its start: check "
-        "the units of the columns and the sign of its input"
-        for k in deviation.argsort(descending=True).tolist()[:5]
-        if deviation[k] > _FAR
-    ]
+def doubtful_units(ratio: Tensor, largest: float, unexplained: Tensor) -> str | None:
+    """Describe data whose units or signs are probably wrong, or return None.
+
+    Args:
+        ratio: fitted over initial force of each joint, ``(N,)``.
+        largest: ratio of the median joint that right units do not exceed.
+        unexplained: spread of the force errors of the fit over that of the input, ``(N,)``.
+    """
+    middle, share = float(ratio.median()), float(unexplained.median())
+    if not 1 / largest < middle < largest:
+        return (
+            f"the fitted forces are {middle:.3g} times those of the initial bodies, expected less "
+            f"than {largest:g} times more or fewer: check the units of u (Nm, N, or the drive "
+            "gain) and of q and v (rad, m)"
+        )
+    if share > _UNEXPLAINED:
+        return (
+            f"the errors of the fit have {share:.0%} of the spread of the inputs: check the signs, "
+            "the order and the units of the columns of q, v and u"
+        )
+    return None

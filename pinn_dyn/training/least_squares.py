@@ -23,7 +23,7 @@ from pinn_dyn.training.constants_fit import (
     Fit,
     Prior,
     StoppedFit,
-    far_from_start,
+    doubtful_units,
     posterior_covariance,
 )
 from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
@@ -160,8 +160,6 @@ class LeastSquares:
         vector_to_parameters(best.z.to(precision), model.parameters())
         if validate is not None and len(stages) > 1:
             log.info("least squares keeps %s: validation errors %s", best.stage, ", ".join(errors))
-        for line in far_from_start(model.parameter_names(), best.z, prior):
-            log.warning("least squares: %s", line)
         return replace(best, stopped_in=None)
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
@@ -216,7 +214,12 @@ class LeastSquares:
         with torch.no_grad():
             correlated = correlation_length((errors() * moves).numpy())
         stage = f"{IDENTIFICATION}, correlation over {correlated:.3g} samples"
-        return self._solve(stage, model, prior, residuals, correlated)
+        result = self._solve(stage, model, prior, residuals, correlated)
+        with torch.no_grad():
+            doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
+        if doubt:
+            log.warning("least squares: %s", doubt)
+        return result
 
     def _roll_out(self, stage: str, model: LearnedConstants, prior: Prior, windows: Windows) -> Fit:
         scale = windows.statistics().qv_increment_std.clone()

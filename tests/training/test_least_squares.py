@@ -15,7 +15,7 @@ from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models import CoulombFriction
 from pinn_dyn.training import LeastSquares, StoppedFit, least_squares
-from pinn_dyn.training.constants_fit import Fit, Prior, far_from_start
+from pinn_dyn.training.constants_fit import Fit
 from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
 from tests.support.known import known_model, motion, motions
 from tests.support.rigid_chains import joint, link, robot
@@ -281,17 +281,3 @@ def test_fewer_residuals_than_constants_are_refused(runs, caplog):
         robot_model("generic"), runs, few, known
     )
     assert f"give 16 residuals for {count} constants" in caplog.text
-
-
-def test_a_constant_far_from_its_start_is_named():
-    names = ["mass of tip", "drive gain of wrist", "torque offset of wrist", "armature of wrist"]
-    root = torch.diag(torch.tensor([1.0, 1.0, 2.0, 0.1]).double())
-    mean = torch.tensor([0.0, 0.0, 1.0, 0.0]).double()
-    z = torch.tensor([-3.5, 6.0, 2.0, 25.0]).double()
-    gain, mass = far_from_start(names, z, Prior(mean, root))
-    assert re.match("drive gain of wrist is 6.0 prior .*: check the units", gain)
-    assert re.match("mass of tip is 3.5 prior ", mass)
-    many = far_from_start(
-        [f"mass of {k}" for k in range(8)], 5 * torch.ones(8), Prior(torch.zeros(8), torch.eye(8))
-    )
-    assert len(many) == 5
