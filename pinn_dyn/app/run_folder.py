@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import pkgutil
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,9 +22,12 @@ from pinn_dyn.app.run import ModelBuilder, Run
 from pinn_dyn.app.trust import require_trusted
 from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.evaluation.tables import short
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import Statistics
 from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.training import COVARIANCE, WholeCheckpoints
 
 CONFIG, METRICS, CHECKPOINTS = "config.yaml", "metrics.json", "checkpoints"
@@ -169,6 +173,20 @@ def require_same_data(
         raise ConfigError(f"{name} has changed since {folder} was trained:\n  {text}")
 
 
+def with_structures(part: Any) -> Any:
+    """Replace the path of each URDF in a configuration by its text, so that a run contains it."""
+    if isinstance(part, list):
+        return [with_structures(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    part = {key: with_structures(value) for key, value in part.items()}
+    if {"_target_", "urdf"} <= part.keys():
+        target = pkgutil.resolve_name(part["_target_"])
+        if isinstance(target, type) and issubclass(target, RigidChain):
+            part["urdf"] = urdf_text(part["urdf"])
+    return part
+
+
 def write_config(folder: Path, config: dict[str, Any]) -> None:
     """Write the resolved configuration of a run."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -198,7 +216,8 @@ def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None,
 
 
 def _require_same_config(folder: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
-    ours, theirs = flattened(now), flattened(before)
+    # Earlier versions recorded paths of URDFs.
+    ours, theirs = flattened(now), flattened(with_structures(before))
     ours.pop("dataset.cache", None)
     differences = [
         f"{key}={ours.get(key)} (there {theirs.get(key)})"
@@ -211,9 +230,9 @@ def _require_same_config(folder: Path, before: dict[str, Any], now: dict[str, An
 
 
 def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested sections as dotted keys."""
+    """Return nested sections as dotted keys, and the text of a URDF as its name and hash."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
         section = isinstance(value, Mapping) and value
-        flat |= flattened(value, f"{prefix}{key}.") if section else {f"{prefix}{key}": value}
+        flat |= flattened(value, f"{prefix}{key}.") if section else {f"{prefix}{key}": short(value)}
     return flat

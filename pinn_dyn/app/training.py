@@ -37,6 +37,7 @@ from pinn_dyn.app.run_folder import (
     load_run,
     read_checkpoint,
     require_same_data,
+    with_structures,
 )
 from pinn_dyn.app.trainer import (
     CLIPPING,
@@ -181,7 +182,7 @@ def train(
             **{name: described(part) for name, part in parts.items()},
             "trainer": {"steps": steps, "validations": validations, **trainer},
         }
-    config = dict(config)
+    config = with_structures(dict(config))
     with contextlib.ExitStack() as stack:
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(threads)

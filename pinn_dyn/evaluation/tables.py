@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -45,7 +46,7 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
     Keys that follow the seed, an earlier key or the names of model and data set are left out.
     """
-    settings = pd.json_normalize(list(configs))
+    settings = pd.json_normalize(list(configs)).map(short)
     text = settings.map(str)
     names = [name for name in _NAMES if name in text and text[name].nunique() > 1]
     partitions = {tuple(pd.factorize(text["seed"])[0])} if text["seed"].nunique() > 1 else set()
@@ -59,6 +60,15 @@ def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         partitions.add(partition)
         columns.append(column)
     return settings[columns]
+
+
+def short(setting: Any) -> Any:
+    """Return the text of a URDF as its name and the first digits of its hash, others unchanged."""
+    if not isinstance(setting, str) or not setting.lstrip().startswith("<"):
+        return setting
+    name = re.match("<!-- (.*?) -->", setting)
+    digits = hashlib.sha256(setting.encode()).hexdigest()[:8]
+    return f"{name[1] if name else 'URDF text'} {digits}"
 
 
 def model_names(names: Sequence[str], configs: Sequence[Mapping[str, Any]]) -> list[str]:

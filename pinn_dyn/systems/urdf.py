@@ -18,6 +18,7 @@ from torch import Tensor
 from pinn_dyn.systems.inertia import pseudo_inertia
 
 _TURNING = ("revolute", "continuous")
+_UNREAD = {"visual", "collision", "material", "transmission", "gazebo"}
 _TOLERANCE = 1e-6  # of the largest principal moment of inertia
 
 
@@ -128,6 +129,20 @@ def read_urdf(
         tip_body=visited[tip][0],
         tip_pose=torch.from_numpy(visited[tip][1]),
     )
+
+
+def urdf_text(urdf: str) -> str:
+    """Return a URDF as text without shapes, behind a comment with its path; keep a text as it is.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`read_urdf`.
+    """
+    if urdf.lstrip().startswith("<"):
+        return urdf
+    path, content = _open(urdf)
+    _UrdfFile(path, content)  # refuses text that is no URDF
+    text = ET.canonicalize(content, strip_text=True, exclude_tags=_UNREAD)
+    return f"<!-- {urdf.replace('--', '-')} -->{text}"
 
 
 class _UrdfFile:

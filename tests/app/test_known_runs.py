@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import pinn_dyn
+from pinn_dyn.systems import RigidChain
 from tests.app.entry import NO_FIGURES, fork_script, refused_text, run_script
 from tests.support.recorded_logs import LOGS, ROOT, needs_logs
 
@@ -39,8 +40,26 @@ def quick():
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory, quick):
     folder = tmp_path_factory.mktemp("runs") / "known"
-    run_script("train.py", *KNOWN, *SMALL, f"hydra.run.dir={folder}")
+    arm = folder.parent / "arm.urdf"
+    text = (ROOT / "examples" / "double_pendulum.urdf").read_text()
+    arm.write_text(text)
+    words = [*KNOWN, f"model.structure.urdf={arm}", *SMALL]
+    run_script("train.py", *words, f"hydra.run.dir={folder}")
+    arm.write_text(text.replace("0 0 -0.2", "0 0 -0.3"))  # after the training
     return folder
+
+
+def test_a_run_contains_its_structure(fitted, capsys):
+    arm = fitted.parent / "arm.urdf"
+    q, v = torch.randn(2, 5, 2, generator=torch.manual_seed(0)).double()
+    structure = pinn_dyn.load(fitted).system.structure
+    trained, edited = (RigidChain(x) for x in (f"{ROOT}/examples/double_pendulum.urdf", str(arm)))
+    expected = trained.rigid_force(q, v, v)
+    assert not torch.allclose(edited.rigid_force(q, v, v), expected, rtol=0.1)
+    torch.testing.assert_close(structure.rigid_force(q, v, v), expected, rtol=1e-6, atol=1e-6)
+    words = [*KNOWN, f"model.structure.urdf={arm}", *SMALL, f"hydra.run.dir={fitted}"]
+    text = " ".join(refused_text(capsys, "train.py", *words).split())
+    assert re.search(r"another configuration: model.structure.urdf=\S+arm.urdf \w{8} \(there", text)
 
 
 def test_what_the_data_leave_open_is_listed(fitted):
