@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from io import StringIO
 from pathlib import Path
 
 import pandas as pd
 
 from pinn_dyn.data import DataSource
-from pinn_dyn.data.whole import write_whole
+from pinn_dyn.data.whole import read_regular, write_whole
 from pinn_dyn.evaluation.identification import COLUMNS, constants_table, undetermined
 from pinn_dyn.evaluation.plots import units
 from pinn_dyn.mechanics import Predictor
@@ -40,7 +41,7 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
 def read_constants(folders: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
     """Read the constants of runs by their names; earlier versions wrote fewer columns."""
     return {
-        name: pd.read_csv(path).reindex(columns=COLUMNS)
+        name: pd.read_csv(StringIO(read_regular(path))).reindex(columns=COLUMNS)
         for name, folder in folders.items()
         if (path := folder / _CONSTANTS).is_file()
     }

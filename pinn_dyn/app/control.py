@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torch import Tensor
 
-from pinn_dyn.app.build import build_law, build_reference, build_source
+from pinn_dyn.app.build import build_law, build_reference
 from pinn_dyn.app.config import ConfigError, build_part, checked
 from pinn_dyn.app.control_results import write_results
 from pinn_dyn.app.provenance import write_provenance
@@ -51,7 +51,7 @@ def control(cfg: DictConfig) -> float:
 
 
 def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
-    source = build_source(run.config)
+    source = run.source
     learned = _learned_system(run, config)
     if source.system is None:
         return _without_robot(learned, source, config, folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import json
 from collections.abc import Sequence
+from io import StringIO
 from pathlib import Path
 
 import pandas as pd
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.run_folder import CONFIG, METRICS
 from pinn_dyn.app.sweep import ERROR, first_line
+from pinn_dyn.data.whole import read_regular
 from pinn_dyn.evaluation import save, sweep_figure
 from pinn_dyn.evaluation.tables import over_seeds, to_text, varied_settings, write_table
 
@@ -33,10 +35,10 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
     rows, configs, problems = [], [], {}
     for folder in sorted({f.parent for f in files if f.parent.name != ".hydra"}):
         try:
-            config = yaml.safe_load((folder / CONFIG).read_text())
+            config = yaml.safe_load(read_regular(folder / CONFIG))
             if "trainer" not in config:
                 continue  # results of another command
-            record = json.loads((folder / METRICS).read_text())
+            record = json.loads(read_regular(folder / METRICS))
             row = {"folder": str(folder), "seed": config["seed"]}
             row |= {key: record[key] for key in _RECORDED if key in record}
             row |= {k: x for k, x in record["validation"].items() if k.startswith("val/")}
@@ -51,7 +53,8 @@ def read_runs(patterns: Sequence[str]) -> tuple[pd.DataFrame, list[dict], dict[s
 def read_test_errors(folders: Sequence[str], patterns: Sequence[str]) -> pd.DataFrame:
     """Return the test errors of runs, indexed by folder, from folders of evaluate.py or globs."""
     paths = [path for x in patterns for p in glob.glob(x) for path in Path(p).glob("summary.csv")]
-    tables = [pd.read_csv(x) for x in sorted(paths, key=lambda path: -path.stat().st_mtime)]
+    paths.sort(key=lambda path: -path.stat().st_mtime)
+    tables = [pd.read_csv(StringIO(read_regular(path))) for path in paths]
     table = pd.concat([x[x["folder"].isin(folders)] for x in tables]) if tables else pd.DataFrame()
     if table.empty:
         raise ConfigError(f"evaluations: {patterns} have no results of these runs")

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pinn_dyn.app.predict_frame import predict_frame
-from pinn_dyn.data import DataSource, LogSource, store
+from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
@@ -73,6 +73,7 @@ class Run:
     covariance: Tensor | None = None
     _made_in_python: DataSource | None = None
     _temporary: TemporaryDirectory[str] | None = None
+    _may_simulate: bool = True
 
     def __repr__(self) -> str:
         name, data = self.config["model_name"], self.config["dataset"].get("name")
@@ -88,7 +89,10 @@ class Run:
         """The data that the run was trained on."""
         from pinn_dyn.app.build import build_source
 
-        return self._made_in_python or build_source(self.config)
+        source = self._made_in_python or build_source(self.config)
+        if isinstance(source, RobotSource):
+            source.may_simulate = self._may_simulate
+        return source
 
     @cached_property
     def log(self) -> LogSource | None:

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from pinn_dyn import __version__
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import ModelBuilder, Run
-from pinn_dyn.app.trust import require_trusted
+from pinn_dyn.app.trust import is_trusted, require_trusted
 from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.tables import short
@@ -92,6 +92,7 @@ def load_run(
     dataset, covariance = config["dataset"], saved.get(COVARIANCE)
     if str(dataset.get("_target_")).endswith(".StoredSource"):
         dataset = {**dataset, "path": str(folder / dataset["path"])}
+    robot = (dataset.get("system") or {}).get("_target_")
     return Run(
         folder,
         {**config, "dataset": dataset},
@@ -101,6 +102,7 @@ def load_run(
         saved.get(DATA, {}),
         bool(saved.get(FINISHED)),
         covariance if isinstance(covariance, torch.Tensor) else None,
+        _may_simulate=trust is None or is_trusted(robot, trust),
     )
 
 
@@ -177,7 +179,7 @@ def with_structures(part: Any) -> Any:
     """Replace the path of each URDF in a configuration by its text, so that a run contains it."""
     if isinstance(part, list):
         return [with_structures(item) for item in part]
-    if not isinstance(part, dict):
+    if not isinstance(part, Mapping):
         return part
     part = {key: with_structures(value) for key, value in part.items()}
     if {"_target_", "urdf"} <= part.keys():
@@ -197,9 +199,16 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None, dict[str, Any]]]:
     """Lock a run folder for a configuration; yield path and content of its newest checkpoint.
 
-    Refuse a folder that another process locks, or with a training of another configuration.
+    Refuse a folder that another process locks, with links that lead out of it, or with a training
+    of another configuration.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    for file in folder.rglob("*"):
+        if file.is_symlink() and not file.resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(
+                f"{file} is a link to {file.resolve()}: nothing is written outside of the run "
+                "folder, expected a file or folder: replace the link by a copy"
+            )
     try:
         with FileLock(folder / ".lock", timeout=0):
             for partial in folder.rglob("*.partial"):  # of a process that was killed while writing

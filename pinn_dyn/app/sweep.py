@@ -76,7 +76,8 @@ def write_error(folder: Path, error: Exception) -> None:
 
 def first_line(path: Path) -> str:
     """Return the message in an ``error.txt``."""
-    return path.read_text(errors="replace").partition("\n")[0]
+    with path.open(errors="replace") as file:
+        return file.readline(10_000).rstrip("\n")
 
 
 def command_line() -> str:

@@ -182,7 +182,7 @@ def train(
             **{name: described(part) for name, part in parts.items()},
             "trainer": {"steps": steps, "validations": validations, **trainer},
         }
-    config = with_structures(dict(config))
+    config = dict(with_structures(config))
     with contextlib.ExitStack() as stack:
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(threads)

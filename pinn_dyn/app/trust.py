@@ -65,7 +65,7 @@ def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, 
         special = not isinstance(key, str) or key.startswith("_") or "${" in key
         if special and key not in ("_target_", "_partial_"):
             raise ConfigError(f"{path} has the key {key!r}, which no configuration of a run has")
-    if "_target_" not in part or _is_trusted(target := part["_target_"], trust):
+    if "_target_" not in part or is_trusted(target := part["_target_"], trust):
         return
     if not may_build(target, ()):
         raise ConfigError(
@@ -79,7 +79,7 @@ def _require_trusted_mapping(path: str, part: dict[Any, Any], trust: tuple[str, 
                 f"{path}.{key} is {part[key]!r}: a configuration from a run folder does not choose "
                 f"where something is written, unless you add trust={target}"
             )
-    for key in ("name", "filename", "version"):
+    for key in ("name", "filename", "filename_suffix", "version"):
         if part.get(key) is not None:
             check_name(f"{path}.{key}", part[key])
 
@@ -95,7 +95,7 @@ def may_build(target: Any, trust: tuple[str, ...]) -> bool:
     if package == "examples.cleaning_steps" and _has_own_examples():
         value = getattr(importlib.import_module(package), name, None)
         return isinstance(value, type) and value.__module__ == package
-    return str(target) in _ALLOWED or _is_trusted(target, trust)
+    return str(target) in _ALLOWED or is_trusted(target, trust)
 
 
 def _has_own_examples() -> bool:
@@ -105,7 +105,7 @@ def _has_own_examples() -> bool:
     return {Path(folder).resolve() for folder in folders} == {beside}
 
 
-def _is_trusted(target: Any, trust: tuple[str, ...]) -> bool:
+def is_trusted(target: Any, trust: tuple[str, ...]) -> bool:
     """Return whether a class is defined in a trusted package, not only imported there."""
     for package in trust:
         if target == package or str(target).startswith(f"{package}."):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +49,9 @@ class RobotSource(DataSource):
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each;
             None takes the middle of the joint ranges.
 
+    Attributes:
+        may_simulate: false for a run folder of others, whose robot no simulator loads.
+
     Raises:
         ValueError: on a joint without limits.
     """
@@ -64,6 +67,7 @@ class RobotSource(DataSource):
     seed: NonNegativeInt = 0
     cache: str
     configurations: Mapping[str, Sequence[float]] | None = None  # type: ignore[assignment]
+    may_simulate: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         arm = self.system
@@ -106,8 +110,15 @@ class RobotSource(DataSource):
 
         Raises:
             SimulationError: if no draw of a trajectory stays within the limits.
-            ValueError: from an excitation that the robot cannot follow.
+            ValueError: from an excitation that the robot cannot follow, or if the robot of a run
+                folder would have to be simulated.
         """
+        if not self.may_simulate:
+            system = f"pinn_dyn.systems.{type(self.system).__name__}"
+            raise ValueError(
+                f"{self.name}: the trajectories are not in {self.cache}, and no simulator is "
+                f"started for a run folder: if you trust its author, add trust={system}"
+            )
         t = np.arange(round(self.duration / self.step) + 2) * self.step
         tasks = [
             (index, k) for index, name in enumerate(SPLITS) for k in range(getattr(self, name))

@@ -45,8 +45,11 @@ class StoredSource(DataSource):
         return names
 
     def _read(self) -> dict[str, Any]:
+        path = Path(self.path).expanduser()
         try:
-            content: dict[str, Any] = torch.load(Path(self.path).expanduser(), weights_only=True)
+            if not path.is_file():  # opening a pipe would wait
+                raise FileNotFoundError("it is missing, or no regular file")
+            content: dict[str, Any] = torch.load(path, weights_only=True)
         except Exception as error:  # a damaged file raises nearly anything
             raise ValueError(
                 f"{self.path}, the data that the run was trained on, cannot be read: {error}"

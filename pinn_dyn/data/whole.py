@@ -1,11 +1,15 @@
-"""Files that are whole or absent."""
+"""Files that are whole or absent, and files of others."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
+
+_LARGEST = 2**26
+"""Largest size of a text file of a run folder, bytes."""
 
 
 @contextlib.contextmanager
@@ -25,6 +29,14 @@ def whole(path: Path) -> Iterator[Path]:
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def read_regular(path: Path) -> str:
+    """Return the text of a file that others wrote; refuse pipes, devices and huge files."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
+        raise ValueError(f"{path} is not read, expected a regular file of at most {_LARGEST} bytes")
+    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -7,6 +7,7 @@ import hashlib
 import math
 from collections.abc import Sequence
 from typing import Annotated
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
@@ -120,7 +121,7 @@ class SimulatedArm(RigidChain, abc.ABC):
             axis = rotation @ self._axes[k].numpy()
             kind = "continuous" if self.turning[k] else "prismatic"
             parts.append(
-                f'<joint name="{name}" type="{kind}"><parent link="{_link(parent)}"/>'
+                f'<joint name={quoteattr(name)} type="{kind}"><parent link="{_link(parent)}"/>'
                 f'<child link="{_link(k)}"/><origin xyz="{_text(origin)}"/>'
                 f'<axis xyz="{_text(axis)}"/>'
                 # PyBullet needs limits of a sliding joint; lower > upper means that there are none.

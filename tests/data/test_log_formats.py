@@ -167,16 +167,6 @@ def test_npz_without_unpickling(tmp_path, expected):
     formats.write_npz(tmp_path / "objects.npz", TABLE, q=np.array([{"a": 1}], dtype=object))
 
 
-def test_hdf5_data_sets_in_other_files_are_not_opened(tmp_path):
-    formats.write_hdf5(tmp_path / "run.h5", TABLE)
-    with h5py.File(tmp_path / "run.h5", "a") as file:
-        place = [(str(tmp_path / "secret"), 0, h5py.h5f.UNLIMITED)]
-        file.create_dataset("log/far", shape=(601,), dtype="f8", external=place)
-    u = dict(columns=["log/far"], unit="Nm")
-    with pytest.raises(LogError, match="no column 'log/far'"):
-        source(tmp_path, files="*.h5", **{**MATRICES, "u": u}).load()
-
-
 LEROBOT = dict(
     files="data/*/*.parquet",
     trajectory="episode_index",

@@ -20,6 +20,10 @@ from pinn_dyn.spelling import did_you_mean
 
 def read_mat(path: Path, request: Request) -> pd.DataFrame:
     """Read a MATLAB file; the fields of a struct are ``name.field``."""
+    h5py = optional("h5py", path)
+    if h5py.is_hdf5(path):  # version 7.3
+        with h5py.File(path, "r") as file:
+            _refuse(path, _visited(h5py, file)[1])
     content = optional("pymatreader", path).read_mat(str(path))
     variables: dict[str, Any] = {}
 
@@ -37,15 +41,37 @@ def read_mat(path: Path, request: Request) -> pd.DataFrame:
 def read_hdf5(path: Path, request: Request) -> pd.DataFrame:
     """Read an HDF5 file. Data sets that lie in other files are not opened."""
     h5py = optional("h5py", path)
-    variables: dict[str, Any] = {}
+    with h5py.File(path, "r") as file:
+        names, outside = _visited(h5py, file)
+        _refuse(path, [x for x in outside if any(y.startswith(x) for y in request.columns)])
+        variables = {name: file[name][()] for name in names}
+    return _table(path, request.time, variables)
+
+
+def _visited(h5py: Any, file: Any) -> tuple[list[str], list[str]]:
+    """Return the names of plain data sets, and of links and data sets with values elsewhere."""
+    plain: list[str] = []
+    outside: list[str] = []
+
+    def link(name: str, item: Any) -> None:
+        if isinstance(item, h5py.ExternalLink):
+            outside.append(name)
 
     def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual:
-            variables[name] = item[()]
+        if isinstance(item, h5py.Dataset):
+            (outside if item.external or item.is_virtual else plain).append(name)
 
-    with h5py.File(path, "r") as file:
-        file.visititems(visit)
-    return _table(path, request.time, variables)
+    file.visititems_links(link)
+    file.visititems(visit)
+    return plain, outside
+
+
+def _refuse(path: Path, outside: list[str]) -> None:
+    if outside:
+        raise LogError(
+            f"{path}: {listed(outside)}: values of other files or virtual data sets are not read, "
+            "expected plain data sets: copy the values into the file"
+        )
 
 
 def read_npz(path: Path, request: Request) -> pd.DataFrame:
