@@ -16,6 +16,7 @@ from pinn_dyn.evaluation import Entry, Evaluation, build_baselines, evaluate_mod
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.evaluation.tables import model_names
 from pinn_dyn.mechanics import Predictor, stack_until
+from pinn_dyn.progress import Progress
 from pinn_dyn.training.least_squares import IDENTIFICATION
 
 log = logging.getLogger(__name__)
@@ -99,24 +100,27 @@ def evaluate(
             names, models, runs, sources, steps, strict=True
         )
     ]
-    training = splits[sources[0]]
-    predictors = build_baselines(training.train, training.validation, step=grid)
-    baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
-    for model, run, trained_on, own_step in zip(models, runs, sources, steps, strict=True):
-        name = f"identification of {model}"
-        if _is_rolled_out(run) and name not in {entry.run for entry in baselines}:
-            identified = _identified(run, trained_on)
-            baselines.append(Entry(name, identified, splits[trained_on], own_step, name))
-    evaluation = evaluate_models(
-        entries,
-        baselines,
-        source,
-        truth,
-        split=split,
-        stride=stride,
-        windows=default_windows(horizon, grid) if windows is None else windows,
-        thresholds=thresholds,
-    )
+    with Progress("evaluation", len(runs), "models") as progress:
+        progress.update(0, ", now the baselines")
+        training = splits[sources[0]]
+        predictors = build_baselines(training.train, training.validation, step=grid)
+        baselines = [Entry(name, x, training, grid, name) for name, x in predictors.items()]
+        for model, run, trained_on, own_step in zip(models, runs, sources, steps, strict=True):
+            name = f"identification of {model}"
+            if _is_rolled_out(run) and name not in {entry.run for entry in baselines}:
+                identified = _identified(run, trained_on)
+                baselines.append(Entry(name, identified, splits[trained_on], own_step, name))
+        evaluation = evaluate_models(
+            entries,
+            baselines,
+            source,
+            truth,
+            split=split,
+            stride=stride,
+            windows=default_windows(horizon, grid) if windows is None else windows,
+            thresholds=thresholds,
+            progress=progress,
+        )
     folders = {name: run.folder for name, run in zip(names, runs, strict=True)}
     evaluation.constants = read_constants(folders)
     return evaluation

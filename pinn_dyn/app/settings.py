@@ -60,7 +60,7 @@ class TrainerArguments:
     precision: Literal["32-true", "32", 32, "bf16-mixed", "bf16"] | None = None
     gradient_clip_val: PositiveFloat | None = None
     gradient_clip_algorithm: Literal["norm", "value"] | None = None
-    enable_progress_bar: bool = True
+    enable_progress_bar: bool = True  # lines of progress
     deterministic: bool | Literal["warn"] = False
     detect_anomaly: bool = False
     profiler: Literal["simple", "advanced"] | None = None

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
@@ -31,8 +32,15 @@ class SweepCallback(Callback):
     last job the program ends with a list of the failures and a non-zero status.
     """
 
+    _jobs = 0  # launchers hand it to the processes of the jobs
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Name the folder of the sweep, and let processes of joblib end with this one."""
+        overrides = OverridesParser.create().parse_overrides(config.hydra.overrides.task)
+        sweeps = [x for x in overrides if x.is_sweep_override()]
+        self._jobs = config.hydra.sweeper.get("n_trials") or math.prod(
+            sum(1 for _ in x.sweep_string_iterator()) for x in sweeps
+        )
         text = "after an interrupt, go on with the same command and hydra.sweep.dir=%s"
         log.info(text, config.hydra.sweep.dir)
         if "joblib" in config.hydra.launcher._target_:
@@ -42,7 +50,9 @@ class SweepCallback(Callback):
             register_parallel_backend("loky", loky)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Remove the error of an earlier try."""
+        """Remove the error of an earlier try, and log the number of the job."""
+        if config.hydra.mode == RunMode.MULTIRUN:
+            log.info("job %d of %d", config.hydra.job.num + 1, self._jobs)
         (Path(config.hydra.runtime.output_dir) / ERROR).unlink(missing_ok=True)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
-import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
@@ -14,7 +11,7 @@ from typing import Any, Literal
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -30,6 +27,7 @@ from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.mechanics.compilation import STEPS_FOR_DERIVATIVE
 from pinn_dyn.models import Statistics
+from pinn_dyn.progress import Progress
 from pinn_dyn.training import (
     DynamicsLearner,
     LeastSquares,
@@ -38,10 +36,10 @@ from pinn_dyn.training import (
     WindowLoss,
 )
 
-log = logging.getLogger(__name__)
-
 LONGEST_EPOCH = 1000
 """Largest number of steps between two writes of the last checkpoint."""
+LOSSES = 50
+"""Smallest number of losses in the log of a training, if it has as many steps."""
 _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer.", "trainer.steps")
 """Beginnings of the settings that TensorBoard shows beside the validation error."""
 CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")
@@ -135,16 +133,32 @@ class _MovableCheckpoint(ModelCheckpoint):
         super().load_state_dict({**state_dict, **changes})
 
 
-class _EpochLines(L.Callback):
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the training loss, and the validation error of validated epochs."""
-        epoch, metrics = trainer.current_epoch + 1, trainer.callback_metrics
-        text = f"training loss {metrics.get('train/loss', math.nan):.4g}"
-        if epoch % (trainer.check_val_every_n_epoch or 1) == 0 and VALIDATION_ERROR in metrics:
-            text += f", validation error {metrics[VALIDATION_ERROR]:.4g}"
-        if trainer.is_global_zero:
-            steps = trainer.global_step
-            log.info("epoch %d of %s, step %d: %s", epoch, trainer.max_epochs, steps, text)
+class _ProgressLines(L.Callback):
+    progress = Progress(None, 0, "steps")
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Start the lines, in the first process."""
+        config = pl_module.hparams["config"]
+        task = f"training {config['name']} seed {config['seed']}"
+        self._steps = config["trainer"]["steps"]
+        self.progress = Progress(task if trainer.is_global_zero else None, self._steps, "steps")
+        self.progress.__enter__()
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Update the steps, the loss and the validation error."""
+        assert isinstance(pl_module, DynamicsLearner)
+        text = f", loss {pl_module.latest_loss:.4g}"
+        if (error := trainer.callback_metrics.get(VALIDATION_ERROR)) is not None:
+            text += f", validation error {error:.4g}"
+        self.progress.update(trainer.global_step, text)
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """End the lines."""
+        self.progress.__exit__()
+
+    def on_exception(self, *_: Any) -> None:
+        """End the lines."""
+        self.progress.__exit__()
 
 
 def build_trainer(
@@ -161,18 +175,17 @@ def build_trainer(
     """
     # A resumed training finds its checkpoints by these names.
     files: dict[str, Any] = {"dirpath": str(folder / CHECKPOINTS), "enable_version_counter": False}
-    bar = settings.get("enable_progress_bar", True) and sys.stdout.isatty()
     count, batches, interval = length
     arguments = {
         **{key: value for key, value in settings.items() if key not in CLIPPING},
-        "enable_progress_bar": bar,
+        "enable_progress_bar": False,
         "max_epochs": count,
         "check_val_every_n_epoch": interval,
         "callbacks": [
             *callbacks,
             _MovableCheckpoint(filename="best", monitor=BEST_BY, **files),
             _MovableCheckpoint(filename="last", save_on_train_epoch_end=True, **files),
-            TQDMProgressBar() if bar else _EpochLines(),
+            *([_ProgressLines()] if settings.get("enable_progress_bar", True) else []),
             *([LearningRateMonitor()] if loggers else []),
         ],
         "logger": list(loggers),
@@ -180,7 +193,7 @@ def build_trainer(
         "default_root_dir": str(folder),
         "inference_mode": False,  # validation needs derivatives
         "num_sanity_val_steps": 0,
-        "log_every_n_steps": min(100, batches),
+        "log_every_n_steps": max(1, min(100, count * batches // LOSSES)),
         "enable_model_summary": False,
         "use_distributed_sampler": False,  # DynamicsData distributes the windows of a batch
     }

@@ -6,13 +6,13 @@ from collections import defaultdict, deque
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.mechanics.arrays import require_finite
+from pinn_dyn.progress import Progress
 
 
 def close_loop(
@@ -49,7 +49,7 @@ def close_loop(
         sensor: noise of the measurement.
         delay: dead time of the input in control instants, with zero input before.
         q_bound: a copy with |q| beyond this bound has diverged, in the units of q.
-        progress: label of a progress bar; None shows no bar.
+        progress: name of the task in lines of progress; None logs none.
 
     Raises:
         ValueError: on sizes that do not agree, or a duration that is no multiple of 1 / rate.
@@ -62,10 +62,10 @@ def close_loop(
     q, v, moving = q0.clone(), v0.clone(), run.running.clone()
     k, u = 0, torch.empty(0)
     try:
-        with torch.no_grad():
+        with torch.no_grad(), Progress(progress, len(run.t), "instants") as lines:
             plant.start(q0, v0)
-            quiet = progress is None or None  # None: unless on a terminal
-            for k in tqdm(range(len(run.t)), desc=progress, disable=quiet):
+            for k in range(len(run.t)):
+                lines.update(k)
                 if not torch.equal(moving, run.running):
                     moving = run.running.clone()
                     plant.start(q[moving], v[moving])

@@ -7,13 +7,13 @@ import torch
 from scipy.integrate import BDF
 from scipy.sparse import block_diag
 from torch import Tensor
-from tqdm import tqdm
 
 from pinn_dyn.control.closed_loop import LoopRun, finite_rows, motion_of_copies
 from pinn_dyn.control.contracts import Controller, Motion, Reference
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.progress import Progress
 
 
 def close_loop_continuous(
@@ -84,8 +84,7 @@ def close_loop_continuous(
             jac_sparsity=block_diag([np.ones((size, size))] * count),
             vectorized=True,
         )
-        # None: unless on a terminal
-        with tqdm(total=duration, desc=progress, disable=progress is None or None) as bar:
+        with Progress(progress, duration, "s") as lines:
             while solver.status == "running":
                 time = float(solver.t)
                 try:
@@ -98,7 +97,7 @@ def close_loop_continuous(
                 if len(now):
                     x = torch.from_numpy(solver.dense_output()(run.t[now].numpy()))
                     states[copies[:, None], now] = x.unflatten(0, (count, -1)).transpose(1, 2)
-                bar.update(float(solver.t) - time)
+                lines.update(float(solver.t))
                 if np.abs(solver.y.reshape(count, 2, -1)[:, 0]).max() > q_bound:
                     return float(solver.t), f"the plant diverged: |q| is beyond {q_bound:g}"
         return np.inf, ""

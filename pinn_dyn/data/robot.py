@@ -11,7 +11,6 @@ from typing import Annotated
 import numpy as np
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
-from tqdm import tqdm
 
 from pinn_dyn.data.cache import Arrays, load_or_make
 from pinn_dyn.data.fingerprint import describe
@@ -19,6 +18,7 @@ from pinn_dyn.data.robot_excitation import Plan, RobotExcitation
 from pinn_dyn.data.simulation import SimulationError, momentum
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.progress import Progress
 from pinn_dyn.systems import SimulatedArm
 
 # Part of the cache key: raise it when the same description would give other numbers.
@@ -151,12 +151,14 @@ class RobotSource(DataSource):
         arm = self.system
         q, v, u = motions = np.empty((3, len(plan.q0), len(t), arm.num_coordinates))
         q[:, 0], v[:, 0] = plan.q0, plan.v0
-        for k in tqdm(range(len(t)), f"recording {self.name}", unit="step", disable=None):
-            u[:, k] = np.clip(plan.torque(k, q[:, k], v[:, k]), -arm.u_max, arm.u_max)
-            if k + 1 < len(t):
-                for i in range(len(q)):
-                    arm.set_state(q[i, k], v[i, k])
-                    q[i, k + 1], v[i, k + 1] = arm.step(u[i, k], self.step)
+        with Progress(f"recording {self.name}", len(t), "steps") as lines:
+            for k in range(len(t)):
+                lines.update(k)
+                u[:, k] = np.clip(plan.torque(k, q[:, k], v[:, k]), -arm.u_max, arm.u_max)
+                if k + 1 < len(t):
+                    for i in range(len(q)):
+                        arm.set_state(q[i, k], v[i, k])
+                        q[i, k + 1], v[i, k + 1] = arm.step(u[i, k], self.step)
         return motions
 
     def _inside(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:

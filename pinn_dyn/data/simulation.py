@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from scipy.integrate import DOP853
 from torch import Tensor
-from tqdm import tqdm
 
 from pinn_dyn.data.excitation import Signal
 from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def simulate(
         rtol, atol: tolerances of the solver.
         compile: compile the equation of motion first, if there is a C++ compiler.
         q_limits: limits of q, ``(2, N)``; samples of a motion that has left them are NaN.
-        progress: label of a progress bar; no bar if None.
+        progress: name of the task in lines of progress; None logs none.
 
     Returns:
         q and v, both ``(K, T, N)``.
@@ -107,12 +107,7 @@ def simulate(
     states[:, 0] = x0
     filled = 1
     solver = DOP853(derivative, t[0], x0.ravel(), t[-1], rtol=rtol, atol=atol)
-    with tqdm(
-        total=float(t[-1] - t[0]),
-        desc=progress,
-        disable=progress is None or None,  # None: unless on a terminal
-        bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}<{remaining}]",
-    ) as bar:
+    with Progress(progress, float(t[-1] - t[0]), "s") as lines:
         while solver.status == "running" and not left.all():
             solver.step()
             # The very last step may be short: it ends where the time does.
@@ -127,5 +122,5 @@ def simulate(
                 filled = until
             left |= outside(solver.y.reshape(count, size))
             solver.f[np.repeat(left, size)] = 0.0  # the slope that the next step begins with
-            bar.update(float(solver.t - solver.t_old))
+            lines.update(float(solver.t - t[0]))
     return states[..., :half], states[..., half:]

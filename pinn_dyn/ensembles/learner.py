@@ -41,9 +41,8 @@ class EnsembleLearner(DynamicsLearner):
             return CompiledMembers(self.loss, stack, vector)
         return Eager(self.loss, stack, vector)
 
-    def log_losses(self, losses: Tensor) -> None:
-        super().log_losses(losses)
-        self.log("train/loss_spread", losses.std(), on_step=False, on_epoch=True, batch_size=1)
+    def loss_figures(self, losses: Tensor) -> dict[str, Tensor]:
+        return {**super().loss_figures(losses), "train/loss_spread": losses.std()}
 
     def built_optimizer(self, vector: ParameterVector) -> Optimizer:
         optimizer = super().built_optimizer(vector)

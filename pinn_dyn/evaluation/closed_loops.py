@@ -132,7 +132,7 @@ def close_loops(
         sensor: noise of the measurement.
         delay: dead time of the input, control instants.
         settle_fraction, settled_after: see :func:`closed_loop_metrics`.
-        progress: show a progress bar on a terminal.
+        progress: log lines of progress.
 
     Raises:
         ValueError: if the reference leaves the limits or the domain of the robot, or a law in

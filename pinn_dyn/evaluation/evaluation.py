@@ -10,7 +10,6 @@ from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.data.whole import write_whole
@@ -36,6 +35,7 @@ from pinn_dyn.evaluation.tables import (
 )
 from pinn_dyn.evaluation.torque import part_shares, residual_share, torque_error
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Sum, Trajectory, samples_of, stack_until
+from pinn_dyn.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -194,6 +194,7 @@ def evaluate_models(
     stride: int,
     windows: Sequence[float],
     thresholds: Mapping[str, float],
+    progress: Progress,
 ) -> Evaluation:
     """Roll out models and baselines along the test trajectories and compare them with the truth.
 
@@ -205,14 +206,17 @@ def evaluate_models(
         stride: samples between two times of comparison, the same for all rows.
         windows: times between two resets to the measured state, s, one windowed error each.
         thresholds: names and values of the valid prediction times, in the units of q.
+        progress: counter of the evaluated models.
     """
     rows: list[dict[str, Any]] = []
     torque, parts = [pd.DataFrame()], [pd.DataFrame()]
     predictions: dict[str, Prediction] = {}
     intervals: dict[str, dict[float, Calibration]] = {}
-    for index, entry in enumerate(tqdm([*entries, *baselines], desc="evaluating", disable=None)):
+    progress.total = len(entries) + len(baselines)
+    for index, entry in enumerate([*entries, *baselines]):
         model, run = entry.model, entry.run
-        row = {"run": run, "model": entry.name, "seed": entry.seed}
+        progress.update(index, f", now {run}")
+        row: dict[str, Any] = {"run": run, "model": entry.name, "seed": entry.seed}
         row |= {"baseline": index >= len(entries), **entry.figures, "step": entry.step}
         item = predictions[run] = _predict(entry, truth, stride)
         row |= rollout_metrics(item.q_hat, item.q, item.t, thresholds=thresholds).to_dict()

@@ -30,7 +30,8 @@ from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
 warnings.filterwarnings("ignore", ".*`dataloader_iter` (argument|step flavor)")
 
 BLOCK_SECONDS = 0.5
-"""Longest time between updates of the progress bar."""
+"""Longest time between two calls of the callbacks, s."""
+_LATEST = 50  # steps that the loss in lines of progress is averaged over
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
 """Function from a model and true trajectories ``(K, T, N)`` to named metrics."""
@@ -121,9 +122,14 @@ class DynamicsLearner(L.LightningModule):
             loop._batches_that_stepped += done - 1
             if self.device.type == "cuda" and (new := self._losses[count:]):
                 self._refuse_non_finite(torch.stack(new), step)
+        period = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if period and self.global_step % period == 0:
+            losses = torch.stack(self._losses[-period:]).mean(0)
+            figures = {name: float(x) for name, x in self.loss_figures(losses).items()}
+            for logger in trainer.loggers:
+                logger.log_metrics(figures, self.global_step - 1)
         if before + done >= trainer.num_training_batches:
             self.log_losses(torch.stack(self._losses).mean(0))
-            self._losses.clear()
 
     def _steps_until_due(self, before: int) -> int:
         """Return the number of steps until Lightning may have something to do."""
@@ -168,10 +174,19 @@ class DynamicsLearner(L.LightningModule):
                 )
 
     def log_losses(self, losses: Tensor) -> None:
-        """Log the mean loss, once per epoch, since a call takes as long as a small step."""
-        # With several processes this is the mean over those that share a batch.
+        """Record the mean loss of an epoch, over the processes that share a batch."""
         options: dict[str, Any] = {"on_step": False, "on_epoch": True, "sync_dist": True}
-        self.log("train/loss", losses.mean(), prog_bar=True, batch_size=1, **options)
+        self.log_dict(self.loss_figures(losses), logger=False, batch_size=1, **options)
+
+    def loss_figures(self, losses: Tensor) -> dict[str, Tensor]:
+        """Return named figures of losses, ``()`` or one for each member of an ensemble."""
+        return {"train/loss": losses.mean()}
+
+    @property
+    def latest_loss(self) -> float:
+        """Mean loss of the latest steps of this epoch, 50 at most; NaN before the first."""
+        losses = self._losses[-_LATEST:]
+        return float(torch.stack(losses).mean()) if losses else math.nan
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
         """Roll out all validation trajectories."""
@@ -179,8 +194,6 @@ class DynamicsLearner(L.LightningModule):
         named = {f"val/{key}": value for key, value in figures.items()}
         named |= {f"model/{key}": value for key, value in self.model.learned_figures().items()}
         self.log_dict(named, batch_size=1, sync_dist=True)
-        error = figures["error_mean"]
-        self.log("error", error, prog_bar=True, logger=False, batch_size=1, sync_dist=True)
 
     def on_validation_model_zero_grad(self) -> None:
         """Keep the gradients, which are views of one vector."""

@@ -1,23 +1,81 @@
-"""Progress without a terminal: a line per epoch, nothing that is drawn over."""
+"""Lines of progress: at least every ten seconds, in the log or on stderr, whatever takes the time."""
 
-import re
+import logging
+import time
 
-from tests.app.entry import NO_FIGURES, train
+import pandas as pd
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-LENGTH = ["trainer.steps=6", "trainer.validations=3", "trainer.enable_progress_bar=true"]
-
-
-def test_a_training_says_a_line_per_epoch(tmp_path, capsys):
-    train(tmp_path / "run", "model=lnn", *LENGTH, NO_FIGURES)
-    captured = capsys.readouterr()
-    assert "\r" not in captured.out + captured.err
-    lines = re.findall(r"epoch (\d) of 3, step (\d): training loss \S+, (.*)", captured.out)
-    assert [(epoch, step) for epoch, step, _ in lines] == [("1", "2"), ("2", "4"), ("3", "6")]
-    assert all(re.fullmatch(r"validation error \d\S*", rest) for *_, rest in lines)
+import pinn_dyn
+from pinn_dyn.progress import Progress
+from tests.app.entry import NO_FIGURES, ROOT, train
 
 
-def test_epochs_between_validations_have_lines_too(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pinn_dyn.app.trainer.LONGEST_EPOCH", 1)
-    train(tmp_path / "run", "model=lnn", "trainer.steps=2", NO_FIGURES)
-    lines = re.findall(r"epoch \d of 2, step \d: (.*)", capsys.readouterr().out)
-    assert ["validation" in line for line in lines] == [False, True]
+@pytest.fixture
+def quick(monkeypatch):
+    """A line every 20 ms instead of every ten seconds."""
+    monkeypatch.setattr("pinn_dyn.progress.FIRST", 0.02)
+    monkeypatch.setattr("pinn_dyn.progress.INTERVAL", 0.02)
+
+
+def test_lines_arrive_without_updates_and_end_with_the_task(quick, caplog):
+    caplog.set_level(logging.INFO)
+    with Progress("work", 10, "parts") as progress:
+        progress.update(1)
+        time.sleep(0.1)
+        progress.update(5, ", loss 0.5")
+        time.sleep(0.1)
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines[0] == "work: 1 of 10 parts"
+    assert lines[-1].startswith("work: 5 of 10 parts, loss 0.5, ")
+    assert lines[-1].endswith("s left")
+    time.sleep(0.05)
+    assert len(caplog.records) == len(lines)
+
+
+def test_the_remaining_time_excludes_what_came_before_the_first_step(monkeypatch):
+    monkeypatch.setattr("time.monotonic", iter([100.0, 110.0, 110.0]).__next__)
+    progress = Progress("work", 500, "steps")
+    progress.update(100)  # after a compilation, or resumed
+    progress.update(200)
+    assert str(progress) == "work: 200 of 500 steps, 30 s left"
+
+
+def test_a_training_and_its_evaluation_log_their_progress(quick, tmp_path, capsys, caplog):
+    run = train(
+        tmp_path / "run",
+        *("model=lnn", "trainer.steps=100", "trainer.enable_progress_bar=true", NO_FIGURES),
+    )
+    text = (run / "train.log").read_text()
+    shown = capsys.readouterr().out
+    for part in ("training soft_arm_1/lnn seed 0: ", " of 100 steps, loss ", " s left"):
+        assert part in text
+        assert part in shown
+    caplog.set_level(logging.INFO)
+    pinn_dyn.evaluate(pinn_dyn.load(run))
+    assert "evaluation: 0 of 5 models, now " in caplog.text
+
+
+def test_a_log_of_a_short_training_has_fifty_losses(tmp_path):
+    run = train(tmp_path / "run", "trainer.steps=100", NO_FIGURES)
+    log = EventAccumulator(str(run / "tensorboard"))
+    log.Reload()
+    losses = log.Scalars("train/loss")
+    assert [item.step for item in losses] == list(range(1, 100, 2))
+    assert len({item.value for item in losses}) == 50
+
+
+def test_a_program_without_handlers_gets_the_lines_on_stderr(quick, monkeypatch, capsys):
+    monkeypatch.setattr(logging.Logger, "hasHandlers", lambda _: False)
+    log = pd.read_csv(ROOT / "examples" / "example_log.csv")
+    pinn_dyn.fit(
+        log[log.run.isin(log.run.unique()[:5])],
+        q={"columns": ["bend_x", "bend_y", "stretch"], "unit": ["deg", "deg", "mm"]},
+        u={"columns": ["torque_x", "torque_y", "force"], "unit": ["Nm", "Nm", "N"]},
+        run="run",
+        steps=20,
+        validations=1,
+        compile=False,
+    )
+    assert "training frame/lnn seed 0: " in capsys.readouterr().err

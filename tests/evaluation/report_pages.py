@@ -20,6 +20,7 @@ from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.prediction_page import prediction_report
 from pinn_dyn.mechanics import Predictor, Signal, Trajectory
+from pinn_dyn.progress import Progress
 
 ODD = "<img src=x onerror=alert(1)></script> & 'co'"
 LABELS = ["Δx [rad]", "Δy [rad]", "δℓ [m]"]
@@ -129,6 +130,7 @@ def evaluation(names=("hnn", "lnn"), source=Source):
         stride=1,
         windows=[0.5],
         thresholds={"large": 0.1},
+        progress=Progress(None, 0, "models"),
     )
     item.origin = origin(names)
     return item
