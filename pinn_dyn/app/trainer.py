@@ -137,11 +137,13 @@ class _ProgressLines(L.Callback):
     progress = Progress(None, 0, "steps")
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Start the lines, in the first process."""
+        """Start the lines, in the first process of several."""
         config = pl_module.hparams["config"]
         task = f"training {config['name']} seed {config['seed']}"
-        self._steps = config["trainer"]["steps"]
-        self.progress = Progress(task if trainer.is_global_zero else None, self._steps, "steps")
+        steps = config["trainer"]["steps"]
+        # A least-squares fit is a single step, and logs its evaluations itself.
+        silent = isinstance(pl_module, LeastSquaresLearner) or not trainer.is_global_zero
+        self.progress = Progress(None if silent else task, steps, "steps")
         self.progress.__enter__()
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:

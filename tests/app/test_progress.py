@@ -1,4 +1,4 @@
-"""Lines of progress: at least every ten seconds, in the log or on stderr, whatever takes the time."""
+"""Lines of progress: every ten seconds, in the log or on stderr, whatever takes the time."""
 
 import logging
 import time
