@@ -6,6 +6,7 @@ The plant is the simulated arm that the example log is of; on a robot, your own 
 """
 
 import argparse
+import sys
 
 import torch
 
@@ -15,14 +16,16 @@ from pinn_dyn.control import Regulation, SetPoint, SystemPlant, close_loop
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("run", help="a run folder, of a one-segment soft arm")
 parser.add_argument("--duration", type=float, default=2.0, help="s")
+parser.add_argument("--gains", type=float, nargs=2, default=[2.0, 0.4], help="K_P and K_D")
 args = parser.parse_args()
 
 # u = A^+(q) G(q) + A(q)^T (K_P (q_ref - q) - K_D v)
-law = Regulation(pinn_dyn.load(args.run).system, position_gain=2.0, velocity_gain=0.2)
+law = Regulation(pinn_dyn.load(args.run).system, *args.gains)
+q_ref = torch.tensor([0.4, -0.3, 0.35])
 record = close_loop(
     SystemPlant(pinn_dyn.SoftArm(segments=1).double()),
     law,
-    SetPoint([0.4, -0.3, 0.35]),
+    SetPoint(q_ref),
     q0=torch.tensor([[0.0, 0.0, 0.3]], dtype=torch.float64),
     v0=torch.zeros(1, 3, dtype=torch.float64),
     duration=args.duration,
@@ -30,4 +33,6 @@ record = close_loop(
 )
 for k in range(0, len(record.t), len(record.t) // 5):
     print(f"t = {record.t[k]:.2f} s   q = {record.q[0, k].numpy().round(4)}")
-print("stopped:", record.stopped[0] or "no")
+if record.stopped[0]:
+    sys.exit(f"{record.stopped[0]}: train on a log that moves all inputs, or reduce the gains")
+print("final error:", (record.q[0, -1] - q_ref).abs().numpy().round(4))

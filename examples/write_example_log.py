@@ -20,9 +20,10 @@ SETTLING = 1  # s of motion before the log starts
 
 def main(path: Path) -> None:
     rng = np.random.default_rng(SEED)
-    # Two bending torques in Nm, and an axial force in N that carries most of the weight.
+    # Two bending torques in Nm, and an axial force in N that carries most of the weight. All vary
+    # enough to tell A(q) u from G(q): with 0.05 N the model predicts, and its regulator diverges.
     inputs = MultiSine(
-        offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.05], frequency=[0.1, 1.0], harmonics=4
+        offset=[0.0, 0.0, -1.15], amplitude=[1.2, 1.2, 0.3], frequency=[0.1, 2.0], harmonics=4
     )
     starts = InitialStates(q_low=[-0.5, -0.5, 0.3], q_high=[0.5, 0.5, 0.4], v_max=[0.0, 0.0, 0.0])
     signal = inputs.draw(RUNS, SETTLING + SECONDS, rng)

@@ -27,7 +27,7 @@ from pinn_dyn.control import (
     export_law,
     term_conditions,
 )
-from pinn_dyn.data import DataSource
+from pinn_dyn.data import DataSource, SimulationError
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
@@ -38,7 +38,11 @@ _REGION_SAMPLES = 200  # states per trajectory that a region of training data is
 
 
 def control(cfg: DictConfig) -> float:
-    """Close the loop of each controller; return the RMS error of the first controller."""
+    """Close the loop of each controller; return the RMS error of the first controller.
+
+    Raises:
+        SimulationError: after all results are written, if a run of the first controller diverged.
+    """
     config = checked("control", cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
@@ -90,7 +94,14 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         for index, reason in enumerate(record.stopped):
             if reason:
                 log.warning("%s, run %d was stopped: %s", name, index, reason)
-    return write_results(result, source, learned, robot, reference, config, folder, origin)
+    error = write_results(result, source, learned, robot, reference, config, folder, origin)
+    first, record = next(iter(result.records.items()))
+    if reasons := [reason for reason in record.stopped if reason]:
+        raise SimulationError(
+            f"{first}: {len(reasons)} of {len(record.stopped)} runs were stopped: {reasons[0]}; "
+            "reduce the gains, raise the rate, or train on data that move all inputs"
+        )
+    return error
 
 
 def _without_robot(

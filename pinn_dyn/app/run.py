@@ -245,9 +245,16 @@ class Run:
         return TermArrays(*(x.numpy() for x in self.system.terms(self._coordinates("q", q))))
 
     def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
-        """Return tau = M a + C v + G + D v + F, ``(*batch, N)``."""
+        """Return tau = M a + C v + G + D v + F, generalized forces ``(*batch, N)``."""
+        return self.system.inverse_dynamics(*self._motion_state(q, v, a)).numpy()
+
+    def input_for(self, q: Values, v: Values, a: Values) -> np.ndarray:
+        """Return u with A(q) u = tau, see :meth:`MechanicalSystem.input_for`, ``(*batch, M)``."""
+        return self.system.input_for(*self._motion_state(q, v, a)).numpy()
+
+    def _motion_state(self, q: Values, v: Values, a: Values) -> tuple[Tensor, ...]:
         values = [self._coordinates(name, x) for name, x in (("q", q), ("v", v), ("a", a))]
-        return self.system.inverse_dynamics(*torch.broadcast_tensors(*values)).numpy()
+        return torch.broadcast_tensors(*values)
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
         """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.mechanics.arrays import matvec, require_last_dim
+from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times, require_last_dim
 
 Gain = float | Sequence[float] | Tensor
 """One positive number for all coordinates, or N of them."""
@@ -56,15 +56,7 @@ class ModelBasedLaw(Controller):
                 f"model is a {type(model).__name__}, expected a system with terms M, G and A, such "
                 "as model=lnn"
             )
-        for present, problem, remedy in (
-            (model.input_history, "a learned input delay", "~model/delay"),
-            (not model.input_affine, "a force not linear in the input", "model/input=network"),
-            (model.has_residual, "a residual force", "~model/residual"),
-        ):
-            if present:
-                raise ValueError(
-                    f"the model has {problem}, which a law cannot invert: train with {remedy}"
-                )
+        model.require_invertible_input()
         super().__init__(model.num_coordinates, model.num_inputs)
         self.position_gain = diagonal_gain("position_gain", position_gain, self.num_coordinates)
         self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)
@@ -176,25 +168,6 @@ class ComputedTorque(ModelBasedLaw):
     def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         a = reference.a + self._feedback(q, v, reference)
         return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a))
-
-
-def pseudo_inverse_times(A: Tensor, tau: Tensor) -> Tensor:
-    """Return A^+ tau, ``(*batch, M)``, for A ``(*batch, N, M)`` and tau ``(*batch, N)``.
-
-    A row of the batch where A lost its rank or is not finite gives infinities or NaN.
-    """
-    rows, columns = A.shape[-2:]
-    transposed = A.transpose(-1, -2)
-    b = tau.expand(A.shape[:-1]).unsqueeze(-1)
-    if rows == columns:
-        x = torch.linalg.solve_ex(A, b).result
-    elif rows < columns:
-        Q, R = torch.linalg.qr(transposed)
-        x = Q @ torch.linalg.solve_triangular(R.transpose(-1, -2), b, upper=False)
-    else:
-        Q, R = torch.linalg.qr(A)
-        x = torch.linalg.solve_triangular(R, Q.transpose(-1, -2) @ b, upper=True)
-    return x.squeeze(-1)
 
 
 def condition_number(A: Tensor) -> Tensor:

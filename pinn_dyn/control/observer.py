@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
 from pinn_dyn.control.effects import Actuator
-from pinn_dyn.control.laws import ModelBasedLaw, pseudo_inverse_times
-from pinn_dyn.mechanics.arrays import matvec
+from pinn_dyn.control.laws import ModelBasedLaw
+from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times
 
 
 class _Memory(NamedTuple):

@@ -33,6 +33,25 @@ def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
+def pseudo_inverse_times(A: Tensor, tau: Tensor) -> Tensor:
+    """Return A^+ tau, ``(*batch, M)``, for A ``(*batch, N, M)`` and tau ``(*batch, N)``.
+
+    A row of the batch where A lost its rank or is not finite gives infinities or NaN.
+    """
+    rows, columns = A.shape[-2:]
+    transposed = A.transpose(-1, -2)
+    b = tau.expand(A.shape[:-1]).unsqueeze(-1)
+    if rows == columns:
+        x = torch.linalg.solve_ex(A, b).result
+    elif rows < columns:
+        Q, R = torch.linalg.qr(transposed)
+        x = Q @ torch.linalg.solve_triangular(R.transpose(-1, -2), b, upper=False)
+    else:
+        Q, R = torch.linalg.qr(A)
+        x = torch.linalg.solve_triangular(R, Q.transpose(-1, -2) @ b, upper=True)
+    return x.squeeze(-1)
+
+
 def spd_solve(matrix: Tensor, vector: Tensor) -> Tensor:
     """Solve ``matrix x = vector`` for a symmetric positive definite matrix, or else return NaN."""
     return spd_solver(matrix)(vector)

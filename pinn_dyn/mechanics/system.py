@@ -9,7 +9,13 @@ from typing import NamedTuple, final
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics.arrays import matvec, require_last_dim, spd_solve, spd_solver
+from pinn_dyn.mechanics.arrays import (
+    matvec,
+    pseudo_inverse_times,
+    require_last_dim,
+    spd_solve,
+    spd_solver,
+)
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 
 
@@ -171,6 +177,40 @@ class MechanicalSystem(ContinuousPredictor):
         self._check(q=q, v=v, a=a)
         conservative = self._inertial_force(q, v, a) + self._potential_force(q)
         return conservative + self.dissipative_force(q, v)
+
+    @final
+    def input_for(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """Return u = A(q)^+ tau with tau = :meth:`inverse_dynamics`, ``(*batch, M)``.
+
+        - M = N: A u = tau.
+        - M > N, over-actuated: the u of least norm with A u = tau.
+        - M < N, under-actuated: the u of least ``|A u - tau|``. The acceleration is ``a`` only if
+          tau lies in the range of A.
+
+        Entries are infinite or NaN where A loses its rank.
+
+        Raises:
+            ValueError: on shapes, or a model that :meth:`require_invertible_input` refuses.
+        """
+        self.require_invertible_input()
+        return pseudo_inverse_times(self.input_matrix(q), self.inverse_dynamics(q, v, a))
+
+    @final
+    def require_invertible_input(self) -> None:
+        """Check that the force is A(q) u at the same time, so that A^+ gives u.
+
+        Raises:
+            ValueError: on a delayed input, a force that is not linear in the input, or a residual.
+        """
+        for present, problem, remedy in (
+            (self.input_history, "a learned input delay", "~model/delay"),
+            (not self.input_affine, "a force not linear in the input", "model/input=network"),
+            (self.has_residual, "a residual force", "~model/residual"),
+        ):
+            if present:
+                raise ValueError(
+                    f"the model has {problem}, which A(q) cannot invert: train with {remedy}"
+                )
 
     @final
     def momentum(self, q: Tensor, v: Tensor) -> Tensor:

@@ -92,7 +92,9 @@ def test_limits_noise_delay_and_another_mass_reach_the_loop(tmp_path, results, l
 def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, lnn_run):
     words = ["gains.position=1e5", "gains.velocity=1e3", "rate=100", "duration=0.4", "runs=1"]
     words += ["settled_after=0.2", "~controllers.truth", "~controllers.pd"]
-    folder = control(tmp_path / "out", lnn_run, *words)
+    folder = tmp_path / "out"
+    with pytest.raises(SystemExit, match=r"learned: 1 of 1 runs were stopped.*the plant diverged"):
+        control(folder, lnn_run, *words)
     assert pd.read_csv(folder / "summary.csv").set_index("controller").loc["learned", "stopped"]
     assert (folder / "closed_loop.png").is_file()
     assert "the plant diverged" in (folder / "report.html").read_text()

@@ -13,8 +13,8 @@ from pinn_dyn.control.laws import (
     ProportionalDerivative,
     Regulation,
     Tracking,
-    pseudo_inverse_times,
 )
+from pinn_dyn.mechanics.arrays import pseudo_inverse_times
 from pinn_dyn.models import NetworkCholesky, Positive
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import ControllerContract, LinearSystem, assert_near

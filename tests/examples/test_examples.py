@@ -67,8 +67,24 @@ def test_torque_feedforward(own_log):
     assert max(map(float, distances)) < 0.1
 
 
-def test_regulator_in_a_loop(own_log):
-    assert "t = 0.00 s   q = [0.  0.  0.3]" in run("regulator_in_a_loop.py", RUN, "--duration=0.05")
+def test_a_regulator_that_diverges_ends_with_an_error(own_log):
+    with pytest.raises(SystemExit, match=r"diverged.* at t = .*: train on a log that moves all"):
+        run("regulator_in_a_loop.py", RUN, "--duration=0.5", "--gains", "1e5", "1e3")
+
+
+@pytest.mark.slow  # a whole training
+def test_the_example_log_determines_a_model_that_controls(home):
+    """The regulator of a training with the defaults of the example holds its set point."""
+    folder = home / "whole_log"  # own_log.py reads the log beside it
+    folder.mkdir()
+    for name in ("own_log.py", "example_log.csv"):
+        shutil.copy(EXAMPLES / name, folder)
+    run(str(folder / "own_log.py"), "--folder", "runs/whole")
+    for gains in (["2", "0.4"], ["5", "0.4"]):
+        text = run("regulator_in_a_loop.py", "runs/whole", "--duration=3", "--gains", *gains)
+        errors = re.search(r"final error: \[(.*)\]", text)[1].split()
+        assert max(map(float, errors)) < 0.01  # of steps of 0.4 and 0.3 rad
+    assert "largest distance" in run("torque_feedforward.py", "runs/whole")
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
 """What the base class promises beyond the contract suite."""
 
+import numpy as np
+import pytest
 import torch
 
-from pinn_dyn.testing import damped_oscillators
+from pinn_dyn.testing import LinearSystem, damped_oscillators
 from tests.support.cart_pole import CartPole
 
 
@@ -29,3 +31,30 @@ def test_forward_dynamics_matches_the_cart_poles_textbook_equations():
     on_bob = bob * rod * cos * ax + bob * rod**2 * turn + bob * g * rod * sin + 0.05 * v[1]
     torch.testing.assert_close(on_cart, push, rtol=1e-12, atol=0)
     torch.testing.assert_close(on_bob, torch.zeros_like(on_bob), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("n", "m"), [(2, 2), (2, 4), (3, 1)])
+def test_input_for_is_the_least_squares_solution_of_numpy(n, m):
+    """Square and over-actuated: exact, of least norm. Under-actuated: least residual."""
+    random = np.random.default_rng(n * m)
+    mass, stiffness, damping = (np.diag(random.uniform(1, 2, n)) for _ in range(3))
+    A, (q, v, a) = random.normal(size=(n, m)), random.normal(size=(3, 2, 5, n))
+    system = LinearSystem(mass, stiffness, damping, A)
+    with torch.no_grad():
+        u = system.input_for(*map(torch.from_numpy, (q, v, a)))
+        u_of_tau = system.forward_dynamics(*map(torch.from_numpy, (q, v)), u).numpy()
+    tau = a @ mass + v @ damping + q @ stiffness
+    expected, *_ = np.linalg.lstsq(A, tau.reshape(-1, n).T, rcond=None)
+    np.testing.assert_allclose(u.numpy(), expected.T.reshape(2, 5, m), atol=1e-12)
+    residual = np.linalg.norm(u.numpy() @ A.T - tau, axis=-1)
+    assert (residual < 1e-12).all() if m >= n else (residual > 0.1).any()
+    assert m < n or np.allclose(u_of_tau, a)  # the robot moves as planned
+
+
+def test_input_for_refuses_forces_that_it_cannot_invert():
+    class WithResidual(LinearSystem):
+        has_residual = True
+
+    eye, x = torch.eye(1), torch.zeros(1)
+    with pytest.raises(ValueError, match=r"residual force.*train with ~model/residual"):
+        WithResidual(eye, eye, eye, eye).input_for(x, x, x)
