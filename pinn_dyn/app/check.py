@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -34,5 +35,16 @@ def check(cfg: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     write_config(folder, config)
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
+    if report.options:
+        print(f"a training with dry friction: {_training(report.options)}")
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
+
+
+def _training(options: list[str]) -> str:
+    """Return the command that trains a Lagrangian network on this data set, for a shell."""
+    words = shlex.split(command_line().replace("check", "train", 1))
+    words = [x for x in words if not x.startswith(("hydra.", "longest_delay=", "model"))]
+    if not any(x.startswith("dataset=") for x in words):
+        words.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
+    return shlex.join([*words, "model=lnn", "data=multi_step", *options])

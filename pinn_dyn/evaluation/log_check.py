@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,6 +14,7 @@ import torch
 from pydantic import PositiveFloat
 
 from pinn_dyn.data import logs
+from pinn_dyn.data.logs.delay import INTERVAL
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import log_numbers as numbers
@@ -42,7 +44,8 @@ class LogCheck:
         measurements: the measurements, each with its verdict.
         runs, coordinates, inputs: tables of stretches, coordinates and inputs.
         delays: delay curve of each input.
-        steps: lines for the YAML of the data set: filter cutoff and delay, if needed.
+        steps: entries for ``steps`` of the data set in YAML: filter cutoff and delay, if needed.
+        options: options of a training: a head for dry friction, if needed.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
     """
 
@@ -53,6 +56,7 @@ class LogCheck:
     inputs: pd.DataFrame
     delays: list[logs.DelayCurve]
     steps: list[str]
+    options: list[str]
     rigid: RigidExcitation | None = None
 
     @property
@@ -64,6 +68,12 @@ class LogCheck:
     def warnings(self) -> list[str]:
         """Texts of the warnings."""
         return [x.text for x in self.measurements if x.verdict == "warning"]
+
+    @property
+    def block(self) -> str:
+        """Entries for the YAML of the data set; without ``steps:`` if the data set has steps."""
+        head = [] if self.source.steps else ["steps:"]
+        return "\n".join([*head, *(f"  {line}" for line in self.steps)])
 
     def table(self) -> pd.DataFrame:
         """Return one row per measurement, stops and warnings first."""
@@ -91,7 +101,10 @@ class LogCheck:
         bad = [x for x in self.measurements if x.verdict != "ok"]
         lines += [f"\n{x.verdict}: {x.text} ({x.section})" for x in bad]
         if self.steps:
-            lines += ["", "steps:", *(f"  {line}" for line in self.steps)]
+            place = "steps" if self.source.steps else "the data set"
+            lines += ["", f"Append to {place}:", "", self.block]
+        if self.options:
+            lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
         verdict = "no sense" if self.problems else "sense"
         return "\n".join([*lines, "", f"Verdict: a training makes {verdict}"])
 
@@ -135,14 +148,14 @@ def check(
     highest = numbers.bandwidth(training, step, noise)
     explained = numbers.explained_share(training, delays, step)
     measurements = [*source.measurements, *_measured(coordinates, explained)]
-    for name, curve in zip(source.u.columns, delays, strict=True):
+    clear = logs.clear_delays(delays, step)
+    for name, curve, late in zip(source.u.columns, delays, clear, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (
-            f"input {name!r} acts {delay:.0f} ms after it is logged: add the InputDelay step below "
-            "or learn the delay with the model (model/delay=learned)"
+            f"input {name!r} acts {1e3 * late:.3g} ms after it is logged: add the "
+            "InputDelay step below or learn the delay with the model (model/delay=learned)"
         )
-        bad = delay > 750 * step
-        measurements.append(_judged("delay [ms]", name, delay, "below a sample", bad, text))
+        measurements.append(_judged("delay [ms]", name, delay, "no clear delay", late > 0, text))
     excitation = None
     if structure is not None:
         longest = max(item.duration for item in splits.train)
@@ -164,7 +177,8 @@ def check(
         "min": u.min(axis=0),
         "max": u.max(axis=0),
         "delay [ms]": [np.nan if x.delay is None else 1e3 * x.delay for x in delays],
-        "spread [ms]": [np.nan if x.delay is None else 1e3 * x.spread for x in delays],
+        "± [ms]": [np.nan if x.delay is None else 1e3 * INTERVAL * x.spread for x in delays],
+        "dry friction": [x.friction for x in delays],
         "method": [x.reason or x.form for x in delays],
     }
     return LogCheck(
@@ -174,7 +188,8 @@ def check(
         coordinates,
         pd.DataFrame(table),
         delays,
-        [*_filter(source, training, step, noise, highest), *_delay(delays, step)],
+        [*_filter(source, training, step, noise, highest), *_delay(source, clear, step)],
+        ["model/friction=coulomb"] if any(x.dry for x in delays) else [],
         excitation,
     )
 
@@ -247,14 +262,22 @@ def _filter(
     filtered = any(isinstance(x, filters) for x in source.steps.values())
     if filtered or share < _NOISE or not cutoff < 0.4 / step:
         return []
+    key = _key(source, "filter")
     return [
-        f"filter: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
+        f"{key}: {{_target_: pinn_dyn.data.logs.Butterworth, cutoff: {cutoff:g}}} # noise is "
         f"{100 * share:.2g} % of the steps of q, and the motion ends at {highest:.2g} Hz"
     ]
 
 
-def _delay(delays: Sequence[logs.DelayCurve], step: float) -> list[str]:
-    shifts = [round(round((curve.delay or 0.0) / step) * step, 6) for curve in delays]
+def _delay(source: logs.LogSource, delays: Sequence[float], step: float) -> list[str]:
+    shifts = [round(round(delay / step) * step, 9) for delay in delays]
     value = shifts[0] if len(set(shifts)) == 1 else shifts
-    text = f"delay: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"
+    key = _key(source, "delay")
+    text = f"{key}: {{_target_: pinn_dyn.data.logs.InputDelay, delay: {value}}} # s"
     return [text] if any(shifts) else []
+
+
+def _key(source: logs.LogSource, name: str) -> str:
+    """Return a name for a step that no step of the data set has."""
+    names = itertools.chain([name], (f"{name}_{k}" for k in itertools.count(2)))
+    return next(key for key in names if key not in source.steps)

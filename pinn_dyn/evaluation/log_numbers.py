@@ -9,13 +9,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import welch
 
 from pinn_dyn.data.logs import DelayCurve, Recording
+from pinn_dyn.data.logs.delay_regression import white_noise as white_noise
 
 _SMOOTH = 0.03  # width of the kernel before a derivative, s
-
-
-def white_noise(x: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of white noise on smooth motions, from third differences."""
-    return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
 
 
 def explained_share(

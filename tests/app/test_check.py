@@ -1,10 +1,15 @@
 """check.py: a verdict on a log, its page, and an error where a training makes no sense."""
 
+import re
+import shlex
+
 import numpy as np
 import pandas as pd
 
+from pinn_dyn import load
+from pinn_dyn.models import CoulombFriction
 from tests.app.entry import ROOT, fails, run_script
-from tests.support.delayed_robots import log
+from tests.support.delayed_robots import log, resting
 
 COLUMNS = [
     "dataset.q.columns=[q1,q2]",
@@ -41,6 +46,27 @@ def test_a_log_gets_a_verdict_a_page_and_a_step_to_copy(tmp_path, capsys):
     assert "Inputs and their delays" in page
     assert "delay: 0.05" in page
     assert page.count("<img") == 2
+
+
+def test_the_printed_training_has_the_friction_of_the_log(tmp_path, capsys):
+    item = resting(0.3)
+    table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
+    table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
+    pd.DataFrame(table).to_csv(tmp_path / "joints.csv", index=False)
+    words = ["dataset=csv_log", f"dataset.root='{tmp_path}'", "dataset.files=joints.csv", *COLUMNS]
+    run_script("check.py", *words, f"hydra.run.dir={tmp_path / 'out'}")
+    (command,) = re.findall(r"dry friction: python (.*)", capsys.readouterr().out)
+    script, *words = shlex.split(command)
+    small = ["trainer.steps=1", "trainer.validations=1", "data.pairs=64", "data.batch_size=64"]
+    run_script(
+        script,
+        *words,
+        *small,
+        "compile=false",
+        "validator.horizon=0.1",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )
+    assert isinstance(load(tmp_path / "run").model.friction, CoulombFriction)
 
 
 def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):

@@ -3,12 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data.logs import Butterworth, LogSource, Recording
 from pinn_dyn.evaluation.log_check import check
 from pinn_dyn.evaluation.log_numbers import bandwidth, white_noise
+from tests.support.delayed_robots import resting
 
 RATE = 100.0
 
@@ -74,6 +76,33 @@ def test_a_delay_is_measured_warned_of_and_given_as_a_step():
     assert verdicts(result)["delay [ms]", "u1"] == "warning"
     (line,) = result.steps
     assert line.startswith("delay: {_target_: pinn_dyn.data.logs.InputDelay, delay: 0.05}")
+
+
+@pytest.mark.parametrize("late", [0, 3])
+@pytest.mark.parametrize("dry", [0.0, 0.3])
+def test_joints_that_rest_in_turn_get_their_friction_and_no_false_delay(dry, late):
+    item = resting(dry, late=late)
+    columns = {"t": item.t} | {f"q{k + 1}": item.q[:, k] for k in range(2)}
+    columns |= {f"u{k + 1}": item.u[:, k] for k in range(2)}
+    result = checked(pd.DataFrame(columns))
+    # A held torque acts half a sample of 5 ms later.
+    lines = [x for x in result.steps if "InputDelay" in x]
+    assert len(lines) == (late > 0)
+    assert all("delay: 0.015}" in x or "delay: 0.02}" in x for x in lines)
+    assert result.options == (["model/friction=coulomb"] if dry else [])
+    shares = result.inputs["dry friction"].to_numpy()
+    assert shares == pytest.approx(dry / item.u.std(axis=0), abs=0.03)
+
+
+def test_the_block_to_copy_extends_the_steps_of_the_data_set():
+    frame = driven(delay=0.05, noise=1e-5)
+    for steps in ({}, {"delay": Butterworth(20.0)}):
+        result = checked(frame, steps=steps)
+        text = "name: masses\n" + ("steps:\n  delay: {cutoff: 20.0}\n" if steps else "")
+        entries = yaml.safe_load(text + result.block)["steps"]
+        (added,) = [x for x in entries.values() if "_target_" in x]
+        assert added == {"_target_": "pinn_dyn.data.logs.InputDelay", "delay": 0.05}
+        assert len(entries) == len(steps) + 1
 
 
 def test_noise_is_measured_and_gives_a_filter_above_the_motion():

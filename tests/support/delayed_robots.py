@@ -105,3 +105,33 @@ def log(kind, seed, delay, *, seconds=12.0, rate=100.0, noise=1e-3, highest=2.0,
         x = solve_ivp(rate_of_change, (0, t[-1]), np.zeros(2), t_eval=t, rtol=1e-6, atol=1e-8)
         q, u = x.y.T[:, :n], signal(t)
     return Recording("run", t, q + noise * np.ptp(q, axis=0) * rng.normal(size=q.shape), None, u)
+
+
+def resting(dry, *, seconds=60.0, rate=200.0, late=0, seed=0):
+    """Two damped joints under gravity that move in turn, with held torques of a controller.
+
+    Dry friction of ``dry`` Nm stops a joint, and holds it. The torque is logged ``late`` samples
+    before it acts.
+    """
+    rng = np.random.default_rng(seed)
+    inertia, weight, sub = np.array([0.3, 0.1]), np.array([3.0, 0.8]), 5
+    h, n = 1 / (rate * sub), round(seconds * rate)
+    # Minimum-jerk motions of 0.6 s, then a rest of 0.6 s, of one joint after the other.
+    s = np.arange(n) / rate / 1.2
+    goals = np.repeat(rng.uniform(-1.2, 1.2, (int(s[-1]) // 2 + 3, 2)), 2, axis=0)
+    goals = np.stack([goals[:-1, 0], goals[1:, 1]], axis=1)
+    part = np.minimum(2 * (s % 1), 1)[:, None]
+    blend = 10 * part**3 - 15 * part**4 + 6 * part**5
+    reference = goals[s.astype(int)] + (goals[s.astype(int) + 1] - goals[s.astype(int)]) * blend
+    q, v, motion, torque = np.zeros(2), np.zeros(2), [], []
+    for target, target_v in zip(reference, np.gradient(reference, 1 / rate, axis=0), strict=True):
+        u = inertia * (400 * (target - q) + 40 * (target_v - v)) + weight * np.sin(q)
+        motion.append(q)
+        torque.append(u)
+        for _ in range(sub):
+            free = v + h * (u - weight * np.sin(q) - 0.1 * v) / inertia
+            v = np.sign(free) * np.maximum(np.abs(free) - h * dry / inertia, 0.0)
+            q = q + h * v
+    q, u = np.array(motion), np.array(torque)
+    q = q + 2e-5 * rng.normal(size=q.shape)
+    return Recording("run", np.arange(n - late) / rate, q[: n - late], None, u[late:])

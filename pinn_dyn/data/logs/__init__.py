@@ -2,7 +2,7 @@
 
 from pinn_dyn.data.logs.clock import Deduplicate, InputDelay, Resample, SplitGaps
 from pinn_dyn.data.logs.columns import UNITS, Columns
-from pinn_dyn.data.logs.delay import DelayCurve, input_delays
+from pinn_dyn.data.logs.delay import DelayCurve, clear_delays, input_delays
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import (
     Butterworth,
@@ -43,6 +43,7 @@ __all__ = [
     "SplitGaps",
     "Step",
     "Table",
+    "clear_delays",
     "input_delays",
     "window_samples",
 ]

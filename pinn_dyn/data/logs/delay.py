@@ -25,7 +25,6 @@ from pinn_dyn.data.logs.delay_regression import (
     Smoothed,
     input_shares,
     motion_shares,
-    rigid_shares,
     terms,
 )
 from pinn_dyn.data.logs.recording import Recording
@@ -38,6 +37,9 @@ _UNEXPLAINED = 0.4  # largest residual
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
+INTERVAL = 2.26
+"""Half width of a 95 % interval in units of the jackknife's spread (Student, 9 degrees)."""
+_FRICTION = 0.025  # smallest dry friction as a share of the spread of the input
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,9 @@ class DelayCurve:
         candidates: d, ``(D,)``, s.
         residual: unexplained share of the variance at each d, ``(D,)``.
         delay: the d of the smallest residual, s; None if the data do not determine it.
-        spread: standard deviation of the estimate by the jackknife, s.
+        spread: standard deviation of the estimate by the jackknife and over kernels, s.
+        friction: dry friction over the spread of the input; NaN if it is not determined.
+        friction_spread: standard deviation of ``friction`` by the jackknife.
         form: equation of motion.
         reason: reason why there is no delay, "" otherwise.
     """
@@ -59,6 +63,13 @@ class DelayCurve:
     spread: float
     form: str
     reason: str = ""
+    friction: float = np.nan
+    friction_spread: float = np.nan
+
+    @property
+    def dry(self) -> bool:
+        """True if the joint clearly has dry friction."""
+        return self.friction > max(_FRICTION, 3 * self.friction_spread)
 
 
 def input_delays(
@@ -82,20 +93,21 @@ def input_delays(
     for width in sorted({max(width, 1.5 * step) for width in _WIDTHS}):
         data = Smoothed.average(recordings, step, width, lags)
         for form, shares in _shares(data, inputs, rigid).items() if data else ():
-            curves = [_curve(lags * step, x, form) for x in np.moveaxis(shares, -1, 0)]
+            parts = np.moveaxis(shares, -1, 0)
+            curves = [_curve(lags * step, share, force, form) for share, force in parts]
             forms.setdefault(form, []).append(curves * (inputs // len(curves)))
     if not forms:
         short = "the stretches are too short"
         return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
     best = {
-        form: [min(curves, key=_rank) for curves in zip(*trials, strict=True)]
+        form: [_best(curves) for curves in zip(*trials, strict=True)]
         for form, trials in forms.items()
     }
     bodies = best.pop(_RIGID, None)
     curves = min(best.values(), key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
-    if bodies is not None:  # its friction is simpler than in the other forms, so it comes last
+    if bodies is not None:
         curves = [
-            of_bodies if curve.reason not in ("", _AFTER) and not of_bodies.reason else curve
+            of_bodies if curve.reason and not of_bodies.reason else curve
             for curve, of_bodies in zip(curves, bodies, strict=True)
         ]
     reason = "the input is a single sine, whose delay looks like damping"
@@ -104,6 +116,36 @@ def input_delays(
         replace(curve, delay=None, reason=reason) if sine else curve
         for curve, sine in zip(curves, sines, strict=True)
     ]
+
+
+def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
+    """Return the delay of each input in s, or 0 where the data agree with no delay.
+
+    A delay is clear from one sample on, if its 95 % interval excludes half a sample: the hold of a
+    sampled input is no delay. Delays that agree within their intervals are one delay.
+    """
+    values = np.array([np.nan if x.delay is None else x.delay for x in curves])
+    if np.isnan(values).all():
+        return [0.0] * len(curves)
+    # The shape of the input between samples is worth a quarter of a sample.
+    widths = INTERVAL * np.hypot([x.spread for x in curves], step / 4)
+    usable = np.isfinite(values)
+    weights = usable / widths**2
+    mean = float(np.nansum(weights * values) / weights.sum())
+    if (np.abs(values - mean) <= widths)[usable].all():
+        logged_late = np.array([x.reason == _AFTER for x in curves])
+        values = np.where(logged_late, np.nan, mean)
+        widths = np.full(len(curves), widths[usable].min())
+    clear = (values >= step) & (values - widths > step / 2)
+    return np.where(clear, values, 0.0).tolist()
+
+
+def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
+    """Return the clearest curve; its spread includes kernels of other widths that are as clear."""
+    best = min(curves, key=_rank)
+    clear = [x for x in curves if x.spread <= 2 * best.spread]
+    width = np.std([_minimum(x.candidates, x.residual) for x in clear])
+    return replace(best, spread=float(np.hypot(best.spread, width)))
 
 
 def _rank(curve: DelayCurve) -> tuple[bool, float]:
@@ -117,19 +159,22 @@ def _is_sine(x: np.ndarray) -> bool:
 
 
 def _shares(data: Smoothed, inputs: int, rigid: Regressor | None) -> dict[str, np.ndarray]:
-    """Return the unexplained shares by form, ``(B + 1, D, M)``, or ``(B + 1, D, 1)`` of all."""
+    """Return unexplained shares and friction by form, ``(2, B + 1, D, M)``; of all inputs M = 1."""
     if inputs > data.q.shape[1]:
-        return {
+        shares = {
             "increments": motion_shares(terms(data, "increments"), data, data.v),
             "acceleration": motion_shares(terms(data, "acceleration"), data, data.a),
         }
-    shares = {_INVERSE: input_shares(terms(data, _INVERSE), data, slice(inputs))}
+        return {form: np.stack([x, np.full_like(x, np.nan)]) for form, x in shares.items()}
+    shares = {_INVERSE: input_shares(data, inputs)}
     if rigid is not None and inputs == data.q.shape[1]:
-        shares[_RIGID] = rigid_shares(data, rigid)
+        shares[_RIGID] = input_shares(data, inputs, rigid)
     return shares
 
 
-def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
+def _curve(
+    candidates: np.ndarray, shares: np.ndarray, friction: np.ndarray, form: str
+) -> DelayCurve:
     """Return the curve of the shares that each delay leaves, ``(B + 1, D)``, with its verdict."""
     gap = candidates[1] - candidates[0]
     residual, best = shares[0], int(shares[0].argmin())
@@ -147,7 +192,11 @@ def _curve(candidates: np.ndarray, shares: np.ndarray, form: str) -> DelayCurve:
     elif best == 0:
         reason = _AFTER
     delay = max(_minimum(candidates, residual), 0.0)
-    return DelayCurve(candidates, residual, None if reason else delay, spread, form, reason)
+    level, parts = friction[0, best], friction[1:, best]
+    level_spread = float(np.sqrt((BLOCKS - 1) * parts.var()))
+    return DelayCurve(
+        candidates, residual, None if reason else delay, spread, form, reason, level, level_spread
+    )
 
 
 def _minimum(candidates: np.ndarray, residual: np.ndarray) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import binary_opening, gaussian_filter1d
 
 from pinn_dyn.data.logs.recording import Recording
 
@@ -16,6 +16,10 @@ BLOCKS = 10
 _FEW = 3  # inputs up to which their products are terms too
 _ROWS = 8_000  # largest number of rows of the regression
 _CUT = 4.0  # width at which the kernel ends
+_SHORT = 0.005  # width of the kernel of the sign of v, s
+_REST = 0.03  # shortest rest, s
+_SLOW = 0.02  # speed at rest as a share of a high speed
+_RESTING = 0.1  # largest weight of samples at rest in an average
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Maps q, v, a ``(R, N)`` to the Y ``(R, N, P)`` of rigid bodies: their torque is Y pi."""
@@ -27,14 +31,20 @@ class Smoothed:
 
     Attributes:
         q, v, a: ``(R, N)``.
+        sign: average of the sign of v, ``(R, N)``.
+        moving: joints that move, ``(R, N)``; dry friction at rest is undetermined.
         u: M inputs, then products of few inputs, of unit spread, ``(R, D, M + K)``.
+        spread: standard deviation of the averages over the one of the inputs, ``(D, M + K)``.
         block: tenth of the data that holds the row, ``(R,)``.
     """
 
     q: np.ndarray
     v: np.ndarray
     a: np.ndarray
+    sign: np.ndarray
+    moving: np.ndarray
     u: np.ndarray
+    spread: np.ndarray
     block: np.ndarray
 
     @classmethod
@@ -58,10 +68,34 @@ class Smoothed:
             return gaussian_filter1d(x, samples, axis=0, order=order, truncate=_CUT) / step**order
 
         q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in pairs]) for order in range(3))
+        signs = [_signs(item.q, step) for item, _ in pairs]
+        sign, still = (
+            np.vstack([smooth(x[k])[r] for x, (_, r) in zip(signs, pairs, strict=True)])
+            for k in range(2)
+        )
         inputs = np.concatenate([item.u for item in recordings])
         mean, spread = inputs.mean(axis=0), inputs.std(axis=0).clip(min=1e-300)
         u = [smooth(_monomials((x.u - mean) / spread))[r[:, None] - lags] for x, r in pairs]
-        return cls(q, v, a, _standard(np.concatenate(u)), np.arange(count) * BLOCKS // count)
+        inputs = np.concatenate(u)
+        block = np.arange(count) * BLOCKS // count
+        return cls(q, v, a, sign, still < _RESTING, _standard(inputs), inputs.std(axis=0), block)
+
+
+def white_noise(x: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of white noise on smooth motions, from third differences."""
+    return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
+
+
+def _signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smooth sign of v, and 1 for samples at rest, ``(T, N)`` each."""
+    samples = max(_SHORT / step, 1.5)
+    v = gaussian_filter1d(q, samples, axis=0, order=1) / step
+    # Deviation of the derivative of white noise that a Gaussian kernel averages.
+    noise = white_noise(q) / step / np.sqrt(4 * np.sqrt(np.pi) * samples**3)
+    slow = np.maximum(_SLOW * np.percentile(np.abs(v), 95, axis=0), 3 * noise).clip(min=1e-300)
+    rest = max(round(_REST / step), 3)  # a reversal of v is no rest
+    still = binary_opening(np.abs(v) < slow, np.ones((rest, 1)))
+    return np.tanh(v / slow), still.astype(float)
 
 
 def _monomials(u: np.ndarray) -> np.ndarray:
@@ -75,15 +109,15 @@ def _monomials(u: np.ndarray) -> np.ndarray:
 def terms(data: Smoothed, form: str) -> np.ndarray:
     """Return the terms that explain the motion in a form apart from the input, ``(R, P)``.
 
-    1, q, q², sin q, cos q; except for increments v, friction, v_i v_j and (for inverse dynamics) a,
-    times 1, sin q and cos q as far as the data are enough for so many.
+    1, q, q², sin q, cos q; except for increments v, v_i v_j and (for inverse dynamics) a, times 1,
+    sin q and cos q as far as the data are enough for so many; for acceleration dry friction.
     """
     q, v, a = data.q, data.v, data.a
     trig = np.hstack([np.ones((len(q), 1)), np.sin(q), np.cos(q)])
     parts = [trig, q, q**2]
     if form != "increments":
         i, j = np.triu_indices(q.shape[1])
-        parts += [v, np.tanh(10 * v / v.std(axis=0).clip(min=1e-300))]
+        parts += [v, data.sign] if form == "acceleration" else [v]
         inertial = [v[:, i] * v[:, j], *([a] if form == "inverse dynamics" else [])]
         products = [
             (trig[:, :, None] * x[:, None, :]).reshape(len(x), -1) for x in [*inertial, trig[:, 1:]]
@@ -93,23 +127,44 @@ def terms(data: Smoothed, form: str) -> np.ndarray:
     return np.hstack(parts)
 
 
-def input_shares(basis: np.ndarray, data: Smoothed, inputs: slice) -> np.ndarray:
-    """Return the share of these inputs that known terms leave, ``(B + 1, D, M)``."""
-    u = data.u[..., inputs]
-    left, squares = _remainders(basis, u.reshape(len(u), -1), data.block)
-    shares = np.diagonal(left, axis1=1, axis2=2) / squares
-    return shares.reshape(-1, *u.shape[1:]).clip(1e-12, 1)
+def input_shares(data: Smoothed, inputs: int, rigid: Regressor | None = None) -> np.ndarray:
+    """Return the share of each input that known terms leave, and its friction ``(2, B + 1, D, M)``.
 
-
-def rigid_shares(data: Smoothed, rigid: Regressor) -> np.ndarray:
-    """Return the share of each input that bodies and friction leave, ``(B + 1, D, N)``."""
-    y = rigid(data.q, data.v, data.a)
-    friction = np.tanh(10 * data.v / data.v.std(axis=0).clip(min=1e-300))
-    shares = []
-    for i in range(data.q.shape[1]):
-        drive = [data.a[:, i], data.v[:, i], friction[:, i], np.ones(len(y))]
-        shares.append(input_shares(np.column_stack([y[:, i], *drive]), data, slice(i, i + 1)))
-    return np.concatenate(shares, axis=-1)
+    The terms are dry friction and those of inverse dynamics or of rigid bodies. The friction is the
+    coefficient of sign(v_i) in units of the spread of u_i, and NaN where it is not determined. With
+    an input per joint, only rows count in which its joint moves.
+    """
+    lags, size = data.u.shape[1], data.q.shape[1]
+    results = np.ones((2, BLOCKS + 1, lags, inputs))
+    results[1] = np.nan
+    basis = terms(data, "inverse dynamics") if rigid is None else rigid(data.q, data.v, data.a)
+    rows, parts = data.moving.all(axis=1), [[i] for i in range(inputs)]
+    if inputs != size:
+        rows, parts = data.moving.any(axis=1), [[*range(inputs)]]
+    elif rigid is None and rows.mean() > 0.5:
+        parts = [[*range(inputs)]]
+    for part in parts:
+        mask = np.asarray(rows if len(parts) == 1 and rigid is None else data.moving[:, part[0]])
+        known, joints = basis, [*range(size)]
+        if rigid is not None:
+            drive = [data.a[:, part[0]], data.v[:, part[0]], np.ones(len(mask))]
+            known, joints = np.column_stack([basis[:, part[0]], *drive]), part
+        u, sign = data.u[mask][..., part], data.sign[mask][:, joints]
+        if len(u) < 20 * BLOCKS:
+            continue
+        m = lags * len(part)
+        x = np.hstack([u.reshape(len(u), m), sign])
+        left, squares = _remainders(known[mask], x, np.arange(len(u)) * BLOCKS // len(u))
+        gram = left[:, m:, m:] + 1e-9 * len(u) * np.eye(len(joints))
+        force = np.linalg.solve(gram, left[:, m:, :m])
+        remainder = np.diagonal(left, axis1=1, axis2=2)[:, :m] - (force * left[:, m:, :m]).sum(1)
+        shares = remainder / squares[:, :m]
+        results[0][..., part] = shares.reshape(-1, lags, len(part)).clip(1e-12, 1)
+        if inputs == size:
+            force = force.reshape(len(left), len(joints), lags, len(part))
+            for k, i in enumerate(part):
+                results[1, ..., i] = force[:, joints.index(i), :, k] * data.spread[:, i]
+    return results
 
 
 def motion_shares(basis: np.ndarray, data: Smoothed, motion: np.ndarray) -> np.ndarray:

@@ -24,11 +24,14 @@ def check_report(check: LogCheck, *, command: str) -> str:
     verdict = [paragraph(text) for text in check.problems or ["A training makes sense."]]
     verdict += [paragraph(f"Warning: {text}") for text in check.warnings]
     if check.steps:
-        text = "Steps that follow from the measured delay and noise, for the YAML of the data set:"
-        verdict += [paragraph(text), preformatted("\n".join(["steps:", *check.steps]))]
+        text = "Steps that follow from the measured delay and noise, to append to the data set:"
+        verdict += [paragraph(text), preformatted(check.block)]
+    if check.options:
+        verdict.append(paragraph(f"Options of a training: model=lnn {' '.join(check.options)}"))
     inputs = (
         "The curve shows the share of the equation of motion that stays unexplained if an input is "
-        "shifted by a delay. The delay is at its minimum."
+        "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
+        "Dry friction is a share of the standard deviation of the input."
     )
     cleaning = cleaning_figure(
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
