@@ -20,7 +20,8 @@ def check_known(model: Predictor, source: DataSource) -> None:
     model = model.known if isinstance(model, KnownAndNetwork) else model
     if not isinstance(model, KnownMechanics):
         return
-    check_structure("model.structure", model.structure, source)
+    driven = [model.structure.joint_names[k] for k in model.driven]
+    check_structure("model.structure", model.structure, source, driven)
     if model.gain is None:
         inputs = [
             f"{name} in {unit}"
@@ -36,17 +37,23 @@ def check_known(model: Predictor, source: DataSource) -> None:
             )
 
 
-def check_structure(path: str, structure: Structure, source: DataSource) -> None:
+def check_structure(
+    path: str, structure: Structure, source: DataSource, driven: Sequence[str] = ()
+) -> None:
     """Refuse rigid bodies whose joints are not the data's.
 
-    If the columns do not name the joints, their order counts. ``path`` is the structure's key.
+    If the columns do not name the joints, their order counts. ``path`` is the structure's key,
+    ``driven`` are the joints with an input; without them, fewer inputs than joints pass.
 
     Raises:
         ConfigError: if number, order or units of the columns are not those of the joints.
     """
-    joints, signals = structure.joint_names, _signals(source)
+    signals = _signals(source)
     for key, units in signals:
-        columns = list(units)
+        columns, is_input = list(units), key in ("dataset.u.columns", "dataset.input_labels")
+        joints = list(driven) if is_input and driven else structure.joint_names
+        if is_input and not driven and len(columns) < len(joints):
+            continue
         if len(columns) != len(joints):
             raise ConfigError(
                 f"{key} has the columns {', '.join(columns)}, and {path} the joints "
@@ -64,7 +71,7 @@ def check_structure(path: str, structure: Structure, source: DataSource) -> None
             pairs = map(" -> ".join, zip(columns, joints, strict=True))
             log.info("%s, column -> joint by their order: %s", key, "; ".join(pairs))
     for (name, unit), joint, turns in zip(
-        signals[0][1].items(), joints, structure.turning, strict=True
+        signals[0][1].items(), structure.joint_names, structure.turning, strict=True
     ):
         expected = "rad" if turns else "m"
         if unit not in ("", expected):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
@@ -53,14 +54,16 @@ class Structure(Protocol):
 class KnownMechanics(LearnedConstants):
     """Rigid bodies with known kinematics and drives, and learned constants::
 
-        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = diag(k) u
+        (M(q) + diag(r)) a + C(q, v) v + G(q) - o + D v + F(v) = A u
 
     M, C and G are those of the ``structure`` with learned pseudo-inertias. r is the armature
     (inertia of the rotors at the joint), o a constant torque, D = diag(d) viscous friction and F
-    dry friction. k are the drive gains from the input to the torque, such as in Nm/A. Bodies have a
-    positive density, and r, d, k > 0 for all values of the parameters, which are standard normal a
-    priori (:mod:`.known_constants`). Scales come from the data: with the typical torque f = k u, d
-    ~ f/v, F ~ f, o ~ f, r ~ f/a.
+    dry friction. A ``(N, M)`` is diag(k) without the columns of passive joints, which have friction
+    but no armature and no constant torque. k are the drive gains from the input to the torque, such
+    as in Nm/A. Bodies have a positive density, and r, d, k > 0 for all values of the parameters,
+    which are standard normal a priori (:mod:`.known_constants`). Scales come from the data: with
+    the typical torque f = k u, d ~ f/v, F ~ f, o ~ f, r ~ f/a. At a passive joint f is the rigid
+    force of the initial bodies at typical states.
 
     Args:
         statistics: scales of the data.
@@ -70,9 +73,11 @@ class KnownMechanics(LearnedConstants):
         spread: prior standard deviation of the bodies, see :class:`PhysicalBodies`: 0.3 for a data
             sheet, 3 for generic bodies (with 1 their intervals are too narrow).
         friction: builder of the dry friction.
-        drive_gain: initial k, one number or N. It is learned if ``gain_spread`` is positive.
+        drive_gain: initial k, one number or M. It is learned if ``gain_spread`` is positive.
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
         integrator: the integration method; Rosenbrock if friction dominates inertia.
+        driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
+            default is all joints.
 
     Raises:
         ValueError: if the structure has no rigid bodies or other joints than the data, or a body is
@@ -89,53 +94,88 @@ class KnownMechanics(LearnedConstants):
         drive_gain: PositiveFloat | Sequence[PositiveFloat] = 1.0,
         gain_spread: NonNegativeFloat = 0.0,
         integrator: Integrator | None = None,
+        driven_joints: Sequence[str] | None = None,
     ):
         if not isinstance(structure, Structure):
             raise ValueError(
                 f"structure is a {type(structure).__name__}, expected rigid bodies such as a "
                 "RigidChain: use model=known_system for the constants of other systems"
             )
-        size = structure.num_coordinates
-        if (statistics.num_coordinates, statistics.num_inputs) != (size, size):
+        names, size = structure.joint_names, structure.num_coordinates
+        driven = list(driven_joints or names)
+        sizes = statistics.num_coordinates, statistics.num_inputs
+        if sizes != (size, len(driven)) or len(set(driven) & set(names)) < len(driven):
             raise ValueError(
-                f"the data have {statistics.num_coordinates} coordinates and "
-                f"{statistics.num_inputs} inputs, expected the {size} joints "
-                f"{', '.join(structure.joint_names)}: lock some (structure.locked_joints)"
+                f"the data have {sizes[0]} coordinates and {sizes[1]} inputs, expected the {size} "
+                f"joints {', '.join(names)} and inputs of {', '.join(driven)}: lock joints "
+                "(structure.locked_joints), or name those with an input (driven_joints)"
             )
-        super().__init__(size, size)
+        super().__init__(size, len(driven))
         self.structure = structure
         self.integrator = integrator or RK4()
         # Rods for the links of an arm. The last body has no link, so a single rod has no size.
-        self._largest_ratio = 5.0 if start == "prior" else 100.0 if size > 1 else math.inf
-        gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(size)
-        force = gain * statistics.u_rms.double()
+        generic = 100.0 if len(driven) > 1 else math.inf
+        self._largest_ratio = 5.0 if start == "prior" else generic
+        self.driven = [names.index(name) for name in driven]
+        gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
         acceleration = statistics.acceleration.double()
-        joints = tuple(map(Joint, structure.joint_names, structure.turning))
+        joints = tuple(map(Joint, names, structure.turning))
         bodies = structure.generic_inertia() if start == "generic" else structure.inertia
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
+        force = self._typical_forces(statistics, bodies, gain * statistics.u_rms.double())
         scales = Scales(statistics, force, named=joints, prior=True)
         inertia, damping = force / acceleration, force / statistics.v_std.double()
-        units = [joint.inertia for joint in joints]
-        self.armature = scales.positive("armature", 0.03, inertia, 1.5, units)
+        motors = replace(scales, named=tuple(joints[k] for k in self.driven))
+        units = [joint.inertia for joint in motors.joints]
+        self.armature = motors.positive("armature", 0.03, inertia[self.driven], 1.5, units)
         units = [joint.damping for joint in joints]
         self.viscous = scales.positive("viscous friction", 0.1, damping, 1.5, units)
         self.offset = RealConstants(
-            0.3 * force,
-            [f"{'torque' if joint.turns else 'force'} offset of {joint.name}" for joint in joints],
-            [joint.force for joint in joints],
+            0.3 * force[self.driven],
+            [f"{'torque' if j.turns else 'force'} offset of {j.name}" for j in motors.joints],
+            [joint.force for joint in motors.joints],
         )
         self.friction = friction(scales)
         self.gain: Constants | None = None
         if gain_spread > 0:
-            units = [f"{joint.force}/u" for joint in joints]
-            self.gain = scales.positive("drive gain", 1.0, gain, gain_spread, units)
+            units = [f"{joint.force}/u" for joint in motors.joints]
+            self.gain = motors.positive("drive gain", 1.0, gain, gain_spread, units)
         self.register_buffer("fixed_gain", gain.clone())
+        self.register_buffer("motors", torch.eye(size)[self.driven], persistent=False)
+        self.register_buffer("typical_force", force, persistent=False)
         self.fixed_gain: Tensor
+        self.motors: Tensor
+        self.typical_force: Tensor
         self.float()
 
+    def _typical_forces(self, statistics: Statistics, bodies: Tensor, driven: Tensor) -> Tensor:
+        """Return f ``(N,)``, with the forces of driven joints ``(M,)``."""
+        force = torch.zeros(self.num_coordinates).double()
+        if len(driven) < len(force):
+            noise = torch.randn(3, 500, len(force), generator=torch.Generator().manual_seed(0))
+            spreads = torch.stack([statistics.q_std, statistics.v_std, statistics.acceleration])
+            q, v, a = (noise * spreads[:, None]).to(self.structure.inertia)
+            q = q + statistics.q_mean.to(q)
+            rigid = self.structure.rigid_force(q, v, a, bodies.to(q), gravity=True)
+            force = rigid.double().square().mean(0).sqrt()
+        force[self.driven] = driven
+        return force
+
     def drive_gain(self) -> Tensor:
-        """Return k, ``(N,)``."""
+        """Return k, ``(N,)``; 1 for passive joints."""
+        return self.input_gain() @ self.motors + (1 - self.motors.sum(0))
+
+    def input_gain(self) -> Tensor:
+        """Return k of the driven joints, ``(M,)``."""
         return self.fixed_gain if self.gain is None else self.gain()
+
+    def constant_force(self) -> Tensor:
+        """Return o, ``(N,)``; 0 for passive joints."""
+        return self.offset() @ self.motors
+
+    def rotor_inertia(self) -> Tensor:
+        """Return r, ``(N,)``; 0 for passive joints."""
+        return self.armature() @ self.motors
 
     def physical_constants(self) -> list[Named]:
         """Return bodies, drives, friction and gains in SI units."""
@@ -156,15 +196,18 @@ class KnownMechanics(LearnedConstants):
 
     def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return r a + D v + F(v) - o - k u, ``(*batch, N)``, all terms except Y pi."""
-        resistance = self.armature() * a + self.viscous() * v + self.friction(v)
-        return resistance - self.offset() - self.drive_gain() * u
+        resistance = self.rotor_inertia() * a + self.viscous() * v + self.friction(v)
+        return resistance - self.constant_force() - (self.input_gain() * u) @ self.motors
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
-        """Return the ratio of root mean square forces of bodies and armatures, per input."""
+        """Return the ratio of the forces of bodies and armatures per input, at driven joints.
+
+        At a passive joint the forces of the right bodies cancel.
+        """
         fitted = self.structure.rigid_force(q, v, a, self.bodies(), gravity=True)
         initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
-        ratio = (fitted + self.armature() * a).norm(dim=0) / initial.norm(dim=0)
-        return ratio * self.fixed_gain / self.drive_gain(), self._largest_ratio
+        ratio = (fitted + self.rotor_inertia() * a).norm(dim=0) / initial.norm(dim=0)
+        return ratio[self.driven] * self.fixed_gain / self.input_gain(), self._largest_ratio
 
     def slopes(self) -> KnownSlopes:
         return KnownSlopes(self)
@@ -174,33 +217,35 @@ class KnownMechanics(LearnedConstants):
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         self._check(q=q)
-        return self.structure.mass_matrix(q, self.bodies()) + torch.diag(self.armature())
+        return self.structure.mass_matrix(q, self.bodies()) + torch.diag(self.rotor_inertia())
 
     def potential_energy(self, q: Tensor) -> Tensor:
         self._check(q=q)
-        return self.structure.potential_energy(q, self.bodies()) - (self.offset() * q).sum(-1)
+        return self.structure.potential_energy(q, self.bodies()) - (self.constant_force() * q).sum(
+            -1
+        )
 
     def damping_matrix(self, q: Tensor) -> Tensor:
         return torch.diag_embed(self.viscous().expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        return torch.diag_embed(self.drive_gain().expand_as(q))
+        return (self.input_gain() * self.motors.mT).expand(*q.shape, -1)
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        return self.drive_gain() * u
+        return (self.input_gain() * u) @ self.motors
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)
-        return force + self.armature() * a
+        return force + self.rotor_inertia() * a
 
     def _potential_force(self, q: Tensor) -> Tensor:
         zero = torch.zeros_like(q)
         gravity = self.structure.rigid_force(q, zero, zero, self.bodies(), gravity=True)
-        return gravity - self.offset()
+        return gravity - self.constant_force()
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
-        return mass + torch.diag(self.armature()), bias - self.offset()
+        return mass + torch.diag(self.rotor_inertia()), bias - self.constant_force()
 
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)

@@ -49,7 +49,7 @@ class KnownAndNetwork(Sum):
     ):
         first = known(statistics=statistics)
         # The network computes forces, so its scales are those of torques instead of currents.
-        gain = first.drive_gain().detach().to(statistics.u_mean)
+        gain = first.input_gain().detach().to(statistics.u_mean)
         forces = replace(statistics, u_mean=gain * statistics.u_mean, u_std=gain * statistics.u_std)
         second = network(statistics=forces)
         drives = second.input(statistics.q_mean[None].float()).any()
@@ -62,7 +62,7 @@ class KnownAndNetwork(Sum):
                 raise ValueError(f"network.{head} is a head that a sum does not use: remove it")
         super().__init__({"known": first, "network": second}, integrator)
         self.weight = weight
-        force = forces.u_rms
+        force = first.typical_force
         self.register_buffer("force", force.float().clone())
         self.force: Tensor
         self.residual = residual and residual(Scales(statistics, force, second.angles))

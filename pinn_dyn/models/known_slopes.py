@@ -42,9 +42,9 @@ class KnownSlopes(Slopes):
         return torch.cat([by_q, by_v + torch.diag_embed(drive)], dim=-1)
 
     def gain(self) -> Tensor:
-        gain = self.model.fixed_gain
+        gain = self.model.viscous()
         # The zero term keeps the sum differentiable if the gain is not learned.
-        drives = self._drive_slopes(lambda m: m.drive_gain() + 0 * m.offset(), gain)
+        drives = self._drive_slopes(lambda m: m.drive_gain() + 0 * m.viscous(), gain)
         return torch.cat([gain.new_zeros(len(gain), len(self._bodies)), drives], dim=-1)
 
     def _body_slopes(self) -> Tensor:
@@ -60,14 +60,22 @@ class KnownSlopes(Slopes):
         """Return d function_i / dz, ``(*batch, N, P - 10 n)``, for values shaped like ``like``."""
         called = Called(self.model, function)
         values = {
-            name: z.detach().expand_as(like).clone().requires_grad_()
+            name: z.detach().expand(*like.shape[:-1], -1).clone().requires_grad_()
             for name, z in called.named_parameters()
             if name != _BODIES
         }
         with torch.enable_grad():
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
-        return torch.cat([torch.diag_embed(slope) for slope in slopes], dim=-1)
+        # Constants of drives have an entry for each driven joint instead of each joint.
+        joints = {f"model.{name}.z": self.model.motors for name in ("armature", "offset", "gain")}
+        return torch.cat(
+            [
+                joints[name].mT * slope.unsqueeze(-2) if name in joints else torch.diag_embed(slope)
+                for name, slope in zip(values, slopes, strict=True)
+            ],
+            dim=-1,
+        )
 
 
 class KnownSamples(Samples):

@@ -56,8 +56,8 @@ class LearnedConstants(MechanicalSystem):
         return torch.where(scale > 0, scale, 1.0)  # no scale for a joint at rest
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
-        """Return fitted over initial force at each joint ``(N,)``, and its largest likely value."""
-        return torch.ones(self.num_coordinates), math.inf
+        """Return fitted over initial force of each input ``(M,)``, and its largest likely value."""
+        return torch.ones(self.num_inputs), math.inf
 
     def slopes(self) -> Slopes:
         """Return the derivatives of e at the present z."""

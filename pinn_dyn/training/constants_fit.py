@@ -81,8 +81,8 @@ def doubtful_units(ratio: Tensor, largest: float, unexplained: Tensor) -> str | 
     """Describe data whose units or signs are probably wrong, or return None.
 
     Args:
-        ratio: fitted over initial force of each joint, ``(N,)``.
-        largest: ratio of the median joint that right units do not exceed.
+        ratio: fitted over initial force of each input, ``(M,)``.
+        largest: ratio of the median input that right units do not exceed.
         unexplained: spread of the force errors of the fit over that of the input, ``(N,)``.
     """
     middle, share = float(ratio.median()), float(unexplained.median())

@@ -212,6 +212,8 @@ class LeastSquares:
 
         self._solve(IDENTIFICATION, model, prior, residuals, 1.0)
         with torch.no_grad():
+            # The scale of a passive joint is the force of the bodies, which were a guess.
+            spread.copy_(model.force_scale(q, v, a, u))
             correlated = correlation_length((errors() * moves).numpy())
         stage = f"{IDENTIFICATION}, correlation over {correlated:.3g} samples"
         result = self._solve(stage, model, prior, residuals, correlated)
