@@ -62,7 +62,6 @@ class ContinuousStack(ContinuousPredictor):
         super().__init__(first.num_coordinates, first.num_inputs, first.state)
         self.integrator = first.integrator
         self.learns_initial_state = first.learns_initial_state
-        self.penalized = first.penalized
         self.template: Template[ContinuousPredictor] = Template(members)
 
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:

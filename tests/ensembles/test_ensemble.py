@@ -7,7 +7,7 @@ import torch
 
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import Signal, double_copy
-from pinn_dyn.models import LearnedVelocity
+from pinn_dyn.models import LearnedVelocity, NetworkResidual
 from pinn_dyn.models.output_limits import output_limits, set_output_limits
 from tests.models.builders import make_model, make_structured, perturb
 
@@ -69,6 +69,16 @@ def test_the_gradient_of_a_member_is_that_of_its_own_loss(kind):
                 assert found is None or not found[index].any(), name
             else:
                 torch.testing.assert_close(found[index], parameter.grad, rtol=1e-9, atol=1e-12)
+
+
+def test_members_have_their_penalties():
+    head = partial(NetworkResidual, hidden=[5])
+    alone = [perturb(make_structured("lnn", 2, 2, residual=head), seed=k) for k in range(3)]
+    ensemble = Ensemble(alone)
+    at = torch.randn(4, 3, 7, 2, generator=torch.Generator().manual_seed(1)).double()
+    expected = torch.stack([item.penalty(*at[:, k]) for k, item in enumerate(alone)])
+    assert ensemble.penalized
+    torch.testing.assert_close(ensemble.stack.penalty(*at), expected)
 
 
 @pytest.mark.parametrize("kind", ["lnn", "next_state"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, rollout
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory, rollout
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
@@ -142,7 +142,41 @@ def test_a_state_of_more_than_q_and_v_stays_inside_the_rollout():
     assert float(x[-1, 1]) == pytest.approx(float(expected), abs=1e-4)
 
 
-# Gradients.
+class StartsFaster(LinearSystem):
+    """Masses whose motion starts at v + u instead of the measured v."""
+
+    def initial_state(self, x0, u0):
+        q, v = x0.chunk(2, -1)
+        return torch.cat([q, v + u0], dim=-1)
+
+
+def test_increments_are_relative_to_the_measured_start(system):
+    started = StartsFaster(system.mass, system.stiffness, system.damping, system.inputs)
+    t, u = samples(11, 0.05)
+    found = started.requires_grad_(False).predict(START, t, Signal(t, u))
+    start = torch.cat([START[:2], START[2:] + u[0]])
+    assert torch.equal(found[0], START)
+    torch.testing.assert_close(found[1:], system.predict(start, t, Signal(t, u))[1:])
+
+
+class Delayed(LinearSystem):
+    """Masses on which the input acts 0.13 s later."""
+
+    input_history = 0.3
+
+    def acting_input(self, input):
+        return input.delayed(torch.tensor(0.13))
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_delayed_input_comes_from_the_past(system, interpolation):
+    """The ramp u = 3 t, which began before the first sample, acts as 3 (t - 0.13)."""
+    late = Delayed(system.mass, system.stiffness, system.damping, system.inputs)
+    t = torch.arange(-3, 11, dtype=torch.float64)[:, None] / 10
+    q = torch.zeros(11, 2, dtype=torch.float64)
+    signal = Signal(t[3:, 0], 3 * t[3:], interpolation)
+    truth = Trajectory(q, q, signal, past=3 * t[:3])
+    torch.testing.assert_close(late.acting_samples(truth), 3 * (t[3:] - 0.13))
 
 
 # Bad input.

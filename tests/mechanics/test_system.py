@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from pinn_dyn.mechanics import Sum
 from pinn_dyn.testing import LinearSystem, damped_oscillators
 from tests.support.cart_pole import CartPole
 
@@ -16,6 +17,27 @@ def test_forward_dynamics_solves_the_linear_equation_of_motion():
     expected = f @ x + b @ u
     torch.testing.assert_close(system.velocity_derivative(x, u), expected)
     torch.testing.assert_close(system.forward_dynamics(x[:2], x[2:], u), expected[2:])
+
+
+class Pushed(LinearSystem):
+    """Masses with the residual force -0.3 q."""
+
+    has_residual = True
+
+    def _residual_force(self, q, v, u):
+        return -0.3 * q
+
+
+def test_a_sum_has_the_residual_of_any_part():
+    """Two equal masses on two equal springs move as one, the residual halved."""
+    plain = damped_oscillators()
+    pushed = Pushed(plain.mass, plain.stiffness, plain.damping, plain.inputs)
+    q, v, u = (torch.tensor(x).double() for x in ([0.5, -0.3], [0.2, 0.8], [1.7]))
+    for parts in ((plain, pushed), (pushed, plain)):
+        total = Sum(dict(zip("ab", parts, strict=True)))
+        residual = torch.linalg.solve(2 * plain.mass, -0.3 * q)
+        expected = plain.forward_dynamics(q, v, u) + residual
+        torch.testing.assert_close(total.forward_dynamics(q, v, u), expected)
 
 
 def test_forward_dynamics_matches_the_cart_poles_textbook_equations():

@@ -127,3 +127,8 @@ def test_drives_start_at_the_scales_of_the_data():
     torch.testing.assert_close(model.armature().double(), 0.03 * force / acceleration)
     torch.testing.assert_close(model.viscous().double(), 0.1 * force / scales.v_std)
     torch.testing.assert_close(model.offset.spread.double(), 0.3 * force)
+    slides = {"armature": "kg", "viscous": "Ns/m", "offset": "N"}
+    turns = {"armature": "kg m^2", "viscous": "Nms/rad", "offset": "Nm"}
+    for name in slides:
+        units = [(turns if turning else slides)[name] for turning in model.structure.turning]
+        assert getattr(model, name).units == units

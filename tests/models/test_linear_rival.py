@@ -92,10 +92,11 @@ def quadratic(count, seed):
 
 
 def test_the_past_of_a_step_is_that_of_the_steps_before():
-    rival = LinearRival(oscillators(3), step=STEP, lags=3, degree=1, ridge=1e-7)
+    train = oscillators(3, interpolation="linear")
+    rival = LinearRival(train, step=STEP, lags=3, degree=1, ridge=1e-7)
     generator = torch.Generator().manual_seed(0)
     rival.weight.copy_(0.1 * torch.randn(rival.weight.shape, generator=generator))
-    (truth,) = oscillators(1, samples=9)
+    (truth,) = oscillators(1, samples=9, interpolation="linear")
     known = torch.cat([truth.states("qv")[0], truth.u[0]])
     past = known @ rival.past_weight + rival.past_bias
     x = [*past[:8].split(4)[::-1], truth.states("qv")[0]]  # x_-2, x_-1, x_0
@@ -103,7 +104,7 @@ def test_the_past_of_a_step_is_that_of_the_steps_before():
     for k in range(8):
         now = k + 2
         state = torch.cat([x[now], x[now - 1], x[now - 2], u[now - 1], u[now - 2]])
-        features = torch.cat([(state - rival.mean) / rival.scale, u[now], u[now]])
+        features = torch.cat([(state - rival.mean) / rival.scale, u[now], u[now + 1]])
         x.append(x[now] + features @ rival.weight + rival.bias)
     found = rival.predict(truth.states("qv")[0], truth.t, truth.input)
     torch.testing.assert_close(found, torch.stack(x[2:]), rtol=1e-9, atol=1e-9)

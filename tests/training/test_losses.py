@@ -19,7 +19,7 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
-from pinn_dyn.training import IncrementLoss
+from pinn_dyn.training import IncrementLoss, Penalized
 
 STATISTICS = Statistics(
     q_mean=torch.zeros(1, dtype=torch.float64),
@@ -147,6 +147,26 @@ def test_a_curriculum_rolls_out_and_compares_the_first_steps_alone(windows, prog
         dq = (with_q[:, 1:, :1] - windows.q[:, None] - windows.dq) / spread[:, :1]
         both = torch.cat([dq[:, :steps], residual], -1)
         assert found == pytest.approx(float(both.square().mean()), rel=1e-6)
+
+
+class Watched(Drift):
+    """Drift with a penalty that stores its arguments."""
+
+    def penalty(self, *arguments):
+        self.arguments = arguments
+        return torch.tensor(3.0).double()
+
+
+def test_a_penalty_is_added_at_the_first_step_of_a_window(windows):
+    """A step has two samples: the mean of a linear input is that of the trapezoidal rule."""
+    model = Watched()
+    loss = IncrementLoss(windows.statistics(), model).double()
+    assert float(Penalized(loss)(model, windows) - loss(model, windows)) == pytest.approx(3.0)
+    u = windows.u[:, 0] / 4 + windows.u[:, 1] / 2 + windows.u[:, 2] / 4
+    for found, expected in zip(
+        model.arguments, (windows.q, windows.v, windows.dv[:, 0] / 0.02, u), strict=True
+    ):
+        torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize("curriculum", [[], [1, 2], [1, 20], [0, 10], [5, 2, 10], [1, 1, 10]])
