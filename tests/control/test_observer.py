@@ -111,6 +111,25 @@ def test_the_input_is_that_of_the_law_less_what_undoes_the_residual():
     assert float(size) == pytest.approx(np.linalg.norm(expected))
 
 
+class Turned(LinearSystem):
+    """Free masses with inputs that turn with q."""
+
+    def input_matrix(self, q):
+        return torch.cos(q[..., :1, None]) * self.inputs
+
+
+def test_the_input_of_a_period_acts_by_the_mean_of_both_input_matrices():
+    system, period, bandwidth = Turned(MASS, ZERO, ZERO, INPUTS), 0.1, 12.0
+    observer = DisturbanceObserver(Regulation(system, 3.0, 2.0), bandwidth)
+    q, v, motion = states(2)
+    goal = Motion(*(x[0] for x in motion))
+    u = observer(0.0, q[0], v[0], goal)
+    observer(period, q[1], v[1], goal)
+    turned = 0.5 * (torch.cos(q[0, 0]) + torch.cos(q[1, 0]))
+    disturbance = tensor(MASS) @ (v[1] - v[0]) / period - turned * tensor(INPUTS) @ u
+    assert_near(observer.residual, (1 - np.exp(-bandwidth * period)) * disturbance, 1e-10)
+
+
 def test_on_a_nonlinear_system_the_residual_is_the_force_that_the_model_misses():
     """All terms are at work; what is left is the trapezoidal rule's error, of second order."""
     bandwidth, errors = 15.0, []

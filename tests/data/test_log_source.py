@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pinn_dyn.data import draw_windows
 from pinn_dyn.data.logs import UNITS, Butterworth, Columns, LogError, SplitGaps
+from pinn_dyn.data.logs.splits import default_split
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
 
@@ -160,6 +161,17 @@ def test_whole_runs_are_drawn_by_the_seed(runs):
     assert len(splits.test) == 6
     starts = [tuple(x.q[0].tolist()) for x in splits.train + splits.validation + splits.test]
     assert len(set(starts)) == len(starts)
+
+
+def test_the_default_split_draws_long_runs_by_the_seed():
+    """Of ten runs, two short, two are the test and two the validation."""
+    clocks = {f"run {k}": np.arange(100 if k < 2 else 300) / 100 for k in range(10)}
+    drawn = [default_split(clocks, seed)[:2] for seed in range(5)]
+    for parts in drawn:
+        found = [name for part in parts for name in part.names]
+        assert len(set(found)) == 4
+        assert not {"run 0", "run 1"} & set(found)
+    assert len({tuple(test.names) for _, test in drawn}) > 1
 
 
 def test_named_runs_and_the_end_of_the_others(runs):

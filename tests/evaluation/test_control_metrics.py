@@ -206,6 +206,9 @@ def test_a_stopped_run_is_counted_and_left_out(spirals):
         "input_peak",
     ):
         assert found.summary[name] == alone.summary[name], name
+    applied = torch.isfinite(record.u[:, :-1]).all(-1).sum()
+    saturated = (record.u[:, :-1] >= 1.0).any(-1).sum()
+    assert found.summary["saturated_percent"] == pytest.approx(float(100 * saturated / applied))
     for name in ("max_error", "settling_time_worst_s", "overshoot_worst_percent"):
         assert found.summary[name] == math.inf, name
     assert not any(math.isnan(value) for value in found.summary.values())

@@ -73,11 +73,11 @@ def test_metrics_of_a_case_computed_by_hand():
 def test_a_diverged_trajectory_is_counted_and_left_out(bad):
     t = torch.linspace(0, 1, 5, dtype=torch.float64)
     q = torch.sin(t)[None, :, None].repeat(3, 1, 1)
-    q_hat = q + 0.5
+    q_hat = q + torch.tensor([0.5, 0.5, 0.1])[:, None, None]
     q_hat[1, 3] = bad
     found = rollout_metrics(q_hat, q, t, thresholds={"wide": 0.6})
     assert found.diverged == 1
-    assert found.error_mean == pytest.approx(0.5)
+    assert (found.error_mean, found.error_median) == pytest.approx((0.3, 0.3))
     assert (found.error_worst, found.worst_trajectory) == (math.inf, 1)
     # The diverged one is valid until t = 0.75, the others up to the horizon.
     assert found.valid_time["wide"] == pytest.approx((1 + 0.75 + 1) / 3)

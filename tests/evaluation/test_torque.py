@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pinn_dyn.evaluation import torque_error
-from pinn_dyn.evaluation.torque import residual_share
-from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
+from pinn_dyn.evaluation.torque import part_shares, residual_share
+from pinn_dyn.mechanics import MechanicalSystem, Signal, Sum, Trajectory
 
 
 class Pendulum(MechanicalSystem):
@@ -87,6 +87,17 @@ def test_the_residual_share_is_relative_to_both_forces():
     residual, applied = (x.square().sum(-1).mean().sqrt() for x in (0.4 * v, u))
     expected = float(residual / (residual + applied))
     assert residual_share(Leaky(), truth) == pytest.approx(expected, rel=1e-6)
+
+
+def test_each_part_of_a_sum_has_its_share_of_each_term():
+    """Three times the mass, damping and stiffness make three quarters of the force."""
+    truth, v, _ = motion()
+    parts = {"light": Pendulum(), "heavy": Pendulum(factor=3.0)}
+    table = part_shares(Sum(parts), truth).set_index(["part", "term"])
+    damping = float((0.5 * v).square().sum(-1).mean().sqrt())
+    assert table.loc[("light", "D v + F"), "rms"] == pytest.approx(damping, rel=1e-6)
+    assert table.loc["light", "share"].tolist() == pytest.approx([0.25] * 3)
+    assert table.loc["heavy", "share"].tolist() == pytest.approx([0.75] * 3)
 
 
 def test_a_joint_without_a_motor_has_no_share_but_counts():

@@ -35,6 +35,7 @@ def test_a_sum_has_the_residual_of_any_part():
     q, v, u = (torch.tensor(x).double() for x in ([0.5, -0.3], [0.2, 0.8], [1.7]))
     for parts in ((plain, pushed), (pushed, plain)):
         total = Sum(dict(zip("ab", parts, strict=True)))
+        assert total.has_residual
         residual = torch.linalg.solve(2 * plain.mass, -0.3 * q)
         expected = plain.forward_dynamics(q, v, u) + residual
         torch.testing.assert_close(total.forward_dynamics(q, v, u), expected)

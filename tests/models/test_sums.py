@@ -5,8 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.evaluation.torque import part_shares
-from pinn_dyn.mechanics import Sum, stack
+from pinn_dyn.mechanics import Sum
 from pinn_dyn.models import (
     CoulombFriction,
     KnownAndNetwork,
@@ -23,7 +22,7 @@ from pinn_dyn.models import (
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from tests.models.builders import make_structured, perturb, random_batch
-from tests.support.known import motion, statistics
+from tests.support.known import statistics
 from tests.support.rigid_chains import TREE
 
 SMALL = Positive(floor=0.0, initial=0.1)
@@ -114,21 +113,6 @@ def test_what_the_network_contributes_is_penalized():
     expected = 0.3 * ((tau / model.force) ** 2).mean() + 0.7 * ((r / model.force) ** 2).mean()
     assert float(r.abs().max()) > 0
     assert_near(model.penalty(q, v, a, u), expected, 1e-9)
-
-
-def test_what_each_part_contributes():
-    model = perturb(both().double(), spread=0.2)
-    truth = stack([motion(model, seconds=0.1)])
-    table = part_shares(model, truth).set_index(["part", "term"])
-    q = truth.q[0]
-    sizes = {
-        name: float((part.potential_force(q) ** 2).sum(-1).mean().sqrt().detach())
-        for name, part in model.parts.items()
-    }
-    for name, size in sizes.items():
-        assert table.loc[name, "G"].rms == pytest.approx(size, rel=1e-6)
-        assert table.loc[name, "G"].share == pytest.approx(size / sum(sizes.values()))
-    assert table.groupby("term").share.sum().tolist() == pytest.approx([1, 1, 1])
 
 
 @pytest.mark.parametrize(
