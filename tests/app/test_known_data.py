@@ -45,6 +45,10 @@ def check(source, names=NAMES):
     check_structure("model.structure", chain(names), source)
 
 
+def test_a_column_that_names_two_joints_counts_by_its_order():
+    check(log_of(["q1", "q2", "hip_leg"]), names=("arm", "hip", "leg"))
+
+
 @pytest.mark.parametrize("signal", ["q", "v", "u"])
 def test_a_crossed_order_is_refused_with_the_right_one(signal):
     crossed = {"q": ["q1", "q2", "q3"], signal: ["elbow_pos", "ShoulderPan.pos", "joint1_pos"]}

@@ -1,6 +1,7 @@
 """Sweeps that lose jobs, are interrupted, and go on."""
 
 import json
+import math
 import os
 import signal
 import time
@@ -8,7 +9,11 @@ import time
 import pytest
 import torch
 import yaml
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import RunMode
+from omegaconf import OmegaConf
 
+from pinn_dyn.app.sweep import SweepCallback
 from tests.app.entry import (
     NO_FIGURES,
     STRIDE,
@@ -35,6 +40,14 @@ def sweep(tmp_path, monkeypatch, capsys):
         return None
 
     return run
+
+
+@pytest.mark.parametrize(("mode", "returned"), [("MULTIRUN", math.inf), ("RUN", math.nan)])
+def test_a_search_takes_nan_for_the_worst_result(mode, returned):
+    config = OmegaConf.create({"hydra": {"mode": RunMode[mode]}})
+    result = JobReturn(status=JobStatus.COMPLETED, _return_value=math.nan)
+    SweepCallback().on_job_end(config, result)
+    assert result.return_value == pytest.approx(returned, nan_ok=True)
 
 
 def job(tmp_path, name):

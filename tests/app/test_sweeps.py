@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import statistics
 
 import pandas as pd
@@ -89,6 +90,14 @@ def test_a_sweep_has_one_row_per_choice_with_mean_and_deviation_over_seeds(sweep
     pd.testing.assert_frame_equal(again, table)
 
 
+def test_the_last_of_repeated_runs_counts(sweep, gather):
+    write_run(sweep / "lnn-16-0-again", seed=0, error=0.35)
+    table, text = gather(f"runs=[{sweep}]")
+    row = table[(table["model_name"] == "lnn") & (table["data.pairs"] == 16)].iloc[0]
+    assert row["val/error_mean"] == pytest.approx((0.35 + 0.25 + 0.75) / 3)
+    assert "left out: 1 runs" in text
+
+
 def test_failed_jobs_are_listed_with_their_errors(sweep, gather):
     failed = write_run(sweep / "failed")
     (failed / "error.txt").write_text("ConfigError: data: too many pairs\n\nTraceback ...\n")
@@ -122,8 +131,10 @@ def write_evaluation(folder, runs, errors, horizon=5.0):
 
 
 def test_test_errors_come_from_evaluations(sweep, gather):
-    write_evaluation(sweep.parent / "seen", [sweep / f"lnn-16-{k}" for k in (0, 1)], [3.0, 5.0])
-    table, text = gather(f"runs=[{sweep}]", "evaluations=[seen]", "sort=test/error_mean")
+    runs = [sweep / f"lnn-16-{k}" for k in (0, 1)]
+    write_evaluation(sweep.parent / "seen", runs, [3.0, 5.0])
+    os.utime(write_evaluation(sweep.parent / "older", runs, [8.0, 9.0]), (1, 1))
+    table, text = gather(f"runs=[{sweep}]", "evaluations=[older,seen]", "sort=test/error_mean")
     assert table["test/error_mean"][0] == 4.0
     assert table["test/error_mean_std"][0] == pytest.approx(math.sqrt(2))
     assert (table["model_name"][0], table["data.pairs"][0]) == ("lnn", 16)
