@@ -44,16 +44,20 @@ _HEADERS = {
 def varied_settings(configs: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return the settings in which runs differ, one row per run and one dotted column per setting.
 
-    Keys that follow the seed, an earlier key or the names of model and data set are left out.
+    Keys that contain the seed or follow an earlier key or the names of model and data set are left
+    out.
     """
     settings = pd.json_normalize(list(configs)).map(short)
     text = settings.map(str)
     names = [name for name in _NAMES if name in text and text[name].nunique() > 1]
-    partitions = {tuple(pd.factorize(text["seed"])[0])} if text["seed"].nunique() > 1 else set()
-    columns = []
+    partitions: set[tuple[int, ...]] = set()
+    columns: list[str] = []
     for column in [*names, *text.columns.difference(names, sort=False)]:
         partition = tuple(pd.factorize(text[column])[0])
         if column in ("seed", "dataset.cache") or max(partition) == 0 or partition in partitions:
+            continue
+        pairs = zip(text["seed"], f"{column}=" + text[column], strict=True)
+        if all(re.search(rf"seed\W?{seed}(?!\d)", x) for seed, x in pairs):
             continue
         if names and column not in names and text.groupby(names)[column].nunique().max() == 1:
             continue

@@ -152,6 +152,8 @@ def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path):
     assert (
         json.loads((tmp_path / "rolled" / "metrics.json").read_text())["stage"][:9] == "roll-outs"
     )
+    table = pd.read_csv(tmp_path / "rolled" / "constants.csv")
+    assert table.name.str.match(r"Coulomb friction.* of (shoulder|elbow)").sum() == 2
     folders = ",".join(str(tmp_path / name) for name in ("rolled", "alone"))
     words = ["windows=[0.1]", "horizon=0.2", f"hydra.run.dir={tmp_path / 'both'}"]
     run_script("evaluate.py", f"runs=[{folders}]", *words)

@@ -35,6 +35,9 @@ def config(model="lnn", width=8, lr=0.1, seed=0, **model_settings):
         ([config(), config(seed=1)], []),
         ([config(), config(lr=0.2), config(lr=0.2, seed=1)], ["optimizer.lr"]),
         ([config(), config(width=16)], ["model.damping.width"]),
+        ([config(), config(width=16, seed=1)], ["model.damping.width"]),
+        ([config(friction={"_target_": "F"}), config(seed=1)], ["model.friction._target_"]),
+        ([config(start="run-seed0/x"), config(start="run-seed1/x", seed=1)], []),
         ([config(), config("mlp", width=64, hidden=[8])], ["model_name"]),
         (
             [config(), config(width=16), config("mlp", width=64)],
