@@ -57,6 +57,7 @@ def control(cfg: DictConfig) -> float:
 def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     source = run.source
     learned = _learned_system(run, config)
+    _require_learned_law(config, source)
     if source.system is None:
         return _without_robot(learned, source, config, folder)
     runs, configurations = {run.config["name"]: run}, {"run": run.config}
@@ -68,12 +69,9 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     if config["trajectory"] >= count:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    threshold = config["guard"].get("threshold")
-    if "learned" not in laws and (config["stability"] or threshold or config["export"]):
-        raise ConfigError("stability, guard and export need the controller 'learned'")
     if config["export"]:
         _export(laws["learned"], config)
-    if threshold is not None:
+    if config["guard"].get("threshold") is not None:
         laws["learned"] = _guarded(laws["learned"], config, source)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     noisy = np.any(sensor.q_noise) or np.any(sensor.v_noise)
@@ -102,6 +100,18 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
             "reduce the gains, raise the rate, or train on data that move all inputs"
         )
     return error
+
+
+def _require_learned_law(config: dict[str, Any], source: DataSource) -> None:
+    """Refuse keys that would be ignored without the learned law, or without a robot."""
+    of_loop = {"stability": config["stability"], "guard": config["guard"].get("threshold")}
+    of_loop = {key: value for key, value in of_loop.items() if value is not None}
+    if source.system is None and of_loop:
+        keys = " and ".join(of_loop)
+        raise ConfigError(f"{keys}: {source.name} has no simulated robot: leave the key out")
+    if "learned" not in config["controllers"] and (of_loop or config["export"]):
+        keys = " and ".join([*of_loop, *(["export"] if config["export"] else [])])
+        raise ConfigError(f"{keys}: needs the controller 'learned': do not remove it")
 
 
 def _without_robot(

@@ -24,9 +24,14 @@ class SetPoint(Reference):
 
     Args:
         q: ``(N,)``, or ``(K, N)`` for K runs, rad (m for a length).
+
+    Raises:
+        ValueError: without q, which a command needs for closed loops only.
     """
 
-    def __init__(self, q: Configurations):
+    def __init__(self, q: Configurations | None = None):
+        if q is None:
+            raise ValueError("no set point for the closed loop: give it as reference.q=[...]")
         self.q = _tensor(q)
         self.num_coordinates = self.q.shape[-1]
         self._zero = torch.zeros_like(self.q)

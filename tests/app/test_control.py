@@ -161,19 +161,26 @@ def test_a_force_that_is_not_linear_in_the_input_is_refused(tmp_path, capsys):
     assert "model/input=network" in text
 
 
-def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, monkeypatch):
-    monkeypatch.chdir(CONF.parent)  # the example log is found from here
-    run = tmp_path / "run"
+def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, capsys):
+    """By the command of docs/your_log.md, which describes no reference and no experiment."""
+    (tmp_path / "examples").symlink_to(CONF.parent / "examples")
+    run = tmp_path / "arm" / "lnn"
     words = [*TINY_TRAINING, NO_FIGURES, "compile=false", f"hydra.run.dir={run}"]
     run_script("train.py", "experiment=example_log", *words)
-    law = tmp_path / "law.pt2"
-    control(tmp_path / "out", run, f"export={law}")
-    assert law.is_file()
-    table = pd.read_csv(tmp_path / "out" / "conditions.csv")
+    command = ["control.py", "run=arm/lnn", "export=law.pt2"]
+    run_script(*command, "gains.position=10", "gains.velocity=1", checked=True)
+    assert (tmp_path / "law.pt2").is_file()
+    (folder,) = (tmp_path / "runs" / "control" / "arm" / "lnn").iterdir()
+    table = pd.read_csv(folder / "conditions.csv")
     model = pinn_dyn.load(run)
     terms = model.terms(table[["q1", "q2", "q3"]].to_numpy())
     np.testing.assert_allclose(np.linalg.eigvalsh(terms.M)[:, 0], table["mass_min"], rtol=1e-6)
     np.testing.assert_allclose(np.linalg.cond(terms.A), table["input_condition"], rtol=1e-6)
+    for words, problem in (
+        (["~controllers.learned", "~controllers.truth"], "export: needs the controller 'learned'"),
+        (["guard.threshold=1"], "guard: example_log has no simulated robot"),
+    ):
+        assert problem in refused_text(capsys, *command, *words)
 
 
 @pytest.mark.panda
