@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import shlex
+import shutil
 import sys
 import traceback
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
@@ -92,6 +95,20 @@ def first_line(path: Path) -> str:
 
 def command_line() -> str:
     """Return the command of this process, for a shell."""
-    program = Path(sys.argv[0]).name
-    start = ["python", program] if program.endswith(".py") else [program]
-    return shlex.join([*start, *(word.removeprefix("++") for word in sys.argv[1:])])
+    return shlex.join([*_program(), *(word.removeprefix("++") for word in sys.argv[1:])])
+
+
+def resume_command(folder: Path) -> str:
+    """Return the command that resumes a training of this process, for a shell."""
+    config_dir = get_args_parser().parse_intermixed_args(sys.argv[1:]).config_dir
+    options = [f"--config-dir={config_dir}"] if config_dir else []
+    quoted = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    value = folder if re.fullmatch(r"[\w./-]+", str(folder)) else f"'{quoted}'"  # for Hydra
+    return shlex.join([*_program(), *options, f"resume={value}"])
+
+
+def _program() -> list[str]:
+    path = Path(sys.argv[0])
+    if path.suffix == ".py":
+        return ["python", str(path)]
+    return [path.name if shutil.which(path.name) else str(path)]

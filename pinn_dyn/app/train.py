@@ -22,6 +22,7 @@ from pinn_dyn.app.run_folder import (
     newest_checkpoint,
     read_checkpoint,
 )
+from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.app.trust import check_name, packages, require_trusted
 
 log = logging.getLogger(__name__)
@@ -55,7 +56,9 @@ def train(cfg: DictConfig) -> float:
     except KeyboardInterrupt as interrupt:
         if not isinstance(stop := interrupt.__cause__, SystemExit):
             raise
-        job, way = HydraConfig.get(), f"resume with: python train.py resume={folder}"
+        job, way = HydraConfig.get(), f"resume with: {resume_command(folder)}"
+        if not (folder / CHECKPOINTS / "last.ckpt").is_file():
+            way = "nothing is saved yet, start again with the same command"
         if job.mode == RunMode.MULTIRUN:
             way = f"go on with the same command and hydra.sweep.dir={job.sweep.dir}"
         log.warning("interrupted; %s", way)

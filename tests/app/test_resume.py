@@ -1,6 +1,7 @@
 """Interrupted trainings: checkpoints are whole, and a resumed training is an uninterrupted one."""
 
 import os
+import shlex
 import shutil
 import signal
 import time
@@ -13,6 +14,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import pinn_dyn
+from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.training import WholeCheckpoints
@@ -172,6 +174,19 @@ def command(tmp_path, monkeypatch, diverging):
     """An unfinished run of train.py."""
     monkeypatch.chdir(tmp_path)
     return shutil.copytree(diverging, tmp_path / "run")
+
+
+@pytest.mark.parametrize("program", [["python", "train.py"], ["/opt/bin/pinn-dyn-train"]])
+def test_the_printed_command_resumes_the_run(command, monkeypatch, program):
+    """With a folder that a shell and Hydra would split, and the options of this program."""
+    folder = command.rename(command.with_name("an arm's run, {seed=0}"))
+    folder.with_name("my_conf").mkdir()
+    options = [*program[1:], "--config-dir=my_conf"]
+    monkeypatch.setattr("sys.argv", [program[-1], "--config-dir", "my_conf", "model=lnn"])
+    words = shlex.split(resume_command(folder))
+    assert words[:-1] == [program[0], *options]
+    run_script("train.py", "--config-dir=my_conf", words[-1], checked=True)
+    assert pinn_dyn.load(folder).finished
 
 
 @pytest.mark.parametrize(
