@@ -5,6 +5,8 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from hydra.utils import instantiate
 
 from examples.cleaning_steps import RowClock
 from pinn_dyn.data.logs import (
@@ -115,6 +117,37 @@ def test_the_named_step_is_the_cure(tmp_path):
     assert len(source(tmp_path, steps={"gaps": SplitGaps(longest=0.05)}).load().train) == 2
     write(tmp_path, clock(lambda t: t + 0.004 * np.sin(40 * t)))
     assert source(tmp_path, steps=RESAMPLE).load().train[0].t.diff().std() < 1e-12
+
+
+def gaps(rng, bursts):
+    keep = rng.uniform(size=1001) > (0.0 if bursts else 0.02)
+    for k in rng.integers(5, 990, 8 * bursts):
+        keep[k : k + 5] = False
+    return np.flatnonzero(keep)
+
+
+CLOCKS = {
+    "jitter": lambda rng: motion().assign(t=lambda x: x["t"] + rng.uniform(0, 1e-3, len(x))),
+    "dropout": lambda rng: motion().iloc[gaps(rng, False)],
+    "dropout of five rows": lambda rng: motion().iloc[gaps(rng, True)],
+    "duplicates": lambda rng: motion().iloc[np.sort(np.r_[:1001, rng.integers(0, 1001, 20)])],
+    "93.75 Hz": lambda rng: motion(rate=93.75).assign(
+        t=lambda x: x["t"] + rng.uniform(0, 1e-3, len(x))
+    ),
+    "long gap": lambda rng: motion().drop(index=range(200, 290)),
+}
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_the_suggested_steps_load_the_log_that_they_were_suggested_for(tmp_path, clock):
+    write(tmp_path, CLOCKS[clock](np.random.default_rng(0)))
+    with pytest.raises(LogError) as error:
+        source(tmp_path).load()
+    (line,) = re.findall(r"steps: {.*}", str(error.value))
+    steps = instantiate(yaml.safe_load(line)["steps"], _convert_="all")
+    splits = source(tmp_path, steps=steps).load()
+    assert sum(len(x.t) for x in splits.train) > 450
+    assert splits.train[0].t[1] == pytest.approx(0.01)
 
 
 def test_two_runs_of_equal_times_are_not_deduplicated_away(tmp_path):

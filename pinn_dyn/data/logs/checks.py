@@ -11,6 +11,7 @@ from scipy.ndimage import median_filter
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
+from pinn_dyn.data.logs.recording import clock_steps
 from pinn_dyn.data.logs.table import Table
 
 _SAMPLE_TIMES = (1e-5, 0.5)  # s
@@ -56,8 +57,8 @@ def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[st
         "if a new run starts there, name its column in 'trajectory' (run=... of pinn_dyn.fit) or "
         "add a SplitGaps step"
     )
-    once = f"{row_clock}add a Deduplicate step, which keeps the first row"
-    fill = f"{row_clock}add a SplitGaps step, or Resample to interpolate over short gaps"
+    once = f"{row_clock}add a Deduplicate step, which keeps the first row, as in {clock_steps(t)}"
+    fill = f"{row_clock}split long gaps and interpolate over short ones, as in {clock_steps(t)}"
     for fault, rows, problem, cure in (
         ("backward times", spacing < 0, "goes back", split),
         ("repeated times", spacing == 0, "repeats", once),

@@ -12,7 +12,29 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 
 SIGNALS: tuple[Literal["q", "v", "u"], ...] = ("q", "v", "u")
+_ROUND = (1, 2, 2.5, 4, 5, 8, 10)  # rates of which usual pieces are a multiple
+_LONGEST_GAP = 10  # sample times that are interpolated
 _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
+
+
+def clock_steps(t: np.ndarray) -> str:
+    """Return the ``steps`` in YAML that give a run of times ``(T,)`` in s a uniform clock.
+
+    The rate is round, near the usual one. SplitGaps leaves no gap that Resample would refuse.
+    """
+    spacing = np.diff(t)
+    usual = float(np.median(spacing[spacing > 0]))
+    decade = 10 ** np.floor(-np.log10(usual))
+    rate = min((decade * x for x in _ROUND), key=lambda x: abs(np.log(x * usual)))
+    digit = 10 ** (np.floor(np.log10(_LONGEST_GAP * usual)) - 1)
+    gap = digit * np.ceil(_LONGEST_GAP * usual / digit)
+    name = "_target_: pinn_dyn.data.logs"
+    steps = [f"deduplicate: {{{name}.Deduplicate}}"] if (spacing == 0).any() else []
+    steps += [
+        f"split_gaps: {{{name}.SplitGaps, longest: {gap:.3g}}}",
+        f"resample: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}",
+    ]
+    return f"steps: {{{', '.join(steps)}}}"
 
 
 @dataclass(frozen=True)
@@ -76,7 +98,8 @@ class Recording:
         if not step > 0 or error[k] > _CLOCK_TOLERANCE * step:
             raise LogError(
                 f"{self.place}: {user} needs a uniform clock, but near t = {t[k]:.6g} s the time "
-                f"is {error[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it"
+                f"is {error[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it, "
+                f"such as {clock_steps(t)}"
             )
         return step
 
