@@ -195,20 +195,23 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
     write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
 
 
+def require_no_links_out(folder: Path) -> None:
+    """Refuse a run folder of others with links through which a training would write elsewhere."""
+    for path in folder.rglob("*"):
+        if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(
+                f"{path} is a link to {path.resolve()}: nothing is written outside of the run "
+                "folder, expected a file or folder: replace the link by a copy"
+            )
+
+
 @contextlib.contextmanager
 def claimed(folder: Path, config: dict[str, Any]) -> Iterator[tuple[Path | None, dict[str, Any]]]:
     """Lock a run folder for a configuration; yield path and content of its newest checkpoint.
 
-    Refuse a folder that another process locks, with links that lead out of it, or with a training
-    of another configuration.
+    Refuse a folder that another process locks, or with a training of another configuration.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for file in folder.rglob("*"):
-        if file.is_symlink() and not file.resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(
-                f"{file} is a link to {file.resolve()}: nothing is written outside of the run "
-                "folder, expected a file or folder: replace the link by a copy"
-            )
     try:
         with FileLock(folder / ".lock", timeout=0):
             for partial in folder.rglob("*.partial"):  # of a process that was killed while writing

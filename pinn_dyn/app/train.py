@@ -21,6 +21,7 @@ from pinn_dyn.app.run_folder import (
     load_run,
     newest_checkpoint,
     read_checkpoint,
+    require_no_links_out,
 )
 from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.app.trust import check_name, packages, require_trusted
@@ -72,6 +73,7 @@ def _recorded(folder: Path, trust: tuple[str, ...]) -> dict[str, Any]:
         raise ConfigError(
             f"resume uses the configuration of the run: leave out {', '.join(ignored)}"
         )
+    require_no_links_out(folder)
     path, saved = newest_checkpoint(folder)
     if path is None:
         saved = read_checkpoint(path := folder / CHECKPOINTS / "last.ckpt")  # says what is wrong

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pinn_dyn.app.config import ConfigError
-from tests.app.entry import refused_text, run_script
+from tests.app.entry import NO_FIGURES, refused_text, run_script, train
 from tests.support.foreign_runs import foreign
 
 LOGGERS = "lightning.pytorch.loggers"
@@ -47,6 +47,12 @@ def test_links_above_and_inside_a_run_folder_are_no_obstacle(tmp_path, lnn_run):
     (tmp_path / "runs").symlink_to(tmp_path / "disk")
     run_script("train.py", f"resume={tmp_path}/runs/run", f"hydra.run.dir={tmp_path / 'hydra'}")
     assert torch.load(run / "checkpoints" / "best.ckpt", weights_only=True)["finished"]
+
+
+def test_a_training_may_begin_in_a_folder_with_links(tmp_path):
+    (tmp_path / "bin").symlink_to("/usr/bin")
+    train(tmp_path, "model=lnn", NO_FIGURES)
+    train(tmp_path, "model=lnn", NO_FIGURES)
 
 
 @pytest.mark.parametrize(
