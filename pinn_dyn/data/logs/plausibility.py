@@ -17,8 +17,8 @@ _FACTORS = (0.8, 1.25)  # range of dq/dt over v without a warning
 _CLEAR = 0.8  # correlation from which the factor is determined
 _AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and of a stop
 _STILL = 1e-12  # range of a coordinate that does not move, m or rad
-_REVERSED = -0.5  # partial correlation of force and acceleration
-_MOST_ROWS = 50_000
+_TENTHS, _MOST_ODD = 10, 0.6  # parts of a stretch; largest share of parts that disagree
+_MOVING, _LEFT = 0.05, 0.7  # of a tenth: share of the mean square, share of Δq² that k v leaves
 
 
 def check_stamps(recordings: list[Recording], repairs: Collection[str]) -> list[Measurement]:
@@ -76,34 +76,53 @@ def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
 
 
 def check_velocities(
-    training: list[Recording], q: Columns, v: Columns, step: float
+    recordings: Sequence[Recording], q: Columns, v: Columns, step: float
 ) -> list[Measurement]:
-    """Measure the factor k between dq/dt and v in the training.
+    """Measure the factor k between dq/dt and v, in all runs and in tenths of each stretch.
 
-    Δq_j = k ∫ v dt over stretches of 10, 100 and 1000 samples, by least squares; integrals are less
-    noisy than derivatives. The stretches count over which the two agree best.
+    Δq_j = k ∫ v dt over 10, 100 and 1000 samples, by least squares; integrals are less noisy than
+    derivatives. The number of samples counts over which the two agree best.
     """
-    correlations, factors = _agreement(training, step)
+    trials = [_products(recordings, step, samples) for samples in (10, 100, 1000)]
     low, high = _FACTORS
     results = []
     for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
-        correlation, factor = correlations[k, k], factors[k]
-        cause = ""
-        if correlation >= _CLEAR and not low <= factor <= high:
+        # Sums of sizes: the sign may change along a run.
+        sums = [np.array([np.abs(p[:, k, k]), x[:, k], y[:, k]]).sum(axis=1) for p, x, y in trials]
+        best = int(np.argmax([p / max(math.sqrt(x * y), 1e-300) for p, x, y in sums]))
+        products, dq, dv = trials[best]
+        odd = _odd_tenths(products[:, k, k], dq[:, k], dv[:, k])
+        norms = np.sqrt(dq[:, k].sum() * dv.sum(axis=0)).clip(min=1e-300)
+        correlations = np.abs(products[:, k].sum(axis=0)) / norms
+        match = int(correlations.argmax())
+        product, x, y = (z[~odd].sum() for z in (products[:, k, k], dq[:, k], dv[:, k]))
+        ratio, correlation = product / max(y, 1e-300), abs(product) / max(math.sqrt(x * y), 1e-300)
+        place = cause = ""
+        if match != k and correlations[match] >= _CLEAR > correlations[k] and moves(recordings, k):
+            cause = f"{v.columns[match]!r} fits it: are columns of v exchanged?"
+            correlation = correlations[k]
+        elif correlation >= _CLEAR and not low <= ratio <= high:
             wrong = (180 / math.pi, math.pi / 180)
-            degrees = any(math.isclose(abs(factor), x, rel_tol=0.2) for x in wrong)
+            degrees = any(math.isclose(abs(ratio), x, rel_tol=0.2) for x in wrong)
             cause = "one of them is in degrees" if degrees else "check unit, scale and sign of both"
-        elif correlation < _CLEAR and moves(training, k):
-            match = int(correlations[k].argmax())
+        elif correlation < _CLEAR and moves(recordings, k):
             cause = "is this the right column?"
-            if correlations[k, match] >= _CLEAR:
-                cause = f"{v.columns[match]!r} fits it: are columns of v exchanged?"
+        elif odd.any():
+            tenths = np.flatnonzero(odd)
+            item = recordings[int(tenths[0]) // _TENTHS]
+            within = tenths[tenths // _TENTHS == tenths[0] // _TENTHS] % _TENTHS
+            edges = np.linspace(item.t[0], item.t[-1], _TENTHS + 1)[[within[0], within[-1] + 1]]
+            more = len({recordings[int(i) // _TENTHS].run for i in tenths} - {item.run})
+            place = f"{item.run} ({edges[0]:.4g} to {edges[1]:.4g} s)"
+            place += f" and {more} more runs, " if more else ", "
+            ratio = products[odd, k, k].sum() / max(dv[odd, k].sum(), 1e-300)
+            cause = "is v reversed, stuck or in another unit there?"
         text = (
-            f"columns {a!r} and {b!r}: the derivative of q is {factor:.4g} times v, expected 1, "
-            f"with a correlation of {correlation:.2f}: {cause}"
+            f"{place}columns {a!r} and {b!r}: the derivative of q is {ratio:.4g} times v, expected "
+            f"1, with a correlation of {correlation:.2f}{' elsewhere' if place else ''}: {cause}"
         )
         expected = f"{low} to {high}"
-        results.append(judged("dq/dt over v", f"{a}, {b}", factor, expected, bool(cause), text))
+        results.append(judged("dq/dt over v", f"{a}, {b}", ratio, expected, bool(cause), text))
     return results
 
 
@@ -117,47 +136,38 @@ def moves(recordings: Sequence[Recording], k: int) -> bool:
     return bool(np.ptp(q) > _STILL and (steps**2).mean() <= q.var())
 
 
-def _agreement(recordings: list[Recording], step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return correlations of Δq_i with ∫ v_k dt, ``(N, N)``, and the factor of each v_i."""
-    correlations, factors = [], []
-    for samples in (10, 100, 1000):
-        dq = np.vstack([np.diff(item.q[1::samples], axis=0) for item in recordings])
-        integrals = [cumulative_trapezoid(item.v, dx=step, axis=0) for item in recordings]
-        dv = np.vstack([np.diff(x[::samples], axis=0) for x in integrals])
-        squares = (dv**2).sum(axis=0).clip(min=1e-300)
-        product = dq.T @ dv * (len(dq) >= 5)  # fewer are too few to tell
-        norms = np.sqrt(np.outer((dq**2).sum(axis=0), squares)).clip(min=1e-300)
-        correlations.append(np.abs(product) / norms)
-        factors.append(np.diag(product) / squares)
-    clearest = np.diagonal(correlations, axis1=1, axis2=2).argmax(axis=0)
-    return np.max(correlations, axis=0), np.array(factors)[clearest, range(len(clearest))]
+def _products(
+    recordings: Sequence[Recording], step: float, samples: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return sums of Δq ∫v ``(B, N, N)``, Δq² and (∫v)² ``(B, N)`` over tenths of stretches."""
+    parts = []
+    for item in recordings:
+        integral = cumulative_trapezoid(item.v, dx=step, axis=0, initial=0)
+        stride = max(1, samples // 10)
+        dq, dv = (x[samples:][::stride] - x[:-samples][::stride] for x in (item.q, integral))
+        tenths = (np.arange(len(dq)) * _TENTHS // max(len(dq), 1))[:, None] == np.arange(_TENTHS)
+        sums = ("rb,ri,rj->bij", dq, dv), ("rb,ri,ri->bi", dq, dq), ("rb,ri,ri->bi", dv, dv)
+        # Fewer increments are too few to tell.
+        enough = len(dq) >= 2 * _TENTHS
+        parts.append([enough * np.einsum(form, tenths.astype(float), x, y) for form, x, y in sums])
+    products, dq, dv = map(np.concatenate, zip(*parts, strict=True))
+    return products, dq, dv
 
 
-def check_force_signs(training: list[Recording], u: Columns, step: float) -> list[Measurement]:
-    """Measure whether a force or torque, one per coordinate, pushes forwards.
+def _odd_tenths(product: np.ndarray, dq: np.ndarray, dv: np.ndarray) -> np.ndarray:
+    """Return the tenths that move and whose Δq is not k ∫v, at least two of a stretch, ``(B,)``.
 
-    The acceleration and input i are both freed of the parts that 1, q, q², sin q, cos q, v and the
-    other inputs explain (least squares). A correlation of the remainders below -0.5 is clear.
+    k is the median of the tenths, with a positive sign unless most of them are negative.
     """
-    size = len(u.columns)
-    if training[0].q.shape[1] != size or not set(u.units) <= {"Nm", "N"}:
-        return []
-    thin = slice(None, None, max(1, sum(map(len, training)) // _MOST_ROWS))
-    signals = [x.values()[:, : 3 * size] for x in training]
-    rows = [np.hstack([x, np.gradient(x[:, size : 2 * size], step, axis=0)]) for x in signals]
-    q, v, forces, a = np.hsplit(np.vstack([x[thin] for x in rows]), 4)
-    basis = np.hstack([np.ones((len(q), 1)), q, q**2, np.sin(q), np.cos(q), v])
-    results = []
-    for k, name in enumerate(u.columns):
-        x = np.hstack([basis, np.delete(forces, k, axis=1)])
-        y = np.column_stack([a[:, k], forces[:, k]])
-        remainders = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-        norm = np.linalg.norm(remainders, axis=0).prod()
-        correlation = float(remainders[:, 0] @ remainders[:, 1]) / norm if norm > 0 else 0.0
-        text = (
-            f"input {name!r} seems to push backwards: it correlates by {correlation:.2f} with what "
-            f"else moves coordinate {k + 1}: is its sign reversed?"
-        )
-        measured = ("correlation of force and acceleration", name, correlation)
-        results.append(judged(*measured, f"above {_REVERSED}", correlation < _REVERSED, text))
-    return results
+    ratio = np.abs(product) / dv.clip(min=1e-300)
+    clear = (np.abs(product) > _CLEAR * np.sqrt(dq * dv)) & (product != 0)
+    if not clear.any():
+        return clear
+    k = np.median(ratio[clear]) * (-1 if np.mean(product[clear] < 0) > 0.75 else 1)
+    size = np.maximum(dq, k**2 * dv)
+    moving = size > _MOVING * min(dq.mean(), k**2 * dv.mean())
+    left = (dq - 2 * k * product + k**2 * dv) / size.clip(min=1e-300)
+    odd = (moving & (left > _LEFT)).reshape(-1, _TENTHS)
+    # Where most tenths disagree, the columns do.
+    odd &= odd.sum(axis=1, keepdims=True) >= 2
+    return odd.ravel() & (odd.sum() <= _MOST_ODD * moving.sum())

@@ -23,6 +23,7 @@ from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summa
 from pinn_dyn.data.logs.readers import find_files, read_table, run_name
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repeats import check_repeats, refuse_copies
+from pinn_dyn.data.logs.runs import check_runs
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.table import Request, Table
@@ -201,10 +202,11 @@ class LogSource(DataSource):
             for name in SPLITS
         }
         training = stretches["train"]
-        step = one_sample_time([item for items in stretches.values() for item in items])
+        everything = [item for items in stretches.values() for item in items]
+        step = one_sample_time(everything)
         if self.v is not None:
-            measurements += plausibility.check_velocities(training, self.q, self.v, step)
-        measurements += plausibility.check_force_signs(training, self.u, step)
+            measurements += plausibility.check_velocities(everything, self.q, self.v, step)
+        measurements += check_runs(everything, self.q, self.u, step)
         measurements += plausibility.check_inputs(training, self.u)
         measurements += plausibility.check_rest(training, self.q)
         report.add("Splits", "train", summary(training, step))
