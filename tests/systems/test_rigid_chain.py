@@ -150,6 +150,28 @@ def dynamics_of(chain, q, v, u):
     return a.detach(), torch.autograd.grad(a.square().mean(), inertia)[0]
 
 
+def test_a_payload_is_not_scaled_with_the_links():
+    settings = {"locked_joints": ["wrist"], "tip": "hand"}
+    plain = RigidChain(TREE, **settings).inertia[:, 3, 3]
+    loaded = RigidChain(TREE, **settings, mass_scale=1.5, payload=0.8).inertia[:, 3, 3]
+    added = torch.where(plain == plain[2], 0.8, 0.0).double()  # the wrist is locked to the elbow
+    torch.testing.assert_close(loaded, 1.5 * plain + added)
+
+
+def test_a_generic_body_is_a_cylinder_to_the_farthest_next_joint():
+    """Of the joints after the shoulder, at 0.36 m and 0.22 m, and inertias of a cylinder."""
+    near = joint("near", "revolute", "shoulder", "branch", xyz="0 0.2 0.1")
+    far = joint("far", "revolute", "shoulder", "elbow", xyz="0 0 0.36")
+    names = ("base", "shoulder", "elbow", "branch")
+    turn = joint("turn", "revolute", "base", "shoulder")
+    body = RigidChain(robot(*map(link, names), turn, near, far)).generic_inertia()[0]
+    length, radius = 0.36, 0.06  # the only rod with a next joint has the mean length
+    mass = 1000 * np.pi * radius**2 * length
+    across, along = mass * (radius**2 / 4 + length**2 / 3), mass * radius**2 / 2
+    expected = [mass, 0, 0, mass * length / 2, across, 0, across, 0, 0, along]
+    np.testing.assert_allclose(inertial_parameters(body), expected, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.slow
 @NEEDS_COMPILER
 def test_compiled_it_is_the_same_chain():
