@@ -37,41 +37,49 @@ def constants_table(
     """Return all constants in SI units with their 95 % intervals.
 
     The equation of motion is linear in the constants c, except for widths of friction and drive
-    gains, but not in the parameters z. The interval is value +- 1.96 sigma of the linear problem,
-    with the information I of the data on z at the fit, and the precision P_0 of the prior at the
-    start::
+    gains, but not in the parameters z. The interval is value +- 1.96 sigma from the information of
+    the data on c = c(z) at the fit and the prior of c, with G = dc/dz at the fit or at the start,
+    whichever is wider in a direction.
 
-        S = (G^-T I G^-1 + G_0^-T P_0 G_0^-1)^-1,    G = dc/dz at the fit, G_0 at the start
-
-    No interval extends below the lower limit of a constant, such as zero for a mass. ``start`` is
-    the center of the prior, and ``known`` the part of the prior variance that the data removed.
-    With ``input_units`` the units of drive gains are complete; without, they are ``Nm/u``.
+    No interval extends below the lower limit of a constant, such as zero for a mass. Data give only
+    upper limits of widths of friction. ``start`` is the center of the prior, and ``known`` the part
+    of the prior variance that the data removed. With ``input_units`` the units of drive gains are
+    complete; without, they are ``Nm/u``.
     """
     model = double_copy(model)
     constants = model.physical_constants()
     values = torch.cat([item.values for item in constants]).detach().numpy()
-    jacobian = _jacobian(model)
+    covariance, prior = constants_covariance(model, fit)
     vector_to_parameters(fit.prior.mean.double(), model.parameters())
     start = torch.cat([item.values for item in model.physical_constants()]).detach().numpy()
-    first = _jacobian(model)
-    change = torch.linalg.lstsq(jacobian, first).solution
-    information = change.T @ fit.information @ change
-    variance, before = (
-        (first @ posterior_covariance(matrix, fit.prior.root) @ first.T).diagonal().numpy()
-        for matrix in (information, torch.zeros_like(information))
-    )
+    variance, before = covariance.diagonal().numpy(), prior.diagonal().numpy()
     lower = np.concatenate([np.full(len(item.names), item.lower) for item in constants])
+    limits = np.concatenate([np.full(len(item.names), item.upper_limit) for item in constants])
     width = 1.96 * np.sqrt(variance)
     columns = {
         "name": [name for item in constants for name in item.names],
         "value": values,
-        "low": np.maximum(values - width, lower),
+        "low": np.where(limits, lower, np.maximum(values - width, lower)),
         "high": values + width,
         "unit": [unit for item in constants for unit in _units(item, input_units)],
         "start": start,
         "known": 1 - variance / before,
     }
     return pd.DataFrame(columns)
+
+
+def constants_covariance(model: LearnedConstants, fit: Fit) -> tuple[Tensor, Tensor]:
+    """Return the covariances of the physical constants after the fit and a priori, ``(P, P)``."""
+    model = double_copy(model)
+    jacobian = _jacobian(model)
+    vector_to_parameters(fit.prior.mean.double(), model.parameters())
+    change = torch.linalg.lstsq(jacobian, _jacobian(model)).solution
+    back = torch.linalg.inv(fit.prior.root)
+    vectors, scale, _ = torch.linalg.svd(fit.prior.root @ change @ back)
+    root = (vectors / scale.clamp(min=1)).T @ fit.prior.root
+    before = posterior_covariance(torch.zeros_like(root), root)
+    after = posterior_covariance(fit.information, root, fit.scores)
+    return jacobian @ after @ jacobian.T, jacobian @ before @ jacobian.T
 
 
 def _units(item: Named, input_units: Sequence[str]) -> list[str]:

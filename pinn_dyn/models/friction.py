@@ -82,8 +82,9 @@ class CoulombFriction(Friction):
         """Add more constants in a subclass."""
 
     def physical_constants(self) -> list[Named]:
-        """Return the constants of the law."""
-        return [*self._levels(), self.width.named()]
+        """Return the constants of the law. Stiction and a low-pass filter look like a width."""
+        width = self.width.named()._replace(lower=0.0, upper_limit=True)
+        return [*self._levels(), width]
 
     def forward(self, v: Tensor) -> Tensor:
         return self._level(v)[0] * torch.tanh(v / self.width())

@@ -13,12 +13,16 @@ from torch import Tensor, nn
 
 
 class Named(NamedTuple):
-    """Constants in physical units. A drive gain has the unit of its force by u, such as Nm/u."""
+    """Constants in physical units. A drive gain has the unit of its force by u, such as Nm/u.
+
+    Data give only an upper limit of the values if ``upper_limit`` is true.
+    """
 
     names: list[str]
     units: list[str]
     values: Tensor
     lower: float = -math.inf
+    upper_limit: bool = False
 
 
 class Constants(nn.Module, abc.ABC):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,6 +12,8 @@ from torch import Tensor
 
 _UNEXPLAINED = 0.9
 """Share of the inputs from which the fit of the median joint explains nothing."""
+_LARGEST_SHARE = 0.9
+"""Largest corrected share of a block of residuals in the information on a direction."""
 
 
 class Prior(NamedTuple):
@@ -34,6 +37,7 @@ class Fit:
         stage: stage of the fit that found z.
         error: validation error of z, or NaN.
         stopped_in: stage in which the fit was interrupted, or None if it is finished.
+        scores: covariance of the data's gradient, see :func:`block_scores`; None: the information.
     """
 
     covariance: Tensor
@@ -45,6 +49,7 @@ class Fit:
     stage: str = ""
     error: float = math.nan
     stopped_in: int | None = None
+    scores: Tensor | None = None
 
     def state(self) -> dict[str, Any]:
         """Convert to tensors and numbers for a checkpoint."""
@@ -69,12 +74,67 @@ class StoppedFit(KeyboardInterrupt):
         self.fit = fit
 
 
-def posterior_covariance(information: Tensor, root: Tensor) -> Tensor:
-    """Return (I + R^T R)^-1, ``(P, P)``, with information I and prior precision R^T R."""
+def posterior_covariance(information: Tensor, root: Tensor, scores: Tensor | None = None) -> Tensor:
+    """Return the covariance of an estimate with the prior precision R^T R, ``(P, P)``::
+
+        H^-1 (B + R^T R) H^-1,    H = I + R^T R
+
+    I is the information and B the covariance of the scores. The default B = I gives H^-1. Variances
+    are limited to those of the prior. Source: White (1982), "Maximum likelihood estimation of
+    misspecified models".
+    """
+    back, values, vectors = _whitened(information, root)
+    half = vectors / (1 + values).sqrt()
+    if scores is not None:
+        side = back @ half
+        spread = side.T @ scores @ side + torch.diag(1 / (1 + values))
+        vectors, deviations, _ = torch.linalg.svd(half @ torch.linalg.cholesky(spread))
+        half = vectors * deviations.clamp(max=1)
+    half = back @ half
+    return half @ half.T
+
+
+def block_scores(
+    slopes: Tensor, errors: Tensor, partitions: Sequence[Tensor], root: Tensor
+) -> tuple[Tensor, float]:
+    """Return the covariance B of the scores J^T r, and the mean of B / J^T J::
+
+        B = sum over k of J_k^T J_k r_k^2 + sum over partitions and their blocks b of s_b s_b^T
+        s_b = (1 - J_b^T J_b H^-1)^-1 J_b^T r_b,    H = J^T J + R^T R
+
+    Residuals of a block may have any correlation: that of a filter, or the repeated error of a
+    friction law at one speed. The factor in s_b replaces the residuals by those of a fit without
+    the block. The mean is over the directions that the data determine.
+
+    Sources: Cameron, Gelbach and Miller (2011), "Robust inference with multiway clustering"; Bell
+    and McCaffrey (2002), "Bias reduction in standard errors for linear regression".
+
+    Args:
+        slopes, errors: J ``(K, P)`` and r ``(K,)``, in units of the noise.
+        partitions: block number of each residual, ``(K,)`` each.
+        root: root R of the precision of the prior, ``(P, P)``.
+    """
+    back, values, vectors = _whitened(slopes.T @ slopes, root)
+    slopes = slopes @ (back @ vectors / (1 + values).sqrt())
+    scores = [slopes * errors[:, None]]
+    for blocks in partitions:
+        for number in blocks.unique():
+            part = slopes[blocks == number]
+            share, axes = torch.linalg.eigh(part.T @ part)
+            score = axes.T @ (part.T @ errors[blocks == number])
+            scores.append((axes @ (score / (1 - share.clamp(max=_LARGEST_SHARE))))[None])
+    joined = torch.cat(scores)
+    covariance = joined.T @ joined
+    dual = root.T @ vectors * (1 + values).sqrt()
+    ratio = float(covariance.trace() / (values / (1 + values)).sum())
+    return dual @ covariance @ dual.T, ratio
+
+
+def _whitened(information: Tensor, root: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return R^-1, and the eigenvalues and eigenvectors of R^-T I R^-1."""
     back = torch.linalg.inv(root)
     values, vectors = torch.linalg.eigh(back.T @ information @ back)
-    half = back @ vectors / (1 + values.clamp(min=0)).sqrt()
-    return half @ half.T
+    return back, values.clamp(min=0), vectors
 
 
 def doubtful_units(ratio: Tensor, largest: float, unexplained: Tensor) -> str | None:

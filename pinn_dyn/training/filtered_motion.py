@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from scipy.signal import butter, sosfiltfilt
 from torch import Tensor
@@ -22,28 +21,11 @@ class Motion(NamedTuple):
     u: Tensor
 
 
-def correlation_length(errors: np.ndarray) -> float:
-    """Return the number of successive errors ``(K, N)`` that are worth one independent error.
-
-    It is 1 + 2 sum over k of rho_k, with the autocorrelation rho up to its first sign change,
-    averaged over the N columns. Source: integrated autocorrelation time, Sokal (1997), "Monte Carlo
-    methods in statistical mechanics".
-    """
-    count = len(errors)
-    spectrum = np.fft.rfft(errors, 2 * count, axis=0)
-    correlation = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[:count].sum(-1)
-    if not correlation[0] > 0:
-        return 1.0
-    share = correlation / correlation[0]
-    until = int(np.argmax(share <= 0)) or count
-    return float(1 + 2 * share[1:until].sum())
-
-
 def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: int) -> Motion:
     """Return at most ``samples`` samples of q, v, a and u after a low-pass filter of ``cutoff`` Hz.
 
     The Butterworth filter of fourth order runs forwards and backwards. a is the derivative of the
-    filtered v by differences. Half a period of the cutoff is removed at both ends.
+    filtered v by differences of fourth order. Half a period of the cutoff is removed at both ends.
 
     Raises:
         ValueError: if the cutoff is above half the sample rate, or all trajectories are too short.
@@ -61,8 +43,10 @@ def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: 
         low_pass = butter(4, cutoff, fs=rate, output="sos")
         smooth = [sosfiltfilt(low_pass, getattr(item, name).numpy(), axis=0) for name in "qvu"]
         q, v, u = (torch.from_numpy(x.copy()).double() for x in smooth)
-        (a,) = torch.gradient(v, spacing=1 / rate, dim=0)
-        edge = max(int(0.5 * rate / cutoff), 1)
+        # Plain differences would lose 2 % of an acceleration at a twentieth of the sample rate.
+        near, far = v.roll(-1, 0) - v.roll(1, 0), v.roll(-2, 0) - v.roll(2, 0)
+        a = (8 * near - far) * rate / 12
+        edge = max(int(0.5 * rate / cutoff), 2)
         parts.append(Motion(*(x[edge:-edge] for x in (q, v, a, u))))
     if not parts:
         longest = max(item.duration for item in trajectories)

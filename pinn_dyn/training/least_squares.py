@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 import torch
 from pydantic import Field, PositiveFloat
+from scipy.cluster.vq import kmeans2
 from scipy.optimize import least_squares
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
@@ -23,10 +24,11 @@ from pinn_dyn.training.constants_fit import (
     Fit,
     Prior,
     StoppedFit,
+    block_scores,
     doubtful_units,
     posterior_covariance,
 )
-from pinn_dyn.training.filtered_motion import correlation_length, filtered_motion
+from pinn_dyn.training.filtered_motion import filtered_motion
 from pinn_dyn.training.sensitivity import rollout_slopes
 
 log = logging.getLogger(__name__)
@@ -37,6 +39,10 @@ AtLeastTwo = Annotated[int, Field(ge=2)]
 REST = 0.05
 """Share of the typical speed of a joint below which it is considered at rest."""
 _CHUNK = 500  # windows whose derivatives are rolled out at once, to limit the memory
+_CHEAP = 8  # evaluations of the inverse dynamics in the time of one roll-out
+_PASSES = 3  # fits of a stage, to estimate the noise
+_BLOCKS = 30  # blocks of the motion, and neighborhoods of windows
+_SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _DIVERGED = 1e4  # residual of a diverged roll-out
@@ -66,9 +72,10 @@ class LeastSquares:
 
     The stage with the smallest validation error is kept, or the last stage without validation.
 
-    s is the root mean square of the residuals, estimated by repeating each stage. Correlated
-    residuals are counted once: successive samples of the motion by :func:`correlation_length`, and
-    the residuals of a coordinate within a window.
+    s^2 is the mean square of the residuals times the number of correlated residuals that count as
+    one, estimated by repeating each stage. The covariance of z, and this number, follow from sums
+    over blocks (:func:`~.constants_fit.block_scores`): successive samples or neighboring windows,
+    and similar speeds of a joint, at which an error of the friction law repeats.
 
     Args:
         cutoff: cutoff of the filter, Hz, above the frequencies of the motion and below the noise.
@@ -210,13 +217,19 @@ class LeastSquares:
             by_z = samples.by_parameters() - by_gain
             return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
 
-        self._solve(IDENTIFICATION, model, prior, residuals, 1.0)
+        periods = self.cutoff * sum(run.duration for run in runs)
+        blocks = min(int(periods / 2), _BLOCKS)  # of two periods of the cutoff or more
+        times = torch.arange(len(q)).mul(blocks).div(len(q), rounding_mode="floor")
+        partitions = [times[:, None].expand_as(v)[moves], _speeds(v)[moves]]
+        group, limit = max(len(q) / (2 * periods), 1.0), _CHEAP * self.evaluations
+        solve = partial(self._solve, IDENTIFICATION, model, prior, residuals)
+        result = solve(partitions, group, limit)
         with torch.no_grad():
+            scale = model.force_scale(q, v, a, u)
+        if not torch.allclose(scale, spread):
             # The scale of a passive joint is the force of the bodies, which were a guess.
-            spread.copy_(model.force_scale(q, v, a, u))
-            correlated = correlation_length((errors() * moves).numpy())
-        stage = f"{IDENTIFICATION}, correlation over {correlated:.3g} samples"
-        result = self._solve(stage, model, prior, residuals, correlated)
+            spread.copy_(scale)
+            result = solve(partitions, group, limit)
         with torch.no_grad():
             doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
         if doubt:
@@ -236,12 +249,28 @@ class LeastSquares:
             predicted = model.increments(x0, windows.t, windows.input)
             return ((predicted[:, 1:] - measured) / scale)[..., first:]
 
-        return self._solve(stage, model, prior, residuals, float(measured.shape[1]))
+        # Windows that overlap have neighboring starts, and so have similar errors of the model.
+        starts = x0 / x0.std(0, correction=0).clamp(min=1e-12)
+        _, near = kmeans2(starts.numpy(), min(_BLOCKS, len(x0)), seed=0, minit="++")
+        speeds = _speeds(windows.v).repeat(1, 2)[:, None, first:]
+        size = residuals(False).shape
+        labels = [torch.from_numpy(near)[:, None, None], speeds]
+        partitions = [label.expand(size).flatten() for label in labels]
+        return self._solve(
+            stage, model, prior, residuals, partitions, float(size[1]), self.evaluations
+        )
 
     def _solve(
-        self, stage: str, model: LearnedConstants, prior: Prior, residuals: Residuals, group: float
+        self,
+        stage: str,
+        model: LearnedConstants,
+        prior: Prior,
+        residuals: Residuals,
+        partitions: Sequence[Tensor],
+        group: float,
+        limit: int,
     ) -> Fit:
-        """Fit twice, then with the noise of the first fit; ``group`` residuals count as one."""
+        """Fit repeatedly, with the noise of the previous fit; ``group`` residuals count as one."""
         z = parameters_to_vector(model.parameters()).detach()
         mean, root = prior.mean.numpy(), prior.root.numpy()
 
@@ -249,11 +278,10 @@ class LeastSquares:
             square = np.mean(_evaluate(model, at, residuals, False) ** 2)
             return max(float(np.sqrt(square)), np.finfo(float).eps)
 
-        noise, steps = min(spread(z.numpy()), _FIRST_NOISE), 0
+        weight, steps = 1 / (min(spread(z.numpy()), _FIRST_NOISE) * group**0.5), 0
         best = np.inf, z.numpy()
-        progress = _Progress(stage, 2 * self.evaluations)
-        for _ in range(2):
-            weight = 1 / (noise * group**0.5)
+        progress = _Progress(stage, _PASSES * limit)
+        for _ in range(_PASSES):
             best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
@@ -270,20 +298,22 @@ class LeastSquares:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
                 return np.concatenate([data, root])
 
-            limit = {"max_nfev": self.evaluations, "ftol": 1e-4, "xtol": 1e-4, "gtol": 1e-8}
+            settings = {"max_nfev": limit, "ftol": 1e-6, "xtol": 1e-6, "gtol": 1e-8}
             try:
-                solution = least_squares(value, z.numpy(), slope, **limit)
+                solution = least_squares(value, z.numpy(), slope, **settings)
             except KeyboardInterrupt:
                 vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
                 raise
             z = torch.from_numpy(solution.x)
+            slopes, data = (torch.from_numpy(x[: -len(z)]) for x in (solution.jac, solution.fun))
+            scores, ratio = block_scores(slopes, data, partitions, prior.root)
+            information = slopes.T @ slopes
             noise = spread(solution.x)
+            weight = min(weight / max(np.finfo(float).eps, ratio) ** 0.5, 1 / noise)
             steps += int(solution.njev)
             log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
-        slopes = torch.from_numpy(solution.jac[: -len(z)])
-        information = slopes.T @ slopes
-        covariance = posterior_covariance(information, prior.root)
-        return Fit(covariance, information, prior, noise, steps, z)
+        covariance = posterior_covariance(information, prior.root, scores)
+        return Fit(covariance, information, prior, noise, steps, z, scores=scores)
 
 
 class _Progress:
@@ -317,6 +347,12 @@ def _evaluate(
     bad = 0.0 if derivative else _DIVERGED
     values = np.nan_to_num(result.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
     return values if derivative else values.clip(-_DIVERGED, _DIVERGED)
+
+
+def _speeds(v: Tensor) -> Tensor:
+    """Return the number of the joint and its block of speed, of equal size, ``(K, N)``."""
+    order = v.argsort(dim=0).argsort(dim=0) * _SPEEDS // len(v)
+    return order * v.shape[1] + torch.arange(v.shape[1])
 
 
 def _informative_blocks(steps: int) -> int:

@@ -71,11 +71,12 @@ def test_no_interval_goes_below_what_a_constant_can_be():
     model = known_model(friction=AsymmetricCoulomb)
     table = constants_table(model, fit_with(model, [1.0] * len(model.parameter_names())))
     table = table.set_index("name")
-    lower = float(model.friction.width.named().lower)
-    assert lower > 0  # a hundredth of the typical speed
-    for name in ("mass of slider", "Izz of slider", "armature of slide"):
+    zero = ["mass of slider", "Izz of slider", "armature of slide", "friction width of slide"]
+    for name in zero:
         assert table.low[name] == 0
-    assert table.low["friction width of slide"] == pytest.approx(lower)
+    # Data give an upper limit of a width: sticking and a filter look like a width.
+    precise = constants_table(model, fit_with(model, [1e-6] * len(model.parameter_names())))
+    assert precise.set_index("name").low["friction width of slide"] == 0
     assert table.low["m cx of slider"] < 0
     assert table.low["force offset of slide"] < 0
 

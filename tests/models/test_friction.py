@@ -117,7 +117,9 @@ def test_parameters_of_an_own_head_have_names_too():
 def test_reported_friction_is_what_acts():
     """Level of each direction and width, against forces of the law itself."""
     model = anywhere(known_model(friction=Stribeck), std=0.4)
-    found = {n: x for c in model.physical_constants() for n, x in zip(*c[::2], strict=True)}
+    found = {
+        n: x for c in model.physical_constants() for n, x in zip(c.names, c.values, strict=True)
+    }
     law, slide = model.friction, model.structure.joint_names.index("slide")
     fast = torch.full((4,), 1e3).double()
     assert float(law(fast)[slide]) == pytest.approx(
