@@ -34,6 +34,8 @@ def on_files(files, config):
     contents = {page: (ROOT / source).read_text() for page, source in TOP_LEVEL.items()}
     contents["config.md"] = config_reference()
     for page, content in contents.items():
+        if stub := files.get_file_from_path(page):  # for readers of the repository
+            files.remove(stub)
         files.append(File.generated(config, page, content=content))
     return files
 

@@ -78,6 +78,7 @@ class Evaluation:
         summary: one row per run and baseline, with all metrics.
         by_model: mean and standard deviation over seeds.
         torque: torque errors, one row per run and joint; empty without mechanical models.
+        ensembles: errors and spreads of members, one row per ensemble; empty without ensembles.
         parts: contributions of the parts of sums, one row per run, part and term.
         predictions: rollouts by name of the row, baselines included.
         intervals: calibration by run and window in s; runs without members have none.
@@ -92,6 +93,7 @@ class Evaluation:
     summary: pd.DataFrame
     by_model: pd.DataFrame
     torque: pd.DataFrame
+    ensembles: pd.DataFrame
     parts: pd.DataFrame
     predictions: dict[str, Prediction]
     intervals: dict[str, dict[float, Calibration]]
@@ -168,6 +170,7 @@ class Evaluation:
             "summary": self.summary,
             "by_model": self.by_model,
             "torque": self.torque,
+            "ensembles": self.ensembles,
             "parts": self.parts,
         }
         tables |= {f"terms_{_stem(run)}": x.to_frame() for run, x in self.terms.items()}
@@ -209,7 +212,7 @@ def evaluate_models(
         progress: counter of the evaluated models.
     """
     rows: list[dict[str, Any]] = []
-    torque, parts = [pd.DataFrame()], [pd.DataFrame()]
+    torque, parts, ensembles = [pd.DataFrame()], [pd.DataFrame()], []
     predictions: dict[str, Prediction] = {}
     intervals: dict[str, dict[float, Calibration]] = {}
     progress.total = len(entries) + len(baselines)
@@ -221,7 +224,8 @@ def evaluate_models(
         item = predictions[run] = _predict(entry, truth, stride)
         row |= rollout_metrics(item.q_hat, item.q, item.t, thresholds=thresholds).to_dict()
         row |= state_squared_error(item) | left_data(item, entry.training.train)
-        row |= {} if item.members is None else member_metrics(item)
+        if item.members is not None:
+            ensembles.append({"run": run, **member_metrics(item)})
         for window in windows:
             item = _predict(entry, truth, stride, window)
             metrics = rollout_metrics(item.q_hat, item.q, item.t, thresholds={})
@@ -255,6 +259,7 @@ def evaluate_models(
         summary=summary,
         by_model=over_seeds(summary, ["model", "baseline"]),
         torque=pd.concat(torque, ignore_index=True),
+        ensembles=pd.DataFrame(ensembles),
         parts=pd.concat(parts, ignore_index=True),
         predictions=predictions,
         intervals=intervals,

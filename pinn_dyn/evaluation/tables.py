@@ -33,7 +33,6 @@ _HEADERS = {
     _WINDOW: r"error, reset every \1 s",
     "torque_share": "torque error / spread",
     "residual_share": "residual force, share",
-    "spread_over_error": "spread / error",
     "window_(.*)s_within": r"errors in 95 % interval, reset every \1 s",
     "input_delay_seconds": "input delay [s]",
     "pairs": "training pairs",

@@ -129,7 +129,7 @@ def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
     )
     table = pd.read_csv(tmp_path / "summary.csv")
     (row,) = table[~table.baseline].to_dict("records")
-    assert row["members"] == 20
+    assert pd.read_csv(tmp_path / "ensembles.csv")["members"].tolist() == [20]
     assert 0.5 < row["window_0.1s_within"] <= 1
     assert row["window_0.1s_factor"] > 0
     model = pinn_dyn.load(fitted)

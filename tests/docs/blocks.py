@@ -14,7 +14,9 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 # Pages whose commands run from start to end: test_played_pages.py.
-PLAYED = ("docs/tutorial.md", "docs/your_log.md", "docs/your_robot.md")
+PLAYED = tuple(
+    f"docs/{name}.md" for name in ("tutorial", "your_log", "from_log_to_controller", "your_robot")
+)
 
 _FENCE = re.compile(r"^( *)(`{3,})([\w+-]*)(.*)$")
 _TITLE = re.compile(r'title="([^"]+)"')

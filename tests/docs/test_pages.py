@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pinn_dyn.app.config import CONF
-from tests.docs.blocks import ROOT, blocks
+from tests.docs.blocks import PAGES, ROOT, blocks
 
 EQUATIONS = (ROOT / "docs" / "equations.md").read_text()
 
@@ -72,3 +72,11 @@ def test_the_configuration_reference_has_types_and_meanings(reference):
     kind = re.escape("list (whole number > 0)")
     assert re.search(rf"\| `model.mass.hidden` \| `\[32, 32, 32\]` \| {kind} \| \w", reference)
     assert "| `gains.position` | `100.0` | | K\\_P. |" in reference  # comment beside the key
+
+
+def test_links_lead_to_files_without_a_build():
+    """A reader of the repository, without the site, follows them too."""
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text(), flags=re.M | re.S)
+        for link in re.findall(r"(?<!!)\]\(([^)\s:#]+)[)#]", text):
+            assert (page.parent / link).exists(), f"{page} links to {link}"

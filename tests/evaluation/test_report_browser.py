@@ -104,10 +104,10 @@ def test_the_slider_of_the_browser_selects_a_trajectory(browser, prediction):
     assert page.fine()
 
 
-@pytest.mark.parametrize("width", [500, 1280])
+@pytest.mark.parametrize("width", [390, 1280])
 def test_a_page_does_not_scroll_sideways(browser, prediction, width):
-    """Chromium makes no window narrower than 500 px."""
-    browser.set_window_size(width, 900)
+    screen = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     page = Opened(browser, prediction)
     root = "return document.documentElement.{}"
     inner = browser.execute_script(root.format("clientWidth"))
