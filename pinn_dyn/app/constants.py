@@ -28,7 +28,7 @@ def write_constants(model: Predictor, result: Fit, source: DataSource, folder: P
     assert isinstance(model, LearnedConstants)
     table = constants_table(model, result, [units([label]) for label in source.input_labels])
     path = folder / _CONSTANTS
-    write_whole(path, table.to_csv(index=False))
+    write_whole(path, table.to_csv(index=False, float_format="%.4g"))
     log.info("constants and their intervals are in %s", path)
     lines = undetermined(model, result)
     head = f"{len(lines)} of {len(table)} directions of the constants are held by the prior"

@@ -16,6 +16,7 @@ from pinn_dyn.data import DynamicsData, LogSource
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.mechanics import Predictor
+from pinn_dyn.training import LeastSquares
 
 Signals = str | Sequence[str] | Mapping[str, Any]
 
@@ -23,6 +24,7 @@ STEPS = 1000
 """Default steps of the optimizer."""
 _PAIRS, _BATCH = 10_000, 128  # at most
 _WINDOW, _STEP = 2, 0.02  # steps of a training window, and their length in s
+_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs and steps for least squares
 _HORIZON = 2.0  # s, at most, of the roll-outs that choose the best checkpoint
 _SI = {"time": "s", "v": "1/s", "q": "1", "u": "1"}
 
@@ -75,10 +77,10 @@ def fit(
     splits = source.load()
     t = splits.train[0].t
     stride = max(round(_STEP / float(t[1] - t[0])), 1)
-    starts = sum(max(len(item.t) - _WINDOW * stride, 0) for item in splits.train)
-    pairs = max(min(_PAIRS, starts), 1)
+    constants = isinstance(options.get("optimizer"), LeastSquares)
+    pairs, window = (_FEW_PAIRS, _LONG_WINDOW) if constants else (_PAIRS, _WINDOW)
     windows = partial(
-        DynamicsData, pairs=pairs, steps=_WINDOW, stride=stride, batch_size=min(_BATCH, pairs)
+        DynamicsData, pairs=pairs, steps=window, stride=stride, batch_size=min(_BATCH, pairs)
     )
     horizon = min(_HORIZON, *(item.duration for item in splits.validation))
     if model == "hnn":  # a log has no momenta

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import logging
+import math
 from typing import Annotated, Literal
 
 import lightning as L
@@ -17,13 +19,16 @@ from pinn_dyn.data.windows import BatchSampler, WindowLoader, Windows, draw_wind
 from pinn_dyn.mechanics import Trajectory, samples_of, stack_until
 from pinn_dyn.models.statistics import Statistics
 
+log = logging.getLogger(__name__)
+
 
 class DynamicsData(L.LightningDataModule):
     """Training pairs from a data source, drawn from its training trajectories alone.
 
     Args:
         source: the source of the trajectories.
-        pairs: number of training windows, or ``"all"`` windows of the trajectories.
+        pairs: number of training windows, or ``"all"`` windows of the trajectories, which are also
+            used if there are fewer.
         steps: steps H of a window; 1 gives the paper's transition pairs.
         stride: samples of the data in a step, or its length as a time, such as ``"20 ms"``.
         batch_size: windows in a batch.
@@ -79,11 +84,18 @@ class DynamicsData(L.LightningDataModule):
         Raises:
             ValueError: on a batch larger than the number of windows.
         """
+        runs, stride, count = self.splits.train, self._samples(), self.pairs
+        sample = float(runs[0].t[1] - runs[0].t[0])
+        span = self.steps * stride + math.ceil(self.history / sample - 1e-6)
+        starts = sum(max(len(x.t) - span, 0) for x in runs)
+        if count != "all" and 0 < starts < count:
+            log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
+            count, self.batch_size = starts, min(self.batch_size, starts)
         windows = draw_windows(
-            self.splits.train,
-            count=None if self.pairs == "all" else self.pairs,
+            runs,
+            count=None if count == "all" else count,
             steps=self.steps,
-            stride=self._samples(),
+            stride=stride,
             seed=self.seed,
             coverage=self.coverage,
             history=self.history,

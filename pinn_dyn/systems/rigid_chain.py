@@ -96,6 +96,14 @@ class RigidChain(MechanicalSystem):
         )
         size = len(tree.joints)
         super().__init__(num_coordinates=size, num_inputs=size)
+        # The description of a run in Python reads the arguments.
+        self.urdf, self.locked_joints, self.damping, self.gravity = (
+            urdf,
+            locked_joints,
+            damping,
+            gravity,
+        )
+        self.tip, self.mass_scale, self.payload = tip, mass_scale, payload
         double = torch.float64
         self.joint_names, self.body_names = tree.joints, tree.bodies
         self.turning = tree.turning

@@ -1,0 +1,82 @@
+"""Known mechanics on seconds of data, in Python, with the default windows."""
+
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pinn_dyn
+from pinn_dyn.data import DynamicsData
+from pinn_dyn.models import KnownMechanics
+from pinn_dyn.systems import RigidChain
+from pinn_dyn.training import LeastSquares
+from tests.support.rigid_chains import joint, link, robot
+
+ROD = robot(
+    link("base"),
+    link("rod", 1.0),
+    joint("swing", "continuous", "base", "rod", xyz="0 0 0", rpy="0 0 0", axis="0 1 0"),
+)
+
+
+def short_log(seconds, rate):
+    """A pendulum of 0.3 kg m^2, 2 Nm and 0.1 Nms/rad by small steps."""
+    t, h = np.arange(seconds * rate) / rate, 1 / rate / 20
+    q, v, rows = 0.5, 0.0, []
+    for k in range(len(t)):
+        u = np.sin(5 * t[k]) + np.cos(3 * t[k])
+        rows.append((t[k], q, v, u))
+        for step in range(20):
+            at = t[k] + step * h
+            v += h * (np.sin(5 * at) + np.cos(3 * at) - 2 * np.sin(q) - 0.1 * v) / 0.3
+            q += h * v
+    return pd.DataFrame(rows, columns=["t", "q", "v", "tau"])
+
+
+@pytest.mark.parametrize(("seconds", "rate"), [(2, 50)])
+def test_seconds_of_a_log_give_the_constants(tmp_path, seconds, rate):
+    run = pinn_dyn.fit(
+        short_log(seconds, rate),
+        q="q",
+        v="v",
+        u="tau",
+        model=partial(KnownMechanics, structure=RigidChain(ROD)),
+        optimizer=LeastSquares(cutoff=8.0, evaluations=6),
+        folder=tmp_path / "run",
+    )
+    table = pd.read_csv(tmp_path / "run" / "constants.csv", dtype=str).set_index("name")
+    assert float(table.value["viscous friction of swing"]) == pytest.approx(0.1, rel=0.2)
+    digits = table.value.str.replace(r"e.*|[-.]", "", regex=True).str.lstrip("0")
+    assert (digits.str.len() <= 4).all()
+    again = pinn_dyn.load(tmp_path / "run")  # built from its description
+    assert float(again.model.mass_matrix(again.statistics.q_mean[None])) == pytest.approx(
+        0.3, rel=0.05
+    )
+    assert run.metrics["validation"]["val/error_mean"] < 0.02
+
+
+def test_all_windows_are_used_if_there_are_fewer_than_pairs(short_source):
+    data = DynamicsData(
+        short_source, pairs=150, steps=10, stride=1, batch_size=150, batches_per_epoch=1, seed=0
+    )
+    starts = sum(len(x.t) - 10 for x in data.splits.train)
+    assert len(data.windows) == starts < 150
+    assert data.batch_size == starts
+
+
+@pytest.fixture
+def short_source(tmp_path):
+    short_log(2, 50).to_csv(tmp_path / "log.csv", index=False)
+    part = {"seconds": 0.3, "piece": 0.3}
+    return pinn_dyn.LogSource(
+        name="rod",
+        root=str(tmp_path),
+        files="log.csv",
+        time=dict(columns="t", unit="s"),
+        q=dict(columns=["q"], unit="rad"),
+        v=dict(columns=["v"], unit="rad/s"),
+        u=dict(columns=["tau"], unit="Nm"),
+        validation=part,
+        test=part,
+    )
