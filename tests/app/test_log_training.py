@@ -160,7 +160,6 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
         ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
         ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
         ("dataset.test.piece=7.0", ["test: ", "no stretch lasts 7 s"]),
-        ("data.pairs=5000", ["5000 windows", "fewer pairs"]),
         ("data.history=0.1 dataset.interpolation=hold", ["held between its samples"]),
         (
             "model/delay=learned data.history=0.05",
