@@ -223,13 +223,13 @@ class LeastSquares:
         partitions = [times[:, None].expand_as(v)[moves], _speeds(v)[moves]]
         group, limit = max(len(q) / (2 * periods), 1.0), _CHEAP * self.evaluations
         solve = partial(self._solve, IDENTIFICATION, model, prior, residuals)
-        result = solve(partitions, group, limit)
+        result = solve(partitions, group, limit, 1e-6)
         with torch.no_grad():
             scale = model.force_scale(q, v, a, u)
         if not torch.allclose(scale, spread):
             # The scale of a passive joint is the force of the bodies, which were a guess.
             spread.copy_(scale)
-            result = solve(partitions, group, limit)
+            result = solve(partitions, group, limit, 1e-6)
         with torch.no_grad():
             doubt = doubtful_units(*model.force_ratio(q, v, a), errors().std(0))
         if doubt:
@@ -257,7 +257,7 @@ class LeastSquares:
         labels = [torch.from_numpy(near)[:, None, None], speeds]
         partitions = [label.expand(size).flatten() for label in labels]
         return self._solve(
-            stage, model, prior, residuals, partitions, float(size[1]), self.evaluations
+            stage, model, prior, residuals, partitions, float(size[1]), self.evaluations, 1e-4
         )
 
     def _solve(
@@ -269,6 +269,7 @@ class LeastSquares:
         partitions: Sequence[Tensor],
         group: float,
         limit: int,
+        tolerance: float,
     ) -> Fit:
         """Fit repeatedly, with the noise of the previous fit; ``group`` residuals count as one."""
         z = parameters_to_vector(model.parameters()).detach()
@@ -298,7 +299,7 @@ class LeastSquares:
                 data = weight * _evaluate(model, at, residuals, True).reshape(-1, len(at))
                 return np.concatenate([data, root])
 
-            settings = {"max_nfev": limit, "ftol": 1e-6, "xtol": 1e-6, "gtol": 1e-8}
+            settings = {"max_nfev": limit, "ftol": tolerance, "xtol": tolerance, "gtol": 1e-8}
             try:
                 solution = least_squares(value, z.numpy(), slope, **settings)
             except KeyboardInterrupt:
