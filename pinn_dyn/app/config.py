@@ -25,12 +25,12 @@ _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
-def _experiment_or_run(experiment: str | None, run: str) -> str:
-    """Return the name of an experiment, or else the last two folders of the path of a run."""
-    return experiment or "/".join(Path(run).absolute().parts[-2:])
-
-
-OmegaConf.register_new_resolver("experiment_or_run", _experiment_or_run, replace=True)
+# The name of an experiment, or else the last two folders of the path of a run.
+OmegaConf.register_new_resolver(
+    "experiment_or_run",
+    lambda name, run: name or "/".join(Path(run).absolute().parts[-2:]),
+    replace=True,
+)
 
 
 def config_folder(command: str) -> Path:

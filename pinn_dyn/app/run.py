@@ -246,23 +246,20 @@ class Run:
 
     def inverse_dynamics(self, q: Values, v: Values, a: Values) -> np.ndarray:
         """Return tau = M a + C v + G + D v + F, generalized forces ``(*batch, N)``."""
-        return self.system.inverse_dynamics(*self._motion_state(q, v, a)).numpy()
+        return self.system.inverse_dynamics(*self._motion_state(q=q, v=v, a=a)).numpy()
 
     def input_for(self, q: Values, v: Values, a: Values) -> np.ndarray:
         """Return u with A(q) u = tau, see :meth:`MechanicalSystem.input_for`, ``(*batch, M)``."""
-        return self.system.input_for(*self._motion_state(q, v, a)).numpy()
-
-    def _motion_state(self, q: Values, v: Values, a: Values) -> tuple[Tensor, ...]:
-        values = [self._coordinates(name, x) for name, x in (("q", q), ("v", v), ("a", a))]
-        return torch.broadcast_tensors(*values)
+        return self.system.input_for(*self._motion_state(q=q, v=v, a=a)).numpy()
 
     def forward_dynamics(self, q: Values, v: Values, u: Values) -> np.ndarray:
         """Return a = M^-1 (A u - C v - G - D v - F), ``(*batch, N)``; u is ``(*batch, M)``."""
-        system = self.system
-        position, velocity = self._coordinates("q", q), self._coordinates("v", v)
-        position, velocity = torch.broadcast_tensors(position, velocity)
+        system, (position, velocity) = self.system, self._motion_state(q=q, v=v)
         force = self._array("u", u, self.model.num_inputs, "M")
         return system.forward_dynamics(position, velocity, force).numpy()
+
+    def _motion_state(self, **values: Values) -> tuple[Tensor, ...]:
+        return torch.broadcast_tensors(*(self._coordinates(*item) for item in values.items()))
 
     def _coordinates(self, name: str, value: Values) -> Tensor:
         return self._array(name, value, self.model.num_coordinates, "N")

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from pinn_dyn import __version__
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.run import ModelBuilder, Run
-from pinn_dyn.app.trust import is_trusted, require_trusted
+from pinn_dyn.app.trust import is_trusted, packages, require_trusted
 from pinn_dyn.data import data_changes
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation.tables import short
@@ -56,8 +56,7 @@ def load(
         ValueError: if the folder is no run folder, its checkpoint is damaged or of another model,
             or it names classes that are not trusted.
     """
-    trusted = (trust,) if isinstance(trust, str) else tuple(trust)
-    return load_run(Path(folder).expanduser(), checkpoint, trusted, model)
+    return load_run(Path(folder).expanduser(), checkpoint, packages(trust), model)
 
 
 def load_run(

@@ -154,13 +154,11 @@ class _ProgressLines(L.Callback):
             text += f", validation error {error:.4g}"
         self.progress.update(trainer.global_step, text)
 
-    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+    def teardown(self, *_: Any, **__: Any) -> None:
         """End the lines."""
         self.progress.__exit__()
 
-    def on_exception(self, *_: Any) -> None:
-        """End the lines."""
-        self.progress.__exit__()
+    on_exception = teardown
 
 
 def build_trainer(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ _DESTINATIONS = (
 """Arguments that say where something is written or sent to."""
 
 
-def packages(trust: str | list[str] | None) -> tuple[str, ...]:
+def packages(trust: str | Sequence[str] | None) -> tuple[str, ...]:
     """Return the packages that the user trusts."""
     return tuple([trust] if isinstance(trust, str) else trust or ())
 

@@ -135,23 +135,17 @@ def term_conditions(model: MechanicalSystem, q: Tensor) -> pd.DataFrame:
     return per_configuration(q, columns)
 
 
-def checked_samples(model: MechanicalSystem, truth: MechanicalSystem, q: Tensor) -> Tensor:
-    """Return configurations ``(K, N)`` of two systems of the same N and M in float64."""
-    sizes = [(system.num_coordinates, system.num_inputs) for system in (model, truth)]
-    if sizes[0] != sizes[1]:
-        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
-    require_last_dim("q", q, truth.num_coordinates, "N")
-    return q.double()
-
-
 def prepare(
     model: MechanicalSystem, truth: MechanicalSystem, q: Tensor
 ) -> tuple[MechanicalSystem, MechanicalSystem, Tensor]:
     """Return float64 copies of two systems and of configurations, after checking them."""
-    q = checked_samples(model, truth, q)
+    sizes = [(system.num_coordinates, system.num_inputs) for system in (model, truth)]
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"model has (N, M) = {sizes[0]}, truth {sizes[1]}: expected the same")
+    require_last_dim("q", q, truth.num_coordinates, "N")
     if truth.num_coordinates != truth.num_inputs:
         raise ValueError(f"Proposition 1 needs N = M inputs, the robot has M = {truth.num_inputs}")
-    return double_copy(model, q.device), double_copy(truth, q.device), q
+    return double_copy(model, q.device), double_copy(truth, q.device), q.double()
 
 
 def per_configuration(q: Tensor, columns: dict[str, Tensor]) -> pd.DataFrame:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,8 +32,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 def read_regular(path: Path) -> str:
     """Return the text of a file that others wrote; refuse pipes, devices and huge files."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
+    if not path.is_file() or path.stat().st_size > _LARGEST:
         raise ValueError(f"{path} is not read, expected a regular file of at most {_LARGEST} bytes")
     return path.read_text(encoding="utf-8", errors="replace")
 

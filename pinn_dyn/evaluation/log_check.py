@@ -15,6 +15,7 @@ from pydantic import PositiveFloat
 
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs.delay import INTERVAL
+from pinn_dyn.data.logs.delay_regression import white_noise
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import log_numbers as numbers
@@ -214,7 +215,7 @@ def _coordinates(
     q = np.vstack([item.q for item in training])
     v = np.vstack([item.v for item in training if item.v is not None])
     raw = [x.raw.q for x in source.cleaned if x.split == "train" and len(x.raw) > 10]
-    noise = np.median([numbers.white_noise(x) for x in raw], axis=0)
+    noise = np.median([white_noise(x) for x in raw], axis=0)
     tested = np.vstack([item.q.numpy() for item in test])
     low, high = q.min(axis=0), q.max(axis=0)
     table = {

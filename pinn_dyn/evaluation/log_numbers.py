@@ -9,7 +9,6 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import welch
 
 from pinn_dyn.data.logs import DelayCurve, Recording
-from pinn_dyn.data.logs.delay_regression import white_noise as white_noise
 
 _SMOOTH = 0.03  # width of the kernel before a derivative, s
 

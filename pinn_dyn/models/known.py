@@ -221,9 +221,8 @@ class KnownMechanics(LearnedConstants):
 
     def potential_energy(self, q: Tensor) -> Tensor:
         self._check(q=q)
-        return self.structure.potential_energy(q, self.bodies()) - (self.constant_force() * q).sum(
-            -1
-        )
+        energy = self.structure.potential_energy(q, self.bodies())
+        return energy - (self.constant_force() * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
         return torch.diag_embed(self.viscous().expand_as(q))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,6 +19,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
+from pinn_dyn.progress import Progress
 from pinn_dyn.training.constants_fit import (
     Fit,
     Prior,
@@ -46,7 +46,6 @@ _SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _DIVERGED = 1e4  # residual of a diverged roll-out
-_SILENCE = 10.0  # s, between two lines about a stage that is not finished
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
 
@@ -280,15 +279,16 @@ class LeastSquares:
             return max(float(np.sqrt(square)), np.finfo(float).eps)
 
         weight, steps = 1 / (min(spread(z.numpy()), _FIRST_NOISE) * group**0.5), 0
-        best = np.inf, z.numpy()
-        progress = _Progress(stage, _PASSES * limit)
+        best, evaluations = (np.inf, z.numpy()), 0
+        task = f"least squares, {stage}", _PASSES * limit, "evaluations or fewer"
         for _ in range(_PASSES):
             best = np.inf, best[1]
 
             def value(at: np.ndarray, weight: float = weight) -> np.ndarray:
-                nonlocal best
+                nonlocal best, evaluations
                 error = _evaluate(model, at, residuals, False)
-                progress.count(float(np.mean(error**2)) ** 0.5)
+                evaluations += 1
+                progress.update(evaluations, f", residual {np.mean(error**2) ** 0.5:.4f}")
                 data = weight * error
                 errors = np.concatenate([data, root @ (at - mean)])
                 if (cost := float(errors @ errors)) < best[0]:
@@ -301,7 +301,8 @@ class LeastSquares:
 
             settings = {"max_nfev": limit, "ftol": tolerance, "xtol": tolerance, "gtol": 1e-8}
             try:
-                solution = least_squares(value, z.numpy(), slope, **settings)
+                with Progress(*task) as progress:
+                    solution = least_squares(value, z.numpy(), slope, **settings)
             except KeyboardInterrupt:
                 vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
                 raise
@@ -315,27 +316,6 @@ class LeastSquares:
             log.info("least squares, %s: residual %.4f after %d steps", stage, noise, steps)
         covariance = posterior_covariance(information, prior.root, scores)
         return Fit(covariance, information, prior, noise, steps, z, scores=scores)
-
-
-class _Progress:
-    """Lines about a running stage, ten seconds apart."""
-
-    def __init__(self, stage: str, limit: int):
-        self.stage, self.limit, self.evaluations = stage, limit, 0
-        self.started = self.shown = time.monotonic()
-
-    def count(self, residual: float) -> None:
-        """Count an evaluation of the residuals, and log a line if it is due."""
-        self.evaluations += 1
-        now = time.monotonic()
-        if now - self.shown < _SILENCE:
-            return
-        self.shown = now
-        left = (now - self.started) * (self.limit / self.evaluations - 1)
-        log.info(
-            "least squares, %s: evaluation %d of at most %d, residual %.4f, at most %.0f s left",
-            *(self.stage, self.evaluations, self.limit, residual, left),
-        )
 
 
 def _evaluate(

@@ -63,11 +63,7 @@ def described(kind: type[_Described], name: str, value: _Described | Mapping[str
         raise LogError("; ".join(mistakes).replace("Value error, ", "")) from error
 
 
-def _as_list(value: Any) -> Any:
-    return [value] if isinstance(value, (str, int, float)) else value
-
-
-PerColumn = BeforeValidator(_as_list)
+PerColumn = BeforeValidator(lambda x: [x] if isinstance(x, (str, int, float)) else x)
 
 
 @dataclass(config=STRICT)
