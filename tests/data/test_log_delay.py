@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, input_delays
-from tests.support.delayed_robots import log, seven_regressor
+from pinn_dyn.data.logs import InputDelay, Recording, input_delays
+from tests.support.delayed_robots import log, seven_regressor, sines
 
 
 @pytest.mark.parametrize("kind", ["pendulum", "arm", "tendons"])
@@ -57,3 +57,23 @@ def test_delays_shift_each_input():
     (shifted,), _ = InputDelay(delay=[0.02, 0.05]).apply(item)
     np.testing.assert_array_equal(shifted.u[:, 0], item.u[3:-2, 0])
     np.testing.assert_array_equal(shifted.u[:, 1], item.u[:-5, 1])
+
+
+def test_the_lag_of_a_pneumatic_joint_is_no_delay():
+    """Two pressures in bar follow their commands in 60 ms; the joint has inertia and damping."""
+    t, parts, steps = np.arange(1500) / 100, [], 5
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        command = 2.5 + sines(rng, 2, size=0.8, highest=1.2)(t)
+        (a, b), q, v, path = command[0], 0.0, 0.0, []
+        for first, second in command:
+            path.append(q)
+            for _ in range(steps):
+                a, b = a + (first - a) / 30, b + (second - b) / 30
+                torque = 2 * (a * (1 - 0.4 * q) - b * (1 + 0.4 * q)) - 4 * q - 1.2 * np.sin(q)
+                v += 0.002 * (torque - 0.5 * v - 0.15 * np.tanh(20 * v)) / 0.04
+                q += 0.002 * v
+        motion = np.array(path)[:, None] + 1e-3 * np.std(path) * rng.normal(size=(len(t), 1))
+        parts.append(Recording(f"run{seed}", t, motion, None, command))
+    for curve in input_delays(parts):
+        assert curve.delay is None or curve.delay < 0.1

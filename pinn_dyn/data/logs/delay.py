@@ -34,6 +34,7 @@ _CANDIDATES = 60  # at most: a parabola finds what is between them
 _DEPTH = 0.9  # largest residual as a share of its median
 _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
 _UNEXPLAINED = 0.4  # largest residual
+_WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
@@ -104,7 +105,7 @@ def input_delays(
         for form, trials in forms.items()
     }
     bodies = best.pop(_RIGID, None)
-    curves = min(best.values(), key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
+    curves = _agreed(list(best.values()), step)
     if bodies is not None:
         curves = [
             of_bodies if curve.reason and not of_bodies.reason else curve
@@ -138,6 +139,23 @@ def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
         widths = np.full(len(curves), widths[usable].min())
     clear = (values >= step) & (values - widths > step / 2)
     return np.where(clear, values, 0.0).tolist()
+
+
+def _agreed(forms: Sequence[list[DelayCurve]], step: float) -> list[DelayCurve]:
+    """Return the curves of the clearest equation, without delays that an equally good one denies.
+
+    A delay makes up for terms that a worse equation of motion lacks, such as inertia.
+    """
+    left = [np.mean([x.residual.min() for x in curves]) for curves in forms]
+    good = [x for x, share in zip(forms, left, strict=True) if share <= _WORSE * min(left)]
+    curves = min(good, key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
+    for others in good:
+        for k, (x, y) in enumerate(zip(curves, others, strict=True)):
+            width = step + INTERVAL * np.hypot(x.spread, y.spread)
+            if x.delay is not None and y.delay is not None and abs(x.delay - y.delay) > width:
+                reason = f"{x.form} and {y.form} disagree, {x.delay:.3g} and {y.delay:.3g} s"
+                curves[k] = replace(x, delay=None, reason=reason)
+    return curves
 
 
 def _best(curves: Sequence[DelayCurve]) -> DelayCurve:
