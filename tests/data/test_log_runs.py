@@ -62,6 +62,21 @@ def arms():
     return {f"r{k}": arm(k) for k in range(6)}
 
 
+def test_a_slow_run_with_dry_friction_is_good():
+    """A slide of 1.2 kg with 4 N of dry friction; one run has a tenth of the amplitude."""
+
+    def run(seed, size):
+        rng, t = np.random.default_rng(seed), np.arange(2000) / 250
+        q, v, a = (
+            sines(np.random.default_rng(seed), 1, size=size, highest=1.0)(t, k) for k in range(3)
+        )
+        u = 1.2 * (a + 9.81) + 4 * np.tanh(1e3 * v)
+        return frame(q, v, u + 0.05 * rng.normal(size=u.shape), t)
+
+    runs = {f"r{k}": run(k, 0.004 if k == 2 else 0.04) for k in range(6)}
+    assert measured(runs, unit="m", force="N") == []
+
+
 def exchanged(table):
     names = {f"{s}{k}": f"{s}{3 - k}" for s in "qvu" for k in (1, 2)}
     return table.rename(columns=names)[list(table)]

@@ -68,9 +68,9 @@ class Smoothed:
             return gaussian_filter1d(x, samples, axis=0, order=order, truncate=_CUT) / step**order
 
         q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in pairs]) for order in range(3))
-        signs = [_signs(item.q, step) for item, _ in pairs]
+        friction = [signs(item.q, step) for item, _ in pairs]
         sign, still = (
-            np.vstack([smooth(x[k])[r] for x, (_, r) in zip(signs, pairs, strict=True)])
+            np.vstack([smooth(x[k])[r] for x, (_, r) in zip(friction, pairs, strict=True)])
             for k in range(2)
         )
         inputs = np.concatenate([item.u for item in recordings])
@@ -86,7 +86,7 @@ def white_noise(x: np.ndarray) -> np.ndarray:
     return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
 
 
-def _signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the smooth sign of v, and 1 for samples at rest, ``(T, N)`` each."""
     samples = max(_SHORT / step, 1.5)
     v = gaussian_filter1d(q, samples, axis=0, order=1) / step

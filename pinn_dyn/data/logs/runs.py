@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay_regression import Smoothed, terms
+from pinn_dyn.data.logs.delay_regression import Smoothed, signs, terms
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
@@ -92,19 +92,19 @@ def check_runs(
     parts: dict[str, list[np.ndarray]] = {}
     for item in sorted(recordings, key=lambda item: item.t[0]):
         rows = np.arange(edge, len(item) - edge, stride).astype(int)
+        signals = *((item.q, order) for order in range(3)), (item.u[:, :size], 0)
         smooth = [
             gaussian_filter1d(x, samples, 0, order, truncate=3.0)[rows] / step**order
-            for x, order in ((item.q, 0), (item.q, 1), (item.q, 2), (item.u[:, :size], 0))
+            for x, order in (*signals, (signs(item.q, step)[0], 0))
         ]
         parts.setdefault(item.run, []).append(np.hstack([item.t[rows, None], *smooth]))
     runs = {run: np.vstack(x) for run, x in parts.items() if sum(map(len, x)) >= _FEWEST}
     if not runs:
         return []
-    signals = np.split(np.vstack(list(runs.values())), 1 + n * np.arange(4), axis=1)
+    signals = np.split(np.vstack(list(runs.values())), [1, 1 + n, 1 + 2 * n, 1 + 3 * n, -n], axis=1)
     tenths = [np.arange(len(x)) * _BLOCKS // len(x) for x in runs.values()]
     blocks = np.concatenate([_BLOCKS * k + x for k, x in enumerate(tenths)])
-    _, motion, v, a, inputs = signals
-    sign = np.tanh(10 * v / v.std(axis=0).clip(min=1e-300))
+    _, motion, v, a, inputs, sign = signals
     data = Smoothed(motion, v, a, sign, sign != 0, inputs, np.ones(size), blocks)
     inverse = size <= n
     if inverse:
