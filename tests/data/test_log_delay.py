@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pinn_dyn.data.logs import InputDelay, Recording, input_delays
+from pinn_dyn.data.logs import InputDelay, Recording, clear_delays, input_delays
 from tests.support.delayed_robots import log, seven_regressor, sines
 
 
@@ -77,3 +77,25 @@ def test_the_lag_of_a_pneumatic_joint_is_no_delay():
         parts.append(Recording(f"run{seed}", t, motion, None, command))
     for curve in input_delays(parts):
         assert curve.delay is None or curve.delay < 0.1
+
+
+def test_friction_that_rises_near_rest_is_no_delay():
+    rng = np.random.default_rng(1)
+    rates, phases = 2 * np.pi * rng.uniform(0.08, 0.7, 4), rng.uniform(0, 2 * np.pi, 4)
+    sizes, t = rng.uniform(0.1, 0.45, 4), np.arange(60_000) / 1000
+    phase = np.outer(t, rates) + phases
+    reference, slopes = np.sin(phase) @ sizes, np.cos(phase) @ (sizes * rates)
+    q, v, motion, torque = reference[0], 0.0, [], []
+    for goal, slope in zip(reference, slopes, strict=True):
+        u = 12 * (goal - q) + slope - v
+        motion.append(q)
+        torque.append(u)
+        level = 0.4 * (1 + 0.6 * np.exp(-((v / 0.08) ** 2)))
+        free = v + 0.05 * (u - 0.15 * v - 0.3 * np.sin(q))
+        v = np.sign(free) * max(abs(free) - 0.05 * level, 0.0)
+        q += 0.001 * v
+    measured = np.array(motion)[::4, None] + 1e-4 * rng.normal(size=(15_000, 1))
+    inputs = np.array(torque)[::4, None] + 0.05 * rng.normal(size=(15_000, 1))
+    curves = input_delays([Recording("run", t[::4], measured, None, inputs)])
+    assert curves[0].dry
+    assert clear_delays(curves, 0.004) == [0.0]

@@ -19,6 +19,7 @@ _CUT = 4.0  # width at which the kernel ends
 _SHORT = 0.005  # width of the kernel of the sign of v, s
 _REST = 0.03  # shortest rest, s
 _SLOW = 0.02  # speed at rest as a share of a high speed
+_STRIBECK = (0.05, 0.2)  # speeds of the fall of friction, as shares of a high speed
 _RESTING = 0.1  # largest weight of samples at rest in an average
 
 Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -32,6 +33,7 @@ class Smoothed:
     Attributes:
         q, v, a: ``(R, N)``.
         sign: average of the sign of v, ``(R, N)``.
+        stribeck: averages of the sign of slow v, of which dry friction has more, ``(R, 2N)``.
         moving: joints that move, ``(R, N)``; dry friction at rest is undetermined.
         u: M inputs, then products of few inputs, of unit spread, ``(R, D, M + K)``.
         spread: standard deviation of the averages over the one of the inputs, ``(D, M + K)``.
@@ -42,6 +44,7 @@ class Smoothed:
     v: np.ndarray
     a: np.ndarray
     sign: np.ndarray
+    stribeck: np.ndarray
     moving: np.ndarray
     u: np.ndarray
     spread: np.ndarray
@@ -69,16 +72,17 @@ class Smoothed:
 
         q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in pairs]) for order in range(3))
         friction = [signs(item.q, step) for item, _ in pairs]
-        sign, still = (
+        sign, stribeck, still = (
             np.vstack([smooth(x[k])[r] for x, (_, r) in zip(friction, pairs, strict=True)])
-            for k in range(2)
+            for k in range(3)
         )
         inputs = np.concatenate([item.u for item in recordings])
         mean, spread = inputs.mean(axis=0), inputs.std(axis=0).clip(min=1e-300)
         u = [smooth(_monomials((x.u - mean) / spread))[r[:, None] - lags] for x, r in pairs]
         inputs = np.concatenate(u)
         block = np.arange(count) * BLOCKS // count
-        return cls(q, v, a, sign, still < _RESTING, _standard(inputs), inputs.std(axis=0), block)
+        moving, spread = still < _RESTING, inputs.std(axis=0)
+        return cls(q, v, a, sign, stribeck, moving, _standard(inputs), spread, block)
 
 
 def white_noise(x: np.ndarray) -> np.ndarray:
@@ -86,16 +90,19 @@ def white_noise(x: np.ndarray) -> np.ndarray:
     return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
 
 
-def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smooth sign of v, and 1 for samples at rest, ``(T, N)`` each."""
+def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the smooth sign of v, that of slow v ``(T, 2N)``, and 1 for samples at rest."""
     samples = max(_SHORT / step, 1.5)
     v = gaussian_filter1d(q, samples, axis=0, order=1) / step
     # Deviation of the derivative of white noise that a Gaussian kernel averages.
     noise = white_noise(q) / step / np.sqrt(4 * np.sqrt(np.pi) * samples**3)
-    slow = np.maximum(_SLOW * np.percentile(np.abs(v), 95, axis=0), 3 * noise).clip(min=1e-300)
+    high = np.percentile(np.abs(v), 95, axis=0)
+    slow = np.maximum(_SLOW * high, 3 * noise).clip(min=1e-300)
     rest = max(round(_REST / step), 3)  # a reversal of v is no rest
     still = binary_opening(np.abs(v) < slow, np.ones((rest, 1)))
-    return np.tanh(v / slow), still.astype(float)
+    sign = np.tanh(v / slow)
+    falls = [np.exp(-((v / np.maximum(x * high, slow)) ** 2)) for x in _STRIBECK]
+    return sign, np.hstack([sign * x for x in falls]), still.astype(float)
 
 
 def _monomials(u: np.ndarray) -> np.ndarray:
@@ -130,9 +137,9 @@ def terms(data: Smoothed, form: str) -> np.ndarray:
 def input_shares(data: Smoothed, inputs: int, rigid: Regressor | None = None) -> np.ndarray:
     """Return the share of each input that known terms leave, and its friction ``(2, B + 1, D, M)``.
 
-    The terms are dry friction and those of inverse dynamics or of rigid bodies. The friction is the
-    coefficient of sign(v_i) in units of the spread of u_i, and NaN where it is not determined. With
-    an input per joint, only rows count in which its joint moves.
+    The terms are dry friction, which may be larger at low speed, and those of inverse dynamics or
+    of rigid bodies. The friction is the coefficient of sign(v_i) in units of the spread of u_i, and
+    NaN where it is not determined. With an input per joint, only rows count in which it moves.
     """
     lags, size = data.u.shape[1], data.q.shape[1]
     results = np.ones((2, BLOCKS + 1, lags, inputs))
@@ -150,14 +157,17 @@ def input_shares(data: Smoothed, inputs: int, rigid: Regressor | None = None) ->
             drive = [data.a[:, part[0]], data.v[:, part[0]], np.ones(len(mask))]
             known, joints = np.column_stack([basis[:, part[0]], *drive]), part
         u, sign = data.u[mask][..., part], data.sign[mask][:, joints]
+        slow = data.stribeck[mask][:, [i + k for k in (0, size) for i in joints]]
         if len(u) < 20 * BLOCKS:
             continue
         m = lags * len(part)
-        x = np.hstack([u.reshape(len(u), m), sign])
+        x = np.hstack([u.reshape(len(u), m), sign, slow])
         left, squares = _remainders(known[mask], x, np.arange(len(u)) * BLOCKS // len(u))
-        gram = left[:, m:, m:] + 1e-9 * len(u) * np.eye(len(joints))
+        gram = left[:, m:, m:] + 1e-9 * len(u) * np.eye(left.shape[1] - m)
         force = np.linalg.solve(gram, left[:, m:, :m])
         remainder = np.diagonal(left, axis1=1, axis2=2)[:, :m] - (force * left[:, m:, :m]).sum(1)
+        end = len(joints)  # The level of the friction is that without its rise at low speed.
+        force = np.linalg.solve(gram[:, :end, :end], left[:, m : m + end, :m])
         shares = remainder / squares[:, :m]
         results[0][..., part] = shares.reshape(-1, lags, len(part)).clip(1e-12, 1)
         if inputs == size:

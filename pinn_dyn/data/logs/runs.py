@@ -105,7 +105,7 @@ def check_runs(
     tenths = [np.arange(len(x)) * _BLOCKS // len(x) for x in runs.values()]
     blocks = np.concatenate([_BLOCKS * k + x for k, x in enumerate(tenths)])
     _, motion, v, a, inputs, sign = signals
-    data = Smoothed(motion, v, a, sign, sign != 0, inputs, np.ones(size), blocks)
+    data = Smoothed(motion, v, a, sign, sign[:, :0], sign != 0, inputs, np.ones(size), blocks)
     inverse = size <= n
     if inverse:
         sides = [(_inverse(data), data.u - np.median(data.u, axis=0))]
