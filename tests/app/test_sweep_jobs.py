@@ -59,8 +59,8 @@ def record(folder):
 
 
 def test_a_failed_job_does_not_end_the_sweep_and_is_listed_with_its_error(sweep, tmp_path):
-    said = sweep("model=lnn", "data.pairs=64,100000,65")
-    assert "1 job failed:\n  sweep/1_lnn-seed0\n    ConfigError: data: 100000 windows" in said
+    said = sweep("model=lnn", "data.steps=1,1000,2")
+    assert "1 job failed:\n  sweep/1_lnn-seed0\n    ConfigError: data: 64 windows" in said
     assert "hydra.sweep.dir=sweep" in said
     error = (job(tmp_path, "1_lnn-seed0") / "error.txt").read_text()
     assert "Traceback" in error
@@ -72,11 +72,11 @@ def test_a_failed_job_does_not_end_the_sweep_and_is_listed_with_its_error(sweep,
 
 def test_a_single_run_that_failed_leaves_its_error_too(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="data: 100000 windows"):
-        run_script("train.py", *TINY, NO_FIGURES, "data.pairs=100000", "hydra.run.dir=one")
+    with pytest.raises(SystemExit, match="data: 64 windows of 5000 samples"):
+        run_script("train.py", *TINY, NO_FIGURES, "data.steps=1000", "hydra.run.dir=one")
     assert "Traceback" in (tmp_path / "one" / "error.txt").read_text()
     run_script("gather.py", "runs=[one]", "plot=null", "hydra.run.dir=gathered")
-    assert "ConfigError: data: 100000 windows" in capsys.readouterr().out
+    assert "ConfigError: data: 64 windows" in capsys.readouterr().out
 
 
 def test_the_same_sweep_again_skips_what_is_done_and_runs_the_rest(sweep, tmp_path, monkeypatch):

@@ -130,8 +130,7 @@ def test_a_sweep_writes_a_folder_per_combination(tmp_path):
     assert len(list((tmp_path / "sweep").glob("*/metrics.json"))) == 4
 
 
-def test_a_step_too_long_for_the_fastest_motion_is_named_before_its_few_pairs(tmp_path, capsys):
-    words = [*TINY, "dataset.step=0.05", "data.stride=1", f"hydra.run.dir={tmp_path}"]
-    text = refused_text(capsys, "train.py", *words)
+def test_a_step_too_long_for_the_fastest_motion_is_named(tmp_path, capsys):
+    run_script("train.py", *TINY, "dataset.step=0.05", "data.stride=1", f"hydra.run.dir={tmp_path}")
+    text = capsys.readouterr().out
     assert "a step of 0.05 s is too long for the fastest motion in the data, that of" in text
-    assert "training trajectories have only" in text
