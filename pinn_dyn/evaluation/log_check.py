@@ -182,6 +182,9 @@ def check(
         "dry friction": [x.friction for x in delays],
         "method": [x.reason or x.form for x in delays],
     }
+    dry = any(x.dry for x in delays)
+    sharp = dry and source.v is not None  # a filter smears reversals of dry friction
+    late_inputs = _delay(source, clear, step)
     return LogCheck(
         source,
         measurements,
@@ -189,8 +192,8 @@ def check(
         coordinates,
         pd.DataFrame(table),
         delays,
-        [*_filter(source, training, step, noise, highest), *_delay(source, clear, step)],
-        ["model/friction=coulomb"] if any(x.dry for x in delays) else [],
+        [*([] if sharp else _filter(source, training, step, noise, highest)), *late_inputs],
+        ["model/friction=coulomb"] if dry else [],
         excitation,
     )
 

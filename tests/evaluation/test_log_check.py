@@ -95,6 +95,20 @@ def test_joints_that_rest_in_turn_get_their_friction_and_no_false_delay(dry, lat
     assert shares == pytest.approx(dry / item.u.std(axis=0), abs=0.03)
 
 
+def test_no_filter_smears_dry_friction_where_v_is_measured():
+    item, rng = resting(0.3), np.random.default_rng(0)
+    columns = {"t": item.t}
+    for k in range(2):
+        columns[f"q{k + 1}"] = item.q[:, k] + 1e-3 * rng.normal(size=len(item.t))
+        columns[f"v{k + 1}"] = np.gradient(item.q[:, k], item.t)
+        columns[f"u{k + 1}"] = item.u[:, k]
+    frame = pd.DataFrame(columns)
+    for v in (None, dict(columns=["v1", "v2"], unit="m/s")):
+        result = checked(frame, v=v)
+        assert result.options
+        assert any(x.startswith("filter") for x in result.steps) == (v is None)
+
+
 def test_the_block_to_copy_extends_the_steps_of_the_data_set():
     frame = driven(delay=0.05, noise=1e-5)
     for steps in ({}, {"delay": Butterworth(20.0)}):
