@@ -47,8 +47,8 @@ class StoredSource(DataSource):
     def _read(self) -> dict[str, Any]:
         path = Path(self.path).expanduser()
         try:
-            if not path.is_file():  # opening a pipe would wait
-                raise FileNotFoundError("it is missing, or no regular file")
+            if path.exists() and not path.is_file():  # opening a pipe would wait
+                raise ValueError("it is no regular file")
             content: dict[str, Any] = torch.load(path, weights_only=True)
         except Exception as error:  # a damaged file raises nearly anything
             raise ValueError(
