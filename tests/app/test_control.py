@@ -161,6 +161,7 @@ def test_a_force_that_is_not_linear_in_the_input_is_refused(tmp_path, capsys):
     assert "model/input=network" in text
 
 
+@pytest.mark.slow
 def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, capsys):
     """By the command of docs/your_log.md, which describes no reference and no experiment."""
     (tmp_path / "examples").symlink_to(CONF.parent / "examples")

@@ -166,6 +166,7 @@ def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path):
     assert identified["error_mean"] != rolled["error_mean"]
 
 
+@pytest.mark.slow
 def test_a_run_that_keeps_its_identification_has_its_constants(tmp_path, fitted):
     folder = tmp_path / "both"
     run_script("train.py", *KNOWN, *WINDOWS, f"hydra.run.dir={folder}")
