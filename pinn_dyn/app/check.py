@@ -37,6 +37,7 @@ def check(cfg: DictConfig) -> None:
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if report.options:
         print(f"a training with dry friction: {_training(report.options)}")
+        print("with a URDF, model=known is often more accurate: docs/known_mechanics.md")
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
 
