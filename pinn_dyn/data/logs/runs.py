@@ -92,10 +92,10 @@ def check_runs(
     parts: dict[str, list[np.ndarray]] = {}
     for item in sorted(recordings, key=lambda item: item.t[0]):
         rows = np.arange(edge, len(item) - edge, stride).astype(int)
-        signals = *((item.q, order) for order in range(3)), (item.u[:, :size], 0)
+        orders = *((item.q, order) for order in range(3)), (item.u[:, :size], 0)
         smooth = [
             gaussian_filter1d(x, samples, 0, order, truncate=3.0)[rows] / step**order
-            for x, order in (*signals, (signs(item.q, step)[0], 0))
+            for x, order in (*orders, (signs(item.q, step)[0], 0))
         ]
         parts.setdefault(item.run, []).append(np.hstack([item.t[rows, None], *smooth]))
     runs = {run: np.vstack(x) for run, x in parts.items() if sum(map(len, x)) >= _FEWEST}
