@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn import load
+from pinn_dyn.app.check import _training
 from pinn_dyn.models import CoulombFriction
 from tests.app.entry import ROOT, fails, run_script
 from tests.support.delayed_robots import log, resting
@@ -67,6 +68,14 @@ def test_the_printed_training_has_the_friction_of_the_log(tmp_path, capsys):
         f"hydra.run.dir={tmp_path / 'run'}",
     )
     assert isinstance(load(tmp_path / "run").model.friction, CoulombFriction)
+
+
+def test_only_the_program_changes_in_the_printed_training(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["checks/check.py", "dataset=check_1"])
+    command = (
+        "python checks/train.py dataset=check_1 model=lnn data=multi_step model/friction=coulomb"
+    )
+    assert _training(["model/friction=coulomb"]) == command
 
 
 def test_inputs_of_another_robot_end_in_an_error(tmp_path, capsys):

@@ -164,7 +164,7 @@ def test_whole_runs_are_drawn_by_the_seed(runs):
 
 
 def test_the_default_split_draws_long_runs_by_the_seed():
-    """Of ten runs, two short, two are the test and two the validation."""
+    """Ten runs, two of them short: two are the test and two the validation."""
     clocks = {f"run {k}": np.arange(100 if k < 2 else 300) / 100 for k in range(10)}
     drawn = [default_split(clocks, seed)[:2] for seed in range(5)]
     for parts in drawn:

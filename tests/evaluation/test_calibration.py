@@ -39,7 +39,7 @@ def test_members_that_are_too_sure_are_corrected_on_validation():
 
 
 def test_a_corrected_interval_contains_its_share_of_few_validation_errors():
-    """Of 19 errors 95 % are 18.05, so the interval must contain all of them."""
+    """95 % of 19 errors are 18.05, so the interval must contain all 19."""
     few = prediction(2, shape=(1, 20, 1))
     found = calibration(few, few)
     assert (found.corrected >= found.level).all()

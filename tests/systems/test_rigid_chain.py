@@ -159,7 +159,7 @@ def test_a_payload_is_not_scaled_with_the_links():
 
 
 def test_a_generic_body_is_a_cylinder_to_the_farthest_next_joint():
-    """Of the joints after the shoulder, at 0.36 m and 0.22 m, and inertias of a cylinder."""
+    """The next joints are 0.36 m and 0.22 m from the shoulder."""
     near = joint("near", "revolute", "shoulder", "branch", xyz="0 0.2 0.1")
     far = joint("far", "revolute", "shoulder", "elbow", xyz="0 0 0.36")
     names = ("base", "shoulder", "elbow", "branch")
