@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs import LogSource, Request
-from pinn_dyn.data.logs.readers import read_table
+from pinn_dyn.data.logs.readers import read_tables
 from pinn_dyn.evaluation.log_check import check as check_log
 
 RATE = 1000.0
@@ -76,9 +76,9 @@ def write_csv(path: Path, rows: int) -> None:
 
 def read(path: Path) -> str:
     """Read all columns; the number of rows in words."""
-    table = read_table(path, Request("/joint_states/t", ["/joint_states/t", *COLUMNS]))
+    (table,) = read_tables(path, Request("/joint_states/t", ["/joint_states/t", *COLUMNS])).values()
     _, values = signals(len(table) - 1, 1)
-    assert np.allclose(table[COLUMNS].iloc[-1], values, atol=1e-6)
+    assert np.allclose(table.frame[COLUMNS].iloc[-1], values, atol=1e-6)
     return f"{len(table)} rows read"
 
 

@@ -233,3 +233,28 @@ def test_the_configurations_of_the_documentation_read_such_files(tmp_path):
         for name in ("q2", "u1", "u2"):  # q1 differs from episode to episode
             column = (train.q if name[0] == "q" else train.u)[:300, int(name[1]) - 1]
             np.testing.assert_allclose(column, table[name][:300], atol=1e-6)
+
+
+def test_groups_of_hdf5_are_runs(tmp_path):
+    """robomimic and the like write the episodes of a file as groups."""
+    with h5py.File(tmp_path / "demos.h5", "w") as file:
+        for k, phase in enumerate((0.0, 1.0, 2.5)):
+            table = motion(4.0, phase=phase)
+            for name in "tqvu":
+                columns = [x for x in table if x.startswith(name)]
+                file[f"data/demo_{k}/obs/{name}"] = table[columns].to_numpy()
+        file["data/total"] = 3
+    columns = {
+        key: dict(columns=[f"data/*/obs/{key}_{k}" for k in (1, 2)], unit=unit)
+        for key, unit in zip("qvu", ("rad", "rad/s", "Nm"), strict=True)
+    }
+    log = source(
+        tmp_path,
+        files="*.h5",
+        time=dict(columns="data/*/obs/t", unit="s"),
+        validation=dict(runs=["demo_1"], piece=1.0),
+        test=dict(runs=["demo_2"], piece=1.0),
+        **columns,
+    )
+    (run,) = log.load().train
+    np.testing.assert_allclose(run.q[:, 1], motion(4.0)["q2"])

@@ -1,12 +1,13 @@
 """Files of named arrays as tables: MATLAB, HDF5, NPZ and Parquet.
 
 An array with as many rows as the time is a column; a matrix is the columns ``name_1``, ``name_2``
-and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5.
+and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5. Groups
+that are runs have the columns ``data/*/q``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +39,28 @@ def read_mat(path: Path, request: Request) -> pd.DataFrame:
     return _table(path, request.time, variables)
 
 
-def read_hdf5(path: Path, request: Request) -> pd.DataFrame:
+def read_hdf5(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """Read an HDF5 file. Data sets that lie in other files are not opened."""
     h5py = optional("h5py", path)
     with h5py.File(path, "r") as file:
         names, outside = _visited(h5py, file)
         _refuse(path, [x for x in outside if any(y.startswith(x) for y in request.columns)])
         variables = {name: file[name][()] for name in names}
-    return _table(path, request.time, variables)
+    runs = _runs(variables, request.columns)
+    return {run: _table(path, request.time, values) for run, values in runs.items()}
+
+
+def _runs(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the variables of each run, the text that stands for the ``*`` of the columns."""
+    before = next((x.split("*")[0] for x in columns if "*" in x), None)
+    if before is None:
+        return {"": dict(variables)}
+    runs: dict[str, dict[str, Any]] = {}
+    for name, value in variables.items():
+        run, _, field = name.removeprefix(before).partition("/")
+        if name.startswith(before) and field:
+            runs.setdefault(run, {})[f"{before}*/{field}"] = value
+    return dict(sorted(runs.items(), key=lambda x: [len(x[0]), x[0]]))
 
 
 def _visited(h5py: Any, file: Any) -> tuple[list[str], list[str]]:

@@ -6,6 +6,8 @@ A new format is one function in ``READERS``::
         return pd.read_feather(path)
 
     READERS[".feather"] = read_feather
+
+A reader of a file with several runs returns a mapping of their names to tables.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from __future__ import annotations
 import csv
 import gzip
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -23,8 +25,11 @@ from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.table import Request, Table
 
-Reader = Callable[[Path, Request], pd.DataFrame | Table]
-"""Function that reads a file. One row per sample; the index names a row in messages."""
+Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataFrame | Table]"]
+"""Function that reads a file, or the runs of a file by name.
+
+One row per sample; the index names a row in messages.
+"""
 
 
 def read_csv(path: Path, request: Request) -> Table:
@@ -66,8 +71,8 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file()
 
 
-def read_table(path: Path, request: Request) -> Table:
-    """Read a log file.
+def read_tables(path: Path, request: Request) -> dict[str, Table]:
+    """Read a log file; return its table under the name ``""``, or a table per run.
 
     Raises:
         LogError: if no reader knows its format, or it is damaged or empty.
@@ -76,17 +81,20 @@ def read_table(path: Path, request: Request) -> Table:
     if suffix not in READERS:
         raise LogError(f"{path}: no reader for {suffix!r}, expected one of {', '.join(READERS)}")
     try:
-        table = READERS[suffix](path, request)
+        content = READERS[suffix](path, request)
     except Exception as error:  # a damaged file raises nearly anything
         if isinstance(error, LogError):
             raise
         text = " ".join(str(error).split()) or type(error).__name__
         raise LogError(f"{path}: cannot be read as {suffix}, is it cut short? {text}") from error
-    if isinstance(table, pd.DataFrame):
-        table = Table(table, str(path))
-    if not len(table):
+    tables = content if isinstance(content, Mapping) else {"": content}
+    if not any(map(len, tables.values())):
         raise LogError(f"{path}: has no rows")
-    return table
+    return {
+        run: x if isinstance(x, Table) else Table(x, f"{path}{run and f', run {run}'}")
+        for run, x in tables.items()
+        if len(x)
+    }
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:

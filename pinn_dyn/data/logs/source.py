@@ -20,7 +20,7 @@ from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
-from pinn_dyn.data.logs.readers import find_files, read_table, run_name
+from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repeats import check_repeats, refuse_copies
 from pinn_dyn.data.logs.runs import check_runs
@@ -230,8 +230,8 @@ class LogSource(DataSource):
         for stem, table in tables.items():
             for note in table.notes:
                 report.warn("rows", f"{stem}: {note}")
-            prefix = f"{stem}:" if self.trajectory is not None and len(tables) > 1 else ""
             rows_of_runs = table.runs(self.trajectory, stem)
+            prefix = f"{stem}:" if self.trajectory is not None and len(tables) > 1 else ""
             runs = {f"{prefix}{run}": rows for run, rows in rows_of_runs.items()}
             recordings += self._recordings(table, runs, report)
         return recordings
@@ -249,7 +249,11 @@ class LogSource(DataSource):
             if stem in paths:
                 raise LogError(f"{paths[stem]} and {path} are both the run {stem!r}: rename one")
             paths[stem] = path
-        return {stem: read_table(path, request) for stem, path in paths.items()}
+        return {
+            ":".join(x for x in (stem if len(paths) > 1 or not run else "", run) if x): table
+            for stem, path in paths.items()
+            for run, table in read_tables(path, request).items()
+        }
 
     def _recordings(
         self, table: Table, runs: Mapping[str, np.ndarray], report: Report

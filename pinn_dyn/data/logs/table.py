@@ -20,8 +20,8 @@ class Request:
     """Columns that a data set needs of a file.
 
     Attributes:
-        time: column of the time.
-        columns: all columns, the time among them. A reader may return more.
+        time: first column of the time; empty if the log has a rate instead.
+        columns: all columns, those of the time among them. A reader may return more.
         max_age: oldest message of another topic of a bag that a row may use, s.
     """
 
