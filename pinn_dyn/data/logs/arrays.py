@@ -1,4 +1,4 @@
-"""Files of named arrays as tables: MATLAB, HDF5, NPZ and Parquet.
+"""Files of named arrays as tables: MATLAB, HDF5 and NPZ.
 
 An array with as many rows as the time is a column; a matrix is the columns ``name_1``, ``name_2``
 and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5. Groups
@@ -7,7 +7,8 @@ that are runs have the columns ``data/*/q``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,39 +16,37 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional
 from pinn_dyn.spelling import did_you_mean
 
 
-def read_mat(path: Path, request: Request) -> pd.DataFrame:
+def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """Read a MATLAB file; the fields of a struct are ``name.field``."""
     h5py = optional("h5py", path)
     if h5py.is_hdf5(path):  # version 7.3
         with h5py.File(path, "r") as file:
             _refuse(path, _visited(h5py, file)[1])
-    content = optional("pymatreader", path).read_mat(str(path))
-    variables: dict[str, Any] = {}
-
-    def visit(prefix: str, values: Mapping[str, Any]) -> None:
-        for name, value in values.items():
-            if isinstance(value, Mapping):
-                visit(f"{prefix}{name}.", value)
-            else:
-                variables[f"{prefix}{name}"] = value
-
-    visit("", content)
-    return _table(path, request.time, variables)
+    runs = elements(matlab_variables(path), request.time, request.columns)
+    return {run: table_of_arrays(path, request, variables) for run, variables in runs.items()}
 
 
 def read_hdf5(path: Path, request: Request) -> dict[str, pd.DataFrame]:
-    """Read an HDF5 file. Data sets that lie in other files are not opened."""
+    """Read an HDF5 file. Data sets that lie in other files are not opened.
+
+    An attribute is a scalar, ``obs@fps``.
+    """
     h5py = optional("h5py", path)
     with h5py.File(path, "r") as file:
         names, outside = _visited(h5py, file)
         _refuse(path, [x for x in outside if any(y.startswith(x) for y in request.columns)])
-        variables = {name: file[name][()] for name in names}
-    runs = _runs(variables, request.columns)
-    return {run: _table(path, request.time, values) for run, values in runs.items()}
+        variables = {name: file[name] for name in names}
+        groups = {name.rpartition("/")[0] for name in names}
+        for name in sorted({"/", *groups, *names}):
+            values = file[name or "/"].attrs.items()
+            variables |= {f"{name.strip('/')}@{key}": np.asarray(x) for key, x in values}
+        runs = _runs(variables, request.columns)
+        return {run: table_of_arrays(path, request, values) for run, values in runs.items()}
 
 
 def _runs(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -92,40 +91,71 @@ def _refuse(path: Path, outside: list[str]) -> None:
 def read_npz(path: Path, request: Request) -> pd.DataFrame:
     """Read an NPZ file. One with Python objects is refused, never unpickled."""
     with np.load(path, allow_pickle=False) as file:
-        return _table(path, request.time, file)
+        return table_of_arrays(path, request, file)
 
 
-def read_parquet(path: Path, request: Request) -> pd.DataFrame:
-    """Read a Parquet file, such as one of LeRobot; a column of vectors is a matrix."""
-    optional("pyarrow", path)
-    content = pd.read_parquet(path, engine="pyarrow")
+def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) -> pd.DataFrame:
+    """Return the vectors and matrices that have as many rows or columns as the time.
+
+    The time is a vector, a column of a matrix, or a scalar: the sample time.
+
+    Raises:
+        LogError: without the time, or if a column of the request is complex or has another length.
+    """
+    arrays = {name: _matrix(value) for name, value in _fields(variables) if value.size}
+    names = dict.fromkeys(filter(None, [request.time, *request.columns]))
+    bases = {x: next((y for y in (x, x.rpartition("_")[0]) if y in arrays), "") for x in names}
+    lengths = [max(arrays[base].shape) for base in bases.values() if base]
+    samples = next((length for length in lengths if length > 1), 0)
     columns: dict[str, Any] = {}
-    for name, column in content.items():
-        if column.dtype != object or not isinstance(column.iloc[0], np.ndarray):
-            columns[str(name)] = column.to_numpy()
-        elif column.map(np.size).nunique() == 1:
-            vectors = np.stack(column.to_list()).T
-            columns |= {f"{name}_{k}": values for k, values in enumerate(vectors, start=1)}
-    return pd.DataFrame(columns, index=pd.RangeIndex(1, len(content) + 1))
-
-
-def _table(path: Path, time: str, variables: Mapping[str, Any]) -> pd.DataFrame:
-    """Return the real vectors and matrices that have as many rows or columns as the time."""
-    arrays = {}
-    for name, value in variables.items():
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim in (1, 2):
-            arrays[name] = value if value.ndim == 2 else value[:, None]
-    if time not in arrays:
-        hint = did_you_mean(time, arrays) or "."
-        sizes = listed(f"{name} {value.shape}" for name, value in sorted(arrays.items()))
-        raise LogError(f"{path}: no variable {time!r} for the time{hint} The file has {sizes}")
-    samples = arrays[time].size
-    columns: dict[str, np.ndarray] = {}
     for name, value in arrays.items():
-        rows = value if value.shape[0] == samples else value.T
-        if rows.shape[0] != samples:  # parameters and the like
-            continue
-        width = rows.shape[1]
-        names = [name] if width == 1 else [f"{name}_{k + 1}" for k in range(width)]
-        columns |= dict(zip(names, rows.T, strict=True))
+        if value.ndim == 2 and samples in value.shape and value.dtype.kind in "fiubmMUTO":
+            rows = value.T if len(value) == samples else value
+            numbered = len(rows) > 1
+            columns |= {f"{name}_{k}" if numbered else name: x for k, x in enumerate(rows, start=1)}
+    scalars = {name: value.item() for name, value in arrays.items() if value.size == 1}
+    if request.time in scalars:
+        columns[request.time] = _sample_time(path, request.time, scalars) * np.arange(samples)
+    for name, base in bases.items():
+        if name not in columns and (base or name == request.time):
+            sizes = sorted((x in scalars, x, y.shape) for x, y in arrays.items())
+            texts = [f"{x} = {scalars[x]}" if x in scalars else f"{x} {y}" for _, x, y in sizes]
+            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or '.'}"
+            if base:
+                problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
+                problem += f"real numbers in {samples} rows."
+            raise LogError(f"{path}: {problem} The file has {listed(texts)}")
     return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+
+
+def _sample_time(path: Path, name: str, scalars: Mapping[str, Any]) -> float:
+    if re.search(r"rate|freq|fps|hz|^fs$", name, re.IGNORECASE):
+        raise LogError(
+            f"{path}: {name} = {scalars[name]} is a rate and no time: "
+            f"write time: {{rate: {scalars[name]}}}"
+        )
+    return scalars[name]
+
+
+def _fields(variables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Return the variables by name; of a compound data set its fields, ``log/q``."""
+    for name, value in variables.items():
+        if value.dtype.names:
+            yield from ((f"{name}/{field}", value[field]) for field in value.dtype.names)
+        else:
+            yield name, value
+
+
+def _matrix(value: Any) -> Any:
+    """Return an array without axes of length 1 beyond two; a vector is a column."""
+    if value.size > max(value.shape, default=1) and len([n for n in value.shape if n > 1]) > 2:
+        return value  # images and the like are not read
+    array = np.asarray(value[()])
+    if array.ndim > 2:
+        array = array.squeeze()
+    if array.dtype.kind in "SO":
+        texts = [x.decode() if isinstance(x, bytes) else x for x in array.flat]
+        array = np.array(texts, dtype=object).reshape(array.shape)
+    if np.iscomplexobj(array) and not array.imag.any():
+        array = array.real
+    return array.reshape(-1, 1) if array.ndim < 2 else array

@@ -20,9 +20,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz, read_parquet
+from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npz
 from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.parquet import read_parquet
 from pinn_dyn.data.logs.table import Request, Table
 
 Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataFrame | Table]"]

@@ -1,0 +1,82 @@
+"""Parquet files as tables, LeRobot's among them.
+
+Entries of a vector are ``action_1``, ``action_2`` and so on, with LeRobot also ``action/shoulder``
+by the names in ``meta/info.json``. Fields of a struct are ``state.q``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.table import Request, optional
+
+
+def read_parquet(path: Path, request: Request) -> pd.DataFrame:
+    """Read a Parquet file; the index of a data frame is a column.
+
+    Raises:
+        LogError: if LeRobot's names of a vector are asked for and do not fit its width.
+    """
+    optional("pyarrow", path)
+    pyarrow = optional("pyarrow.parquet", path)
+    content = pyarrow.ParquetFile(path).read()
+    while any(str(kind).startswith("struct") for kind in content.schema.types):
+        content = content.flatten()
+    columns: dict[str, Any] = {}
+    labels = _labels(path)
+    for name, column in content.to_pandas(ignore_metadata=True).items():
+        vectors = _vectors(column)
+        if vectors is None:
+            columns[str(name)] = column
+            continue
+        columns |= {f"{name}_{k}": values for k, values in enumerate(vectors, start=1)}
+        names = [f"{name}/{label}" for label in labels.get(str(name), [])]
+        if len(names) == len(vectors):
+            columns |= dict(zip(names, vectors, strict=True))
+        elif {*names} & {*request.columns}:
+            raise LogError(
+                f"{path}: meta/info.json has {len(names)} names of {name!r}, which has "
+                f"{len(vectors)} entries: write their numbers, {name}_1 to {name}_{len(vectors)}; "
+                f"the names are {listed(names)}"
+            )
+    return pd.DataFrame(columns).set_axis(pd.RangeIndex(1, len(content) + 1))
+
+
+def _vectors(column: pd.Series) -> np.ndarray | None:
+    """Return the entries of vectors or matrices, ``(K, T)``; None for other columns."""
+    rows = np.flatnonzero(column.notna())
+    if column.dtype != object or not len(rows) or not isinstance(column.iloc[rows[0]], np.ndarray):
+        return None
+    cells = [np.concatenate(x) if x.dtype == object else x for x in column.iloc[rows]]
+    vectors = np.full((len(column), max(map(len, cells))), np.nan)
+    for row, cell in zip(rows, cells, strict=True):
+        vectors[row, : len(cell)] = cell
+    return vectors.T
+
+
+def _labels(path: Path) -> dict[str, list[str]]:
+    """Return LeRobot's names of the entries of each vector."""
+    info = next(
+        (x / "meta/info.json" for x in path.parents if (x / "meta/info.json").is_file()), None
+    )
+    if info is None:
+        return {}
+    features = json.loads(info.read_text()).get("features", {})
+    return {name: list(_texts(feature.get("names"))) for name, feature in features.items()}
+
+
+def _texts(names: Any) -> Iterator[str]:
+    """Return the texts of lists and mappings in their order, such as ``{motors: [...]}``."""
+    if isinstance(names, str):
+        yield names
+    elif names:
+        for item in names:
+            entry = names[item] if isinstance(names, dict) else item
+            yield from _texts(item if isinstance(entry, int) else entry)

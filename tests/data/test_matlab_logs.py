@@ -1,0 +1,173 @@
+"""A motion in the forms of MATLAB and Simulink gives the trajectories of the same CSV."""
+
+import matio
+import numpy as np
+import pytest
+from matio.utils import MatlabOpaque
+
+from pinn_dyn.data.logs import LogError
+from tests.data.logs_files import motion, source, write
+
+TABLE = motion(6.0)
+T, Q, V, U = (TABLE.filter(regex=f"^{name}").to_numpy() for name in "tqvu")
+SIGNALS = {"t": T, "q": Q, "v": V, "u": U}
+
+
+def columns(q, v, u, time):
+    return dict(
+        time=dict(columns=time, unit="s"),
+        q=dict(columns=[q.format(1), q.format(2)], unit="rad"),
+        v=dict(columns=[v.format(1), v.format(2)], unit="rad/s"),
+        u=dict(columns=[u.format(1), u.format(2)], unit="Nm"),
+    )
+
+
+def fields(prefix):
+    return columns(*(f"{prefix}{name}_{{}}" for name in "qvu"), time=f"{prefix}t")
+
+
+def structs(items, shape=None):
+    array = np.empty(shape or (1, len(items)), dtype=[(name, object) for name in items[0]])
+    for k, item in enumerate(items):
+        array[np.unravel_index(k, array.shape, order="F")] = tuple(item.values())
+    return array
+
+
+def cells(items):
+    array = np.empty((1, len(items)), dtype=object)
+    array[0, :] = items
+    return array
+
+
+def opaque(classname, **properties):
+    return MatlabOpaque(properties=properties, classname=classname)
+
+
+def timeseries(data, *, uniform=False):
+    """As MATLAB saves a time series: a uniform clock by its start, step and length."""
+    none = np.empty((0, 0))
+    step = np.array([[T[1, 0] - T[0, 0]]])
+    info = dict(Start_=T[:1], Increment_=step, Length=np.array([[float(len(T))]]))
+    return opaque(
+        "timeseries",
+        Name="",
+        TimeInfo=opaque("tsdata.timemetadata", Units="seconds", Time_=none, **info),
+        Data_=data.T[:, None, :],  # each sample is a vector
+        Time_=none if uniform else T,
+    )
+
+
+def data_set():
+    elements = [
+        opaque("Simulink.SimulationData.Signal", Name=name, Values=timeseries(x, uniform=True))
+        for name, x in (("q", Q), ("v", V), ("u", U))
+    ]
+    storage = opaque("Simulink.SimulationData.Storage.RamDatasetStorage", Elements=cells(elements))
+    content = structs([dict(Name="logsout", Storage=storage)])
+    return opaque("Simulink.SimulationData.Dataset", any=content)
+
+
+def scope():
+    signals = structs([dict(values=x, label="") for x in (Q, V.T[:, None, :], U)])
+    return dict(time=T, signals=signals, blockName="arm/Scope")
+
+
+FORMS = {
+    "rows": ({name: x.T for name, x in SIGNALS.items()}, fields("")),
+    "nested": ({"log": {"arm": SIGNALS}, "f": {"M": np.eye(3), "e": []}}, fields("log.arm.")),
+    "matrix": (
+        {"data": np.hstack([T, Q, V, U])},
+        dict(
+            time=dict(columns="data_1", unit="s"),
+            q=dict(columns=["data_2", "data_3"], unit="rad"),
+            v=dict(columns=["data_4", "data_5"], unit="rad/s"),
+            u=dict(columns=["data_6", "data_7"], unit="Nm"),
+        ),
+    ),
+    "sample time": ({**SIGNALS, "t": T[1] - T[0]}, fields("")),
+    "one element": (
+        {"trial": structs([{name: 2 * x for name, x in SIGNALS.items()}, SIGNALS])},
+        fields("trial(2)."),
+    ),
+    "samples": (  # messages of a bag in MATLAB
+        {"msgs": cells([{name: x[k] for name, x in SIGNALS.items()} for k in range(len(T))])},
+        fields("msgs."),
+    ),
+    "table": ({"log": TABLE}, columns(*(f"log.{name}{{}}" for name in "qvu"), time="log.t")),
+    "timeseries": (
+        {name: timeseries(x) for name, x in zip("qvu", (Q, V, U), strict=True)},
+        columns(*(f"{name}.Data_{{}}" for name in "qvu"), time="q.Time"),
+    ),
+    "data set": (
+        {"out": {"logsout": data_set(), "simTime": 0.3}},
+        columns(*(f"out.logsout.{name}.Data_{{}}" for name in "qvu"), time="out.logsout.q.Time"),
+    ),
+    "structure with time": (
+        {"ScopeData": scope()},
+        dict(
+            time=dict(columns="ScopeData.time", unit="s"),
+            q=dict(columns=[f"ScopeData.signals.values_{k}" for k in (1, 2)], unit="rad"),
+            v=dict(columns=[f"ScopeData.signals(2).values_{k}" for k in (1, 2)], unit="rad/s"),
+            u=dict(columns=[f"ScopeData.signals.values_{k}" for k in (5, 6)], unit="Nm"),
+        ),
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("csv")
+    write(folder, TABLE)
+    return source(folder).load().train
+
+
+@pytest.mark.parametrize(
+    ("form", "version"),
+    [(form, version) for form in FORMS for version in ("v7", "v7.3")[: 2 - (form == "samples")]],
+)
+def test_forms_of_matlab_give_the_same_motion(tmp_path, expected, form, version):
+    content, description = FORMS[form]
+    matio.save_to_mat(str(tmp_path / "run.mat"), content, version=version)
+    for ours, theirs in zip(
+        source(tmp_path, files="run.mat", **description).load().train, expected, strict=True
+    ):
+        for name in ("t", "q", "v", "u"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6)
+
+
+@pytest.mark.parametrize("version", ["v7", "v7.3"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda trials: {"trial": structs(trials)},
+        lambda trials: {"trial": cells(trials)},
+        lambda trials: {f"trial_{name}": cells([x[name] for x in trials]) for name in "tqvu"},
+    ],
+)
+def test_elements_are_runs(tmp_path, form, version):
+    trials = [
+        {name: x[: 200 + k] * (1 + k) ** (name != "t") for name, x in SIGNALS.items()}
+        for k in range(4)
+    ]
+    content = form(trials)
+    matio.save_to_mat(str(tmp_path / "run.mat"), content, version=version)
+    prefix = "trial." if "trial" in content else "trial_"
+    part = dict(runs=1, piece=0.5)
+    log = source(tmp_path, files="run.mat", **fields(prefix), validation=part, test=part)
+    recordings = {x.raw.run: x.raw for x in log.cleaned}
+    assert len(recordings) == 4
+    np.testing.assert_allclose(recordings["3"].q, trials[2]["q"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(u=U + 1j), r"'u_1' is of complex128 \(601, 2\).*q \(601, 2\)"),
+        (dict(u=U[::10]), r"'u_1' is of float64 \(61, 2\), expected real numbers in 601 rows"),
+        (dict(t=np.empty(0), fs=100.0), r"no variable 't'.*fs = 100"),
+    ],
+)
+def test_variables_that_do_not_fit_are_named_with_their_sizes(tmp_path, changes, message):
+    matio.save_to_mat(str(tmp_path / "run.mat"), {**SIGNALS, **changes}, version="v7")
+    with pytest.raises(LogError, match=message):
+        source(tmp_path, files="run.mat", **fields("")).load()
