@@ -185,10 +185,11 @@ def test_lerobot_files_have_episodes_and_vectors(tmp_path):
     np.testing.assert_allclose(parts[0].raw.u[:, 1], TABLE["u2"][: len(parts[0].raw)])
 
 
-def test_parquet_without_episodes_is_told(tmp_path):
+def test_episodes_are_told_apart_by_the_restart_of_the_clock(tmp_path):
     formats.write_lerobot(tmp_path, TABLE)
-    with pytest.raises(LogError, match="the time goes back"):
-        source(tmp_path, **{**LEROBOT, "trajectory": None}).load()
+    log = source(tmp_path, **{**LEROBOT, "trajectory": None})
+    assert len({part.raw.run for part in log.cleaned}) == 3
+    assert "the time restarts at 0 s (2 times)" in log.report
 
 
 def write_mat73(path, table):

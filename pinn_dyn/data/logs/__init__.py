@@ -17,6 +17,7 @@ from pinn_dyn.data.logs.readers import READERS
 from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part
+from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step, window_samples
 from pinn_dyn.data.logs.table import Request, Table
 
@@ -25,6 +26,7 @@ __all__ = [
     "UNITS",
     "Butterworth",
     "Cleaned",
+    "Clock",
     "Columns",
     "Deduplicate",
     "DelayCurve",

@@ -12,9 +12,9 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.recording import clock_steps
+from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
 from pinn_dyn.data.logs.table import Table
 
-_SAMPLE_TIMES = (1e-5, 0.5)  # s
 _GAP_FACTOR = 3.0  # sample times from which a distance between rows is a gap
 BURSTS = 0.4
 """Share of rows right after the row before from which stamps come in bursts."""
@@ -32,33 +32,40 @@ def burst_share(t: np.ndarray) -> float:
     return float((np.diff(t) < (t[-1] - t[0]) / (len(t) - 1) / 5).mean())
 
 
-def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[str]) -> None:
+def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[str]) -> None:
     """Check the times of one run in s.
 
     Raises:
         LogError: on an implausible sample time, and on times that go back, repeat or jump unless a
             step repairs this; names the row and the step.
     """
+    if clock.rate is not None:
+        return
     spacing = np.diff(t)
+    rate = "state the rate in Hz instead, as in time: {{rate: {:.4g}}}"
     if not (spacing > 0).any():
-        raise LogError(f"{table.place(0, column)}: the time never increases in this run")
-    typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
-    low, high = _SAMPLE_TIMES
-    if not low <= typical <= high:
         raise LogError(
-            f"{table.name}, column {column!r}: the sample time would be {typical:.6g} s, expected "
-            f"{low:g} to {high:g} s: is the unit of the time wrong "
-            f"({'ms' if typical > high else 's'}?)"
+            f"{table.place(0, clock.name)}: the time never increases in this run: "
+            + rate.format(100)
+        )
+    typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
+    low, high = SAMPLE_TIMES
+    if not low <= typical <= high:
+        unit = clock.plausible_unit(typical)
+        cure = f"write the unit {unit}, or " if unit else ""
+        raise LogError(
+            f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s, "
+            f"expected {low:g} to {high:g} s: {cure}{rate.format(1 / typical)}"
         )
     row_clock = ""
     if burst_share(t) > BURSTS:
         row_clock = "its stamps come in bursts: use the step examples.cleaning_steps.RowClock, or "
     split = (
         "if a new run starts there, name its column in 'trajectory' (run=... of pinn_dyn.fit) or "
-        "add a SplitGaps step"
+        "split the run"
     )
-    once = f"{row_clock}add a Deduplicate step, which keeps the first row, as in {clock_steps(t)}"
-    fill = f"{row_clock}split long gaps and interpolate over short ones, as in {clock_steps(t)}"
+    once = f"{row_clock}add a Deduplicate step, which keeps the first row"
+    fill = f"{row_clock}split long gaps and interpolate over short ones"
     for fault, rows, problem, cure in (
         ("backward times", spacing < 0, "goes back", split),
         ("repeated times", spacing == 0, "repeats", once),
@@ -67,8 +74,9 @@ def check_clock(t: np.ndarray, table: Table, column: str, repairs: Collection[st
         if rows.any() and fault not in repairs:
             k = int(rows.argmax())
             raise LogError(
-                f"{table.place(k + 1, column)}: the time {problem} from {t[k]:.9g} to "
-                f"{t[k + 1]:.9g} s ({int(rows.sum())} such rows, {typical:.6g} s is usual): {cure}"
+                f"{table.place(k + 1, clock.name)}: the time {problem} from {t[k]:.9g} to "
+                f"{t[k + 1]:.9g} s ({int(rows.sum())} such rows, {typical:.6g} s is usual): "
+                f"{cure}, as in{clock_steps(t)}"
             )
 
 

@@ -19,7 +19,7 @@ _DEGREE, _TURN = math.pi / 180, 2 * math.pi
 _FACTORS: dict[str, dict[str, float]] = {
     "1": {"1": 1.0, "%": 0.01},
     "1/s": {"1/s": 1.0},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
     "rad": {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN},
     "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "rpm": _TURN / 60},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
@@ -96,7 +96,7 @@ class Columns:
             values = getattr(self, key)
             if len(values) not in (1, size):
                 raise LogError(f"{key} has {len(values)} entries, expected one, or {size}")
-            setattr(self, key, values * (size // len(values)))
+            setattr(self, key, values * size if len(values) == 1 else values)
         units = [to_si(name) for name in self.unit]
         self.units = [name for name, _ in units]
         """SI unit of each column."""

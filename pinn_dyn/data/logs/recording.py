@@ -18,7 +18,7 @@ _CLOCK_TOLERANCE = 0.02  # of a sample time, for files that round their times
 
 
 def clock_steps(t: np.ndarray) -> str:
-    """Return the ``steps`` in YAML that give a run of times ``(T,)`` in s a uniform clock.
+    """Return the block ``steps`` in YAML that gives a run of times ``(T,)`` in s a uniform clock.
 
     The rate is round, near the usual one. SplitGaps leaves no gap that Resample would refuse.
     """
@@ -34,7 +34,7 @@ def clock_steps(t: np.ndarray) -> str:
         f"split_gaps: {{{name}.SplitGaps, longest: {gap:.3g}}}",
         f"resample: {{{name}.Resample, rate: {rate:.6g}, max_gap: {gap:.3g}}}",
     ]
-    return f"steps: {{{', '.join(steps)}}}"
+    return "\n  ".join(["\n\nsteps:", *steps])
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Recording:
             raise LogError(
                 f"{self.place}: {user} needs a uniform clock, but near t = {t[k]:.6g} s the time "
                 f"is {error[k]:.3g} s off a clock of {step:.6g} s: put a Resample step before it, "
-                f"such as {clock_steps(t)}"
+                f"such as{clock_steps(t)}"
             )
         return step
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict
 from functools import cached_property
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,25 +13,23 @@ import pandas as pd
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from pinn_dyn.data.logs import plausibility
-from pinn_dyn.data.logs.checks import check_clock, check_rows
+from pinn_dyn.data.logs.cleaning import clean, long_enough
 from pinn_dyn.data.logs.columns import UNITS, Columns, described
 from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.filters import SavitzkyGolayVelocity
 from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
-from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
+from pinn_dyn.data.logs.reading import Layout
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.repeats import check_repeats, refuse_copies
 from pinn_dyn.data.logs.runs import check_runs
 from pinn_dyn.data.logs.splits import Part, default_split, split
+from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.step import Step
 from pinn_dyn.data.logs.table import Request, Table
 from pinn_dyn.data.source import SPLITS, DataSource, Splits
 from pinn_dyn.mechanics import Interpolation
 
 log = logging.getLogger(__name__)
-
-_SINCE_1970 = 1e8  # s; later times count from 1970, and are counted from the first
 
 
 class _Loaded(NamedTuple):
@@ -54,7 +51,7 @@ class LogSource(DataSource):
         files: names or glob patterns in the folder ``root``; or a data frame, or data frames by the
             name of their run.
         root: folder of the files.
-        time: column of the time.
+        time: columns of the time, or ``{rate: 100}`` for a log without time, see :class:`Clock`.
         q: columns of the configuration, N.
         u: columns of the input, M.
         v: columns of the velocity, N, or None.
@@ -79,7 +76,7 @@ class LogSource(DataSource):
         name: str,
         files: str | Sequence[str] | pd.DataFrame | Mapping[str, pd.DataFrame],
         root: str = ".",
-        time: Columns | Mapping[str, Any],
+        time: Clock | Columns | Mapping[str, Any] | str,
         q: Columns | Mapping[str, Any],
         u: Columns | Mapping[str, Any],
         v: Columns | Mapping[str, Any] | None = None,
@@ -97,7 +94,11 @@ class LogSource(DataSource):
         self.name = name
         self.files = {"frame": files} if isinstance(files, pd.DataFrame) else files
         self.root = root
-        self.time: Columns = described(Columns, "time", time)
+        if isinstance(time, str):
+            time = {"columns": time}
+        if isinstance(time, Columns) and not isinstance(time, Clock):
+            time = asdict(time)
+        self.time: Clock = described(Clock, "time", time)
         self.q: Columns = described(Columns, "q", q)
         self.u: Columns = described(Columns, "u", u)
         self.v: Columns | None = None if v is None else described(Columns, "v", v)
@@ -125,7 +126,6 @@ class LogSource(DataSource):
             self.input_labels = step.input_labels(self.input_labels)
 
     def _check_units(self) -> None:
-        self.time.check_units("time", ["s"])
         self.q.check_units("q", ["rad", "m", "1"])
         self.u.check_units("u", sorted({unit for unit, _ in UNITS.values()} - {"s"}))
         if self.v is not None and self.v.units != [f"{unit}/s" for unit in self.q.units]:
@@ -171,21 +171,28 @@ class LogSource(DataSource):
             LogError: as :meth:`load`, or if the steps do not leave one stretch of each run.
         """
         table, report = Table(frame, "the frame"), Report(self.name)
-        runs = table.runs(self.trajectory if self.trajectory in frame else None, "the frame")
-        raws = self._recordings(table, runs, report)
-        cleaned = self._clean([Cleaned("", raw, [raw]) for raw in raws], report)
+        column = self.trajectory
+        runs = table.runs(column if column and column in table else None, "the frame")
+        raws = self._layout.recordings(table, runs, report)
+        cleaned = clean([Cleaned("", raw, [raw]) for _, raw in raws], self.steps, report)
         for part in cleaned:
             if (count := len(part.clean)) != 1:
                 raise LogError(f"{part.raw.place}: the steps leave {count} stretches, expected one")
         return [
-            (np.flatnonzero(rows), part.raw, part.clean[0])
-            for rows, part in zip(runs.values(), cleaned, strict=True)
+            (rows, part.raw, part.clean[0]) for (rows, _), part in zip(raws, cleaned, strict=True)
         ]
+
+    @property
+    def _layout(self) -> Layout:
+        columns = [x for part in (self.time, *self._signals.values()) for x in part.columns]
+        columns += [] if self.trajectory is None else [self.trajectory]
+        request = Request(next(iter(self.time.columns), ""), columns, self.max_age)
+        return Layout(self.time, self._signals, self.trajectory, request, self._repairs)
 
     @cached_property
     def _loaded(self) -> _Loaded:
         report = Report(self.name)
-        recordings = self._read(report)
+        recordings = self._layout.read(self.files, self.root, report)
         measurements = report.measurements
         measurements += plausibility.check_stamps(recordings, self._repairs)
         measurements += plausibility.check_angles(recordings, self.q)
@@ -195,8 +202,10 @@ class LogSource(DataSource):
         parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
         refuse_copies(parts)
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
-        cleaned = self._long_enough("splitting", cleaned, report)
-        cleaned = self._clean(cleaned, report, drop=True)
+        pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
+        limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
+        cleaned = long_enough("splitting", cleaned, limits, report)
+        cleaned = clean(cleaned, self.steps, report, limits)
         stretches = {
             name: [item for part in cleaned if part.split == name for item in part.clean]
             for name in SPLITS
@@ -210,120 +219,16 @@ class LogSource(DataSource):
         measurements += plausibility.check_inputs(training, self.u)
         measurements += plausibility.check_rest(training, self.q)
         report.add("Splits", "train", summary(training, step))
-        pieces = {"train": training}
+        rollouts = {"train": training}
         for name, part in (("validation", self.validation), ("test", self.test)):
-            pieces[name], note = pieces_of(name, part, stretches[name], step)
+            rollouts[name], note = pieces_of(name, part, stretches[name], step)
             report.add("Splits", name, note)
-            measurements += check_repeats(training, pieces[name], name)
+            measurements += check_repeats(training, rollouts[name], name)
         for text in report.warnings:
             log.warning("%s: %s", self.name, text)
-        names = {name: [item.place for item in items] for name, items in pieces.items()}
+        names = {name: [item.place for item in items] for name, items in rollouts.items()}
         splits = {
             name: [trajectory(item, step, self.interpolation) for item in items]
-            for name, items in pieces.items()
+            for name, items in rollouts.items()
         }
         return _Loaded(Splits(**splits), names, cleaned, report)
-
-    def _read(self, report: Report) -> list[Recording]:
-        recordings: list[Recording] = []
-        tables = self._tables()
-        for stem, table in tables.items():
-            for note in table.notes:
-                report.warn("rows", f"{stem}: {note}")
-            rows_of_runs = table.runs(self.trajectory, stem)
-            prefix = f"{stem}:" if self.trajectory is not None and len(tables) > 1 else ""
-            runs = {f"{prefix}{run}": rows for run, rows in rows_of_runs.items()}
-            recordings += self._recordings(table, runs, report)
-        return recordings
-
-    def _tables(self) -> dict[str, Table]:
-        if isinstance(self.files, Mapping):
-            return {name: Table(frame, name) for name, frame in self.files.items()}
-        signals = [self.time, *self._signals.values()]
-        columns = [name for signal in signals for name in signal.columns]
-        columns += [] if self.trajectory is None else [self.trajectory]
-        request = Request(self.time.columns[0], columns, self.max_age)
-        paths: dict[str, Path] = {}
-        for path in find_files(self.root, self.files):
-            stem = run_name(path, self.root)
-            if stem in paths:
-                raise LogError(f"{paths[stem]} and {path} are both the run {stem!r}: rename one")
-            paths[stem] = path
-        return {
-            ":".join(x for x in (stem if len(paths) > 1 or not run else "", run) if x): table
-            for stem, path in paths.items()
-            for run, table in read_tables(path, request).items()
-        }
-
-    def _recordings(
-        self, table: Table, runs: Mapping[str, np.ndarray], report: Report
-    ) -> list[Recording]:
-        """Convert the runs of a table, masks of its rows, to SI units, and check them."""
-        (clock,) = self.time.columns
-        times = self.time.to_si(table.numbers([clock], "time"))[:, 0]
-        values = {
-            signal: columns.to_si(table.numbers(columns.columns, signal))
-            for signal, columns in self._signals.items()
-        }
-        recordings = []
-        for run, rows in runs.items():
-            part = table.select(rows)
-            t = times[rows]
-            t = t - t[0] if t[0] > _SINCE_1970 else t
-            check_clock(t, part, clock, self._repairs)
-            signals = {signal: x[rows] for signal, x in values.items()}
-            for signal, x in signals.items():
-                columns = self._signals[signal]
-                report.measurements += check_rows(part, t, signal, columns, x, self._repairs)
-            recordings.append(Recording(run, t, signals["q"], signals.get("v"), signals["u"]))
-            text = f"{len(t)} rows, {t[-1] - t[0]:.6g} s, from {Path(table.name).name}"
-            report.add("Read", run, text)
-        return recordings
-
-    def _clean(
-        self, cleaned: list[Cleaned], report: Report, *, drop: bool = False
-    ) -> list[Cleaned]:
-        for name, step in self.steps.items():
-            cleaned = _apply(name, step, cleaned, report)
-            if drop:
-                cleaned = self._long_enough(name, cleaned, report)
-        if any(item.v is None for part in cleaned for item in part.clean):
-            cleaned = _apply("velocity", SavitzkyGolayVelocity(), cleaned, report)
-        return cleaned
-
-    def _long_enough(self, name: str, cleaned: list[Cleaned], report: Report) -> list[Cleaned]:
-        """Drop the stretches that a step left shorter than a piece or than ``shortest``."""
-        pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
-        limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
-        result = []
-        for part in cleaned:
-            limit = limits[part.split]
-            clean = []
-            for item in part.clean:
-                # Half a sample: times are rounded.
-                if len(item) > 1 and item.duration >= limit - 0.5 * (item.t[1] - item.t[0]):
-                    clean.append(item)
-                    continue
-                text = f"{item.duration:.4g} s, shorter than {limit:g} s (piece or shortest)"
-                report.warn("length", f"{part.split} {item.place} after {name}: {text}: dropped")
-            result.append(replace(part, clean=clean))
-        for key in limits.keys() - {part.split for part in result if part.clean}:
-            raise LogError(
-                f"{key}: after {name} no stretch lasts {limits[key]:g} s: lower piece or shortest"
-            )
-        return result
-
-
-def _apply(name: str, step: Step, cleaned: Sequence[Cleaned], report: Report) -> list[Cleaned]:
-    result = []
-    for part in cleaned:
-        clean = []
-        for recording in part.clean:
-            try:
-                stretches, text = step.apply(recording)
-            except ValueError as error:  # also of SciPy, as of too few samples
-                raise LogError(f"{recording.place}, step {name}: {error}") from error
-            report.add(f"{name}: {step}", f"{part.split} {recording.place}", text)
-            clean += stretches
-        result.append(replace(part, clean=clean))
-    return result

@@ -68,11 +68,17 @@ class Table:
         text += f", column {column!r}" if column else ""
         return text + (f" ({signal})" if signal else "")
 
+    def __contains__(self, name: str) -> bool:
+        return name in self.frame.columns or name in ("index", *self.frame.index.names)
+
     def column(self, name: str, signal: str) -> pd.Series:
-        """Return one column as it is."""
+        """Return one column, or a level of the index, as it is."""
         count = list(self.frame.columns).count(name)
         if count > 1:
             raise LogError(f"{self.name}: {count} columns have the name {name!r}")
+        if not count and name in self:
+            index = self.frame.index
+            return (index if name == "index" else index.get_level_values(name)).to_series()
         if not count:
             hint = did_you_mean(name, map(str, self.frame.columns)) or "."
             names = f"{hint} The log has {listed(self.frame.columns)}"
@@ -80,16 +86,16 @@ class Table:
         return self.frame[name]
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
-        """Return columns as finite numbers, ``(T, K)``."""
+        """Return columns as finite numbers, ``(T, K)``, NaN for empty cells."""
         return np.column_stack([self._numbers(name, signal) for name in columns])
 
     def _numbers(self, name: str, signal: str) -> np.ndarray:
         raw = self.column(name, signal)
         values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
-        bad = ~np.isfinite(values)
+        bad = ~np.isfinite(values) & ~(np.isnan(values) & raw.isna().to_numpy())
         if bad.any():
             k = int(bad.argmax())
-            text = "empty or NaN" if pd.isna(raw.iloc[k]) else repr(str(raw.iloc[k]))[:80]
+            text = f"{str(raw.iloc[k])!r}"[:80]
             text += f", expected a number with a decimal point ({int(bad.sum())} such rows)"
             raise LogError(f"{self.place(k, name, signal)}: the value is {text}")
         return values

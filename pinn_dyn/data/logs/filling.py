@@ -1,0 +1,115 @@
+"""Empty cells of signals with slower clocks, such as of joined topics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.recording import clock_steps
+from pinn_dyn.data.logs.table import Table
+
+_SLOWER = 0.1  # share of empty cells from which a signal has a slower clock
+_MISSED = 3  # usual sample times of a signal that are filled in any case
+
+
+def fill(
+    t: np.ndarray,
+    values: dict[str, np.ndarray],
+    signals: Mapping[str, Columns],
+    table: Table,
+    max_age: float,
+    *,
+    splits: bool,
+) -> tuple[np.ndarray, list[str], list[str]]:
+    """Fill the empty cells of a run in place: hold u, interpolate q and v linearly.
+
+    Rows without the first column of q are dropped if it is a slower signal. No cell is filled
+    between two values that are further apart than ``max_age``, s, and three usual sample times of
+    the column. Rows with such cells are dropped too.
+
+    Args:
+        t: times of the rows, ``(T,)``, s.
+        values: values of each signal, ``(T, K)``, NaN in empty cells.
+        signals: columns of each signal.
+        table: the rows, for messages.
+        max_age: see above, s.
+        splits: a later step splits runs where rows are missing.
+
+    Returns:
+        The rows that stay, a mask ``(T,)``, notes, and warnings.
+
+    Raises:
+        LogError: if a column has no value, no row stays, or rows are missing in the middle of a
+            run that no step splits there.
+    """
+    if (back := np.diff(t) < 0).any():
+        raise LogError(
+            f"{table.place(int(back.argmax()) + 1)}: the time goes back in a log with empty cells, "
+            "which are filled along the time: name the column of the runs in 'trajectory'"
+        )
+    notes: list[str] = []
+    warnings: list[str] = []
+    clock = ~np.isnan(values["q"][:, 0])
+    clock |= clock.mean() > 1 - _SLOWER
+    stays = clock.copy()
+    for signal, columns in signals.items():
+        counts, ages, names = [0], [0.0], []
+        for k, name in enumerate(columns.columns):
+            x = values[signal][:, k]
+            present = ~np.isnan(x)
+            if not present.any():
+                raise LogError(f"{table.name}: the column {name!r} ({signal}) has no values")
+            empty = clock & ~present
+            if not empty.any():
+                continue
+            age, x[empty] = _filled(t, t[present], x[present], empty, hold=signal == "u")
+            usual = np.diff(t[present])
+            longest = max(max_age, _MISSED * float(np.median(usual))) if len(usual) else 0.0
+            good = age <= longest
+            stays[np.flatnonzero(empty)[~good]] = False
+            if good.any():
+                names.append(name)
+                counts.append(int(good.sum()))
+                ages.append(float(age[good].max()))
+            inside = np.isfinite(age) & ~good
+            if inside.any():
+                row = int(np.flatnonzero(empty)[inside.argmax()])
+                text = (
+                    f"{table.place(row, name, signal)}: no value for {age[inside].max():.3g} s, "
+                    f"more than {longest:.3g} s (max_age)"
+                )
+                if not splits:
+                    raise LogError(f"{text}: split the run there, as in{clock_steps(t[clock])}")
+                warnings.append(f"{text}: {inside.sum()} rows are dropped")
+        if names:
+            way = "held" if signal == "u" else "interpolated"
+            text = (
+                f"{max(counts)} of {clock.sum()} values of {signal} ({', '.join(names)}) are "
+                f"missing and {way}, over at most {max(ages):.3g} s"
+            )
+            slower = max(counts) > _SLOWER * clock.sum()
+            (notes if slower else warnings).append(text if slower else f"{table.name}: {text}")
+    if not stays.any():
+        raise LogError(f"{table.name}: no row has values of {', '.join(signals)}: raise max_age")
+    if dropped := int((clock & ~stays).sum()):
+        notes.append(f"{dropped} of {clock.sum()} rows lack a value and are dropped")
+    return stays, notes, warnings
+
+
+def _filled(
+    t: np.ndarray, times: np.ndarray, x: np.ndarray, empty: np.ndarray, *, hold: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances of the values around the empty cells, s, and the cells' new values."""
+    at = t[empty]
+    last = np.searchsorted(times, at, side="right") - 1
+    following = np.searchsorted(times, at)
+    bounded = np.r_[times, np.inf]
+    age = np.where(last < 0, np.inf, bounded[following] - times[last])
+    if not hold:
+        return age, np.interp(at, times, x)
+    # A value is held beyond the end of its signal, too.
+    age = np.where(following < len(times), age, at - times[last])
+    return age, x[last]

@@ -1,0 +1,143 @@
+"""Files and data frames of a log, read to recordings in SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from pinn_dyn.data.logs.checks import check_clock, check_rows
+from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.filling import fill
+from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
+from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.stamps import Clock
+from pinn_dyn.data.logs.table import Request, Table
+
+Files = str | Sequence[str] | Mapping[str, pd.DataFrame]
+_RESTART = 10  # samples after the first time up to which a clock restarts
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Columns of a log, and the way from its tables to recordings.
+
+    Attributes:
+        time: clock.
+        signals: columns of q, v (if measured) and u.
+        trajectory: column that tells the runs of a table apart, or None.
+        request: what a reader gets.
+        repairs: faults that the cleaning repairs.
+    """
+
+    time: Clock
+    signals: Mapping[str, Columns]
+    trajectory: str | None
+    request: Request
+    repairs: Collection[str]
+
+    def read(self, files: Files, root: str, report: Report) -> list[Recording]:
+        """Read all runs of a log.
+
+        Raises:
+            LogError: on a file that cannot be used.
+        """
+        recordings: list[Recording] = []
+        tables = self._tables(files, root)
+        for stem, table in tables.items():
+            for note in table.notes:
+                report.warn("rows", f"{stem}: {note}")
+            prefix = f"{stem}:" if self.trajectory is not None and len(tables) > 1 else ""
+            runs = {
+                f"{prefix}{run}": rows for run, rows in table.runs(self.trajectory, stem).items()
+            }
+            recordings += [item for _, item in self.recordings(table, runs, report)]
+        return recordings
+
+    def _tables(self, files: Files, root: str) -> dict[str, Table]:
+        if isinstance(files, Mapping):
+            return {name: Table(frame, name) for name, frame in files.items()}
+        paths: dict[str, Path] = {}
+        for path in find_files(root, files):
+            stem = run_name(path, root)
+            if stem in paths:
+                raise LogError(f"{paths[stem]} and {path} are both the run {stem!r}: rename one")
+            paths[stem] = path
+        return {
+            ":".join(x for x in (stem if len(paths) > 1 or not run else "", run) if x): table
+            for stem, path in paths.items()
+            for run, table in read_tables(path, self.request).items()
+        }
+
+    def recordings(
+        self, table: Table, runs: Mapping[str, np.ndarray], report: Report
+    ) -> list[tuple[np.ndarray, Recording]]:
+        """Convert the runs of a table, masks of its rows, to SI units, and check them.
+
+        Returns:
+            For each run the numbers of its rows in the table, and the recording.
+        """
+        values = {
+            signal: columns.to_si(table.numbers(columns.columns, signal))
+            for signal, columns in self.signals.items()
+        }
+        results = []
+        for run, mask in runs.items():
+            rows = np.flatnonzero(mask)
+            t, notes = self.time.seconds(table.select(rows))
+            starts = _restarts(t)[: None if "backward times" not in self.repairs else 0]
+            if len(starts):
+                report.warn(
+                    "clock",
+                    f"{table.place(rows[starts[0]], self.time.name)}: the time restarts at "
+                    f"{t[starts[0]]:.6g} s ({len(starts)} times): a run is assumed to start there",
+                )
+            pieces = np.split(np.arange(len(rows)), starts)
+            for k, piece in enumerate(pieces):
+                name = f"{run}:{k + 1}" if len(pieces) > 1 else run
+                part = {signal: x[rows[piece]] for signal, x in values.items()}
+                kept, item = self._recording(name, t[piece], part, table, rows[piece], report)
+                text = f"{len(item)} rows, {item.duration:.6g} s, from {Path(table.name).name}"
+                report.add("Read", name, "; ".join([text, *notes]))
+                results.append((kept, item))
+        return results
+
+    def _recording(
+        self,
+        run: str,
+        t: np.ndarray,
+        values: dict[str, np.ndarray],
+        table: Table,
+        rows: np.ndarray,
+        report: Report,
+    ) -> tuple[np.ndarray, Recording]:
+        part = table.select(rows)
+        if any(np.isnan(x).any() for x in values.values()):
+            splits = "gaps" in self.repairs
+            stays, notes, warnings = fill(
+                t, values, self.signals, part, self.request.max_age, splits=splits
+            )
+            for text in notes:
+                report.add("Read", run, text)
+            for text in warnings:
+                report.warn("empty cells", text)
+            rows, t = rows[stays], t[stays]
+            part, values = part.select(stays), {key: x[stays] for key, x in values.items()}
+        check_clock(t, part, self.time, self.repairs)
+        for signal, x in values.items():
+            columns = self.signals[signal]
+            report.measurements += check_rows(part, t, signal, columns, x, self.repairs)
+        return rows, Recording(run, t, values["q"], values.get("v"), values["u"])
+
+
+def _restarts(t: np.ndarray) -> np.ndarray:
+    """Return the rows at which the time goes back to the first times of the run."""
+    steps = np.diff(t)
+    if not (steps < 0).any() or not (steps > 0).any():
+        return np.array([], dtype=int)
+    early = t[0] + _RESTART * np.median(steps[steps > 0])
+    return np.flatnonzero((steps < 0) & (t[1:] <= early) & (t[:-1] > early)) + 1

@@ -1,0 +1,115 @@
+"""Clocks of logs: counters, dates, an index, two columns, a rate, and repairs of bad clocks."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pinn_dyn.data.logs import LogError
+from tests.data.logs_files import motion, source, write
+
+SECONDS = motion()["t"]
+NS = np.int64(1_790_000_000_123_456_789) + (1e9 * SECONDS).round().astype(np.int64)
+STAMPS = pd.to_datetime(NS)
+
+
+def texts(form):
+    return STAMPS.dt.strftime(form).str.slice(stop=-3)
+
+
+CLOCKS = {
+    "rate": (None, dict(rate=100)),
+    "seconds and nanoseconds": (
+        {"secs": NS // 10**9, "nsecs": NS % 10**9},
+        dict(columns=["secs", "nsecs"], unit=["s", "ns"]),
+    ),
+    "integer nanoseconds": ({"t": NS}, dict(columns="t", unit="ns")),
+    "float milliseconds": ({"t": NS / 1e6}, dict(columns="t", unit="ms")),
+    "ISO 8601": ({"t": [x.isoformat() for x in STAMPS.dt.tz_localize("UTC")]}, {}),
+    "ISO 8601 with zones": (
+        {"t": [x.isoformat() for x in (STAMPS + pd.Timedelta("36.5d")).dt.tz_localize("UTC")
+               .dt.tz_convert("Europe/Berlin")]},
+        {},
+    ),
+    "German": ({"t": texts("%d.%m.%Y %H:%M:%S,%f")}, {}),
+    "time of day": ({"t": texts("%H:%M:%S.%f")}, {}),
+    "time of day with a colon": ({"t": texts("%H:%M:%S:%f")}, {}),
+    "midnight": ({"t": (STAMPS + pd.Timedelta("10:46:31")).dt.strftime("%H:%M:%S.%f")}, {}),
+    "minutes": ({"t": texts("%M:%S.%f")}, {}),
+    "AM and PM": ({"t": STAMPS.dt.strftime("%m/%d/%Y %I:%M:%S.%f %p")}, {}),
+    "date and time": (
+        {"day": STAMPS.dt.strftime("%Y-%m-%d"), "time": texts("%H:%M:%S.%f")},
+        dict(columns=["day", "time"]),
+    ),
+    "days of MATLAB": ({"t": (719529 + NS / 86400e9).map("{:.12f}".format)}, "d"),
+    "micros()": ({"t": (2**32 - 4_000_000 + (1e6 * SECONDS).round().astype(int)) % 2**32}, "us"),
+    "signed micros()": (
+        {"t": (2**31 - 4_000_000 + (1e6 * SECONDS).round().astype(int) + 2**31) % 2**32 - 2**31},
+        "us",
+    ),
+    "16 bits": ({"t": (65_000 + (1e3 * SECONDS).round().astype(int)) % 2**16}, "ms"),
+    "micros() / 1e6": ({"t": (2**32 / 1e6 - 4 + SECONDS) % (2**32 / 1e6)}, "s"),
+    "sample time": ({"t": 0.01 + 0 * SECONDS}, {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_every_clock_gives_the_same_times(tmp_path, clock):
+    columns, time = CLOCKS[clock]
+    table = motion().drop(columns="t")
+    write(tmp_path, table if columns is None else table.assign(**columns))
+    time = dict(columns="t", unit=time) if isinstance(time, str) else time
+    log = source(tmp_path, time=time or dict(columns="t", unit="s"))
+    times = np.sort(np.concatenate([part.raw.t for part in log.cleaned]))
+    assert not log.warnings
+    np.testing.assert_allclose(np.median(np.diff(times)), 0.01, atol=1e-5)
+    np.testing.assert_allclose(np.ptp(times), 10.0, atol=1e-4)
+    assert len(log.load().train[0].t) == 601
+
+
+FRAMES = {
+    "dates": ("index", STAMPS),
+    "dates in ms with a zone": ("index", STAMPS.dt.tz_localize("Asia/Tokyo").dt.as_unit("ms")),
+    "durations": ("elapsed", pd.to_timedelta(SECONDS, unit="s").rename("elapsed")),
+    "numbers": ("index", SECONDS),
+    "column of dates": ("stamp", None),
+}
+
+
+@pytest.mark.parametrize("index", FRAMES)
+def test_the_index_of_a_frame_is_its_clock(index):
+    time, values = FRAMES[index]
+    frame = motion().drop(columns="t").assign(stamp=STAMPS)
+    log = source(".", files=frame if values is None else frame.set_index(values), time=time)
+    np.testing.assert_allclose(log.load().train[0].t.diff(), 0.01, atol=1e-9)
+
+
+ADVICE = {
+    "no clock": (motion().drop(columns="t"), dict(rate=100)),
+    "constant": (motion().assign(t=7.0), dict(rate=100)),
+    "ms": (motion().assign(t=1000 * SECONDS), dict(columns="t", unit="ms")),
+    "us": (motion().assign(t=1e6 * SECONDS), dict(columns="t", unit="us")),
+    "UNIX ns": (motion().assign(t=NS), dict(columns="t", unit="ns")),
+    "days": (motion().assign(t=46000 + SECONDS / 86400), dict(columns="t", unit="d")),
+}
+
+
+@pytest.mark.parametrize("fault", ADVICE)
+def test_the_advice_on_a_clock_works_on_the_log_that_gets_it(tmp_path, fault):
+    table, cure = ADVICE[fault]
+    write(tmp_path, table.assign(t=table["t"].map(repr)) if fault == "days" else table)
+    with pytest.raises(LogError) as error:
+        source(tmp_path).load()
+    advice = f"rate: {cure['rate']}}}" if "rate" in cure else f"write the unit {cure['unit']},"
+    assert advice in str(error.value)
+    np.testing.assert_allclose(source(tmp_path, time=cure).load().train[0].t.diff(), 0.01)
+
+
+def test_a_restart_of_the_clock_starts_a_run(tmp_path):
+    runs = [motion(), motion(phase=1.0), motion(phase=2.0)]
+    write(tmp_path, pd.concat(runs))
+    log = source(tmp_path)
+    assert len(log.load().train) == 3
+    assert "the time restarts at 0 s (2 times)" in "\n".join(log.warnings)
+    write(tmp_path, pd.concat([motion(), motion()[300:]]))  # no restart
+    with pytest.raises(LogError, match="SplitGaps"):
+        source(tmp_path).load()
