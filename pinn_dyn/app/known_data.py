@@ -21,8 +21,9 @@ def check_known(model: Predictor, source: DataSource) -> None:
     if not isinstance(model, KnownMechanics):
         return
     driven = [model.structure.joint_names[k] for k in model.driven]
+    driven *= model.num_inputs // len(driven)  # targets and feed-forward forces
     check_structure("model.structure", model.structure, source, driven)
-    if model.gain is None:
+    if model.gain is None and model.servo is None:
         inputs = [
             f"{name} in {unit}"
             for (name, unit), gain in zip(

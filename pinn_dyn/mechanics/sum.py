@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.integrators import RK4, Integrator
@@ -72,6 +73,11 @@ class Sum(MechanicalSystem):
         for part_mass, part_bias in terms:
             mass, bias = mass + part_mass, bias + part_bias
         return mass, bias
+
+    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+        matrices = [part._stiffness_matrix(q) for part in self._systems()]
+        stiff = [matrix for matrix in matrices if matrix is not None]
+        return torch.stack(stiff).sum(0) if stiff else None
 
     def _systems(self) -> list[MechanicalSystem]:
         parts: list[Any] = list(self.parts.values())

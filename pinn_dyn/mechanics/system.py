@@ -99,6 +99,10 @@ class MechanicalSystem(ContinuousPredictor):
     def _friction_slope(self, v: Tensor) -> Tensor:
         return torch.zeros_like(v)
 
+    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+        """Return stiff terms K(q) of dG/dq, ``(*batch, N, N)``, or None, for implicit methods."""
+        return None
+
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return matvec(self.input_matrix(q), u)
 
@@ -204,7 +208,11 @@ class MechanicalSystem(ContinuousPredictor):
         """
         for present, problem, remedy in (
             (self.input_history, "a learned input delay", "~model/delay"),
-            (not self.input_affine, "a force not linear in the input", "model/input=network"),
+            (
+                not self.input_affine,
+                "a force not linear in the input",
+                "model/input=network, or model.input.limit=null for servos",
+            ),
             (self.has_residual, "a residual force", "~model/residual"),
         ):
             if present:
@@ -265,27 +273,31 @@ class MechanicalSystem(ContinuousPredictor):
 
     @final
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return a function from r to k with (1 - s J) k = r, where J is the stiff dissipation::
+        """Return a function from r to k with (1 - s J) k = r, where J has the stiff terms::
 
-            (q, v):  J = [[0, 1], [0, -M^-1 D']]       (q, p):  J = [[0, M^-1], [0, -D' M^-1]]
+            (q, v):  J = [[0, 1], [-M^-1 K, -M^-1 D']]     (q, p):  J = [[0, M^-1], [-K, -D' M^-1]]
 
-        D' = D + diag(dF_i/dv_i). With r = (r_q, r_v) or (r_q, r_p) and E = (M + s D')^-1 that is
-        k_v = E M r_v and k_q = r_q + s k_v, or k_p = M E r_p and k_q = r_q + s E r_p.
+        D' = D + diag(dF_i/dv_i), and K is the stiffness of servos and elastic joints. With
+        r = (r_q, r_v) or (r_q, r_p), r_p = M r_v and E = (M + s D' + s^2 K)^-1 that is
+        k_v = E (r_p - s K r_q), k_p = M k_v and k_q = r_q + s k_v.
         """
         q, v = x.chunk(2, dim=-1)
         if self.state == "qp":
             v = self._velocity(q, v)
         mass = self.mass_matrix(q)
         resistance = self.damping_matrix(q) + torch.diag_embed(self._friction_slope(v))
+        stiffness = self._stiffness_matrix(q)
+        if stiffness is not None:
+            resistance = resistance + step * stiffness
         inverse = spd_solver(mass + step * resistance)
 
         def solve(rate: Tensor) -> Tensor:
             rate_q, rate = rate.chunk(2, dim=-1)
-            if self.state == "qv":
-                velocity = rate = inverse(matvec(mass, rate))
-            else:
-                velocity = inverse(rate)
-                rate = matvec(mass, velocity)
+            force = matvec(mass, rate) if self.state == "qv" else rate
+            if stiffness is not None:
+                force = force - step * matvec(stiffness, rate_q)
+            velocity = inverse(force)
+            rate = velocity if self.state == "qv" else matvec(mass, velocity)
             return torch.cat([rate_q + step * velocity, rate], dim=-1)
 
         return solve

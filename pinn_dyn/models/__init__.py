@@ -35,6 +35,7 @@ from pinn_dyn.models.positivity import Bounded, Positive, Positivity
 from pinn_dyn.models.potential import ChainPotential, NetworkPotential
 from pinn_dyn.models.residual import NetworkResidual
 from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
 
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "Positive",
     "Positivity",
     "Scales",
+    "Servo",
     "Statistics",
     "Stribeck",
 ]

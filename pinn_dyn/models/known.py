@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, Protocol, runtime_checkable
 
@@ -17,6 +17,7 @@ from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, Re
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.scales import Joint, Scales
+from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.structured import FrictionHead
 
@@ -65,6 +66,9 @@ class KnownMechanics(LearnedConstants):
     the typical torque f = k u, d ~ f/v, F ~ f, o ~ f, r ~ f/a. At a passive joint f is the rigid
     force of the initial bodies at typical states.
 
+    With servos (:class:`Servo`) the inputs are targets, and A u is the force of the servos. k is
+    their stiffness, and D contains their damping.
+
     Args:
         statistics: scales of the data.
         structure: the kinematics, such as a :class:`~pinn_dyn.systems.RigidChain`.
@@ -78,6 +82,7 @@ class KnownMechanics(LearnedConstants):
         integrator: the integration method; Rosenbrock if friction dominates inertia.
         driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
             default is all joints.
+        input: builder of the servos, if the inputs are targets; k is then ``input.stiffness``.
 
     Raises:
         ValueError: if the structure has no rigid bodies or other joints than the data, or a body is
@@ -95,6 +100,7 @@ class KnownMechanics(LearnedConstants):
         gain_spread: NonNegativeFloat = 0.0,
         integrator: Integrator | None = None,
         driven_joints: Sequence[str] | None = None,
+        input: Callable[..., Servo] | None = None,
     ):
         if not isinstance(structure, Structure):
             raise ValueError(
@@ -103,14 +109,17 @@ class KnownMechanics(LearnedConstants):
             )
         names, size = structure.joint_names, structure.num_coordinates
         driven = list(driven_joints or names)
-        sizes = statistics.num_coordinates, statistics.num_inputs
+        inputs = statistics.num_inputs
+        if input is not None and inputs == 2 * len(driven):
+            inputs //= 2  # targets and feed-forward forces
+        sizes = statistics.num_coordinates, inputs
         if sizes != (size, len(driven)) or len(set(driven) & set(names)) < len(driven):
             raise ValueError(
                 f"the data have {sizes[0]} coordinates and {sizes[1]} inputs, expected the {size} "
                 f"joints {', '.join(names)} and inputs of {', '.join(driven)}: lock joints "
                 "(structure.locked_joints), or name those with an input (driven_joints)"
             )
-        super().__init__(size, len(driven))
+        super().__init__(size, statistics.num_inputs)
         self.structure = structure
         self.integrator = integrator or RK4()
         # Rods for the links of an arm. The last body has no link, so a single rod has no size.
@@ -122,8 +131,15 @@ class KnownMechanics(LearnedConstants):
         joints = tuple(map(Joint, names, structure.turning))
         bodies = structure.generic_inertia() if start == "generic" else structure.inertia
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
-        force = self._typical_forces(statistics, bodies, gain * statistics.u_rms.double())
+        drives = None if input else gain * statistics.u_rms.double()
+        force = self._typical_forces(statistics, bodies, drives)
         scales = Scales(statistics, force, named=joints, prior=True)
+        self.servo = input and input(scales, joints=self.driven)
+        if self.servo is not None:
+            gain = self.servo.strength().detach().double()
+            force = self.servo.typical_force(force)
+            scales = replace(scales, value=force)
+            self.input_affine = self.servo.affine
         inertia, damping = force / acceleration, force / statistics.v_std.double()
         motors = replace(scales, named=tuple(joints[k] for k in self.driven))
         units = [joint.inertia for joint in motors.joints]
@@ -137,7 +153,7 @@ class KnownMechanics(LearnedConstants):
         )
         self.friction = friction(scales)
         self.gain: Constants | None = None
-        if gain_spread > 0:
+        if gain_spread > 0 and self.servo is None:
             units = [f"{joint.force}/u" for joint in motors.joints]
             self.gain = motors.positive("drive gain", 1.0, gain, gain_spread, units)
         self.register_buffer("fixed_gain", gain.clone())
@@ -148,17 +164,20 @@ class KnownMechanics(LearnedConstants):
         self.typical_force: Tensor
         self.float()
 
-    def _typical_forces(self, statistics: Statistics, bodies: Tensor, driven: Tensor) -> Tensor:
-        """Return f ``(N,)``, with the forces of driven joints ``(M,)``."""
+    def _typical_forces(
+        self, statistics: Statistics, bodies: Tensor, driven: Tensor | None
+    ) -> Tensor:
+        """Return f ``(N,)``, with the forces of driven joints ``(M,)`` if they are known."""
         force = torch.zeros(self.num_coordinates).double()
-        if len(driven) < len(force):
+        if driven is None or len(driven) < len(force):
             noise = torch.randn(3, 500, len(force), generator=torch.Generator().manual_seed(0))
             spreads = torch.stack([statistics.q_std, statistics.v_std, statistics.acceleration])
             q, v, a = (noise * spreads[:, None]).to(self.structure.inertia)
             q = q + statistics.q_mean.to(q)
             rigid = self.structure.rigid_force(q, v, a, bodies.to(q), gravity=True)
             force = rigid.double().square().mean(0).sqrt()
-        force[self.driven] = driven
+        if driven is not None:
+            force[self.driven] = driven
         return force
 
     def drive_gain(self) -> Tensor:
@@ -166,7 +185,9 @@ class KnownMechanics(LearnedConstants):
         return self.input_gain() @ self.motors + (1 - self.motors.sum(0))
 
     def input_gain(self) -> Tensor:
-        """Return k of the driven joints, ``(M,)``."""
+        """Return k of the driven joints, or the strength of their servos, ``(M,)``."""
+        if self.servo is not None:
+            return self.servo.strength()
         return self.fixed_gain if self.gain is None else self.gain()
 
     def constant_force(self) -> Tensor:
@@ -188,16 +209,23 @@ class KnownMechanics(LearnedConstants):
             constants.append(Named(names, [unit] * len(names), table[:, column], lower))
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
         gains = [] if self.gain is None else [self.gain.named()]
+        if self.servo is not None:
+            gains = self.servo.physical_constants()
         return [*constants, *drives, *self.friction.physical_constants(), *gains]
 
     def body_parameters(self) -> Tensor:
         """Return the inertial parameters pi ``(n, 10)``, with M a + C v + G = Y(q, v, a) pi."""
         return self.structure.parameters_of(self.bodies())
 
-    def drive_force(self, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return r a + D v + F(v) - o - k u, ``(*batch, N)``, all terms except Y pi."""
+    def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return k u, or the force of the servos, ``(*batch, N)``."""
+        force = self.input_gain() * u if self.servo is None else self.servo.torque(q, v, u)
+        return force @ self.motors
+
+    def drive_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+        """Return r a + D v + F(v) - o - motor force, ``(*batch, N)``, all terms except Y pi."""
         resistance = self.rotor_inertia() * a + self.viscous() * v + self.friction(v)
-        return resistance - self.constant_force() - (self.input_gain() * u) @ self.motors
+        return resistance - self.constant_force() - self.motor_force(q, v, u)
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
         """Return the ratio of the forces of bodies and armatures per input, at driven joints.
@@ -222,16 +250,32 @@ class KnownMechanics(LearnedConstants):
     def potential_energy(self, q: Tensor) -> Tensor:
         self._check(q=q)
         energy = self.structure.potential_energy(q, self.bodies())
-        return energy - (self.constant_force() * q).sum(-1)
+        return energy + ((0.5 * self._springs() * q - self.constant_force()) * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        return torch.diag_embed(self.viscous().expand_as(q))
+        rates = self.viscous()
+        if self.servo is not None:
+            rates = rates + self.servo.damping_rates()
+        return torch.diag_embed(rates.expand_as(q))
 
     def input_matrix(self, q: Tensor) -> Tensor:
+        if self.servo is not None:
+            return self.servo(q)
         return (self.input_gain() * self.motors.mT).expand(*q.shape, -1)
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        return (self.input_gain() * u) @ self.motors
+        return self.motor_force(q, q, u) if self.servo is None else self.servo.force(q, u)
+
+    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        force = self._input_force(q, u)
+        return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
+
+    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+        return torch.diag(self._springs()) if self.servo else None
+
+    def _springs(self) -> Tensor:
+        """Return the stiffness of springs, ``(N,)``."""
+        return self.servo.springs() if self.servo else torch.zeros_like(self.viscous())
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)
@@ -240,11 +284,12 @@ class KnownMechanics(LearnedConstants):
     def _potential_force(self, q: Tensor) -> Tensor:
         zero = torch.zeros_like(q)
         gravity = self.structure.rigid_force(q, zero, zero, self.bodies(), gravity=True)
-        return gravity - self.constant_force()
+        return gravity + self._springs() * q - self.constant_force()
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
-        return mass + torch.diag(self.rotor_inertia()), bias - self.constant_force()
+        bias = bias + self._springs() * q - self.constant_force()
+        return mass + torch.diag(self.rotor_inertia()), bias
 
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)

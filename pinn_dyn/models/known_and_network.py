@@ -49,8 +49,9 @@ class KnownAndNetwork(Sum):
     ):
         first = known(statistics=statistics)
         # The network computes forces, so its scales are those of torques instead of currents.
-        gain = first.input_gain().detach().to(statistics.u_mean)
-        forces = replace(statistics, u_mean=gain * statistics.u_mean, u_std=gain * statistics.u_std)
+        force = first.typical_force[first.driven].to(statistics.u_mean)
+        force = force.repeat(statistics.num_inputs // len(force))
+        forces = replace(statistics, u_mean=0 * force, u_std=force)
         second = network(statistics=forces)
         drives = second.input(statistics.q_mean[None].float()).any()
         for head, present in (

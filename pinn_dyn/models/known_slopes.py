@@ -17,7 +17,7 @@ _BODIES = "model.bodies.z"
 class KnownSlopes(Slopes):
     """Derivatives of :class:`~.known.KnownMechanics` by the regressor Y of its bodies::
 
-        e = Y(q, v, a) pi(z) + drive force(v, a, u; z)
+        e = Y(q, v, a) pi(z) + drive force(q, v, a, u; z)
         de/dz = Y dpi/dz + d(drive force)/dz
 
     One reverse pass through all drives, with copies of the constants, gives the second term.
@@ -28,18 +28,20 @@ class KnownSlopes(Slopes):
         self._bodies = self._body_slopes()
 
     def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        return self.by_regressor(self.model.structure.regressor(q, v, a), v, a, u)
+        return self.by_regressor(self.model.structure.regressor(q, v, a), q, v, a, u)
 
-    def by_regressor(self, regressor: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        drives = self._drive_slopes(lambda m: m.drive_force(v, a, u), v)
+    def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
+        drives = self._drive_slopes(lambda m: m.drive_force(*at), at[0])
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         by_q, by_v = self.model.structure.force_slopes(q, v, a, self.model.bodies())
-        speed = v.clone().requires_grad_()
+        state = q.clone().requires_grad_(), v.clone().requires_grad_()
         with torch.enable_grad():
-            (drive,) = torch.autograd.grad(self.model.drive_force(speed, a, u).sum(), speed)
-        return torch.cat([by_q, by_v + torch.diag_embed(drive)], dim=-1)
+            force = self.model.drive_force(*state, a, u).sum()
+            drives = torch.autograd.grad(force, state, materialize_grads=True)
+        by_q, by_v = (x + torch.diag_embed(y) for x, y in zip((by_q, by_v), drives, strict=True))
+        return torch.cat([by_q, by_v], dim=-1)
 
     def gain(self) -> Tensor:
         gain = self.model.viscous()
@@ -68,10 +70,12 @@ class KnownSlopes(Slopes):
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
         # Constants of drives have an entry for each driven joint instead of each joint.
-        joints = {f"model.{name}.z": self.model.motors for name in ("armature", "offset", "gain")}
+        driven = "model.armature", "model.offset", "model.gain", "model.servo."
         return torch.cat(
             [
-                joints[name].mT * slope.unsqueeze(-2) if name in joints else torch.diag_embed(slope)
+                self.model.motors.mT * slope.unsqueeze(-2)
+                if name.startswith(driven)
+                else torch.diag_embed(slope)
                 for name, slope in zip(values, slopes, strict=True)
             ],
             dim=-1,
@@ -82,7 +86,7 @@ class KnownSamples(Samples):
     """Samples whose regressor Y is computed once, since Y does not depend on the parameters."""
 
     def __init__(self, model: LearnedConstants, q: Tensor, v: Tensor, a: Tensor, u: Tensor):
-        super().__init__(model, v, a, u)
+        super().__init__(model, q, v, a, u)
         self._regressor = self.model.structure.regressor(q, v, a)
 
     def missing_force(self) -> Tensor:

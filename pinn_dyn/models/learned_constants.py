@@ -44,13 +44,17 @@ class LearnedConstants(MechanicalSystem):
         """Return the gain k ``(N,)`` of each input: 1, unless gains are learned."""
         return torch.ones(self.num_coordinates, dtype=next(self.parameters()).dtype)
 
+    def motor_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return the force that the inputs exert on the joints, ``(*batch, N)``."""
+        return self._applied_force(q, v, u)
+
     def missing_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return e, ``(*batch, N)``, the force that the input lacks for the acceleration."""
         return self.inverse_dynamics(q, v, a) - self._applied_force(q, v, u)
 
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return the spread of A u / k over samples, ``(N,)``, or of M a / k without an input."""
-        driven = (self._applied_force(q, v, u) / self.drive_gain()).std(0)
+        """Return the spread of motor force / k over samples, ``(N,)``, or else of M a / k."""
+        driven = (self.motor_force(q, v, u) / self.drive_gain()).std(0)
         inertial = (matvec(self.mass_matrix(q), a) / self.drive_gain()).std(0)
         scale = torch.where(driven > 1e-9 * inertial, driven, inertial)
         return torch.where(scale > 0, scale, 1.0)  # no scale for a joint at rest

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
@@ -16,6 +17,7 @@ from pinn_dyn.models.positivity import Positive
 from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
 from pinn_dyn.models.scales import Scales
+from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
 
 CholeskyHead = Callable[[Scales], CholeskyFactor]
@@ -69,14 +71,29 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
     def _scales(self, statistics: Statistics, value: Tensor) -> Scales:
         return Scales(statistics, value, self.angles)
 
+    @property
+    def servo(self) -> Servo | None:
+        """The input head if inputs are targets of servos."""
+        return self.input if isinstance(self.input, Servo) else None
+
     def potential_energy(self, q: Tensor) -> Tensor:
-        return self.potential(q)
+        energy = self.potential(q)
+        return energy + 0.5 * (self.servo.springs() * q * q).sum(-1) if self.servo else energy
 
     def damping_matrix(self, q: Tensor) -> Tensor:
-        return self.damping.matrix(q)
+        matrix = self.damping.matrix(q)
+        return matrix + torch.diag(self.servo.damping_rates()) if self.servo else matrix
 
     def _damping_force(self, q: Tensor, v: Tensor) -> Tensor:
-        return self.damping.product(q, v)
+        force = self.damping.product(q, v)
+        return force + self.servo.damping_rates() * v if self.servo else force
+
+    def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
+        return torch.diag(self.servo.springs()) if self.servo else None
+
+    def _applied_force(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        force = super()._applied_force(q, v, u)
+        return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         return self.input(q)
@@ -97,4 +114,5 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         return v.new_zeros(()) if self.residual is None else self.residual.penalty(q, v, u)
 
     def _potential_force(self, q: Tensor) -> Tensor:
-        return self.potential.gradient(q)
+        force = self.potential.gradient(q)
+        return force + self.servo.springs() * q if self.servo else force

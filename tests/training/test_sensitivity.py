@@ -7,13 +7,16 @@ import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from pinn_dyn.mechanics import RK4
-from pinn_dyn.models import Stribeck
+from pinn_dyn.models import Servo, Stribeck
 from pinn_dyn.models.learned_constants import Slopes
 from pinn_dyn.training.sensitivity import rollout_slopes
 from tests.support.known import known_arm, known_model, windows_of
 
 MODELS = {
     "Stribeck": lambda: known_model(gain_spread=0.3, friction=Stribeck),
+    "servos": lambda: known_model(
+        friction=Stribeck, input=partial(Servo, stiffness=3.0, limit="learned")
+    ),
     "soft arm": known_arm,
     "two segments": lambda: known_arm(2),
 }

@@ -1,0 +1,163 @@
+"""Position servos, whose input is a target instead of a force."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Literal
+
+import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
+from torch import Tensor
+
+from pinn_dyn.models.input_matrix import InputMatrix
+from pinn_dyn.models.known_constants import Constants, Named
+from pinn_dyn.models.scales import Scales
+
+_START = 10.0  # initial k in units of the typical force over the spread of q
+_SHARPNESS = 8  # the force is 0.92 of its limit where the linear law reaches the limit
+_BEYOND = 1e3  # ratio to the limit beyond which the force is constant
+
+
+class Servo(InputMatrix):
+    """Position servos with targets u, and optional feed-forward forces f::
+
+        s = k (u - q) - d v + f,      tau = s / (1 + |s / L|^8)^(1/8)
+
+    Without a limit L, tau = s. The spring is a part of the potential, V + k q^2 / 2, and d of the
+    damping matrix, so that a model with a servo is passive at a constant target. The input matrix
+    is A = k, or (k, 1) with feed-forward forces, and A^-1 gives the target of a force exactly.
+    Without a limit, d is zero, because the damping of the joint contains it.
+
+    k ``(n,)`` is in Nm/rad or N/m, d in Nms/rad or Ns/m, L in Nm or N. All forces of a model with a
+    learned k share an unknown factor. A fixed k, known bodies or a feed-forward force determine it.
+
+    Args:
+        scales: scales of the data. With a prior, the value is the typical force, ``(N,)``.
+        stiffness: initial k, one number or n. The default follows from the data.
+        spread: prior standard deviation of the logarithm of the constants; 0 fixes k.
+        limit: L, one number or n; ``"learned"``; or None for a servo that does not saturate.
+        joints: coordinates with a servo, in the order of the targets. The default is all.
+
+    Raises:
+        ValueError: if the data do not have n or 2 n inputs.
+    """
+
+    stiffness: Constants | None
+    damping: Constants | None
+    limit: Constants | None
+    selection: Tensor
+    error: Tensor
+    fixed_stiffness: Tensor
+    fixed_limit: Tensor
+
+    def __init__(
+        self,
+        scales: Scales,
+        *,
+        stiffness: PositiveFloat | Sequence[PositiveFloat] | None = None,
+        spread: NonNegativeFloat = 1.5,
+        limit: PositiveFloat | Sequence[PositiveFloat] | Literal["learned"] | None = None,
+        joints: Sequence[NonNegativeInt] | None = None,
+    ):
+        super().__init__(scales)
+        size, inputs = self.shape
+        index = list(range(size)) if joints is None else list(joints)
+        if inputs not in (len(index), 2 * len(index)):
+            raise ValueError(
+                f"the data have {inputs} inputs, expected targets of {len(index)} joints, or "
+                "targets and then feed-forward forces: correct dataset.u.columns, or "
+                "model.input.joints"
+            )
+        self.register_buffer("selection", torch.eye(size)[index], persistent=False)
+        data = scales.statistics
+        force = scales.value.double()
+        if not scales.prior:
+            force = super().typical_force(data.u_rms[-len(index) :]).double()
+        spread_of_q = data.q_std[index].double()
+        if stiffness is None:
+            start = _START * force[index] / spread_of_q
+        else:
+            start = torch.as_tensor(stiffness, dtype=torch.float64).expand(len(index)).clone()
+            force = force.index_copy(0, torch.tensor(index), start * spread_of_q / _START)
+        self._force, force = force, force[index]
+        motors = replace(scales, named=tuple(scales.joints[k] for k in index))
+        units = [joint.force + ("/rad" if joint.turns else "/m") for joint in motors.joints]
+        build = partial(motors.positive, spread=spread or 1.5)
+        self.stiffness = self.damping = self.limit = None
+        if spread > 0:
+            self.stiffness = build("servo stiffness", 1.0, start, units=units)
+        self.affine = limit is None
+        if not self.affine:
+            units = [joint.damping for joint in motors.joints]
+            rate = force / data.v_std[index]
+            self.damping = build("servo damping", 0.1, rate, units=units)
+        if limit == "learned":
+            units = [joint.force for joint in motors.joints]
+            self.limit, limit = build("servo limit", 1.0, force, units=units), None
+        largest = torch.as_tensor(limit or torch.inf, dtype=torch.float32)
+        self.register_buffer("error", (spread_of_q / _START).float(), persistent=False)
+        self.register_buffer("fixed_limit", largest.expand(len(index)).clone())
+        self.register_buffer("fixed_stiffness", start.float())
+
+    def gain(self) -> Tensor:
+        """Return k, ``(n,)``."""
+        return self.fixed_stiffness if self.stiffness is None else self.stiffness()
+
+    def strength(self) -> Tensor:
+        """Return 1 / (1/k + e/L), ``(n,)``, the force by target error, with a typical error e."""
+        return self.gain() / (1 + self.gain() * self.error / self._largest())
+
+    def springs(self) -> Tensor:
+        """Return k of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
+        return self.gain() @ self.selection
+
+    def damping_rates(self) -> Tensor:
+        """Return d of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
+        return self._rate() @ self.selection
+
+    def forward(self, q: Tensor) -> Tensor:
+        """Return A, ``(*batch, N, M)``."""
+        columns = self.gain()[:, None] * self.selection
+        if self.shape[1] > len(columns):
+            columns = torch.cat([columns, self.selection])
+        return columns.mT.expand(*q.shape[:-1], -1, -1)
+
+    def torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return tau, ``(*batch, n)``."""
+        linear = self._linear_torque(q, v, u)
+        return linear if self.affine else self._limited(linear)
+
+    def excess(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return tau - s on all coordinates, ``(*batch, N)``, which is not linear in the input."""
+        linear = self._linear_torque(q, v, u)
+        return (self._limited(linear) - linear) @ self.selection
+
+    def typical_force(self, u_rms: Tensor) -> Tensor:
+        """Return a tenth of k times the spread of q, ``(N,)``, the force of a typical lag."""
+        return self._force.to(u_rms)
+
+    def physical_constants(self) -> list[Named]:
+        """Return the learned constants in physical units."""
+        parts = self.stiffness, self.damping, self.limit
+        return [part.named() for part in parts if part is not None]
+
+    def _rate(self) -> Tensor:
+        return torch.zeros_like(self.gain()) if self.damping is None else self.damping()
+
+    def _linear_torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        """Return s, ``(*batch, n)``."""
+        target, *feedforward = u.split(len(self.selection), dim=-1)
+        torque = self.gain() * (target - q @ self.selection.mT)
+        torque = sum(feedforward, torque)
+        return torque if self.affine else torque - self._rate() * (v @ self.selection.mT)
+
+    def _largest(self) -> Tensor:
+        """Return L, ``(n,)``."""
+        return self.fixed_limit if self.limit is None else self.limit()
+
+    def _limited(self, linear: Tensor) -> Tensor:
+        limit = self._largest()
+        ratio = (linear / limit).clamp(-_BEYOND, _BEYOND)
+        return limit * ratio / (1 + ratio**_SHARPNESS) ** (1 / _SHARPNESS)
