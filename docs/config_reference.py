@@ -23,7 +23,7 @@ from pinn_dyn.app.validation import arguments_model
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
-PROGRAMS = ("train", "evaluate", "control", "gather", "check")
+PROGRAMS = ("train", "evaluate", "control", "gather", "check", "excite")
 PLAIN = (bool, int, float, str, tuple, type(None))
 # Keys of the programs that stand in no YAML.
 OPTIONAL = {

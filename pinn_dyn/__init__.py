@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pinn_dyn.data import LogSource as LogSource
     from pinn_dyn.data import Splits as Splits
     from pinn_dyn.evaluation.closed_loops import close_loop as close_loop
+    from pinn_dyn.evaluation.excitation_design import design_excitation as design_excitation
     from pinn_dyn.evaluation.log_check import check as check
     from pinn_dyn.mechanics import MechanicalSystem as MechanicalSystem
     from pinn_dyn.mechanics import Signal as Signal
@@ -42,6 +43,7 @@ _MODULES = {
     "check": "pinn_dyn.evaluation.log_check",
     "close_loop": "pinn_dyn.evaluation.closed_loops",
     "dataset": "pinn_dyn.app.build",
+    "design_excitation": "pinn_dyn.evaluation.excitation_design",
     "evaluate": "pinn_dyn.app.evaluation",
     "fit": "pinn_dyn.app.fit",
     "load": "pinn_dyn.app.run_folder",

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import logging
 import os
+import re
 import sys
 import warnings
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +31,7 @@ def main(command: str) -> None:
     flags = get_args_parser().parse_intermixed_args(sys.argv[1:])
     options = [word for word in sys.argv[1:] if word not in flags.overrides]
     shows = flags.help or flags.hydra_help or flags.cfg or flags.info or flags.shell_completion
+    installed = Path(sys.argv[0]).name.startswith("pinn-dyn-")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print a traceback of
     hush()
     try:
@@ -36,13 +41,25 @@ def main(command: str) -> None:
             composed(command, flags.overrides, flags.config_dir)
         folder = str(config_folder(command))
         run = partial(_run, command)
-        hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
+        with _help_of_installed() if flags.help and installed else contextlib.nullcontext():
+            hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
     except (HydraException, OmegaConfBaseException) as error:
         raise SystemExit(f"Error: {explained(error)}") from error
     except ConfigError as error:
         raise SystemExit(f"Error: {error}") from error
+
+
+@contextlib.contextmanager
+def _help_of_installed() -> Iterator[None]:
+    """Replace the scripts in the help by the installed commands."""
+    text = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(text):
+            yield
+    finally:
+        print(re.sub(r"python (\w+)\.py", r"pinn-dyn-\1", text.getvalue()), end="")
 
 
 def _run(command: str, cfg: DictConfig) -> object:
@@ -68,6 +85,5 @@ def hush() -> None:
     warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
 
 
-train, evaluate, control, gather, check = (
-    partial(main, name) for name in ("train", "evaluate", "control", "gather", "check")
-)
+COMMANDS = ("train", "evaluate", "control", "gather", "check", "excite")
+train, evaluate, control, gather, check, excite = (partial(main, name) for name in COMMANDS)

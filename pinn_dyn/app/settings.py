@@ -16,8 +16,10 @@ from pinn_dyn.app.validation import STAND_INS, Seed
 from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
 from pinn_dyn.data import DataSource, DynamicsData, InitialStates
 from pinn_dyn.evaluation import RolloutValidator
+from pinn_dyn.evaluation.motion_limits import JointValues, MotionLimits
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models.known import Structure
+from pinn_dyn.systems import RigidChain
 from pinn_dyn.training import LeastSquares, WindowLoss
 
 Names = str | Sequence[str]
@@ -169,6 +171,28 @@ class CheckSettings:
 
 
 @dataclass(kw_only=True)
+class RobotKinematics:
+    """Known structure of the robot."""
+
+    structure: RigidChain
+
+
+@dataclass(kw_only=True)
+class ExciteSettings:
+    """Keys of excite.py."""
+
+    model: RobotKinematics | Mapping[str, Any]
+    duration: PositiveFloat
+    frequency: PositiveFloat
+    start: JointValues
+    limits: MotionLimits | Mapping[str, Any]
+    steps: PositiveInt
+    seed: Seed
+    rate: PositiveFloat
+    approach: NonNegativeFloat
+
+
+@dataclass(kw_only=True)
 class GatherSettings:
     """Keys of gather.py."""
 
@@ -184,4 +208,5 @@ SETTINGS: dict[str, type] = {
     "control": ControlSettings,
     "check": CheckSettings,
     "gather": GatherSettings,
+    "excite": ExciteSettings,
 }

@@ -55,6 +55,14 @@ def base_parameters(regressor: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.abs(np.diag(np.linalg.qr(scaled, mode="r"))) > _DEPENDENT)
 
 
+def base_columns(structure: Structure) -> np.ndarray:
+    """Return the columns of :func:`drive_regressor` that are independent at random states."""
+    generator = torch.Generator().manual_seed(0)
+    size = structure.num_coordinates
+    q, v, a = 3 * torch.rand(3, 600, size, generator=generator).double() - 1.5
+    return base_parameters(drive_regressor(structure, q, v, a, v.sign()).flatten(0, 1).numpy())
+
+
 def rigid_excitation(
     structure: Structure,
     trajectories: Sequence[Trajectory],
@@ -62,17 +70,7 @@ def rigid_excitation(
     cutoff: float,
     still: Sequence[bool] = (),
 ) -> RigidExcitation:
-    """Return the condition number of the regressor of base parameters on motions.
-
-    The equation of motion of rigid bodies on drives is linear in their constants::
-
-        Y(q, v, a) pi + r a + d v + c sign(v) - o = tau
-
-    with inertial parameters pi, armatures r, viscous and dry friction d and c, and offsets o. The
-    columns that are independent at random states are scaled to unit norm on the filtered motion.
-    Directions with less than a hundredth of the largest singular value are not determined. Sources:
-    Gautier and Khalil 1992, "Exciting trajectories for the identification of base inertial
-    parameters of robots"; Swevers et al. 1997, "Optimal robot excitation and identification".
+    """Return the :func:`motion_excitation` of filtered motions.
 
     Args:
         structure, trajectories: kinematics and motions.
@@ -83,14 +81,30 @@ def rigid_excitation(
         ValueError: if all trajectories are too short for the filter.
     """
     q, v, a, _ = filtered_motion(trajectories, cutoff, 2000)
+    return motion_excitation(structure, q, v, a, still)
+
+
+def motion_excitation(
+    structure: Structure, q: Tensor, v: Tensor, a: Tensor, still: Sequence[bool] = ()
+) -> RigidExcitation:
+    """Return the condition number of the regressor of base parameters on a motion ``(K, N)``.
+
+    The equation of motion of rigid bodies on drives is linear in their constants::
+
+        Y(q, v, a) pi + r a + d v + c sign(v) - o = tau
+
+    with inertial parameters pi, armatures r, viscous and dry friction d and c, and offsets o. The
+    columns that are independent at random states are scaled to unit norm on the motion.
+    Directions with less than a hundredth of the largest singular value are not determined. Sources:
+    Gautier and Khalil 1992, "Exciting trajectories for the identification of base inertial
+    parameters of robots"; Swevers et al. 1997, "Optimal robot excitation and identification".
+    """
     size = structure.num_coordinates
     rests = torch.tensor(list(still) or [False] * size)
     moves = (v.abs() > REST * v.std(0)) & ~rests
-    motion = (torch.where(rests, q.mean(0), q), v * ~rests, a * ~rests)
-    generator = torch.Generator().manual_seed(0)
-    states = 3 * torch.rand(3, 600, size, generator=generator).to(q) - 1.5
-    base = base_parameters(_regressor(structure, *states).flatten(0, 1).numpy())
-    rows = _regressor(structure, *motion)[moves].numpy()[:, base]
+    q, v, a = torch.where(rests, q.mean(0), q), v * ~rests, a * ~rests
+    base = base_columns(structure)
+    rows = drive_regressor(structure, q, v, a, v.sign())[moves].numpy()[:, base]
     rows = np.vstack([rows, np.zeros((len(base), len(base)))])  # short motions have fewer rows
     scaled = rows / np.linalg.norm(rows, axis=0).clip(min=1e-300)
     _, sizes, directions = np.linalg.svd(scaled, full_matrices=False)
@@ -114,7 +128,10 @@ def rigid_excitation(
     )
 
 
-def _regressor(structure: Structure, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-    """Return W ``(K, N, 14 N)`` of bodies, then armatures, frictions and offsets."""
-    drives = [torch.diag_embed(x) for x in (a, v, v.sign(), -torch.ones_like(v))]
+def drive_regressor(structure: Structure, q: Tensor, v: Tensor, a: Tensor, sign: Tensor) -> Tensor:
+    """Return W ``(*batch, N, 14 N)`` of bodies, then armatures, frictions and offsets.
+
+    ``sign`` of v may be a smooth approximation.
+    """
+    drives = [torch.diag_embed(x) for x in (a, v, sign, -torch.ones_like(v))]
     return torch.cat([structure.regressor(q, v, a), *drives], dim=-1)

@@ -5,6 +5,7 @@ import re
 import pytest
 import torch
 
+from pinn_dyn.app.command import COMMANDS, main
 from tests.app.entry import NO_FIGURES, TINY, fails, run_script
 
 
@@ -95,6 +96,16 @@ def test_a_folder_without_a_run_cannot_be_resumed(elsewhere, capsys):
     text = said(fails("train.py", "resume=empty"), capsys)
     assert "empty/checkpoints/last.ckpt does not exist: this is no run folder" in text
     assert "Traceback" not in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_an_installed_command_names_the_command(capsys, monkeypatch, command):
+    monkeypatch.setattr("sys.argv", [f"/usr/bin/pinn-dyn-{command}", "--help"])
+    with pytest.raises(SystemExit):
+        main(command)
+    text = capsys.readouterr().out
+    assert f"  pinn-dyn-{command} " in text
+    assert f"{command}.py" not in text
 
 
 @pytest.mark.parametrize(

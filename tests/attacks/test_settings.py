@@ -234,6 +234,19 @@ MISTAKES = {
         plot=[x]
         sorted=x
     """,
+    "excite": """
+        duration=0
+        frequency=x
+        start={a: x}
+        limits.share=1.5
+        limits.velocity=x
+        limits.speed=1
+        limits.low=[x]
+        steps=0
+        approach=-1
+        rate=0
+        model.structure.urdf=3
+    """,
     "check": """
         longest_delay=0
         longest_delay=null

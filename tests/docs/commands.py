@@ -14,7 +14,7 @@ from omegaconf import OmegaConf, open_dict
 from pinn_dyn.app.config import checked, completed, config_folder
 from tests.docs.blocks import ROOT
 
-PROGRAMS = ("train", "evaluate", "control", "gather", "check")
+PROGRAMS = ("train", "evaluate", "control", "gather", "check", "excite")
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 TARGETS = re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
 

@@ -12,6 +12,7 @@ REQUIRED = {
     "control": ["run=x", "reference.q=[0,0,0]"],
     "gather": ["runs=[x]"],
     "check": [],
+    "excite": ["model.structure.urdf=x"],
 }
 
 
