@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from pinn_dyn.app.build import build_source
 from pinn_dyn.app.config import ConfigError, build_part, checked
-from pinn_dyn.app.known_data import check_structure
+from pinn_dyn.app.known_data import match_structure
 from pinn_dyn.app.run_folder import write_config
 from pinn_dyn.app.sweep import command_line
 from pinn_dyn.app.trainer import naming
@@ -28,8 +28,7 @@ def check(cfg: DictConfig) -> None:
         )
     structure = None
     if (part := config["model"]["structure"]) is not None:
-        structure = build_part("model.structure", part)
-        check_structure("model.structure", structure, source)
+        structure = match_structure(build_part("model.structure", part), source)
     with naming(source.name):
         report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -1,18 +1,117 @@
-"""Agreement of data and known mechanics: the order and the units of joints, inputs as forces."""
+"""Agreement of data and known mechanics: order and units of the joints, inputs as forces."""
 
 from __future__ import annotations
 
 import logging
 import re
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.run import ModelBuilder
 from pinn_dyn.data import DataSource, LogSource
 from pinn_dyn.mechanics import Predictor
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics
-from pinn_dyn.models.known import Structure
+from pinn_dyn.systems import RigidChain
 
 log = logging.getLogger(__name__)
+
+_PATH = "model.structure"
+
+
+def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str, Any]]:
+    """Return the builder of a model whose joints are the columns of the data, and its new settings.
+
+    Only builders of known mechanics change: ``structure.joints`` and ``driven_joints`` become the
+    joints that the columns name.
+
+    Raises:
+        ConfigError: as :func:`match_structure`.
+    """
+    settings = getattr(model, "keywords", {})
+    if "known" in settings:
+        known, changes = match_model(settings["known"], source)
+        return partial(model, known=known), {"known": changes}
+    structure, driven = settings.get("structure"), settings.get("driven_joints")
+    if not isinstance(structure, RigidChain):
+        return model, {}
+    matched = match_structure(structure, source)
+    if settings.get("start") == "prior" and structure.tree.problems:
+        log.warning("start=prior: %s", "; ".join(structure.tree.problems))
+    names = driven or matched.joint_names
+    columns = list(_signals(source)[-1][1])  # of servos, maybe, targets and feed-forward forces
+    inputs = _joints_of(columns[: len(names)] if len(columns) == 2 * len(names) else columns, names)
+    if inputs is None or inputs == list(names):
+        return partial(model, structure=matched), {"structure": {"joints": matched.joints}}
+    log.info("the inputs drive the joints %s", ", ".join(inputs))
+    changes = {"structure": {"joints": matched.joints}, "driven_joints": inputs}
+    return partial(model, structure=matched, driven_joints=inputs), changes
+
+
+def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
+    """Return the chain whose coordinates are the columns of q, in their order.
+
+    All joints that no column names are held at zero. If the columns do not name joints, their
+    number must be that of the joints, and their order counts.
+
+    Raises:
+        ConfigError: if the columns cannot be matched, or their units are not those of the joints.
+    """
+    signals = _signals(source)
+    key, units = signals[0]
+    columns, names = list(units), structure.joint_names
+    candidates = structure.tree.movable if structure.joints is None else names
+    joints = _joints_of(columns, candidates)
+    if joints is None:
+        _check_order(key, columns, structure)
+    elif joints != names:
+        structure = structure.with_joints(joints)
+        held = [name for name in candidates if name not in joints]
+        log.info(
+            "%s: the coordinates are the joints %s%s",
+            *(key, ", ".join(joints)),
+            f"; held at zero: {', '.join(held)}" if held else "",
+        )
+    if structure.tree.held:
+        log.info("the base is fixed, joints that are held: %s", ", ".join(structure.tree.held))
+    names = structure.joint_names
+    for key, others in signals[1:-1]:
+        if (order := _joints_of(list(others), names)) not in (None, names):
+            columns = [list(others)[order.index(name)] for name in names]
+            raise ConfigError(
+                f"{key} has the order {', '.join(others)}, and q that of the joints "
+                f"{', '.join(names)}: expected {key}=[{','.join(columns)}]"
+            )
+    for (column, unit), joint, turns in zip(units.items(), names, structure.turning, strict=True):
+        expected = "rad" if turns else "m"
+        if unit not in ("", expected):
+            raise ConfigError(
+                f"{column} is in {unit}, expected {expected} for the joint {joint} of {_PATH}, "
+                f"which {'turns' if turns else 'slides'}: check the order of the columns, and the "
+                "unit"
+            )
+    return structure
+
+
+def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> None:
+    """Refuse columns that the joints do not fit in their order, and log the pairs otherwise."""
+    names = structure.joint_names
+    matches = [_joint_of(column, names) for column in columns]
+    matches = [None if matches.count(k) > 1 else k for k in matches]
+    crossed = any(joint not in (None, k) for k, joint in enumerate(matches))
+    if len(columns) != len(names) or (crossed and structure.joints is None):
+        others = iter([name for k, name in enumerate(names) if k not in matches])
+        guess = [next(others, "?") if k is None else names[k] for k in matches]
+        way = (
+            f"name the joints of the columns in their order, as {_PATH}.joints=[{','.join(guess)}]"
+        )
+        raise ConfigError(
+            f"{key} has the columns {', '.join(columns)}, and {_PATH} the joints "
+            f"{', '.join(names)}: {'leave out columns' if '?' in guess else way}"
+        )
+    pairs = map(" -> ".join, zip(columns, names, strict=True))
+    log.info("%s, column -> joint by their order: %s", key, "; ".join(pairs))
 
 
 def check_known(model: Predictor, source: DataSource) -> None:
@@ -20,65 +119,29 @@ def check_known(model: Predictor, source: DataSource) -> None:
     model = model.known if isinstance(model, KnownAndNetwork) else model
     if not isinstance(model, KnownMechanics):
         return
-    driven = [model.structure.joint_names[k] for k in model.driven]
-    driven *= model.num_inputs // len(driven)  # targets and feed-forward forces
-    check_structure("model.structure", model.structure, source, driven)
+    names = model.structure.joint_names
+    driven = [names[k] for k in model.driven]
+    (key, q), *_, (input_key, u) = _signals(source)
+    halves = [list(u)[k : k + len(driven)] for k in range(0, len(u), len(driven))]
+    for name, columns, expected in (
+        (key, list(q), names),
+        *((input_key, x, driven) for x in halves),
+    ):
+        if (order := _joints_of(columns, expected)) not in (None, expected):
+            raise ConfigError(
+                f"{name} has the order {', '.join(columns)}, and the model the joints "
+                f"{', '.join(expected)}: build it with joints={order} or driven_joints={order}"
+            )
     if model.gain is None and model.servo is None:
         inputs = [
             f"{name} in {unit}"
-            for (name, unit), gain in zip(
-                _signals(source)[-1][1].items(), model.fixed_gain.tolist(), strict=False
-            )
+            for (name, unit), gain in zip(u.items(), model.fixed_gain.tolist(), strict=False)
             if unit not in ("", "N", "Nm") and gain == 1
         ]
         if inputs:
             raise ConfigError(
                 f"the inputs are {', '.join(inputs)}, no forces: set drive gains, as "
                 "model.drive_gain=10 model.gain_spread=0.5, or correct dataset.u.unit"
-            )
-
-
-def check_structure(
-    path: str, structure: Structure, source: DataSource, driven: Sequence[str] = ()
-) -> None:
-    """Refuse rigid bodies whose joints are not the data's.
-
-    If the columns do not name the joints, their order counts. ``path`` is the structure's key,
-    ``driven`` are the joints with an input; without them, fewer inputs than joints pass.
-
-    Raises:
-        ConfigError: if number, order or units of the columns are not those of the joints.
-    """
-    signals = _signals(source)
-    for key, units in signals:
-        columns, is_input = list(units), key in ("dataset.u.columns", "dataset.input_labels")
-        joints = list(driven) if is_input and driven else structure.joint_names
-        if is_input and not driven and len(columns) < len(joints):
-            continue
-        if len(columns) != len(joints):
-            raise ConfigError(
-                f"{key} has the columns {', '.join(columns)}, and {path} the joints "
-                f"{', '.join(joints)}: leave out columns, or set {path}.locked_joints"
-            )
-        numbers = [_joint_of(column, joints) for column in columns]
-        matches = [None if numbers.count(k) > 1 else k for k in numbers]
-        if any(joint not in (None, k) for k, joint in enumerate(matches)):
-            order = [columns[matches.index(k)] if k in matches else "?" for k in range(len(joints))]
-            raise ConfigError(
-                f"{key} has the order {', '.join(columns)}, and {path} has the joints "
-                f"{', '.join(joints)}: expected {key}=[{','.join(order)}]"
-            )
-        if None in matches:
-            pairs = map(" -> ".join, zip(columns, joints, strict=True))
-            log.info("%s, column -> joint by their order: %s", key, "; ".join(pairs))
-    for (name, unit), joint, turns in zip(
-        signals[0][1].items(), structure.joint_names, structure.turning, strict=True
-    ):
-        expected = "rad" if turns else "m"
-        if unit not in ("", expected):
-            raise ConfigError(
-                f"{name} is in {unit}, expected {expected} for the joint {joint} of {path}, which "
-                f"{'turns' if turns else 'slides'}: check the order of the columns, and the unit"
             )
 
 
@@ -99,6 +162,28 @@ def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
             ]
             signals.append((f"dataset.{key}.columns", dict(zip(x.columns, units, strict=True))))
     return signals
+
+
+def _joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | None:
+    """Return the joint of each column, or None unless each names one of its own.
+
+    A column contains the name of its joint. Otherwise, if there are more joints than columns, names
+    of joints may end as the columns do, behind the same prefix: panda_joint1 and q1.
+    """
+    names = [joints[k] for column in columns if (k := _joint_of(column, joints)) is not None]
+    if len(set(names)) == len(columns):
+        return names
+    for pattern in ("(.*)", r".*?(\d*)\D*$"):  # the whole column, or its last number
+        endings = [re.sub(pattern, r"\1", _letters(column)) for column in columns]
+        prefixes = [
+            {_letters(x)[: -len(end)]: x for x in joints if end and _letters(x).endswith(end)}
+            for end in endings
+        ]
+        shared = set.intersection(*map(set, prefixes)) if len(joints) > len(columns) else set()
+        if len(shared) == 1 and len(set(endings)) == len(columns):
+            (prefix,) = shared
+            return [names_by_prefix[prefix] for names_by_prefix in prefixes]
+    return None
 
 
 def _joint_of(column: str, joints: Sequence[str]) -> int | None:

@@ -188,6 +188,15 @@ def with_structures(part: Any) -> Any:
     return part
 
 
+def merged(config: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a nested configuration with some of its values replaced."""
+    result = dict(config)
+    for key, value in changes.items():
+        is_section = isinstance(value, Mapping)
+        result[key] = merged(result[key], value) if is_section else value
+    return result
+
+
 def write_config(folder: Path, config: dict[str, Any]) -> None:
     """Write the resolved configuration of a run."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ from pinn_dyn.app.command import hush
 from pinn_dyn.app.config import ConfigError
 from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.described import described
-from pinn_dyn.app.known_data import check_known
+from pinn_dyn.app.known_data import check_known, match_model
 from pinn_dyn.app.provenance import provenance
 from pinn_dyn.app.run import TRAJECTORIES, VALIDATION_ERROR, ModelBuilder, Run
 from pinn_dyn.app.run_folder import (
@@ -35,6 +35,7 @@ from pinn_dyn.app.run_folder import (
     finish,
     in_one_line,
     load_run,
+    merged,
     read_checkpoint,
     require_same_data,
     with_structures,
@@ -163,6 +164,7 @@ def train(
     if isinstance(model, str):
         model_name, model = model_name or model, MODELS[model]
     made_in_python = config is None
+    model, changes = match_model(model, source)
     if config is None:
         parts = dict(
             data=data, loss=loss, optimizer=optimizer, scheduler=scheduler, validator=validator
@@ -182,7 +184,7 @@ def train(
             **{name: described(part) for name, part in parts.items()},
             "trainer": {"steps": steps, "validations": validations, **trainer},
         }
-    config = dict(with_structures(config))
+    config = merged(with_structures(config), {"model": changes} if changes else {})
     with contextlib.ExitStack() as stack:
         stack.callback(torch.set_num_threads, torch.get_num_threads())
         torch.set_num_threads(threads)

@@ -114,7 +114,7 @@ def motion_excitation(
     names = [[*bodies, *drives][k] for k in base]
     lost = named_directions(directions[sizes < max(sizes[0], 1e-300) / MOST], names)
     # Joint of each column: ten constants of each body, then a constant of each drive in turn.
-    joint = np.r_[np.repeat(np.arange(size), 10), np.tile(np.arange(size), len(_DRIVE))][base]
+    joint = np.r_[np.repeat(structure.body_joints, 10), np.tile(np.arange(size), len(_DRIVE))][base]
     table = {
         "joint": structure.joint_names,
         "base parameters": np.bincount(joint, minlength=size),

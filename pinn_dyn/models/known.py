@@ -29,16 +29,19 @@ INERTIAL = ("mass", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "
 class Structure(Protocol):
     """Rigid bodies with known kinematics. All terms are linear in their pseudo-inertias.
 
-    ``turning`` is true for each revolute joint. ``inertia`` are the pseudo-inertias ``(n, 4, 4)``.
+    ``turning`` is true for each revolute joint. ``inertia`` are the pseudo-inertias ``(n, 4, 4)``,
+    ``body_joints`` the numbers of the joints that move the bodies.
     """
 
     num_coordinates: int
     joint_names: list[str]
     turning: list[bool]
     body_names: list[str]
+    body_joints: list[int]
     inertia: Tensor
 
     def generic_inertia(self) -> Tensor: ...
+    def prior_inertia(self) -> Tensor: ...
     def parameters_of(self, inertia: Tensor) -> Tensor: ...
     def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor: ...
     def potential_energy(self, q: Tensor, inertia: Tensor) -> Tensor: ...
@@ -129,7 +132,7 @@ class KnownMechanics(LearnedConstants):
         gain = torch.as_tensor(drive_gain, dtype=torch.float64).expand(len(driven))
         acceleration = statistics.acceleration.double()
         joints = tuple(map(Joint, names, structure.turning))
-        bodies = structure.generic_inertia() if start == "generic" else structure.inertia
+        bodies = structure.generic_inertia() if start == "generic" else structure.prior_inertia()
         self.bodies = PhysicalBodies(bodies, spread, structure.body_names)
         drives = None if input else gain * statistics.u_rms.double()
         force = self._typical_forces(statistics, bodies, drives)

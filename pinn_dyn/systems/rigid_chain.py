@@ -1,10 +1,12 @@
-"""A rigid robot with a fixed base, from a URDF, in batched and differentiable torch."""
+"""A rigid robot with a fixed base, from a URDF or MJCF, in batched and differentiable torch."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
@@ -17,7 +19,7 @@ from pinn_dyn.systems.urdf import read_urdf
 
 
 class Kinematics(NamedTuple):
-    """Poses T of the N bodies in the world, and twists xi of the N joints, ``(*batch, N, 4, 4)``.
+    """Poses T of the B bodies in the world, and twists xi of the B joints, ``(*batch, B, 4, 4)``.
 
     A point x = (x, y, z, 1) that a joint moves at unit speed has the velocity xi x.
     """
@@ -27,7 +29,7 @@ class Kinematics(NamedTuple):
 
 
 class RigidChain(MechanicalSystem):
-    """A chain or tree of N rigid bodies on revolute, continuous and prismatic joints::
+    """A chain or tree of B rigid bodies on revolute, continuous and prismatic joints::
 
         M(q) a + C(q, v) v + G(q) + D v = u
 
@@ -45,13 +47,18 @@ class RigidChain(MechanicalSystem):
     linearly, and so do the ten inertial parameters of each body (:meth:`regressor`). Functions take
     another ``inertia`` than the URDF's, which a model learns.
 
+    The N coordinates move the joints by S q, with S ``(B, N)``: the identity, unless ``joints`` has
+    another order or joints mimic others. Then M is S^T M S with the M above, and tau is S^T tau.
+
     Sources: Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 5 and 6; Legnani et al. 1996, "A
     homogeneous matrix approach to 3D kinematics and dynamics".
 
     Args:
-        urdf: path of the URDF, one that ships with PyBullet (``franka_panda/panda.urdf``), or the
-            text of a URDF.
-        locked_joints: names of joints that are held at zero.
+        urdf: path of a URDF or MJCF, one that ships with PyBullet (``franka_panda/panda.urdf``), or
+            the text of the file.
+        joints: names of the joints that move, in the order of the coordinates, the others are held
+            at zero; None for all that mimic no other joint, in the order of the file.
+        locked_joints: names of joints that are held at zero, or positions by name, rad or m.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
         gravity: gravitational acceleration in the frame of the base, m/s^2, 3 numbers.
         tip: link that carries the payload; None for the last of the file without a joint behind it.
@@ -59,13 +66,16 @@ class RigidChain(MechanicalSystem):
         payload: point mass at the origin of the tip's frame, kg, which is not scaled.
 
     Attributes:
-        joint_names, body_names: N names each; a body is a link with everything fixed to it.
-        turning: true for a joint that turns, false for a joint that slides.
-        limits: position, speed and effort of the joints, see :class:`~pinn_dyn.systems.urdf.Tree`.
-        inertia: pseudo-inertias of the URDF, ``(N, 4, 4)``, in the frames of the joints.
+        joint_names: N names of the coordinates.
+        body_names: B names; a body is a link with everything fixed to it.
+        body_joints: index of the coordinate that moves the joint of each body, B.
+        turning: true for a coordinate that turns, false for one that slides, N.
+        tree: everything read from the file, see :class:`~pinn_dyn.systems.urdf.Tree`.
+        limits: position, speed and effort of the coordinates, ``(N, 4)``.
+        inertia: pseudo-inertias of the file, ``(B, 4, 4)``, in the frames of the joints.
 
     Raises:
-        FileNotFoundError, ValueError: as :func:`~pinn_dyn.systems.urdf.read_urdf`.
+        FileNotFoundError, ImportError, ValueError: as :func:`~pinn_dyn.systems.urdf.read_urdf`.
     """
 
     z_is_down = False
@@ -75,6 +85,7 @@ class RigidChain(MechanicalSystem):
     _axes: Tensor
     _turning: Tensor
     _moved: Tensor
+    _coupling: Tensor
     _damping: Tensor
     _screws: Tensor
     _basis: Tensor
@@ -84,7 +95,8 @@ class RigidChain(MechanicalSystem):
         self,
         urdf: str,
         *,
-        locked_joints: Sequence[str] = (),
+        joints: Sequence[str] | None = None,
+        locked_joints: Sequence[str] | Mapping[str, float] = (),
         damping: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.0,
         gravity: Annotated[Sequence[float], Field(min_length=3, max_length=3)] = (0.0, 0.0, -9.81),
         tip: str | None = None,
@@ -92,34 +104,37 @@ class RigidChain(MechanicalSystem):
         payload: NonNegativeFloat = 0.0,
     ):
         tree = read_urdf(
-            urdf, locked_joints=locked_joints, tip=tip, mass_scale=mass_scale, payload=payload
+            urdf,
+            joints=joints,
+            locked_joints=locked_joints,
+            tip=tip,
+            mass_scale=mass_scale,
+            payload=payload,
         )
-        size = len(tree.joints)
+        bodies, size = tree.coupling.shape
         super().__init__(num_coordinates=size, num_inputs=size)
         # The description of a run in Python reads the arguments.
-        self.urdf, self.locked_joints, self.damping, self.gravity = (
-            urdf,
-            locked_joints,
-            damping,
-            gravity,
-        )
+        self.urdf, self.joints, self.locked_joints = urdf, joints, locked_joints
+        self.damping, self.gravity = damping, gravity
         self.tip, self.mass_scale, self.payload = tip, mass_scale, payload
         double = torch.float64
-        self.joint_names, self.body_names = tree.joints, tree.bodies
+        self.tree, self.joint_names, self.body_names = tree, tree.joints, tree.bodies
+        self.body_joints = tree.coupling.abs().argmax(1).tolist()
+        self._coupled = not torch.equal(tree.coupling, torch.eye(size, dtype=double))
         self.turning = tree.turning
         self.parents = tuple(tree.parents)
         self.limits = tree.limits
         # The pose of a joint is F0 + s F1 + c F2, with s = sin q and c = 1 - cos q (Rodrigues'
         # formula), or s = q and c = 0 where it slides.
-        turning = torch.tensor(tree.turning)
+        turning = tree.revolute
         axes = torch.where(turning[:, None], tree.axes, 0)
-        cross = torch.zeros(size, 4, 4, dtype=double)
+        cross = torch.zeros(bodies, 4, 4, dtype=double)
         cross[:, :3, :3] = cross_matrix(axes)
-        slide = torch.zeros(size, 4, 4, dtype=double)
+        slide = torch.zeros(bodies, 4, 4, dtype=double)
         slide[:, :3, 3] = tree.axes - axes
-        start = torch.eye(4, dtype=double).expand(size, 4, 4)
+        start = torch.eye(4, dtype=double).expand(bodies, 4, 4)
         placements = tree.placements @ torch.stack([start, cross + slide, cross @ cross])
-        moved = torch.eye(size, dtype=double)  # row j: the bodies that joint j moves
+        moved = torch.eye(bodies, dtype=double)  # row j: the bodies that joint j moves
         for k, parent in enumerate(tree.parents):
             if parent >= 0:
                 moved[:, k] += moved[:, parent]
@@ -131,6 +146,7 @@ class RigidChain(MechanicalSystem):
             "_axes": tree.axes,
             "_turning": turning.to(double)[:, None],
             "_moved": moved,
+            "_coupling": tree.coupling,
             "_screws": _screw_basis(),
             "_basis": pseudo_inertia_basis(),
             "_tip_pose": tree.tip_pose,
@@ -139,14 +155,30 @@ class RigidChain(MechanicalSystem):
             constant = name in ("inertia", "_gravity", "_damping")
             self.register_buffer(name, value, persistent=constant)
         self._tip_body = tree.tip_body
-        smallest = float(torch.linalg.eigvalsh(self.mass_matrix(torch.zeros(size).double()))[0])
+
+    def with_joints(self, joints: Sequence[str]) -> RigidChain:
+        """Return the same robot with other coordinates; see ``joints``."""
+        names = inspect.signature(type(self)).parameters
+        return type(self)(**{**{x: getattr(self, x) for x in names}, "joints": list(joints)})
+
+    def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
+        """Check that the bodies of the file have a positive mass matrix at q = 0.
+
+        Raises:
+            ValueError: if M is singular or indefinite.
+        """
+        mass = self.mass_matrix(torch.zeros(self.num_coordinates, dtype=torch.float64))
+        smallest = float(torch.linalg.eigvalsh(mass)[0])
         if not smallest > 0:
+            reasons = "; ".join(["", *self.tree.problems])
             raise ValueError(
-                f"{urdf[:80]}: M has the eigenvalue {smallest:g} at q = 0, expected positive ones"
+                f"{self.tree.path}: M has the eigenvalue {smallest:g} at q = 0, expected positive "
+                f"ones: correct the masses and inertias{reasons}"
             )
 
     def kinematics(self, q: Tensor) -> Kinematics:
         """Return poses and twists at q ``(*batch, N)``."""
+        q = self._of_joints(q)
         turning = self._turning.squeeze(-1)
         first = turning * torch.sin(q) + (1 - turning) * q
         second = turning * (1 - torch.cos(q))
@@ -182,16 +214,17 @@ class RigidChain(MechanicalSystem):
         return self._force(at, self._accelerations(at, v, a, pull), self._in_world(at, inertia))
 
     def regressor(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """Return Y ``(*batch, N, 10 N)`` with M a + C v + G = Y pi.
+        """Return Y ``(*batch, N, 10 B)`` with M a + C v + G = Y pi.
 
-        pi ``(10 N,)`` are ten parameters of each body, body after body, in the order of Pinocchio:
+        pi ``(10 B,)`` are ten parameters of each body, body after body, in the order of Pinocchio:
         m in kg, m c in kg m, and Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the frame's origin in kg m^2.
         """
         at = self.kinematics(q)
         moving = self._accelerations(at, v, a, self._gravity) @ at.poses
         per_joint = at.twists.unsqueeze(-3) @ at.poses.unsqueeze(-4)  # (*batch, j, k, 4, 4)
         per_body = moving.unsqueeze(-4).mT @ per_joint * self._moved[..., None, None]
-        return (per_body.flatten(-2) @ self._basis.flatten(1).T).flatten(-2)
+        rows = (per_body.flatten(-2) @ self._basis.flatten(1).T).flatten(-2)
+        return self._coupling.mT @ rows if self._coupled else rows
 
     def force_slopes(
         self, q: Tensor, v: Tensor, a: Tensor, inertia: Tensor | None = None
@@ -211,6 +244,7 @@ class RigidChain(MechanicalSystem):
         """
         at = self.kinematics(q)
         twists, bodies = at.twists, self._in_world(at, inertia)
+        v, a = self._of_joints(v), self._of_joints(a)
         joint_velocity = twists * v[..., None, None]
         velocity = self._tree_sum(self._moved.mT, joint_velocity)
         before = velocity - joint_velocity
@@ -234,31 +268,69 @@ class RigidChain(MechanicalSystem):
         driving = _pairs(by_momentum, twists) + _pairs(by_composite, turned)
         former, later = self._moved.mT, self._moved.triu(1)
         by_q = former * to_former + later * to_later
-        return by_q, 2 * (former * driving + later * slowing)
+        by_v = 2 * (former * driving + later * slowing)
+        return self._of_coordinates(by_q), self._of_coordinates(by_v)
 
     def parameters_of(self, inertia: Tensor | None = None) -> Tensor:
-        """Return the ten inertial parameters of each body, ``(N, 10)``: kg, kg m, kg m^2."""
+        """Return the ten inertial parameters of each body, ``(B, 10)``: kg, kg m, kg m^2."""
         return inertial_parameters(self.inertia if inertia is None else inertia)
 
+    def _ends(self) -> list[Tensor | None]:
+        """Return the farthest next joint of each body in the frame of its joint, m."""
+        starts = self._placements[0, :, :3, 3].double()
+        behind: list[list[Tensor]] = [[] for _ in self.parents]
+        for start, parent in zip(starts, self.parents, strict=True):
+            if parent >= 0:
+                behind[parent].append(start)
+        return [max(points, key=torch.linalg.norm, default=None) for points in behind]
+
+    def _usual_length(self) -> float:
+        """Return the mean distance of joints, m; 0.1 m if there is one joint."""
+        norms = [float(end.norm()) for end in self._ends() if end is not None]
+        lengths = [length for length in norms if length > 0.02]
+        return sum(lengths) / len(lengths) if lengths else 0.1
+
     def generic_inertia(self, density: float = 1000.0) -> Tensor:
-        """Return pseudo-inertias ``(N, 4, 4)`` from the kinematics alone: a rod for each body.
+        """Return pseudo-inertias ``(B, 4, 4)`` from the kinematics alone: a rod for each body.
 
         A rod leads to the farthest next joint, or, where that is nearer than half the mean
         distance, along the joint's axis by the mean distance. Its radius is a sixth of that mean.
         """
-        starts = self._placements[0, :, :3, 3].double()
-        behind = [
-            [starts[j] for j, parent in enumerate(self.parents) if parent == k]
-            for k in range(self.num_coordinates)
-        ]
-        ends = [max(points, key=torch.linalg.norm, default=None) for points in behind]
-        lengths = [float(end.norm()) for end in ends if end is not None and end.norm() > 0.02]
-        usual = sum(lengths) / len(lengths) if lengths else 0.1
+        ends = self._ends()
+        usual = self._usual_length()
         bodies = []
         for end, axis in zip(ends, self._axes.double(), strict=True):
             end = usual * axis if end is None or end.norm() < usual / 2 else end
             bodies.append(rod(torch.zeros_like(end), end, radius=usual / 6, density=density))
         return torch.stack(bodies)
+
+    def prior_inertia(self) -> Tensor:
+        """Return pseudo-inertias ``(B, 4, 4)`` of positive density, close to those of the file.
+
+        A point mass, rod or plate has a standard deviation of its mass of at least l / 300 along
+        each axis, with the mean distance l of the joints: 1 mm for links of 0.3 m. A body without
+        mass gets 1/10,000 of the mass of the heaviest.
+
+        Raises:
+            ValueError: if no body has a mass, or a mass is negative.
+        """
+        masses = self.inertia[:, 3, 3]
+        if masses.min() < 0 or masses.max() == 0:
+            pairs = zip(self.body_names, masses.tolist(), strict=True)
+            raise ValueError(
+                f"{self.tree.path}: the moving bodies have the masses "
+                f"{', '.join(f'{name}: {mass:g} kg' for name, mass in pairs)}, expected positive "
+                "masses: correct <inertial>, or use start='generic'"
+            )
+        mass = masses.clamp_min(1e-4 * float(masses.max()))[:, None, None]
+        centre = self.inertia[:, :3, 3:] / mass
+        variance = self.inertia[:, :3, :3] / mass - centre @ centre.mT
+        sizes, axes = torch.linalg.eigh(variance)
+        sizes = sizes.clamp_min((self._usual_length() / 300) ** 2)
+        inertia = torch.ones_like(self.inertia)
+        inertia[:, :3, :3] = axes * sizes.unsqueeze(-2) @ axes.mT + centre @ centre.mT
+        inertia[:, :3, 3:], inertia[:, 3:, :3] = centre, centre.mT
+        return mass * inertia
 
     def tip_position(self, q: Tensor) -> Tensor:
         """Return the origin of the tip's frame in the frame of the base, ``(*batch, 3)``, m."""
@@ -269,7 +341,7 @@ class RigidChain(MechanicalSystem):
         return self.kinematics(q).poses[..., self._tip_body, :3, :] @ origin
 
     def lines(self, q: Tensor) -> Tensor:
-        """Return a line from each joint to the next, and to the tip, ``(*batch, N + 1, 2, 3)``."""
+        """Return a line from each joint to the next, and to the tip, ``(*batch, B + 1, 2, 3)``."""
         origins = self.kinematics(q).poses[..., :3, 3]
         base = torch.zeros_like(origins[..., :1, :])
         points = torch.cat([base, origins, self.tip_position(q).unsqueeze(-2)], dim=-2)
@@ -312,21 +384,30 @@ class RigidChain(MechanicalSystem):
         composite = self._tree_sum(self._moved, bodies)
         momenta = (at.twists @ composite).flatten(-2)
         upper = at.twists.flatten(-2) @ momenta.mT * self._moved
-        return upper + upper.triu(1).mT
+        return self._of_coordinates(upper + upper.triu(1).mT)
 
     def _accelerations(self, at: Kinematics, v: Tensor, a: Tensor | None, pull: Tensor) -> Tensor:
-        """Xi' + Xi^2 - Gamma of every body, ``(*batch, N, 4, 4)``."""
-        joint_velocity = at.twists * v[..., None, None]
+        """Xi' + Xi^2 - Gamma of every body, ``(*batch, B, 4, 4)``."""
+        joint_velocity = at.twists * self._of_joints(v)[..., None, None]
         velocity = self._tree_sum(self._moved.mT, joint_velocity)
         change = _bracket(velocity, joint_velocity)
         if a is not None:
-            change = change + at.twists * a[..., None, None]
+            change = change + at.twists * self._of_joints(a)[..., None, None]
         gravity = torch.nn.functional.pad(pull.unsqueeze(-1), (3, 0, 0, 1))
         return self._tree_sum(self._moved.mT, change) + velocity @ velocity - gravity
 
     def _force(self, at: Kinematics, accelerations: Tensor, bodies: Tensor) -> Tensor:
         forces = self._tree_sum(self._moved, accelerations @ bodies)
-        return (at.twists * forces).sum((-2, -1))
+        tau = (at.twists * forces).sum((-2, -1))
+        return tau @ self._coupling if self._coupled else tau
+
+    def _of_joints(self, x: Tensor) -> Tensor:
+        """Return S x, ``(*batch, B)``, of coordinates ``(*batch, N)``."""
+        return matvec(self._coupling, x) if self._coupled else x
+
+    def _of_coordinates(self, matrix: Tensor) -> Tensor:
+        """Return S^T X S, ``(*batch, N, N)``, of a matrix of the joints ``(*batch, B, B)``."""
+        return self._coupling.mT @ matrix @ self._coupling if self._coupled else matrix
 
 
 def _bracket(first: Tensor, second: Tensor) -> Tensor:

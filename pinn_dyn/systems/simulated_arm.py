@@ -60,6 +60,12 @@ class SimulatedArm(RigidChain, abc.ABC):
             mass_scale=mass_scale,
             payload=payload,
         )
+        if self._coupled:
+            raise ValueError(
+                f"{self.tree.path}: the simulation has no mimic joints, add those of "
+                f"{self.body_names} to locked_joints"
+            )
+        self.check_domain(np.zeros(0), np.zeros(0))
         self.q_low, self.q_high, self.v_max, self.u_max = self.limits.T.copy()
         for joint, low, high in zip(self.joint_names, self.q_low, self.q_high, strict=True):
             if not low < high:

@@ -2,91 +2,110 @@
 
 from __future__ import annotations
 
-import importlib.util
-import math
 import xml.etree.ElementTree as ET
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pinn_dyn.systems.inertia import pseudo_inertia
+from pinn_dyn.systems.urdf_file import TEXT, UrdfFile
 
-_TURNING = ("revolute", "continuous")
 _UNREAD = {"visual", "collision", "material", "transmission", "gazebo"}
-_TOLERANCE = 1e-6  # of the largest principal moment of inertia
 
 
 class Tree(NamedTuple):
-    """N moving joints, each with one rigid body: a link and everything fixed to it.
+    """N coordinates, and the B joints that they move, each with one rigid body.
+
+    A body is a link and everything fixed to it. Joint k moves by ``coupling[k] @ q``: a joint that
+    mimics another follows the coordinate of that joint.
 
     Attributes:
         path: the file.
-        joints, bodies: names of the joints and of the links behind them.
+        joints: names of the joints whose positions are the coordinates.
+        movable: names of all joints that can be coordinates.
+        bodies: names of the links behind the B joints.
         parents: index of the joint before each joint, -1 at the base; parents come first.
-        placements: pose of each joint's frame at q = 0 in its parent's frame, ``(N, 4, 4)``.
-        axes: unit axis of each joint in its own frame, ``(N, 3)``.
-        turning: true for a joint that turns, false for a joint that slides.
-        inertia: pseudo-inertia of each body in its joint's frame, ``(N, 4, 4)``; kg, kg m, kg m^2.
-        limits: lower and upper position, speed and effort of each joint, ``(N, 4)``; zero where
-            the URDF has none, a position of -pi to pi for a continuous joint.
+        placements: pose of each joint's frame at q = 0 in its parent's frame, ``(B, 4, 4)``.
+        axes: unit axis of each joint in its own frame, ``(B, 3)``.
+        revolute: true for a joint that turns, false for a joint that slides, ``(B,)``.
+        turning: the same of the coordinates, N.
+        coupling: motion of the joints by the coordinates, ``(B, N)``.
+        inertia: pseudo-inertia of each body in its joint's frame, ``(B, 4, 4)``; kg, kg m, kg m^2.
+        limits: lower and upper position, speed and effort of each coordinate, ``(N, 4)``; zero
+            where the URDF has none, a position of -pi to pi for a continuous joint.
         tip_body: index of the body that carries the tip, -1 for the base.
         tip_pose: pose of the tip in that body's frame, ``(4, 4)``.
+        held: joints that cannot be coordinates, with their types.
+        problems: masses and inertias of moving links that no body has.
     """
 
     path: Path
     joints: list[str]
+    movable: list[str]
     bodies: list[str]
     parents: list[int]
     placements: Tensor
     axes: Tensor
+    revolute: Tensor
     turning: list[bool]
+    coupling: Tensor
     inertia: Tensor
     limits: np.ndarray
     tip_body: int
     tip_pose: Tensor
+    held: list[str]
+    problems: list[str]
 
 
 def read_urdf(
     urdf: str,
     *,
-    locked_joints: Sequence[str] = (),
+    joints: Sequence[str] | None = None,
+    locked_joints: Sequence[str] | Mapping[str, float] = (),
     tip: str | None = None,
     mass_scale: float = 1.0,
     payload: float = 0.0,
 ) -> Tree:
-    """Read a URDF: a file, a file that ships with PyBullet, or the text itself.
+    """Read a URDF or an MJCF: a file, a file that ships with PyBullet, or the text itself.
 
     Args:
         urdf: path or text.
-        locked_joints: names of joints that stay at zero.
+        joints: names of the joints that move, in the order of the coordinates; None for all that
+            mimic no other joint, in the order of the tree.
+        locked_joints: names of joints that stay at zero, or positions by name, rad or m.
         tip: link at the end of the arm; None for the last of the file without a joint behind it.
         mass_scale: factor of all masses and inertias.
         payload: point mass at the origin of the tip, kg, which is not scaled.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: on text that is no URDF of a tree of links, an unknown locked joint or tip, no
-            joint that moves, another kind of joint, or a mass or inertia that no body has.
+        ImportError: on an MJCF without MuJoCo.
+        ValueError: on text that is no URDF of a tree of links, an unknown joint or tip, or no joint
+            that moves.
     """
-    file = _UrdfFile(*_open(urdf))
-    if unknown := set(locked_joints) - file.joints.keys():
-        names = list(file.joints)
-        raise ValueError(f"{file.path} has no joints {sorted(unknown)} to lock, only {names}")
-    children = [_end(joint, "child") for joint in file.joints.values()]
+    file = UrdfFile(urdf)
+    locked = dict.fromkeys(locked_joints, 0.0)
+    locked |= locked_joints if isinstance(locked_joints, Mapping) else {}
+    movable = [name for name in file.order if file.moves(name) and name not in locked]
+    if joints is None:
+        joints = [name for name in movable if file.drive(name)[0] == name]
+    for key, names, known in (("locked_joints", locked, file.order), ("joints", joints, movable)):
+        if unknown := [name for name in names if name not in known]:
+            raise ValueError(f"{file.path}: {key} has {unknown}, expected of {known}")
+    if not joints:
+        raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
+    children = [file.child(name) for name in file.joints]
     if tip is None:
-        inner = {_end(joint, "parent") for joint in file.joints.values()}
-        tip = [name for name in children if name not in inner][-1]
+        tip = [name for name in children if not file.after(name)][-1]
     if tip not in children:
         raise ValueError(f"{file.path}: tip is {tip!r}, expected a link behind a joint: {children}")
-    joints: list[str] = []
+    moving: list[str] = []
     parents: list[int] = []
     placements: list[np.ndarray] = []
+    coupling: list[np.ndarray] = []
     inertia: list[np.ndarray] = []
     visited: dict[str, tuple[int, np.ndarray]] = {}
 
@@ -97,159 +116,55 @@ def read_urdf(
             inertia[body] += mass_scale * pose @ file.pseudo_inertia(link) @ pose.T
             if link == tip:
                 inertia[body] += payload * np.outer(pose[:, 3], pose[:, 3])
-        for name, joint in file.joints.items():
-            if _end(joint, "parent") != link:
+        for name in file.after(link):
+            driver, factor, offset = file.drive(name, (*joints, *locked))
+            if driver not in joints:
+                offset += factor * locked.get(driver, 0.0)
+            placement = pose @ file.pose(name, offset)
+            if driver not in joints or factor == 0:
+                visit(file.child(name), body, placement)
                 continue
-            placement = pose @ file.pose(joint)
-            if joint.get("type") == "fixed" or name in locked_joints:
-                visit(_end(joint, "child"), body, placement)
-                continue
-            joints.append(name)
+            moving.append(name)
             parents.append(body)
             placements.append(placement)
+            coupling.append(factor * np.eye(len(joints))[joints.index(driver)])
             inertia.append(np.zeros((4, 4)))
-            visit(_end(joint, "child"), len(joints) - 1, np.eye(4))
+            visit(file.child(name), len(moving) - 1, np.eye(4))
 
-    visit(file.root, -1, np.eye(4))
-    if unreached := file.links.keys() - visited.keys():
-        links = sorted(unreached)
-        raise ValueError(f"{file.path}: no joints lead from the base {file.root!r} to {links}")
-    if not joints:
-        raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked_joints)})")
+    for root in file.roots:
+        visit(root, -1, np.eye(4))
     return Tree(
         path=file.path,
-        joints=joints,
-        bodies=[_end(file.joints[name], "child") for name in joints],
+        joints=list(joints),
+        movable=movable,
+        bodies=[file.child(name) for name in moving],
         parents=parents,
         placements=torch.from_numpy(np.stack(placements)),
-        axes=torch.from_numpy(np.stack([file.axis(name) for name in joints])),
-        turning=[file.joints[name].get("type") in _TURNING for name in joints],
+        axes=torch.from_numpy(np.stack([file.axis(name) for name in moving])),
+        revolute=torch.tensor([file.turns(name) for name in moving]),
+        turning=[file.turns(name) for name in joints],
+        coupling=torch.from_numpy(np.stack(coupling)),
         inertia=torch.from_numpy(np.stack(inertia)),
         limits=np.array([file.limits(name) for name in joints]),
         tip_body=visited[tip][0],
         tip_pose=torch.from_numpy(visited[tip][1]),
+        held=file.held,
+        problems=file.problems,
     )
 
 
 def urdf_text(urdf: str) -> str:
-    """Return a URDF as text without shapes, behind a comment with its path; keep a text as it is.
+    """Return a robot file as the text of a URDF without shapes, behind a comment with its path.
+
+    Keep the text of a URDF as it is.
 
     Raises:
-        FileNotFoundError, ValueError: as :func:`read_urdf`.
+        FileNotFoundError, ImportError, ValueError: as :func:`read_urdf`.
     """
-    if urdf.lstrip().startswith("<"):
+    file = UrdfFile(urdf)
+    if file.path == Path(TEXT):
         return urdf
-    path, content = _open(urdf)
-    _UrdfFile(path, content)  # refuses text that is no URDF
-    text = ET.canonicalize(content, strip_text=True, exclude_tags=_UNREAD)
-    return f"<!-- {urdf.replace('--', '-')} -->{text}"
-
-
-class _UrdfFile:
-    """The links and joints of a URDF by name, and their numbers."""
-
-    def __init__(self, path: Path, content: bytes):
-        self.path = path
-        try:
-            robot = ET.fromstring(content)
-        except (ET.ParseError, LookupError, ValueError) as error:  # also unknown encodings
-            raise ValueError(f"{path} is not valid XML for a URDF: {error}") from error
-        self.links, self.joints = (self._by_name(robot, kind) for kind in ("link", "joint"))
-        children = Counter(_end(joint, "child") for joint in self.joints.values())
-        roots = [name for name in self.links if name not in children]
-        shared = [name for name, count in children.items() if count > 1]
-        if len(roots) != 1 or not children or shared:
-            raise ValueError(
-                f"{path}: expected a <robot> with joints and one base link; links without a parent "
-                f"are {roots[:5]}, links of several parents {shared}"
-            )
-        self.root = roots[0]
-
-    def axis(self, name: str) -> np.ndarray:
-        """Return the unit axis of a joint that moves."""
-        joint = self.joints[name]
-        mimic, kind = joint.find("mimic") is not None, joint.get("type")
-        if mimic or kind not in (*_TURNING, "prismatic"):
-            kind = "a mimic joint" if mimic else repr(kind)
-            expected = "revolute, continuous, prismatic or fixed: add it to locked_joints"
-            raise ValueError(f"{self.path}: joint {name!r} is {kind}, expected {expected}")
-        axis = self._numbers(joint, "axis", "xyz", 3, "1 0 0")
-        return axis / np.linalg.norm(axis)
-
-    def limits(self, name: str) -> list[float]:
-        """Return lower and upper position, speed and effort of a joint; see :class:`Tree`."""
-        joint = self.joints[name]
-        keys = ("lower", "upper", "velocity", "effort")
-        low, high, *limits = (self._numbers(joint, "limit", key, 1, "0")[0] for key in keys)
-        if joint.get("type") == "continuous":
-            low, high = -math.pi, math.pi
-        return [low, high, *limits]
-
-    def pose(self, owner: ET.Element) -> np.ndarray:
-        """Return the ``<origin>`` of a joint or an ``<inertial>``, ``(4, 4)``."""
-        pose = np.eye(4)
-        rpy = self._numbers(owner, "origin", "rpy", 3, "0 0 0")
-        pose[:3, :3] = Rotation.from_euler("xyz", rpy).as_matrix()
-        pose[:3, 3] = self._numbers(owner, "origin", "xyz", 3, "0 0 0")
-        return pose
-
-    def pseudo_inertia(self, link: str) -> np.ndarray:
-        """Return J of a link in its frame, ``(4, 4)``; zero for a mere frame."""
-        inertial = self.links[link].find("inertial")
-        if inertial is None:
-            return np.zeros((4, 4))
-        mass = self._numbers(inertial, "mass", "value", 1)[0]
-        keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-        values = [self._numbers(inertial, "inertia", key, 1)[0] for key in keys]
-        xx, xy, yy, xz, yz, zz = values
-        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        slack = _TOLERANCE * np.abs(moments).max()
-        if mass < 0 or moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
-            raise ValueError(
-                f"{self.path}: link {link!r} has mass {mass:g} kg and moments {moments.tolist()} "
-                "kg m^2, expected none negative and no moment larger than the sum of the other two"
-            )
-        pose = self.pose(inertial)
-        parameters = torch.tensor([mass, 0.0, 0.0, 0.0, *values], dtype=torch.float64)
-        return pose @ pseudo_inertia(parameters).numpy() @ pose.T
-
-    def _by_name(self, robot: ET.Element, kind: str) -> dict[str, ET.Element]:
-        elements = robot.findall(kind)
-        by_name = {element.get("name", ""): element for element in elements}
-        if len(by_name) != len(elements):
-            raise ValueError(f"{self.path} has several {kind}s of the same name")
-        return by_name
-
-    def _numbers(
-        self, owner: ET.Element, tag: str, key: str, count: int, default: str = ""
-    ) -> np.ndarray:
-        """Return the numbers of an attribute, ``(count,)``, or the default."""
-        element = owner.find(tag)
-        text = default if element is None else element.get(key, default)
-        try:
-            values = np.array(text.split(), dtype=float)
-        except ValueError:
-            values = np.empty(0)
-        if len(values) != count or not np.isfinite(values).all():
-            raise ValueError(
-                f"{self.path}: <{tag} {key}={text!r}> of {owner.get('name', 'an <inertial>')}, "
-                f"expected {count} finite numbers"
-            )
-        return values
-
-
-def _end(joint: ET.Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
-
-
-def _open(urdf: str) -> tuple[Path, bytes]:
-    if urdf.lstrip().startswith("<"):
-        return Path("URDF text"), urdf.encode()
-    path = Path(urdf).expanduser()
-    package = importlib.util.find_spec("pybullet_data")
-    shipped = Path(package.origin).parent if package is not None and package.origin else Path()
-    for file in (path, shipped / path):
-        if file.is_file():
-            return file.resolve(), file.read_bytes()
-    raise FileNotFoundError(f"URDF {urdf!r} not found from {Path.cwd()}")
+    text = ET.tostring(file.robot, encoding="unicode")
+    text = ET.canonicalize(text, strip_text=True, exclude_tags=_UNREAD)
+    name = str(file.path) if "<" in urdf else urdf
+    return f"<!-- {name.replace('--', '-')} -->{text}"

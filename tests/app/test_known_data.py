@@ -1,14 +1,16 @@
-"""Known mechanics are refused on data of other joints, and on currents without gains."""
+"""Known mechanics take the joints that the columns name, and refuse currents without gains."""
 
 import logging
+import re
+from functools import partial
 
 import pytest
 import torch
 
 from pinn_dyn.app.config import ConfigError
-from pinn_dyn.app.known_data import check_known, check_structure
+from pinn_dyn.app.known_data import check_known, match_model, match_structure
 from pinn_dyn.data import LogSource
-from pinn_dyn.models import KnownMechanics, Statistics
+from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.systems import RigidChain
 from tests.support.rigid_chains import joint, link, robot
 
@@ -41,46 +43,85 @@ def chain(names=NAMES):
     return RigidChain(urdf=urdf(names))
 
 
-def check(source, names=NAMES):
-    check_structure("model.structure", chain(names), source)
+def joints_of(columns, names=NAMES, **settings):
+    return match_structure(RigidChain(urdf(names), **settings), log_of(columns)).joint_names
 
 
-def test_a_column_that_names_two_joints_counts_by_its_order():
-    check(log_of(["q1", "q2", "hip_leg"]), names=("arm", "hip", "leg"))
-
-
-@pytest.mark.parametrize("signal", ["q", "v", "u"])
-def test_a_crossed_order_is_refused_with_the_right_one(signal):
-    crossed = {"q": ["q1", "q2", "q3"], signal: ["elbow_pos", "ShoulderPan.pos", "joint1_pos"]}
-    message = (
-        rf"dataset.{signal}.columns has the order elbow_pos, ShoulderPan.pos, joint1_pos, and "
-        r"model.structure has the joints shoulder_pan_joint, elbow_joint, joint1: expected "
-        rf"dataset.{signal}.columns=\[ShoulderPan.pos,elbow_pos,joint1_pos\]"
-    )
-    with pytest.raises(ConfigError, match=message):
-        check(log_of(**crossed))
+PANDA = [f"panda_joint{k}" for k in (1, 2, 3)] + ["panda_finger_joint1", "panda_finger_joint2"]
 
 
 @pytest.mark.parametrize(
-    "columns",
-    [["shoulder_pan", "elbow", "joint1"], ["q1", "q2", "q3"], ["q1", "elbow_joint", "x"]],
+    ("columns", "names", "joints"),
+    [
+        (["elbow_pos", "ShoulderPan.pos", "joint1"], NAMES, [NAMES[1], NAMES[0], NAMES[2]]),
+        (["q1", "elbow_joint", "x"], NAMES, NAMES),  # by their order
+        (["q1", "q2", "hip_leg"], ("arm", "hip", "leg"), ("arm", "hip", "leg")),  # names two
+        (["joint10_q", "joint1_q"], ("joint1", "joint10", "joint100"), ["joint10", "joint1"]),
+        (["elbow", "joint1"], NAMES, ["elbow_joint", "joint1"]),
+        (["q_3[rad]", "q_1[rad]", "q_2[rad]"], PANDA, [PANDA[2], *PANDA[:2]]),
+        (["joint1", "joint2", "joint3"], PANDA, PANDA[:3]),
+    ],
 )
-def test_the_order_of_the_joints_passes(columns):
-    check(log_of(columns))
+def test_columns_name_the_joints_of_the_coordinates(columns, names, joints):
+    assert joints_of(columns, names) == list(joints)
 
 
-def test_a_longer_name_is_not_taken_for_a_shorter_one():
-    names = ("joint1", "joint10", "joint100")
-    check(log_of(["joint1_q", "joint10_q", "joint100_q"]), names)
-    with pytest.raises(ConfigError, match=r"\[joint1_q,joint10_q,joint100_q\]"):
-        check(log_of(["joint10_q", "joint1_q", "joint100_q"]), names)
+def test_joints_that_no_column_names_are_held_with_a_line(caplog):
+    with caplog.at_level(logging.INFO):
+        assert joints_of(["joint1", "elbow"]) == ["joint1", "elbow_joint"]
+    assert "the joints joint1, elbow_joint; held at zero: shoulder_pan_joint" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("columns", "names"),
+    [
+        (["q0", "q1"], NAMES),
+        (["elbow", "x", "y"], NAMES),
+        (["q1", "q2"], ["left_joint1", "left_joint2", "right_joint1", "right_joint2"]),
+    ],
+)
+def test_columns_that_fit_no_joints_are_refused_with_a_setting_that_works(columns, names):
+    with pytest.raises(ConfigError, match=r"name the joints of the columns") as error:
+        joints_of(columns, names)
+    advice = re.search(r"model.structure.joints=\[(.*)\]", str(error.value))[1].split(",")
+    assert joints_of(columns, names, joints=advice) == advice
+    with pytest.raises(ConfigError, match="leave out columns"):
+        joints_of([*"abcdefg"])
+
+
+def test_velocities_in_another_order_are_refused_with_the_right_one():
+    crossed = log_of(["elbow", "joint1"], v=["joint1_v", "elbow_v"])
+    with pytest.raises(ConfigError, match=r"expected dataset.v.columns=\[elbow_v,joint1_v\]"):
+        match_structure(chain(), crossed)
+    match_structure(chain(), log_of(["elbow", "joint1"], v=["elbow_v", "joint1_v"]))
+
+
+def test_the_inputs_name_the_driven_joints():
+    build = partial(KnownMechanics, structure=chain())
+    model, changes = match_model(build, log_of(["elbow", "joint1"], ["tau_joint1", "tau_elbow"]))
+    assert model.keywords["structure"].joint_names == ["elbow_joint", "joint1"]
+    assert model.keywords["driven_joints"] == ["joint1", "elbow_joint"]
+    expected = {"structure": {"joints": ["elbow_joint", "joint1"]}}
+    assert changes == {**expected, "driven_joints": ["joint1", "elbow_joint"]}
+    both = partial(KnownAndNetwork, known=build)
+    model, changes = match_model(both, log_of(["elbow", "joint1"], ["tau_elbow"]))
+    assert changes == {"known": {**expected, "driven_joints": ["elbow_joint"]}}
+    assert model.keywords["known"].keywords["driven_joints"] == ["elbow_joint"]
+
+
+def test_a_built_model_of_another_order_is_refused():
+    crossed = ["elbow", "shoulder_pan", "joint1"]
+    with pytest.raises(ConfigError, match=r"build it with joints=\['elbow_joint'"):
+        check_known(known(), log_of(crossed))
+    with pytest.raises(ConfigError, match=r"dataset.u.columns has the order elbow"):
+        check_known(known(), log_of(["q1", "q2", "q3"], crossed))
 
 
 def test_columns_that_name_no_joint_are_logged_with_their_joints(caplog):
     with caplog.at_level(logging.INFO):
-        check(log_of(["q1", "q2", "q3"], ["u_shoulder_pan", "u_elbow", "u_joint1"]))
+        joints_of(["q1", "q2", "q3"])
     expected = "by their order: q1 -> shoulder_pan_joint; q2 -> elbow_joint; q3 -> joint1"
-    assert expected in caplog.text  # u names its joints
+    assert expected in caplog.text
 
 
 def test_a_joint_that_turns_is_not_measured_in_metres():
@@ -88,10 +129,10 @@ def test_a_joint_that_turns_is_not_measured_in_metres():
         '"slider" type="continuous"', '"slider" type="prismatic"'
     )
     structure = RigidChain(urdf=text)
-    check_structure("structure", structure, log_of(["q1", "q2"], q_unit=["mm", "deg"]))
-    check_structure("structure", structure, log_of(["q1", "q2"], q_unit="1"))
+    match_structure(structure, log_of(["q1", "q2"], q_unit=["mm", "deg"]))
+    match_structure(structure, log_of(["q1", "q2"], q_unit="1"))
     with pytest.raises(ConfigError, match=r"q1 is in rad, expected m for the joint slider"):
-        check_structure("structure", structure, log_of(["q1", "q2"], q_unit=["deg", "mm"]))
+        match_structure(structure, log_of(["q1", "q2"], q_unit=["deg", "mm"]))
 
 
 def known(**settings):

@@ -198,3 +198,92 @@ def test_a_locked_mimic_joint_is_a_weld():
     chain, other = (RigidChain(text, locked_joints=locked) for text in (MIMICKING, TREE))
     assert chain.joint_names == other.joint_names == ["turn", "slide", "fork"]
     assert torch.equal(chain.inertia, other.inertia)
+
+
+def test_coordinates_may_have_another_order():
+    """A permutation P of the coordinates: P^T M P, and all terms of the contract alike."""
+    names = ["fork", "turn", "bend", "slide"]
+    chain, usual = (RigidChain(TREE, locked_joints=["wrist"], joints=x) for x in (names, None))
+    order = [usual.joint_names.index(name) for name in names]
+    q, v, a = states(4)
+    theirs = [torch.empty_like(x).index_copy_(-1, torch.tensor(order), x) for x in (q, v, a)]
+    assert_same(chain.mass_matrix(q), usual.mass_matrix(theirs[0])[:, order][:, :, order])
+    assert_same(chain.inverse_dynamics(q, v, a), usual.inverse_dynamics(*theirs)[:, order])
+    assert_same(chain.potential_energy(q), usual.potential_energy(theirs[0]))
+    for ours, other in zip(chain.force_slopes(q, v, a), usual.force_slopes(*theirs), strict=True):
+        assert_same(ours, other[:, order][:, :, order])
+    assert_same(chain.tip_position(q), usual.tip_position(theirs[0]))
+    assert chain.turning == [True, True, True, False]
+    assert chain.limits.tolist() == usual.limits[order].tolist()
+
+
+def test_joints_that_are_not_named_are_locked():
+    chain = RigidChain(TREE, joints=["turn", "bend"])
+    other = RigidChain(TREE, locked_joints=["slide", "fork", "wrist"])
+    q, v, a = states(2)
+    assert_same(chain.rigid_force(q, v, a), other.rigid_force(q, v, a))
+    with pytest.raises(ValueError, match=r"joints has \['elbow'\], expected of \['turn', "):
+        RigidChain(TREE, joints=["turn", "elbow"])
+
+
+def test_a_joint_is_locked_at_its_angle():
+    chain = RigidChain(TREE, locked_joints={"wrist": 0.0, "slide": 0.2, "fork": -1.0, "bend": 0.7})
+    whole = RigidChain(TREE)
+    q, v, a = states(1)
+    full = [torch.zeros(STATES, 5).double() for _ in range(3)]
+    for x, values in zip(full, (q, v, a), strict=True):
+        x[:, 0] = values[:, 0]
+    for name, angle in chain.locked_joints.items():
+        full[0][:, whole.joint_names.index(name)] = angle
+    assert_same(chain.rigid_force(q, v, a), whole.rigid_force(*full)[:, :1])
+
+
+COUPLED = TREE.replace(
+    '<joint name="bend" type="continuous">',
+    '<joint name="bend" type="continuous"><mimic joint="turn" multiplier="-1.5" offset="0.4"/>',
+).replace(
+    '<joint name="fork" type="revolute">',
+    '<joint name="fork" type="revolute"><mimic joint="bend" multiplier="0.5" offset="-0.1"/>',
+)
+
+
+def test_mimic_joints_move_as_in_pinocchio():
+    """M, C v + G, G, V and slopes of the free tree, reduced by q_all = J q + offset."""
+    chain, other = RigidChain(COUPLED), PinocchioRobot(TREE, ())
+    assert chain.joint_names == ["turn", "slide", "wrist"]
+    jacobian = torch.zeros(len(other.names), 3).double()
+    offset = torch.zeros(len(other.names)).double()
+    for row, column, factor, shift in (
+        *(("turn", 0, 1, 0), ("bend", 0, -1.5, 0.4), ("fork", 0, -0.75, 0.1)),
+        *(("slide", 1, 1, 0), ("wrist", 2, 1, 0)),
+    ):
+        k = other.names.index(row)
+        jacobian[k, column], offset[k] = factor, shift
+    q, v, a = states(3)
+    theirs = [q @ jacobian.T + offset, v @ jacobian.T, a @ jacobian.T]
+    pin = other.pin
+    mass = other(pin.crba, theirs[0])
+    mass = torch.from_numpy(np.triu(mass) + np.triu(mass, 1).transpose(0, 2, 1))
+    assert_same(chain.mass_matrix(q), jacobian.T @ mass @ jacobian)
+    force = torch.from_numpy(other(pin.rnea, *theirs)) @ jacobian
+    assert_same(chain.inverse_dynamics(q, v, a), force)
+    assert_same(chain.regressor(q, v, a) @ chain.parameters_of().flatten(), force)
+    gravity = torch.from_numpy(other(pin.computeGeneralizedGravity, theirs[0]))
+    assert_same(chain.potential_force(q), gravity @ jacobian)
+    for which, ours in enumerate(chain.force_slopes(q, v, a)):
+        slope = other(lambda *at, k=which: pin.computeRNEADerivatives(*at)[k], *theirs)
+        assert_same(ours, jacobian.T @ torch.from_numpy(slope) @ jacobian)
+
+
+def test_mimic_joints_are_held_with_a_joint_that_is_locked():
+    chain = RigidChain(COUPLED, locked_joints={"turn": 0.2})
+    other = RigidChain(TREE, locked_joints={"turn": 0.2, "bend": 0.1, "fork": -0.05})
+    assert chain.joint_names == other.joint_names
+    torch.testing.assert_close(chain.inertia, other.inertia)
+    torch.testing.assert_close(chain.tree.placements, other.tree.placements)
+
+
+class TestCoupledChainContract(MechanicalSystemContract):
+    @pytest.fixture
+    def system(self):
+        return RigidChain(COUPLED, joints=["wrist", "turn", "slide"], damping=[0.1, 0.2, 0.0])

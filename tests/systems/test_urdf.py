@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.systems import RigidChain
-from pinn_dyn.systems.urdf import read_urdf
+from pinn_dyn.systems.urdf import read_urdf, urdf_text
 from tests.attacks.damage import byte_hits, hit, places
 from tests.support.arm_urdf import ARM, changed
 
@@ -45,37 +45,35 @@ def test_the_links_may_come_in_any_order_and_an_axis_may_have_any_length():
 
 WRONG = {
     "empty": (ARM, "", "is not valid XML"),
-    "no joint": (ARM, '<robot name="x"><link name="a"/></robot>', "expected a <robot> with joints"),
-    "two links of a name": ('name="lower"', 'name="upper"', "several links of the same name"),
-    "an unknown parent": (ELBOW, '<parent link="uper"/><child link="lower"/>', "no joints lead"),
+    "a web page": (ARM, "<!DOCTYPE html><html><br></html>", "it is a web page"),
+    "SDF": (ARM, '<sdf version="1.9"><model name="x"/></sdf>', "is SDF, expected the URDF"),
+    "xacro": ("<link", '<x:arg xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
+    "a xacro number": ('value="1.5"', 'value="${m}"', "is a xacro file"),
+    "no joint": (ARM, '<robot name="x"><link name="a"/></robot>', "there is no <joint>"),
+    "two links of a name": ('name="lower"', 'name="upper"', "several links have the same name"),
+    "an unknown parent": (ELBOW, ELBOW.replace("upper", "uper"), r"the links \['uper'\]"),
     "a circle": (
         "</robot>",
         f'<link name="a"/><link name="b"/>{joint("x", "a", "b")}{joint("y", "b", "a")}</robot>',
-        r"no joints lead from the base 'base' to \['a', 'b'\]",
+        r"no joints lead from a base to the links \['a', 'b'\]",
     ),
     "two parents": (
         "</robot>",
         joint("x", "base", "lower") + "</robot>",
-        r"several parents \['lower'\]",
-    ),
-    "two roots": (
-        "</robot>",
-        '<link name="loose"/></robot>',
-        r"without a parent are \['base', 'loose'\]",
+        r"the links \['lower'\] have several parents",
     ),
     "an axis of two": ('"0 1 0"', '"0 1"', "<axis xyz='0 1'> of shoulder, expected 3 finite"),
-    "an origin of commas": ('"0 0 -0.5"', '"0, 0, -0.5"', "<origin xyz='0, 0, -0.5'> of elbow"),
-    "a centre of one": ('"0 0 -0.3"', '"-0.3"', "<origin xyz='-0.3'>"),
-    "a negative mass": ('value="1.5"', 'value="-1.5"', "link 'upper' has mass -1.5 kg"),
-    "a mass in words": ('value="1.5"', 'value="1.5 kg"', "<mass value='1.5 kg'>"),
-    "a missing product": ('iyz="0"', "", "<inertia iyz=''>"),
-    "no triangle": ('ixx="0.09"', 'ixx="0.2"', "no moment larger than the sum of the other two"),
-    "a mimic joint": (
-        'continuous">',
-        'continuous"><mimic joint="shoulder"/>',
-        "'elbow' is a mimic joint, expected .* add it to locked_joints",
+    "no axis": ('"0 1 0"', '"0 0 0"', "'shoulder' has the axis 0 0 0"),
+    "a type": (
+        '"continuous"',
+        '"continous"',
+        "'elbow' has the type 'continous', expected revolute",
     ),
-    "a floating joint": ('"continuous"', '"floating"', "'elbow' is 'floating', expected revolute"),
+    "a factor": (
+        'continuous">',
+        'continuous"><mimic joint="shoulder" multiplier="x"/>',
+        "<mimic multiplier='x'> of elbow",
+    ),
 }
 
 
@@ -88,6 +86,88 @@ def test_a_robot_that_cannot_be_is_refused_by_name(tmp_path, old, new, message):
     assert str(path) in str(error.value)
 
 
+def test_all_mistakes_are_in_a_line():
+    text = changed(('"0 1 0"', '"0 1"'), ('"0 0 -0.5"', '"low"'), ('"continuous"', '"turning"'))
+    with pytest.raises(ValueError, match=r"<axis.*'0 1'.*<origin.*'low'.*'turning'") as error:
+        read_urdf(text)
+    assert "\n" not in str(error.value)
+
+
+ENCODED = {
+    "a byte order mark": ARM.encode("utf-8-sig"),
+    "UTF-16 that states UTF-8": f'<?xml version="1.0" encoding="utf-8"?>{ARM}'.encode("utf-16"),
+    "Windows-1252": ARM.replace("<link", "<!-- K\xf6rper --><link", 1).encode("cp1252"),
+    "an empty line first": f'\n<?xml version="1.0"?>\n{ARM}'.encode(),
+    "a namespace": ARM.replace("<robot", '<robot xmlns="https://drake.mit.edu"', 1).encode(),
+    "a prefix": ARM.replace("</robot>", "<sensor:camera/></robot>").encode(),
+    "a wrapper": f"<model><robot/>{ARM}</model>".replace("<robot/>", "").encode(),
+    "commas": ARM.replace('"0 0 -0.5"', '"0, 0, -0.5"').encode(),
+}
+
+
+@pytest.mark.parametrize("content", ENCODED.values(), ids=ENCODED)
+def test_a_file_is_read_as_editors_and_tools_write_it(tmp_path, content):
+    (tmp_path / "arm.urdf").write_bytes(content)
+    text = urdf_text(str(tmp_path / "arm.urdf"))
+    for tree in (read_urdf(str(tmp_path / "arm.urdf")), read_urdf(text)):
+        assert tree.joints == ["shoulder", "elbow"]
+        assert tree.placements[1, :3, 3].tolist() == [0, 0, -0.5]
+
+
+UNUSED = {
+    "no triangle": ('ixx="0.09"', 'ixx="0.2"'),
+    "a negative mass": ('value="1.5"', 'value="-1.5"'),
+    "a mass in words": ('value="1.5"', 'value="1.5 kg"'),
+    "a centre of one": ('"0 0 -0.3"', '"-0.3"'),
+    "no inertial": (ARM[ARM.index("<inertial>") : ARM.index("</link>")], ""),
+    "a limit in words": ('lower="-1.5"', 'lower="low"'),
+}
+
+
+@pytest.mark.parametrize(("old", "new"), UNUSED.values(), ids=UNUSED)
+def test_inertias_and_limits_that_a_fit_does_not_use_are_not_checked(old, new):
+    chain = RigidChain(changed((old, new)))
+    usual = RigidChain(ARM)
+    torch.testing.assert_close(chain.generic_inertia(), usual.generic_inertia())
+
+
+def test_inertias_that_a_fit_starts_from_are_physical_or_refused():
+    point = '<inertial><origin xyz="0 0 -0.3"/><mass value="1.5"/></inertial>'
+    inertial = ARM[ARM.index("<inertial>") : ARM.index("</link>")]
+    for text in (
+        changed((inertial, point)),
+        changed((inertial, "")),
+        changed(UNUSED["no triangle"]),
+    ):
+        chain = RigidChain(text)
+        assert torch.linalg.eigvalsh(chain.prior_inertia()).min() > 0
+        q = torch.tensor([0.3, -0.7]).double()
+        mass, prior = chain.mass_matrix(q), chain.mass_matrix(q, chain.prior_inertia())
+        torch.testing.assert_close(prior, mass, rtol=0.05, atol=1e-4)
+    torch.testing.assert_close(RigidChain(ARM).prior_inertia(), RigidChain(ARM).inertia)
+    assert RigidChain(changed(UNUSED["no triangle"])).tree.problems
+    with pytest.raises(ValueError, match=r"upper: -1.5 kg.*start='generic'"):
+        RigidChain(changed(UNUSED["a negative mass"])).prior_inertia()
+    with pytest.raises(ValueError, match=r"M has the eigenvalue .*link 'upper' has mass -15 kg"):
+        RigidChain(changed(('value="1.5"', 'value="-15"'))).check_domain([], [])
+
+
+def test_round_off_of_a_massless_link_is_no_problem():
+    inertia = '<inertia ixx="0" ixy="2.4e-35" ixz="0" iyy="0" iyz="0" izz="0"/>'
+    frame = f'<link name="tool"><inertial><mass value="0"/>{inertia}</inertial></link>'
+    assert not read_urdf(changed(('<link name="tool"/>', frame))).problems
+
+
+def test_links_without_a_joint_and_joints_of_several_coordinates_are_held():
+    loose = changed(("</robot>", '<link name="loose"/></robot>'))
+    assert read_urdf(loose).joints == ["shoulder", "elbow"]
+    floating = changed(('"revolute"', '"floating"'))
+    tree = read_urdf(floating)
+    assert (tree.joints, tree.held) == (["elbow"], ["shoulder (floating)"])
+    welded = RigidChain(ARM, locked_joints=["shoulder"])
+    torch.testing.assert_close(RigidChain(floating).inertia, welded.inertia)
+
+
 TEXTS = ["", "base", "upper", "0", "-1", "1e300", "nan", "0 0 0", "1,2,3", "fixed", "prismatic"]
 
 
@@ -95,7 +175,7 @@ TEXTS = ["", "base", "upper", "0", "-1", "1e300", "nan", "0 0 0", "1,2,3", "fixe
     st.lists(st.tuples(places, places, st.sampled_from(TEXTS)), min_size=1, max_size=4),
     byte_hits(0, 1),
 )
-def test_a_damaged_robot_is_refused_by_name_or_has_positive_mass(tmp_path_factory, edits, hits):
+def test_a_damaged_robot_is_refused_by_name_or_has_generic_bodies(tmp_path_factory, edits, hits):
     robot = ET.fromstring(ARM)
     for where, which, text in edits:
         elements = [element for element in robot.iter() if element.attrib]
@@ -108,10 +188,7 @@ def test_a_damaged_robot_is_refused_by_name_or_has_positive_mass(tmp_path_factor
         chain = RigidChain(str(path))
     except ValueError as error:
         message = str(error)
-    except KeyError:  # a joint that leads to no link
-        return
     else:
-        mass = chain.mass_matrix(torch.full((chain.num_coordinates,), 0.3, dtype=torch.float64))
-        assert torch.linalg.eigvalsh(mass)[0] > -1e-9 * float(mass.abs().max())
+        assert torch.linalg.eigvalsh(chain.generic_inertia()).min() > 0
         message = str(path)
     assert str(path) in message
