@@ -12,6 +12,7 @@ from pinn_dyn.data.logs.recording import clock_steps
 from pinn_dyn.data.logs.table import Table
 
 _SLOWER = 0.1  # share of empty cells from which a signal has a slower clock
+_LOST = 1.8  # usual sample times of q between two samples from which a sample is lost
 _MISSED = 3  # usual sample times of a signal that are filled in any case
 
 
@@ -26,7 +27,7 @@ def fill(
 ) -> tuple[np.ndarray, list[str], list[str]]:
     """Fill the empty cells of a run in place: hold u, interpolate q and v linearly.
 
-    Rows without the first column of q are dropped if it is a slower signal. No cell is filled
+    Rows between two samples of the first column of q are dropped. No cell is filled
     between two values that are further apart than ``max_age``, s, and three usual sample times of
     the column. Rows with such cells are dropped too.
 
@@ -53,7 +54,9 @@ def fill(
     notes: list[str] = []
     warnings: list[str] = []
     clock = ~np.isnan(values["q"][:, 0])
-    clock |= clock.mean() > 1 - _SLOWER
+    if len(times := t[clock]) > 1:  # rows between samples of q are of other signals
+        age, _ = _filled(t, times, times, np.ones(len(t), dtype=bool), hold=False)
+        clock |= age > _LOST * np.median(np.diff(times))
     stays = clock.copy()
     for signal, columns in signals.items():
         counts, ages, names = [0], [0.0], []

@@ -13,6 +13,7 @@ from pinn_dyn.data.logs.checks import check_clock, check_rows
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.filling import fill
+from pinn_dyn.data.logs.joining import joined, widened
 from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
 from pinn_dyn.data.logs.recording import Recording, Report
 from pinn_dyn.data.logs.stamps import Clock
@@ -30,6 +31,7 @@ class Layout:
         time: clock.
         signals: columns of q, v (if measured) and u.
         trajectory: column that tells the runs of a table apart, or None.
+        long: column that names the joint of a row, or None.
         request: what a reader gets.
         repairs: faults that the cleaning repairs.
     """
@@ -37,6 +39,7 @@ class Layout:
     time: Clock
     signals: Mapping[str, Columns]
     trajectory: str | None
+    long: str | None
     request: Request
     repairs: Collection[str]
 
@@ -48,6 +51,13 @@ class Layout:
         """
         recordings: list[Recording] = []
         tables = self._tables(files, root)
+        if self.long is not None:
+            tables = {
+                name: widened(table, self.long, self.time.columns, self.trajectory)
+                for name, table in tables.items()
+            }
+        columns = [name for signal in self.signals.values() for name in signal.columns]
+        tables = joined(tables, self.time, columns, self.trajectory)
         for stem, table in tables.items():
             for note in table.notes:
                 report.warn("rows", f"{stem}: {note}")

@@ -49,14 +49,16 @@ class LogSource(DataSource):
     Args:
         name: short name, for tables and titles.
         files: names or glob patterns in the folder ``root``; or a data frame, or data frames by the
-            name of their run.
+            name of their run. Files that hold parts of the columns are joined.
         root: folder of the files.
         time: columns of the time, or ``{rate: 100}`` for a log without time, see :class:`Clock`.
         q: columns of the configuration, N.
         u: columns of the input, M.
         v: columns of the velocity, N, or None.
-        max_age: oldest message of another topic of a bag that a row may use, s.
+        max_age: oldest message of another topic, or value of a slower column, of a row, s.
         trajectory: column that tells the runs of a file apart, or None where a file is one run.
+        long: column that names the joint, of a log with a row per joint and time. Other columns
+            are then ``<name>/<joint>``.
         steps: names and steps of the cleaning, in order; None entries are left out.
         validation, test: whole runs, ``{runs: 2, piece: 5.0}``, or the ends of runs,
             ``{seconds: 3.0, piece: 3.0}``, see :class:`Part`; None takes :func:`default_split`.
@@ -81,6 +83,7 @@ class LogSource(DataSource):
         u: Columns | Mapping[str, Any],
         v: Columns | Mapping[str, Any] | None = None,
         trajectory: str | None = None,
+        long: str | None = None,
         max_age: PositiveFloat = 0.1,
         steps: Mapping[str, Step | None] | None = None,
         validation: Part | Mapping[str, Any] | None = None,
@@ -106,6 +109,7 @@ class LogSource(DataSource):
         self._signals = {key: columns for key, columns in signals.items() if columns is not None}
         self._check_units()
         self.trajectory = trajectory
+        self.long = long
         self.max_age = max_age
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
@@ -187,7 +191,7 @@ class LogSource(DataSource):
         columns = [x for part in (self.time, *self._signals.values()) for x in part.columns]
         columns += [] if self.trajectory is None else [self.trajectory]
         request = Request(next(iter(self.time.columns), ""), columns, self.max_age)
-        return Layout(self.time, self._signals, self.trajectory, request, self._repairs)
+        return Layout(self.time, self._signals, self.trajectory, self.long, request, self._repairs)
 
     @cached_property
     def _loaded(self) -> _Loaded:

@@ -1,0 +1,120 @@
+"""Signals of a run that lie in several tables, or in the rows of a long table."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.stamps import Clock
+from pinn_dyn.data.logs.table import Table
+
+_SAME = 0.05  # of the usual sample time, between stamps of the same sample
+_PARTS = (r"[^\W_]+", r"[^\W\d_]+|\d+")  # of names: words, then also numbers
+
+
+def widened(table: Table, key: str, time: Sequence[str], trajectory: str | None) -> Table:
+    """Return a table of rows of single joints with a row per time and columns ``<name>/<joint>``.
+
+    Args:
+        table: rows of single joints.
+        key: column that names the joint.
+        time: columns of the time; without any the rows of a joint are counted.
+        trajectory: column of the run, or None.
+
+    Raises:
+        LogError: if a joint has two rows at the same time.
+    """
+    joints = table.column(key, "long")
+    index = [*(time or ["row"]), *([trajectory] if trajectory else [])]
+    frame = table.frame.assign(row=table.frame.groupby(joints.to_numpy()).cumcount())
+    if (repeats := frame.duplicated([*index, key])).any():
+        place = table.place(int(repeats.argmax()), key, "long")
+        raise LogError(f"{place}: a second row of this joint at the same time: drop the row")
+    wide = frame.set_index([*index, key]).unstack(key)
+    wide.columns = pd.Index([f"{name}/{joint}" for name, joint in wide.columns])
+    rows = frame[index].drop_duplicates()
+    return replace(table, frame=rows.merge(wide.reset_index(), on=index), row="row")
+
+
+def joined(
+    tables: Mapping[str, Table], clock: Clock, columns: Sequence[str], trajectory: str | None
+) -> dict[str, Table]:
+    """Join tables that hold parts of the columns; the first column is the clock of the result.
+
+    Tables with the same columns are of different runs. Words that only their names share tell
+    nothing; the other words of the names tell which tables belong together: ``run1_pos`` and
+    ``run1_vel``, or ``run1/pos`` and ``run1/vel``.
+
+    Raises:
+        LogError: if no table has a column, or the names do not tell the runs apart.
+    """
+    parts = {name: tuple(x for x in columns if x in table) for name, table in tables.items()}
+    if len(tables) == 1 or any(len(part) == len(columns) for part in parts.values()):
+        return dict(tables)
+    kinds = sorted(dict.fromkeys(parts.values()), key=lambda part: columns[0] not in part)
+    for column in columns:
+        if not any(column in part for part in kinds):
+            next(iter(tables.values())).column(column, "the log")
+    for pattern in _PARTS:
+        words = {name: re.findall(pattern, name) for name in tables}
+        runs: dict[str, list[str]] = {}
+        for kind in kinds:
+            names = [name for name in tables if parts[name] == kind]
+            others = {word for name in tables.keys() - names for word in words[name]}
+            usual = set.intersection(*(set(words[name]) for name in names)) - others
+            for name in names:
+                run = "_".join(word for word in words[name] if word not in usual)
+                runs.setdefault(run, []).append(name)
+        if all([parts[name] for name in names] == kinds for names in runs.values()):
+            return {
+                run or "+".join(names): _join([tables[x] for x in names], clock, trajectory)
+                for run, names in runs.items()
+            }
+    raise LogError(
+        f"the files {listed(tables)} hold parts of the columns, and their names do not tell which "
+        "belong to the same run: name them as run1_q, run1_u, run2_q, run2_u"
+    )
+
+
+def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Table:
+    """Join the rows of tables with the same stamps, otherwise those of all clocks, with gaps."""
+    first, *others = tables
+    name = " + ".join([first.name, *(Path(x.name).name for x in others)])
+    notes = [note for table in tables for note in table.notes]
+    times = [
+        clock.seconds(table, first)[0] if all(x in table for x in clock.columns) else None
+        for table in tables
+    ]
+    frames = [table.frame for table in tables]
+    stamps = [x for x in times if x is not None]
+    if all(len(x) == len(first) for x in tables) and all(_same(stamps[0], x) for x in stamps):
+        frame = pd.concat([frame.set_axis(first.frame.index) for frame in frames], axis=1)
+        frame = frame.loc[:, ~frame.columns.duplicated()]
+        return replace(first, frame=frame, name=name, notes=notes)
+    for table, x in zip(tables, times, strict=True):
+        if x is None or clock.rate or trajectory:
+            raise LogError(
+                f"{table.name} has {len(table)} rows and {first.name} has {len(first)}: expected "
+                "the same rows, or a clock in both (and a single run)"
+            )
+        if (back := np.diff(x) < 0).any():
+            place = table.place(int(back.argmax()) + 1, clock.name)
+            raise LogError(f"{place}: the time goes back, expected a single run in each file")
+    frame = pd.concat(
+        [
+            frame.set_axis([f"{row} of {Path(table.name).name}" for row in frame.index])
+            for table, frame in zip(tables, frames, strict=True)
+        ]
+    )
+    order = np.argsort(np.concatenate(stamps), kind="stable")
+    return replace(first, frame=frame.iloc[order], name=name, notes=notes)
+
+
+def _same(t: np.ndarray, x: np.ndarray) -> bool:
+    return bool(np.abs(t - x).max() <= _SAME * np.median(np.abs(np.diff(t))))
