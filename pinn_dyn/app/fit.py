@@ -54,7 +54,8 @@ def fit(
         q, u, v: columns of the configuration, the input and, if measured, the velocity: names in
             SI units, or ``{"columns": [...], "unit": "deg"}`` and other arguments of
             :class:`~pinn_dyn.data.logs.Columns`.
-        time: column of the time, described like q.
+        time: column of the time, described like q; ``"index"``, or ``{"rate": 100}`` in Hz
+            without a time.
         run: column that tells runs apart; None if all rows are one run.
         model: as in :func:`~pinn_dyn.train`.
         cleaning: names and steps of the cleaning, in order.

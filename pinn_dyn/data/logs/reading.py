@@ -104,7 +104,8 @@ class Layout:
                 report.warn(
                     "clock",
                     f"{table.place(rows[starts[0]], self.time.name)}: the time restarts at "
-                    f"{t[starts[0]]:.6g} s ({len(starts)} times): a run is assumed to start there",
+                    f"{t[starts[0]]:.6g} s ({len(starts)} times): a run is assumed to start "
+                    "there; name a column of the runs in 'trajectory'",
                 )
             pieces = np.split(np.arange(len(rows)), starts)
             for k, piece in enumerate(pieces):
