@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, MCAP included, as tables; decoded by rosbags, without ROS.
+"""Bags of ROS 1 and ROS 2 and MCAP files as tables, without ROS.
 
 A column is ``<topic>/<field>``, as ``/joint_states/position/panda_joint1`` or ``/commands/data/2``.
 ``<topic>/t`` is the time of a message, s: that of its header, or when the bag received it. The
@@ -11,18 +11,28 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.cache import cache_key
 from pinn_dyn.data.logs.errors import LogError, listed
+from pinn_dyn.data.logs.messages import open_bag
 from pinn_dyn.data.logs.table import Request, Table, optional
 from pinn_dyn.data.whole import whole
 
-# Names of the entries of a message's arrays, in sensor_msgs and trajectory_msgs.
-_NAMES = ("name", "joint_names")
+# Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
+_NAMES = ("name", "joint_names", "interface_names")
+_LATEST = 1.0  # s; a message that is later than this begins a new run
+
+
+class _Topic(NamedTuple):
+    """Values by the times of the messages, masks of missing entries, and who published them."""
+
+    frame: pd.DataFrame
+    missing: np.ndarray
+    publishers: pd.Series
 
 
 def read_bag(path: Path, request: Request) -> Table:
@@ -30,12 +40,14 @@ def read_bag(path: Path, request: Request) -> Table:
     optional("pyarrow", path)
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    fields = list(dict.fromkeys([request.time, *request.columns]))
-    key = cache_key([str(path.absolute()), stats, fields, request.max_age])
+    fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
+    key = cache_key([2, str(path.absolute()), stats, fields, request.max_age])
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
     cached = folder / f"bag-{key}.parquet"
     if not cached.is_file():
-        frame = _merge(path, _decode(path, fields), request)
+        notes: list[str] = []
+        frame = _merge(path, _decode(path, fields, notes), fields[0], request.max_age, notes)
+        frame.attrs["notes"] = notes
         folder.mkdir(parents=True, exist_ok=True)
         with whole(cached) as partial:
             frame.to_parquet(partial)
@@ -43,90 +55,156 @@ def read_bag(path: Path, request: Request) -> Table:
     return Table(frame, str(path), "message", notes=frame.attrs["notes"])
 
 
-def _decode(path: Path, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
-    highlevel = optional("rosbags.highlevel", path)
-    stores = optional("rosbags.typesys", path)
-    # Old bags hold no definitions of their messages: the common ones are known.
-    store = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
-    with highlevel.AnyReader([path], default_typestore=store) as reader:
-        fields = _fields_of_topics(path, reader, columns)
-        numbers: dict[str, list[list[float]]] = {topic: [] for topic in fields}
-        connections = [item for item in reader.connections if item.topic in fields]
-        for connection, stamp, raw in reader.messages(connections):
-            message = reader.deserialize(raw, connection.msgtype)
-            time = _time(message, stamp)
-            topic = f"{path}, topic {connection.topic}"
+def _decode(path: Path, columns: Sequence[str], notes: list[str]) -> dict[str, _Topic]:
+    with open_bag(path) as bag:
+        kinds = listed(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
+        fields = _fields_of_topics(path, sorted(bag.topics, key=len, reverse=True), columns, kinds)
+        rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in fields}
+        for topic, publisher, received, message in bag.messages(list(fields)):
+            place = f"{path}, topic {topic}"
             values = [
-                time if field == "t" else _number(message, field, topic)
-                for field in fields[connection.topic].values()
+                None
+                if field == "t" and not hasattr(message, "t")
+                else _number(message, field, place)
+                for field in fields[topic].values()
             ]
-            numbers[connection.topic].append([time, *values])
-    topics = {}
-    for topic, names in fields.items():
-        frame = pd.DataFrame(numbers[topic], columns=["", *names], dtype=float).set_index("")
-        if (empty := frame.isna().all()).any():
-            raise LogError(f"{path}: no message has a value of {empty.idxmax()!r}")
-        topics[topic] = frame
-    return topics
+            names = tuple(sorted(map(str, getattr(message, "name", ()))))
+            times = _stamp(message), 1e-9 * received
+            rows[topic].append((*times, (publisher, names), *values))
+        notes += bag.notes
+    return {
+        topic: _topic(path, topic, list(names), np.array(rows[topic], dtype=object), kinds, notes)
+        for topic, names in fields.items()
+    }
 
 
-def _fields_of_topics(path: Path, reader: Any, columns: Sequence[str]) -> dict[str, dict[str, str]]:
-    topics = sorted(reader.topics, key=len, reverse=True)
+def _topic(
+    path: Path, topic: str, columns: list[str], rows: np.ndarray, kinds: str, notes: list[str]
+) -> _Topic:
+    """Return the values of a topic in the order of the times of its messages."""
+    if not len(rows):
+        raise LogError(f"{path}: the topic {topic} has no message, choose another of {kinds}")
+    stamps, times = rows[:, :2].astype(float).T
+    keep = np.arange(len(rows))
+    if (stamps > 0).any():
+        # In a simulation 0 is the first time.
+        zero = (stamps == 0) & (stamps[stamps > 0].min() > _LATEST)
+        keep, times = np.flatnonzero(~zero), np.where(np.isnan(stamps), times, stamps)[~zero]
+        if zero.any():
+            notes.append(
+                f"{zero.sum()} of {len(rows)} messages of {topic} with stamp 0 are dropped"
+            )
+    elif (stamps == 0).any():
+        notes.append(f"the stamps of {topic} are 0: its times are those of receipt")
+    late = np.maximum.accumulate(times) - times
+    if 0 < late.max() < _LATEST:
+        notes.append(f"{(late > 0).sum()} messages of {topic} came late: sorted by their times")
+        order = times.argsort(kind="stable")
+        keep, times = keep[order], times[order]
+    content = rows[keep, 3:]
+    if f"{topic}/t" in columns and content[0, columns.index(f"{topic}/t")] is None:
+        content[:, columns.index(f"{topic}/t")] = times
+    missing = np.array(content == None)  # noqa: E711
+    values = content.astype(float)
+    for column, absent, numbers in zip(columns, missing.T, values.T, strict=True):
+        if absent.all():
+            joints = sorted({name for _, names in rows[:, 2] for name in names})
+            empty = column.rpartition("/")[2] in joints
+            reason = "its array is empty" if empty else f"the messages name {listed(joints)}"
+            raise LogError(f"{path}: no message has a value of {column!r}: {reason}")
+        if np.isnan(numbers).all():
+            raise LogError(
+                f"{path}: {column!r} is NaN in all {len(rows)} messages: the driver does not "
+                f"measure it. Choose another signal, such as the commands, of {kinds}"
+            )
+    frame = pd.DataFrame(values, columns=columns, index=times)
+    return _Topic(frame, np.any(missing, axis=1), pd.Series(rows[keep, 2]))
+
+
+def _fields_of_topics(
+    path: Path, topics: Sequence[str], columns: Sequence[str], kinds: str
+) -> dict[str, dict[str, str]]:
+    """Return the field of each column by its topic; the longest topic that fits."""
     fields: dict[str, dict[str, str]] = {}
     for column in columns:
         topic = next((name for name in topics if column.startswith(f"{name}/")), None)
         if topic is None:
-            names = listed(f"{name} ({x.msgtype})" for name, x in sorted(reader.topics.items()))
-            raise LogError(f"{path}: no topic for the column {column!r}: the bag has {names}")
+            raise LogError(f"{path}: no topic for the column {column!r}: the bag has {kinds}")
         fields.setdefault(topic, {})[column] = column[len(topic) + 1 :]
     return fields
 
 
-def _time(message: Any, received: int) -> float:
-    """Return the time of a message, s, from its header or from when the bag received it, ns."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is not None and (stamp.sec or stamp.nanosec):
-        received = 10**9 * stamp.sec + stamp.nanosec
-    return 1e-9 * received
+def _seconds(time: Any) -> float | None:
+    """Return a time or duration of ROS, JSON or protobuf in s; None for other objects."""
+    for seconds, fraction in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos")):
+        if hasattr(time, seconds) and hasattr(time, fraction):
+            return 1e-9 * (10**9 * getattr(time, seconds) + getattr(time, fraction))
+    return None
 
 
-def _number(message: Any, field: str, topic: str) -> float:
-    """Return the number at a path such as ``position/joint1``; NaN for a missing entry."""
+def _stamp(message: Any) -> float | None:
+    """Return the time of a message, s, from its header or ``timestamp``; None without."""
+    header = getattr(message, "header", None)
+    return _seconds(getattr(header, "stamp", getattr(message, "timestamp", None)))
+
+
+def _number(message: Any, field: str, place: str) -> float | None:
+    """Return the number at a path such as ``position/joint1``; None for a missing entry."""
     node = message
+    parents: list[Any] = []
     for step in field.split("/"):
+        parents.insert(0, node)
         if hasattr(node, "__len__") and not isinstance(node, str):
-            names = next((list(getattr(message, x)) for x in _NAMES if hasattr(message, x)), [])
-            k = int(step) if step.isdigit() else names.index(step) if step in names else len(node)
+            k = int(step) if step.isdigit() else _index(step, node, parents)
             if k >= len(node):
-                return np.nan
+                return None
             node = node[k]
         elif hasattr(node, step):
             node = getattr(node, step)
         else:
-            names = [name for name in message.__dataclass_fields__ if not name.startswith("__")]
-            raise LogError(f"{topic}: no {field!r} in its messages, which have {listed(names)}")
-    if not isinstance(node, (int, float, np.number, np.bool_)):
+            names = listed(name for name in dir(node) if name[0].islower())
+            raise LogError(f"{place}: no {field!r} in its messages, which have {names}")
+    seconds = _seconds(node)
+    if seconds is None and not isinstance(node, (int, float, np.number, np.bool_)):
         kind = type(node).__name__
-        raise LogError(f"{topic}: {field!r} is a {kind}, expected a number, or '<topic>/t'")
-    return float(node)
+        raise LogError(f"{place}: {field!r} is a {kind}, expected a number, or '<topic>/t'")
+    return float(node) if seconds is None else seconds
 
 
-def _merge(path: Path, topics: dict[str, pd.DataFrame], request: Request) -> pd.DataFrame:
-    clock = next(topic for topic, frame in topics.items() if request.time in frame)
-    frame = topics.pop(clock)
-    times = frame[request.time].to_numpy()
+def _index(name: str, node: Any, parents: Sequence[Any]) -> int:
+    """Return the position of a name among those beside an array or in its elements."""
+    lists = [getattr(parent, x) for parent in parents for x in _NAMES if hasattr(parent, x)]
+    lists.append([getattr(element, "name", None) for element in node])
+    return next((list(x).index(name) for x in lists if name in x), len(node))
+
+
+def _merge(
+    path: Path, topics: dict[str, _Topic], first: str, max_age: float, notes: list[str]
+) -> pd.DataFrame:
+    """Return the rows of the topic of the first column, with the last values of other topics."""
+    clock = next(name for name, topic in topics.items() if first in topic.frame)
+    frame, missing, publishers = topics.pop(clock)
+    sources = set(publishers[~missing])
+    if len(sources) > 1:
+        notes.append(f"{len(sources)} publishers of {clock} alternate: their clocks may differ")
+    joints = {name for _, names in publishers[missing] for name in names}
+    joints -= {name for _, names in sources for name in names}
+    lack = f"lack an entry, being of {listed(sorted(joints))}," if joints else "lack an entry"
+    lost = {lack: missing, "are NaN": ~missing & frame.isna().any(axis=1).to_numpy()}
+    times = frame.index
     frame.index = pd.RangeIndex(1, len(frame) + 1)
-    for messages in topics.values():
-        messages = messages.dropna().sort_index(kind="stable")
+    for topic in topics.values():
+        messages = topic.frame.dropna().sort_index(kind="stable")
         messages = messages[~messages.index.duplicated(keep="last")]
-        latest = messages.reindex(times, method="ffill", tolerance=request.max_age)
+        latest = messages.reindex(times, method="ffill", tolerance=max_age)
         frame[messages.columns] = latest.to_numpy()
-    rows = frame.dropna()
-    dropped = (
-        f"{len(frame) - len(rows)} of {len(frame)} messages of {clock} are dropped: they lack an "
-        f"entry, or a message of {listed(topics)} in the {request.max_age:g} s before them"
-    )
-    if not len(rows):
-        raise LogError(f"{path}: no row is left: {dropped}")
-    rows.attrs["notes"] = [dropped] if len(rows) < len(frame) else []
-    return rows
+    empty = frame.isna().any(axis=1).to_numpy()
+    age = f"have no message of {listed(topics)} in the {max_age:g} s before them"
+    lost[age] = empty & ~np.any(list(lost.values()), axis=0)
+    if empty.any():
+        reasons = ", ".join(f"{rows.sum()} {text}" for text, rows in lost.items() if rows.any())
+        dropped = f"{empty.sum()} of {len(frame)} messages of {clock} are dropped: {reasons}"
+        if empty.all():
+            raise LogError(f"{path}: no row is left: {dropped}")
+        notes.append(dropped)
+    return frame[~empty]
