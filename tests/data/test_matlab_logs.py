@@ -2,6 +2,7 @@
 
 import matio
 import numpy as np
+import pandas as pd
 import pytest
 from matio.utils import MatlabOpaque
 
@@ -92,6 +93,14 @@ FORMS = {
     "samples": (  # messages of a bag in MATLAB
         {"msgs": cells([{name: x[k] for name, x in SIGNALS.items()} for k in range(len(T))])},
         fields("msgs."),
+    ),
+    "timetable": (
+        {
+            "TT": TABLE.drop(columns="t").set_index(
+                pd.to_timedelta(T[:, 0], unit="s").rename("Time")
+            )
+        },
+        columns(*(f"TT.{name}{{}}" for name in "qvu"), time="TT.Time"),
     ),
     "table": ({"log": TABLE}, columns(*(f"log.{name}{{}}" for name in "qvu"), time="log.t")),
     "timeseries": (

@@ -115,7 +115,7 @@ def _topic(
         if np.isnan(numbers).all():
             raise LogError(
                 f"{path}: {column!r} is NaN in all {len(rows)} messages: the driver does not "
-                f"measure it. Choose another signal, such as the commands, of {kinds}"
+                f"measure it. Choose another signal, such as commands; the bag has {kinds}"
             )
     frame = pd.DataFrame(values, columns=columns, index=times)
     return _Topic(frame, np.any(missing, axis=1), pd.Series(rows[keep, 2]))
