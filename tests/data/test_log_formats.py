@@ -214,6 +214,18 @@ def test_a_format_is_one_function(tmp_path, expected, monkeypatch):
         source(tmp_path, files="*.foo").load()
 
 
+def test_other_formats_are_named_with_the_call_that_converts_them(tmp_path):
+    """The calls were run on files that asammdf, npTDMS and pyulog write."""
+    for name, call in (
+        ("run.mf4", "MDF('run.mf4').to_dataframe().to_parquet('run.parquet')"),
+        ("run.TDMS", "TdmsFile('run.TDMS').as_dataframe().to_parquet('run.parquet')"),
+        ("run.ulg", "ulog2csv run.ulg"),
+    ):
+        (tmp_path / name).touch()
+        with pytest.raises(LogError, match=re.escape(call)):
+            source(tmp_path, files=name).load()
+
+
 PAGE = (Path(__file__).parents[2] / "docs" / "bags_and_other_logs.md").read_text()
 BLOCKS = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
 

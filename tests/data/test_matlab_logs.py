@@ -173,7 +173,8 @@ def test_elements_are_runs(tmp_path, form, version):
     [
         (dict(u=U + 1j), r"'u_1' is of complex128 \(601, 2\).*q \(601, 2\)"),
         (dict(u=U[::10]), r"'u_1' is of float64 \(61, 2\), expected real numbers in 601 rows"),
-        (dict(t=np.empty(0), fs=100.0), r"no variable 't'.*fs = 100"),
+        (dict(t=np.empty(0), fs=100.0), r"no variable 't'.*write time: \{rate: 100.0\}.*fs = 100"),
+        (dict(t=np.empty(0), Ts=0.01, Generate=1.0), r"no variable 't'.*rate: 100\}.*Ts = 0.01"),
     ],
 )
 def test_variables_that_do_not_fit_are_named_with_their_sizes(tmp_path, changes, message):

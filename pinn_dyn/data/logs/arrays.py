@@ -20,6 +20,8 @@ from pinn_dyn.data.logs.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional
 from pinn_dyn.spelling import did_you_mean
 
+_RATE = re.compile(r"(^|[._@/])(fs|fps|hz|(sampl\w*?)?_?(rate|freq\w*)(_hz)?)$", re.IGNORECASE)
+
 
 def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """Read a MATLAB file; the fields of a struct are ``name.field``."""
@@ -114,27 +116,25 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
             numbered = len(rows) > 1
             columns |= {f"{name}_{k}" if numbered else name: x for k, x in enumerate(rows, start=1)}
     scalars = {name: value.item() for name, value in arrays.items() if value.size == 1}
-    if request.time in scalars:
-        columns[request.time] = _sample_time(path, request.time, scalars) * np.arange(samples)
+    largest = sorted(arrays.items(), key=lambda item: (-item[1].size, item[0]))
+    sizes = [f"{x} {y.shape}" for x, y in largest if x not in scalars]
+    sizes += [f"{x} = {y}" for x, y in scalars.items()]
     for name, base in bases.items():
-        if name not in columns and (base or name == request.time):
-            sizes = sorted((x in scalars, x, y.shape) for x, y in arrays.items())
-            texts = [f"{x} = {scalars[x]}" if x in scalars else f"{x} {y}" for _, x, y in sizes]
-            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or '.'}"
-            if base:
-                problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
-                problem += f"real numbers in {samples} rows."
-            raise LogError(f"{path}: {problem} The file has {listed(texts)}")
+        problem = ""
+        if name in scalars and name == request.time:
+            columns[name] = scalars[name] * np.arange(samples)
+            if _RATE.search(name):
+                problem = f"{name} is a rate: write time: {{rate: {scalars[name]}}}."
+        elif name not in columns and base:
+            problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
+            problem += f"real numbers in {samples} rows."
+        elif name not in columns and name == request.time:
+            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or ''}; "
+            rate = next((y for x, y in scalars.items() if _RATE.search(x)), 100)
+            problem += f"without a clock write time: {{rate: {rate}}}, in Hz."
+        if problem:
+            raise LogError(f"{path}: {problem} The file has {listed(sizes)}")
     return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
-
-
-def _sample_time(path: Path, name: str, scalars: Mapping[str, Any]) -> float:
-    if re.search(r"rate|freq|fps|hz|^fs$", name, re.IGNORECASE):
-        raise LogError(
-            f"{path}: {name} = {scalars[name]} is a rate and no time: "
-            f"write time: {{rate: {scalars[name]}}}"
-        )
-    return scalars[name]
 
 
 def _fields(variables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -151,11 +151,11 @@ def _matrix(value: Any) -> Any:
     if value.size > max(value.shape, default=1) and len([n for n in value.shape if n > 1]) > 2:
         return value  # images and the like are not read
     array = np.asarray(value[()])
-    if array.ndim > 2:
-        array = array.squeeze()
+    array = array.squeeze() if array.ndim > 2 else array
     if array.dtype.kind in "SO":
-        texts = [x.decode() if isinstance(x, bytes) else x for x in array.flat]
-        array = np.array(texts, dtype=object).reshape(array.shape)
+        array = np.reshape(
+            [x.decode() if isinstance(x, bytes) else x for x in array.flat], array.shape
+        )
     if np.iscomplexobj(array) and not array.imag.any():
         array = array.real
     return array.reshape(-1, 1) if array.ndim < 2 else array

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -17,27 +17,21 @@ from typing import Any, NamedTuple
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.table import optional
 
+Message = tuple[str, int, int, Any]
+"""Topic, number of the publisher, time of receipt in ns, and decoded message."""
+
 
 class Bag(NamedTuple):
-    """Open bag.
-
-    Attributes:
-        topics: type of the messages of each topic.
-        messages: function of topics that iterates over (topic, number of the publisher, time of
-            receipt in ns, decoded message).
-        notes: remarks, complete after the iteration.
-    """
+    """Types of messages by topic, iterator over messages, and remarks, complete after it."""
 
     topics: dict[str, str]
-    messages: Callable[[Sequence[str]], Iterator[tuple[str, int, int, Any]]]
+    messages: Callable[[Sequence[str]], Iterator[Message]]
     notes: list[str]
 
 
-@contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
+def open_bag(path: Path) -> AbstractContextManager[Bag]:
     """Open a bag of ROS, or an MCAP file."""
-    with (_mcap if path.suffix == ".mcap" else _rosbag)(path) as bag:
-        yield bag
+    return _mcap(path) if path.suffix == ".mcap" else _rosbag(path)
 
 
 @contextmanager
@@ -47,7 +41,7 @@ def _rosbag(path: Path) -> Iterator[Bag]:
     with highlevel.AnyReader([path], default_typestore=common) as reader:
         _register(reader.typestore, common.fielddefs)
 
-        def messages(topics: Sequence[str]) -> Iterator[tuple[str, int, int, Any]]:
+        def messages(topics: Sequence[str]) -> Iterator[Message]:
             connections = [item for item in reader.connections if item.topic in topics]
             for item in connections:
                 _check_type(path, reader.typestore, item.msgtype)
@@ -87,7 +81,7 @@ def _mcap(path: Path) -> Iterator[Bag]:
         else:
             schemas = {channel.topic: schema for schema, channel, _ in stream(None)}
 
-        def messages(topics: Sequence[str]) -> Iterator[tuple[str, int, int, Any]]:
+        def messages(topics: Sequence[str]) -> Iterator[Message]:
             decoders: dict[int, Callable[[bytes], Any]] = {}
             for schema, channel, message in stream(topics):
                 if channel.id not in decoders:

@@ -68,6 +68,14 @@ READERS: dict[str, Reader] = {
 """Reader of each suffix; the folder of a ROS 2 bag is read as ``.db3``."""
 
 
+# Commands that convert a file of another format, and its name without the suffix.
+_CONVERSIONS = {
+    ".mf4": " (asammdf: MDF('{}').to_dataframe().to_parquet('{}.parquet'))",
+    ".tdms": " (npTDMS: TdmsFile('{}').as_dataframe().to_parquet('{}.parquet'))",
+    ".ulg": " (pyulog: ulog2csv {})",
+}
+
+
 def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file()
 
@@ -80,7 +88,10 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
     """
     suffix = ".db3" if _is_bag(path) else path.suffix.lower()
     if suffix not in READERS:
-        raise LogError(f"{path}: no reader for {suffix!r}, expected one of {', '.join(READERS)}")
+        convert = _CONVERSIONS.get(suffix, "").format(path.name, path.stem)
+        raise LogError(
+            f"{path}: no reader for {suffix!r}{convert}, expected one of {', '.join(READERS)}"
+        )
     try:
         content = READERS[suffix](path, request)
     except Exception as error:  # a damaged file raises nearly anything
