@@ -35,7 +35,9 @@ def check(cfg: DictConfig) -> None:
     write_config(folder, config)
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if report.options:
-        print(f"a training with dry friction: {_training(report.options)}")
+        heads = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
+        effects = " and ".join(heads[option] for option in report.options)
+        print(f"a training with {effects}: {_training(report.options)}")
         print("with a URDF, model=known is often more accurate: docs/known_mechanics.md")
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")

@@ -25,6 +25,7 @@ from pinn_dyn.models.known import Structure
 
 _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a training makes no sense
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
+_TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
 _ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
@@ -46,7 +47,7 @@ class LogCheck:
         runs, coordinates, inputs: tables of stretches, coordinates and inputs.
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: filter cutoff and delay, if needed.
-        options: options of a training: a head for dry friction, if needed.
+        options: options of a training: heads for dry friction or servos, if needed.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
     """
 
@@ -149,7 +150,10 @@ def check(
     highest = numbers.bandwidth(training, step, noise)
     explained = numbers.explained_share(training, delays, step)
     measurements = [*source.measurements, *_measured(coordinates, explained)]
-    clear = logs.clear_delays(delays, step)
+    same_units = source.u.units[: len(source.q.units)] == source.q.units
+    servo = same_units and numbers.target_distance(training, step, longest_delay) < _TARGET
+    # The lag of a servo is no delay.
+    clear = [0.0] * inputs if servo else logs.clear_delays(delays, step)
     for name, curve, late in zip(source.u.columns, delays, clear, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (
@@ -193,7 +197,7 @@ def check(
         pd.DataFrame(table),
         delays,
         [*([] if sharp else _filter(source, training, step, noise, highest)), *late_inputs],
-        ["model/friction=coulomb"] if dry else [],
+        ["model/input=servo"] * servo + ["model/friction=coulomb"] * dry,
         excitation,
     )
 

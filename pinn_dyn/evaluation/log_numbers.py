@@ -10,6 +10,8 @@ from scipy.signal import welch
 
 from pinn_dyn.data.logs import DelayCurve, Recording
 
+_LAGS = 30  # of a target that are tried
+_STILL = 0.01  # variance of a coordinate at rest as a share of the largest
 _SMOOTH = 0.03  # width of the kernel before a derivative, s
 
 
@@ -41,6 +43,24 @@ def explained_share(
         # The acceleration of a controlled robot may follow from q and v; its torque then does too.
         1 - _unexplained(u, np.hstack([basis, v, a])),
     )
+
+
+def target_distance(training: Sequence[Recording], step: float, longest: float) -> float:
+    """Return the largest part of the variance of q that a late target u leaves, over coordinates.
+
+    Each coordinate has the lag, ``longest`` or less, that leaves least. An offset does not count.
+    """
+    size = training[0].q.shape[1]
+    if training[0].u.shape[1] not in (size, 2 * size):
+        return np.inf
+    spread = np.vstack([item.q for item in training]).var(axis=0)
+    spread = spread.clip(min=max(_STILL * spread.max(), 1e-300))
+    lags = range(0, round(longest / step) + 1, max(round(longest / step / _LAGS), 1))
+    shares = []
+    for lag in lags:
+        parts = [item.q[lag:] - item.u[: len(item) - lag, :size] for item in training]
+        shares.append(np.vstack(parts).var(axis=0) / spread)
+    return float(np.min(shares, axis=0).max())
 
 
 def _unexplained(y: np.ndarray, x: np.ndarray) -> float:

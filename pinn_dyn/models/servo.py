@@ -96,7 +96,8 @@ class Servo(InputMatrix):
         if limit == "learned":
             units = [joint.force for joint in motors.joints]
             self.limit, limit = build("servo limit", 1.0, force, units=units), None
-        largest = torch.as_tensor(limit or torch.inf, dtype=torch.float32)
+        unlimited = torch.finfo(torch.float32).max  # a checkpoint has no infinite numbers
+        largest = torch.as_tensor(limit or unlimited, dtype=torch.float32)
         self.register_buffer("error", (spread_of_q / _START).float(), persistent=False)
         self.register_buffer("fixed_limit", largest.expand(len(index)).clone())
         self.register_buffer("fixed_stiffness", start.float())

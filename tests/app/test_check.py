@@ -5,10 +5,11 @@ import shlex
 
 import numpy as np
 import pandas as pd
+from scipy.signal import lfilter
 
 from pinn_dyn import load
 from pinn_dyn.app.check import _training
-from pinn_dyn.models import CoulombFriction
+from pinn_dyn.models import CoulombFriction, Servo
 from tests.app.entry import ROOT, fails, run_script
 from tests.support.delayed_robots import log, resting
 
@@ -49,25 +50,37 @@ def test_a_log_gets_a_verdict_a_page_and_a_step_to_copy(tmp_path, capsys):
     assert page.count("<img") == 2
 
 
+def printed_training(folder, capsys, table, effects, *settings):
+    """Follow the advice of check.py for a log for one step, and return the model."""
+    table.to_csv(folder / "joints.csv", index=False)
+    words = ["dataset=csv_log", f"dataset.root='{folder}'", "dataset.files=joints.csv", *COLUMNS]
+    run_script("check.py", *words, *settings, f"hydra.run.dir={folder / 'out'}")
+    (command,) = re.findall(rf"a training with {effects}: python (.*)", capsys.readouterr().out)
+    script, *words = shlex.split(command)
+    small = ["trainer.steps=1", "trainer.validations=1", "data.pairs=64", "data.batch_size=64"]
+    small += ["compile=false", "validator.horizon=0.1", f"hydra.run.dir={folder / 'run'}"]
+    run_script(script, *words, *small)
+    return load(folder / "run").model
+
+
 def test_the_printed_training_has_the_friction_of_the_log(tmp_path, capsys):
     item = resting(0.3)
     table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
     table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
-    pd.DataFrame(table).to_csv(tmp_path / "joints.csv", index=False)
-    words = ["dataset=csv_log", f"dataset.root='{tmp_path}'", "dataset.files=joints.csv", *COLUMNS]
-    run_script("check.py", *words, f"hydra.run.dir={tmp_path / 'out'}")
-    (command,) = re.findall(r"dry friction: python (.*)", capsys.readouterr().out)
-    script, *words = shlex.split(command)
-    small = ["trainer.steps=1", "trainer.validations=1", "data.pairs=64", "data.batch_size=64"]
-    run_script(
-        script,
-        *words,
-        *small,
-        "compile=false",
-        "validator.horizon=0.1",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    )
-    assert isinstance(load(tmp_path / "run").model.friction, CoulombFriction)
+    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "dry friction")
+    assert isinstance(model.friction, CoulombFriction)
+
+
+def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
+    t = np.arange(3000) / 100
+    table = {"t": t}
+    for k, frequency in ((1, 0.31), (2, 0.47)):
+        target = 0.4 * np.sin(6.28 * frequency * t) + 0.3 * np.sin(6.28 * 1.7 * frequency * t)
+        poles = lfilter([0.0, 0.02], [1, -1.75, 0.77], target)  # a lag of a few samples
+        table |= {f"q{k}": poles, f"u{k}": target}
+    effects, unit = "targets of servos.*", "dataset.u.unit=rad"
+    model = printed_training(tmp_path, capsys, pd.DataFrame(table), effects, unit)
+    assert isinstance(model.input, Servo)
 
 
 def test_only_the_program_changes_in_the_printed_training(monkeypatch):

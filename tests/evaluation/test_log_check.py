@@ -158,3 +158,42 @@ def test_the_bandwidth_is_where_the_motion_ends():
     q = np.sin(2 * np.pi * 4.0 * t) + 1e-4 * np.random.default_rng(0).normal(size=t.shape)
     item = Recording("run", t, q[:, None], None, q[:, None])
     assert bandwidth([item], 1 / RATE, np.array([1e-4])) == pytest.approx(4.0, abs=0.3)
+
+
+def servo_arm(gain=60.0, *, late=0, seconds=30.0, seed=0):
+    """Two joints that follow slow targets by position servos; the second rests at first."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds * RATE)) / RATE
+    table, lag = {"t": t}, late / RATE
+    for k in (1, 2):
+        frequency, phase = rng.uniform(0.1, 0.8, 4), rng.uniform(0, 6, 4)
+
+        def target(x, frequency=frequency, phase=phase):
+            return 0.3 * np.sin(np.outer(x, frequency) * 6.28 + phase).sum(axis=1)
+
+        fine = np.arange(-1, seconds, 0.001)
+        q, v, motion = 0.0, 0.0, []
+        for u in target(fine - lag):
+            v += 0.001 * (gain * (u - q) - 14 * v - 5 * np.sin(q) - 0.2 * np.tanh(v / 0.01))
+            q += 0.001 * v
+            motion.append(q)
+        table[f"q{k}"] = np.interp(t, fine, motion) + 1e-4 * rng.normal(size=len(t))
+        table[f"u{k}"] = target(t)
+    return pd.DataFrame(table)
+
+
+@pytest.mark.parametrize("settings", [{}, {"late": 6}, {"gain": 400.0}])
+def test_targets_of_servos_are_told_from_forces(settings):
+    signals = {name: dict(columns=[f"{name}1", f"{name}2"], unit="rad") for name in "qu"}
+    result = checked(servo_arm(**settings), **signals)
+    assert "model/input=servo" in result.options
+    assert not any("InputDelay" in line for line in result.steps)
+    assert not [text for text in result.warnings if "acts" in text]
+    torques = signals | {"u": dict(columns=["u1", "u2"], unit="Nm")}
+    assert "model/input=servo" not in checked(servo_arm(**settings), **torques).options
+
+
+def test_inputs_in_the_unit_of_the_coordinates_are_no_targets_if_the_robot_does_not_follow():
+    """Motors of tendons, or torques without a unit."""
+    signals = {name: dict(columns=[f"{name}1", f"{name}2"], unit="m") for name in "qu"}
+    assert "model/input=servo" not in checked(driven(), **signals).options
