@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Sequence
 from functools import partial
@@ -31,22 +32,27 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
     """
     settings = getattr(model, "keywords", {})
     if "known" in settings:
-        known, changes = match_model(settings["known"], source)
-        return partial(model, known=known), {"known": changes}
+        known, inner = match_model(settings["known"], source)
+        return partial(model, known=known), {"known": inner}
     structure, driven = settings.get("structure"), settings.get("driven_joints")
     if not isinstance(structure, RigidChain):
         return model, {}
     matched = match_structure(structure, source)
     if settings.get("start") == "prior" and structure.tree.problems:
         log.warning("start=prior: %s", "; ".join(structure.tree.problems))
-    names = driven or matched.joint_names
-    columns = list(_signals(source)[-1][1])  # of servos, maybe, targets and feed-forward forces
-    inputs = _joints_of(columns[: len(names)] if len(columns) == 2 * len(names) else columns, names)
-    if inputs is None or inputs == list(names):
-        return partial(model, structure=matched), {"structure": {"joints": matched.joints}}
-    log.info("the inputs drive the joints %s", ", ".join(inputs))
-    changes = {"structure": {"joints": matched.joints}, "driven_joints": inputs}
-    return partial(model, structure=matched, driven_joints=inputs), changes
+    changes: dict[str, Any] = {"structure": {"joints": matched.joints}}
+    names = list(driven or matched.joint_names)
+    key, units = _signals(source)[-1]
+    columns = list(units)  # of servos, maybe, targets and feed-forward forces
+    columns = columns[: len(names)] if len(columns) == 2 * len(names) else columns
+    inputs = _joints_of(columns, names)
+    if inputs is None:
+        _log_order(key, columns, names)
+    elif inputs != names:
+        log.info("the inputs drive the joints %s", ", ".join(inputs))
+        changes["driven_joints"] = driven = inputs
+    settings = {"structure": matched} | ({} if driven is None else {"driven_joints": driven})
+    return partial(model, **settings), changes
 
 
 def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
@@ -99,7 +105,8 @@ def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> Non
     names = structure.joint_names
     matches = [_joint_of(column, names) for column in columns]
     matches = [None if matches.count(k) > 1 else k for k in matches]
-    crossed = any(joint not in (None, k) for k, joint in enumerate(matches))
+    steps = {_number(x) - _number(y) for x, y in zip(columns, names, strict=False)}
+    crossed = any(x not in (None, k) for k, x in enumerate(matches)) and len(steps) > 1
     if len(columns) != len(names) or (crossed and structure.joints is None):
         others = iter([name for k, name in enumerate(names) if k not in matches])
         guess = [next(others, "?") if k is None else names[k] for k in matches]
@@ -110,8 +117,18 @@ def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> Non
             f"{key} has the columns {', '.join(columns)}, and {_PATH} the joints "
             f"{', '.join(names)}: {'leave out columns' if '?' in guess else way}"
         )
-    pairs = map(" -> ".join, zip(columns, names, strict=True))
+    _log_order(key, columns, names)
+
+
+def _log_order(key: str, columns: Sequence[str], names: Sequence[str]) -> None:
+    pairs = map(" -> ".join, zip(columns, names, strict=False))
     log.info("%s, column -> joint by their order: %s", key, "; ".join(pairs))
+
+
+def _number(name: str) -> float:
+    """Return the last number in a name, NaN without any."""
+    digits = re.findall(r"\d+", name)
+    return float(digits[-1]) if digits else math.nan
 
 
 def check_known(model: Predictor, source: DataSource) -> None:
@@ -167,8 +184,8 @@ def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
 def _joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | None:
     """Return the joint of each column, or None unless each names one of its own.
 
-    A column contains the name of its joint. Otherwise, if there are more joints than columns, names
-    of joints may end as the columns do, behind the same prefix: panda_joint1 and q1.
+    A column contains the name of its joint. Otherwise the names of joints may end as the columns do
+    or with their numbers, all behind the same prefix: panda_joint1 and q1.
     """
     names = [joints[k] for column in columns if (k := _joint_of(column, joints)) is not None]
     if len(set(names)) == len(columns):
@@ -179,7 +196,7 @@ def _joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | Non
             {_letters(x)[: -len(end)]: x for x in joints if end and _letters(x).endswith(end)}
             for end in endings
         ]
-        shared = set.intersection(*map(set, prefixes)) if len(joints) > len(columns) else set()
+        shared = set.intersection(*map(set, prefixes)) if len(joints) >= len(columns) else set()
         if len(shared) == 1 and len(set(endings)) == len(columns):
             (prefix,) = shared
             return [names_by_prefix[prefix] for names_by_prefix in prefixes]

@@ -316,11 +316,10 @@ class RigidChain(MechanicalSystem):
         """
         masses = self.inertia[:, 3, 3]
         if masses.min() < 0 or masses.max() == 0:
-            pairs = zip(self.body_names, masses.tolist(), strict=True)
             raise ValueError(
-                f"{self.tree.path}: the moving bodies have the masses "
-                f"{', '.join(f'{name}: {mass:g} kg' for name, mass in pairs)}, expected positive "
-                "masses: correct <inertial>, or use start='generic'"
+                f"{self.tree.path}: the bodies {', '.join(self.body_names)} have the masses "
+                f"{masses.tolist()} kg, expected positive ones: correct <inertial>, or use "
+                "start='generic'"
             )
         mass = masses.clamp_min(1e-4 * float(masses.max()))[:, None, None]
         centre = self.inertia[:, :3, 3:] / mass

@@ -69,16 +69,7 @@ def read_urdf(
     mass_scale: float = 1.0,
     payload: float = 0.0,
 ) -> Tree:
-    """Read a URDF or an MJCF: a file, a file that ships with PyBullet, or the text itself.
-
-    Args:
-        urdf: path or text.
-        joints: names of the joints that move, in the order of the coordinates; None for all that
-            mimic no other joint, in the order of the tree.
-        locked_joints: names of joints that stay at zero, or positions by name, rad or m.
-        tip: link at the end of the arm; None for the last of the file without a joint behind it.
-        mass_scale: factor of all masses and inertias.
-        payload: point mass at the origin of the tip, kg, which is not scaled.
+    """Read a URDF or an MJCF; arguments as of :class:`~pinn_dyn.systems.RigidChain`.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -93,8 +84,8 @@ def read_urdf(
     if joints is None:
         joints = [name for name in movable if file.drive(name)[0] == name]
     for key, names, known in (("locked_joints", locked, file.order), ("joints", joints, movable)):
-        if unknown := [name for name in names if name not in known]:
-            raise ValueError(f"{file.path}: {key} has {unknown}, expected of {known}")
+        if wrong := [name for name in names if name not in known or [*names].count(name) > 1]:
+            raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {known}")
     if not joints:
         raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
     children = [file.child(name) for name in file.joints]

@@ -60,6 +60,8 @@ PANDA = [f"panda_joint{k}" for k in (1, 2, 3)] + ["panda_finger_joint1", "panda_
         (["elbow", "joint1"], NAMES, ["elbow_joint", "joint1"]),
         (["q_3[rad]", "q_1[rad]", "q_2[rad]"], PANDA, [PANDA[2], *PANDA[:2]]),
         (["joint1", "joint2", "joint3"], PANDA, PANDA[:3]),
+        (["q2", "q1"], ["joint1", "joint2"], ["joint2", "joint1"]),
+        (["joint_0", "joint_1"], ["joint1", "joint2"], ["joint1", "joint2"]),  # numbers from 0
     ],
 )
 def test_columns_name_the_joints_of_the_coordinates(columns, names, joints):

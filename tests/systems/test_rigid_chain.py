@@ -222,7 +222,9 @@ def test_joints_that_are_not_named_are_locked():
     other = RigidChain(TREE, locked_joints=["slide", "fork", "wrist"])
     q, v, a = states(2)
     assert_same(chain.rigid_force(q, v, a), other.rigid_force(q, v, a))
-    with pytest.raises(ValueError, match=r"joints has \['elbow'\], expected of \['turn', "):
+    with pytest.raises(
+        ValueError, match=r"joints has \['elbow'\], expected once each of \['turn', "
+    ):
         RigidChain(TREE, joints=["turn", "elbow"])
 
 
