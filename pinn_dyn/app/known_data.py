@@ -73,12 +73,8 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
         _check_order(key, columns, structure)
     elif joints != names:
         structure = structure.with_joints(joints)
-        held = [name for name in candidates if name not in joints]
-        log.info(
-            "%s: the coordinates are the joints %s%s",
-            *(key, ", ".join(joints)),
-            f"; held at zero: {', '.join(held)}" if held else "",
-        )
+        held = ", ".join(name for name in names if name not in joints) or "none"
+        log.info("%s are the joints %s; held at zero: %s", key, ", ".join(joints), held)
     if structure.tree.held:
         log.info("the base is fixed, joints that are held: %s", ", ".join(structure.tree.held))
     names = structure.joint_names

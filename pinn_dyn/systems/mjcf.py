@@ -9,7 +9,17 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 _KINDS = ("floating", "spherical", "prismatic", "revolute")  # free, ball, slide and hinge
-_STRIPPED = ("keys", "sensors", "actuators", "tendons", "pairs", "skins", "materials", "textures")
+_STRIPPED = (
+    "keys",
+    "sensors",
+    "actuators",
+    "tendons",
+    "pairs",
+    "skins",
+    "materials",
+    "textures",
+    "hfields",
+)
 
 
 def mjcf_to_urdf(source: Path | str) -> str:
@@ -63,7 +73,7 @@ def mjcf_to_urdf(source: Path | str) -> str:
         if not count:
             weld = f"weld of {links[body]}"
             parts.append(_joint(weld, "fixed", link, links[body], frames[body] - origin))
-        inertial = "<inertial/>" if links[body] in unknown else ""
+        inertial = '<inertial><mass value="unknown"/></inertial>' if links[body] in unknown else ""
         if not inertial and model.body_mass[body] > 0:
             inertial = _inertial(model, data, body, frames[body])
         parts.append(f"<link name={quoteattr(links[body])}>{inertial}</link>")

@@ -61,10 +61,9 @@ class SimulatedArm(RigidChain, abc.ABC):
             payload=payload,
         )
         if self._coupled:
-            raise ValueError(
-                f"{self.tree.path}: the simulation has no mimic joints, add those of "
-                f"{self.body_names} to locked_joints"
-            )
+            mimics = [name for name in self.tree.movable if name not in self.joint_names]
+            text = f"the simulation has no mimic joints: add {mimics} to locked_joints"
+            raise ValueError(f"{self.tree.path}: {text}")
         self.check_domain(np.zeros(0), np.zeros(0))
         self.q_low, self.q_high, self.v_max, self.u_max = self.limits.T.copy()
         for joint, low, high in zip(self.joint_names, self.q_low, self.q_high, strict=True):

@@ -88,7 +88,7 @@ def read_urdf(
             raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {known}")
     if not joints:
         raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
-    children = [file.child(name) for name in file.joints]
+    children = [file.ends[name][1] for name in file.joints]
     if tip is None:
         tip = [name for name in children if not file.after(name)][-1]
     if tip not in children:
@@ -113,14 +113,14 @@ def read_urdf(
                 offset += factor * locked.get(driver, 0.0)
             placement = pose @ file.pose(name, offset)
             if driver not in joints or factor == 0:
-                visit(file.child(name), body, placement)
+                visit(file.ends[name][1], body, placement)
                 continue
             moving.append(name)
             parents.append(body)
             placements.append(placement)
             coupling.append(factor * np.eye(len(joints))[joints.index(driver)])
             inertia.append(np.zeros((4, 4)))
-            visit(file.child(name), len(moving) - 1, np.eye(4))
+            visit(file.ends[name][1], len(moving) - 1, np.eye(4))
 
     for root in file.roots:
         visit(root, -1, np.eye(4))
@@ -128,10 +128,10 @@ def read_urdf(
         path=file.path,
         joints=list(joints),
         movable=movable,
-        bodies=[file.child(name) for name in moving],
+        bodies=[file.ends[name][1] for name in moving],
         parents=parents,
         placements=torch.from_numpy(np.stack(placements)),
-        axes=torch.from_numpy(np.stack([file.axis(name) for name in moving])),
+        axes=torch.from_numpy(np.stack([file.axes[name] for name in moving])),
         revolute=torch.tensor([file.turns(name) for name in moving]),
         turning=[file.turns(name) for name in joints],
         coupling=torch.from_numpy(np.stack(coupling)),

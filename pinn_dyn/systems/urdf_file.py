@@ -33,6 +33,8 @@ class UrdfFile:
         path: the file.
         robot: its XML without namespaces.
         links, joints: elements by name.
+        ends: names of the links before and behind each joint.
+        axes: unit axes of the joints that move.
         roots: links without a parent.
         order: names of the joints, depth first.
         problems: masses and inertias that no body has, of the links that were read.
@@ -49,20 +51,20 @@ class UrdfFile:
         mistakes: list[str] = []
         self.links = self._by_name("link", mistakes)
         self.joints = self._by_name("joint", mistakes)
-        self._ends = {name: _ends(joint) for name, joint in self.joints.items()}
-        if undefined := {end for pair in self._ends.values() for end in pair} - self.links.keys():
+        self.ends = {name: _ends(joint) for name, joint in self.joints.items()}
+        if undefined := {end for pair in self.ends.values() for end in pair} - self.links.keys():
             mistakes.append(f"joints name the links {sorted(undefined)}, which are not defined")
-        children = Counter(behind for _, behind in self._ends.values())
+        children = Counter(behind for _, behind in self.ends.values())
         if shared := [name for name, count in children.items() if count > 1]:
             mistakes.append(f"the links {shared} have several parents, expected a tree")
         self._poses: dict[str, np.ndarray] = {}
-        self._axes: dict[str, np.ndarray] = {}
+        self.axes: dict[str, np.ndarray] = {}
         self._mimics: dict[str, tuple[str, float, float]] = {}
         for name, joint in self.joints.items():
             self._read_joint(name, joint, mistakes)
         self.roots = [name for name in self.links if name not in children]
         self.order = [] if shared else [x for root in self.roots for x in self._behind(root)]
-        reached = {self._ends[name][1] for name in self.order}
+        reached = {self.ends[name][1] for name in self.order}
         if not shared and (circle := sorted(children.keys() - reached)):
             mistakes.append(f"no joints lead from a base to the links {circle}")
         if mistakes:
@@ -89,7 +91,7 @@ class UrdfFile:
         length = np.linalg.norm(axis)
         if length == 0:
             mistakes.append(f"joint {name!r} has the axis 0 0 0, expected a direction")
-        self._axes[name] = axis / max(length, 1e-300)
+        self.axes[name] = axis / max(length, 1e-300)
         mimic = joint.find("mimic")
         if mimic is not None and mimic.get("joint") in self.joints:
             keys = (("multiplier", "1"), ("offset", "0"))
@@ -99,15 +101,11 @@ class UrdfFile:
     def _behind(self, link: str) -> list[str]:
         """Return the names of all joints behind a link, depth first."""
         names = self.after(link)
-        return [x for name in names for x in (name, *self._behind(self.child(name)))]
+        return [x for name in names for x in (name, *self._behind(self.ends[name][1]))]
 
     def after(self, link: str) -> list[str]:
         """Return the names of the joints on a link."""
-        return [name for name, (before, _) in self._ends.items() if before == link]
-
-    def child(self, name: str) -> str:
-        """Return the name of the link behind a joint."""
-        return self._ends[name][1]
+        return [name for name, (before, _) in self.ends.items() if before == link]
 
     def moves(self, name: str) -> bool:
         """Return true for a joint of one coordinate."""
@@ -137,19 +135,15 @@ class UrdfFile:
         kinds = {name: self.joints[name].get("type") for name in self.order}
         return [f"{name} ({kind})" for name, kind in kinds.items() if kind in _HELD]
 
-    def axis(self, name: str) -> np.ndarray:
-        """Return the unit axis of a joint that moves."""
-        return self._axes[name]
-
     def pose(self, name: str, position: float = 0.0) -> np.ndarray:
         """Return the pose of the link behind a joint in the link before it, ``(4, 4)``."""
         motion = np.eye(4)
-        if name not in self._axes:
+        if name not in self.axes:
             position = 0.0
         if position and self.turns(name):
-            motion[:3, :3] = Rotation.from_rotvec(position * self._axes[name]).as_matrix()
+            motion[:3, :3] = Rotation.from_rotvec(position * self.axes[name]).as_matrix()
         elif position:
-            motion[:3, 3] = position * self._axes[name]
+            motion[:3, 3] = position * self.axes[name]
         return self._poses[name] @ motion
 
     def limits(self, name: str) -> list[float]:

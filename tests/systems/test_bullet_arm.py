@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -188,3 +189,11 @@ def test_copies_and_pickles_give_the_same_numbers(panda):
 def test_a_robot_that_is_no_arm_is_refused_with_what_to_do(pendulum, changes, message):
     with pytest.raises(ValueError, match=message):
         BulletArm(pendulum(*changes))
+
+
+def test_mimic_joints_are_refused_with_a_setting_that_works():
+    text = TREE.replace('continuous">', 'continuous"><mimic joint="turn"/>')
+    with pytest.raises(ValueError, match="mimic joints: add") as error:
+        BulletArm(text, locked_joints=["wrist"])
+    (name,) = re.findall(r"add \['(\w+)'\]", str(error.value))
+    assert BulletArm(text, locked_joints=["wrist", name]).joint_names == ["turn", "slide", "fork"]

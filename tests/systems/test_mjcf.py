@@ -100,6 +100,7 @@ def test_the_text_of_an_mjcf_with_includes_loads_without_mujoco(tmp_path, monkey
 
 def test_missing_meshes_leave_the_kinematics_and_are_a_problem_of_a_prior_only():
     mesh = '<asset><mesh name="shell" file="missing.stl"/>'
+    mesh += '<hfield name="ground" file="missing.png" size="1 1 1 1"/>'
     looks = ARM.replace("<asset>", mesh).replace("<site", '<geom type="mesh" mesh="shell"/><site')
     torch.testing.assert_close(RigidChain(looks).inertia, RigidChain(ARM).inertia)
     box = '<geom type="box" size="0.05 0.04 0.03" pos="0.03 0 0"/>'
