@@ -17,6 +17,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pinn_dyn.app.export import export
 from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
@@ -144,6 +145,10 @@ class Run:
         shutil.copytree(self.folder, target, ignore=shutil.ignore_patterns(".lock"))
         if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
             store(self._made_in_python, target / TRAJECTORIES)
+
+    def export(self, path: str | Path) -> Path:
+        """Write the identified robot to a URDF or an MJCF, see :func:`~.app.export.export`."""
+        return export(self.model, path)
 
     @overload
     def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...

@@ -61,3 +61,12 @@ def rod(start: Tensor, end: Tensor, *, radius: float, density: float) -> Tensor:
     pseudo[:3, 3] = pseudo[3, :3] = mass * centre
     pseudo[3, 3] = mass
     return pseudo
+
+
+def central_parameters(pseudo: Tensor) -> Tensor:
+    """Return mass, center of mass c, and Ixx, Ixy, Iyy, Ixz, Iyz, Izz about c, ``(*batch, 10)``."""
+    mass = pseudo[..., 3:, 3]
+    center = pseudo[..., :3, 3] / mass
+    second = pseudo[..., :3, :3] - mass[..., None] * center[..., :, None] * center[..., None, :]
+    about_center = inertial_parameters(torch.nn.functional.pad(second, (0, 1, 0, 1)))
+    return torch.cat([mass, center, about_center[..., 4:]], dim=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -154,6 +154,7 @@ class RigidChain(MechanicalSystem):
         for name, value in buffers.items():
             constant = name in ("inertia", "_gravity", "_damping")
             self.register_buffer(name, value, persistent=constant)
+        self._exact = {name: value.clone() for name, value in buffers.items()}
         self._tip_body = tree.tip_body
 
     def with_joints(self, joints: Sequence[str]) -> RigidChain:
@@ -175,6 +176,15 @@ class RigidChain(MechanicalSystem):
                 f"{self.tree.path}: M has the eigenvalue {smallest:g} at q = 0, expected positive "
                 f"ones: correct the masses and inertias{reasons}"
             )
+
+    def _apply(self, fn: Callable[..., Tensor], recurse: bool = True) -> RigidChain:
+        """Convert the buffers. Back in double precision, rotations are exact again."""
+        super()._apply(fn, recurse)
+        for name, value in self._exact.items():
+            buffer = getattr(self, name)
+            if buffer.dtype == value.dtype and torch.equal(buffer.cpu(), value.float().double()):
+                setattr(self, name, value.to(buffer.device, copy=True))
+        return self
 
     def kinematics(self, q: Tensor) -> Kinematics:
         """Return poses and twists at q ``(*batch, N)``."""

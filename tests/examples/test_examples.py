@@ -30,8 +30,8 @@ def home(tmp_path_factory):
         patch.setenv("PINN_DYN_CACHE", str(folder / "cache"))
         log = pd.read_csv(EXAMPLES / "example_log.csv")
         log[log.t <= 1.0].to_csv(folder / "example_log.csv", index=False)  # of 5 s
-        for script in EXAMPLES.glob("*.py"):
-            shutil.copy(script, folder)
+        for file in [*EXAMPLES.glob("*.py"), EXAMPLES / "double_pendulum.urdf"]:
+            shutil.copy(file, folder)
         yield folder
 
 
@@ -100,6 +100,12 @@ def test_simulate_and_learn():
 
 def test_own_robot():
     assert "M learned" in run("own_robot.py", "--steps", "2")
+
+
+def test_identified_robot():
+    pytest.importorskip("pinocchio", reason="the dev extra is not installed")
+    torques = re.findall(r"(?:Pinocchio|the model): \[(.*)\]", run("identified_robot.py"))
+    assert len(set(torques)) == 1
 
 
 @pytest.mark.slow

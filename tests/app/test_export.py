@@ -1,0 +1,141 @@
+"""Identified robots written to URDF and MJCF, against Pinocchio, MuJoCo and Bullet."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.app.export import export
+from pinn_dyn.app.run_folder import with_structures
+from pinn_dyn.models import KnownMechanics, LagrangianNetwork, NoFriction, Stribeck
+from pinn_dyn.systems import RigidChain
+from tests.support.arm_urdf import ARM
+from tests.support.known import statistics
+from tests.support.rigid_chains import TREE
+
+mujoco = pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
+pinocchio = pytest.importorskip("pinocchio", reason="the dev extra is not installed")
+FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
+BOX = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+# Branches, prismatic and reversed joints, fixed links and locked joints.
+ROBOTS = {
+    "tree": (TREE.replace('<link name="bracket">', f'<link name="bracket">{BOX}'), ["wrist"]),
+    "spatial": (TREE, ["fork", "slide"]),
+    "panda": ("franka_panda/panda.urdf", FINGERS),
+}
+STATES = 10
+
+
+def learned(urdf, locked=(), friction=Stribeck, **settings):
+    """A model in double precision with random constants."""
+    structure = RigidChain(urdf, locked_joints=locked, payload=0.7)
+    scales = statistics(structure.num_coordinates)
+    if driven := settings.get("driven_joints"):
+        inputs = torch.ones(len(driven)).double()
+        scales = replace(scales, u_mean=0 * inputs, u_std=inputs)
+    model = KnownMechanics(scales, structure, friction=friction, **settings).double()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(0.3 * torch.randn(parameter.shape, generator=generator))
+    return model.requires_grad_(False)
+
+
+def states(size):
+    return torch.randn(3, STATES, size, generator=torch.Generator().manual_seed(1)).double()
+
+
+def pinocchio_forces(path, names, q, v, a):
+    """Inverse dynamics without armatures and friction, in the order of the names."""
+    model = pinocchio.buildModelFromUrdf(str(path))
+    data, order = model.createData(), [names.index(name) for name in list(model.names)[1:]]
+    forces = np.empty_like(q)
+    for k, row in enumerate(q):
+        angles = []
+        for joint, angle in zip(list(model.joints)[1:], row[order], strict=True):
+            angles += [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+        tau = pinocchio.rnea(model, data, np.array(angles), v[k][order], a[k][order])
+        forces[k, order] = tau
+    return forces
+
+
+def mujoco_forces(path, names, q, v, a):
+    """Inverse dynamics without the dry friction, which is a constraint there."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    data, order = mujoco.MjData(model), [model.joint(name).id for name in names]
+    forces = np.empty_like(q)
+    for k in range(len(q)):
+        data.qpos[order], data.qvel[order], data.qacc[order] = q[k], v[k], a[k]
+        mujoco.mj_inverse(model, data)
+        forces[k] = data.qfrc_inverse[order]
+    return forces
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_an_exported_robot_has_the_learned_dynamics_elsewhere(name, tmp_path):
+    model = learned(*ROBOTS[name])
+    structure, names = model.structure, model.structure.joint_names
+    q, v, a = (x.numpy() for x in states(len(names)))
+    rigid = structure.rigid_force(*map(torch.from_numpy, (q, v, a)), model.bodies()).numpy()
+    drives = model.rotor_inertia().numpy() * a + model.viscous().numpy() * v
+    urdf, mjcf = (export(model, tmp_path / f"arm.{ending}") for ending in ("urdf", "xml"))
+    scale = np.abs(rigid).max()
+    np.testing.assert_allclose(
+        pinocchio_forces(urdf, names, q, v, a), rigid, rtol=0, atol=1e-9 * scale
+    )
+    np.testing.assert_allclose(
+        mujoco_forces(mjcf, names, q, v, a), rigid + drives, rtol=0, atol=1e-9 * scale
+    )
+    again = RigidChain(str(urdf)).mass_matrix(torch.from_numpy(q))
+    torch.testing.assert_close(again, structure.mass_matrix(torch.from_numpy(q), model.bodies()))
+
+
+def test_friction_gains_and_offsets_are_in_the_files(tmp_path):
+    """MuJoCo computes the torque of the drives from the input."""
+    model = learned(ARM, gain_spread=0.3, drive_gain=20.0, driven_joints=["elbow"])
+    level = (model.friction(torch.tensor([1e6])) - model.friction(torch.tensor([-1e6]))) / 2
+    fields = pinocchio.buildModelFromUrdf(str(export(model, tmp_path / "arm.urdf")))
+    np.testing.assert_allclose(fields.damping, model.viscous())
+    np.testing.assert_allclose(fields.upperDryFrictionLimit, level)
+    arm = mujoco.MjModel.from_xml_path(str(export(model, tmp_path / "arm.xml")))
+    np.testing.assert_allclose(arm.dof_frictionloss, level)
+    np.testing.assert_allclose(arm.jnt_range[0], [-1.5, 1.5])
+    data = mujoco.MjData(arm)
+    data.ctrl[:] = 0.7
+    mujoco.mj_forward(arm, data)
+    expected = model.constant_force() + 0.7 * model.drive_gain() * torch.tensor([0, 1])
+    np.testing.assert_allclose(data.qfrc_actuator, expected, atol=1e-12)
+    assert "drive gain of elbow" in (tmp_path / "arm.urdf").read_text()
+
+
+def test_a_network_has_no_robot_file(tmp_path):
+    with pytest.raises(TypeError, match="LagrangianNetwork has no robot file"):
+        export(LagrangianNetwork(statistics(2)), tmp_path / "arm.urdf")
+
+
+SHAPE = '<visual><geometry><mesh filename="meshes/upper.stl"/></geometry></visual>'
+
+
+def test_an_export_keeps_the_file_of_the_robot_while_it_is_the_same(tmp_path, caplog):
+    """A run has the text of its robot without shapes, and the path of the file."""
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "upper.stl").touch()
+    file = tmp_path / "arm.urdf"
+    text = ARM.replace('<link name="upper">', f'<link name="upper"><!-- 3 mm -->{SHAPE}')
+    file.write_text(text)
+    stored = with_structures({"_target_": "pinn_dyn.systems.RigidChain", "urdf": str(file)})["urdf"]
+    model = learned(stored, friction=NoFriction)
+    kept = export(model, tmp_path / "out" / "new.urdf").read_text()
+    assert "<!-- 3 mm -->" in kept
+    assert 'filename="../meshes/upper.stl"' in kept
+    assert 'velocity="0.5"' in kept
+    file.write_text(text.replace("0 0 -0.5", "0 0 -0.6"))
+    changed = export(model, tmp_path / "new.urdf")
+    assert "has changed" in caplog.text
+    q = states(2)[0]
+    again = RigidChain(str(changed)).mass_matrix(q)
+    torch.testing.assert_close(again, model.structure.mass_matrix(q, model.bodies()))
+    assert Path(changed).read_text().count("mesh") == 0
