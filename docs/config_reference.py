@@ -28,6 +28,7 @@ PLAIN = (bool, int, float, str, tuple, type(None))
 # Keys of the programs that stand in no YAML.
 OPTIONAL = {
     "start_from": "a run folder whose trained weights the training starts from.",
+    "payload": "files with the columns of the log, recorded with a load that is identified.",
     "resume": "a run folder to go on with after an interruption, by its own configuration.",
     "trust": "packages whose classes the configuration of a run folder may build: SECURITY.md.",
 }

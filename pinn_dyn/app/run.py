@@ -22,9 +22,10 @@ from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
+from pinn_dyn.evaluation.payload import Payload, identify_payload
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
 from pinn_dyn.mechanics.arrays import require_finite
-from pinn_dyn.models import Statistics
+from pinn_dyn.models import KnownMechanics, Statistics
 
 VALIDATION_ERROR = "val/error_mean"
 """Metric that summarizes a training; sweeps minimize it."""
@@ -149,6 +150,34 @@ class Run:
     def export(self, path: str | Path) -> Path:
         """Write the identified robot to a URDF or an MJCF, see :func:`~.app.export.export`."""
         return export(self.model, path)
+
+    def identify_payload(self, loaded: DataSource | pd.DataFrame | str | Sequence[str]) -> Payload:
+        """Identify the load of the robot in another log, see :func:`~.evaluation.identify_payload`.
+
+        Args:
+            loaded: data of the robot with the load; files or frames have the columns of the log.
+
+        Raises:
+            TypeError: if the model has no bodies.
+            ValueError: if the data cannot be used.
+        """
+        from pinn_dyn.app.build import build_source
+
+        if not isinstance(self.model, KnownMechanics):
+            kind = type(self.model).__name__
+            raise TypeError(f"a {kind} has no bodies that carry a load: use a run of model=known")
+        if not isinstance(loaded, DataSource):
+            part = self.config.get("log") or self.config["dataset"]
+            files = "*" if isinstance(loaded, pd.DataFrame) else loaded
+            whole = {"files": files, "validation": None, "test": None}
+            source: Any = build_source({"dataset": {**part, **whole}})
+            if isinstance(loaded, pd.DataFrame):
+                source.files = {"frame": loaded}
+            loaded = source
+        cutoff = self.config["optimizer"].get("cutoff", 6.0)
+        splits = loaded.load()
+        runs = [*splits.train, *splits.validation, *splits.test]
+        return identify_payload(self.model, self.source.load().train, runs, cutoff=cutoff)
 
     @overload
     def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...

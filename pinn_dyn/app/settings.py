@@ -36,6 +36,7 @@ class TrainSettings:
     ensemble: PositiveInt = 1
     threads: PositiveInt
     start_from: str | None = None
+    payload: Names | None = None
     resume: str | None = None
     trust: Names | None = None
     dataset: DataSource

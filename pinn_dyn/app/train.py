@@ -25,6 +25,7 @@ from pinn_dyn.app.run_folder import (
 )
 from pinn_dyn.app.sweep import resume_command
 from pinn_dyn.app.trust import check_name, packages, require_trusted
+from pinn_dyn.data.whole import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ def train(cfg: DictConfig) -> float:
         config = checked("train", cfg)
         check_name("model_name", config["model_name"])  # files are named by it
         check_name("dataset.name", config["dataset"].get("name", "data"))
-    start = config.get("start_from")
+    start, payload = config.get("start_from"), config.pop("payload", None)
     try:
         run = training.train(
             **training_arguments(config, folder),
@@ -64,6 +65,10 @@ def train(cfg: DictConfig) -> float:
             way = f"go on with the same command and hydra.sweep.dir={job.sweep.dir}"
         log.warning("interrupted; %s", way)
         raise SystemExit(stop.code or 128 + signal.SIGTERM) from interrupt
+    if payload is not None:
+        load = run.identify_payload(payload)
+        write_whole(folder / "payload.csv", load.table.to_csv(index=False, float_format="%.4g"))
+        print(f"\n{load}\n")
     return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
 
 

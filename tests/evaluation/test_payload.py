@@ -1,0 +1,89 @@
+"""Loads on an arm whose torques Pinocchio computes, with noise and friction."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.evaluation.payload import identify_payload
+from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.models import CoulombFriction, KnownMechanics
+from pinn_dyn.systems import RigidChain
+from tests.support.arm_urdf import changed
+from tests.support.known import statistics
+
+pinocchio = pytest.importorskip("pinocchio", reason="the dev extra is not installed")
+LIMIT = '<limit lower="-9" upper="9" velocity="9" effort="99"/>'
+ARM = changed(("continuous", "revolute"), ('<axis xyz="1 0 0"/>', f'<axis xyz="1 0 0"/>{LIMIT}'))
+MASS, CENTER = 0.9, np.array([0.05, -0.03, -0.1])
+INERTIA = np.array([[0.02, 0.003, 0.001], [0.003, 0.015, 0.002], [0.001, 0.002, 0.012]])
+TRUTH = np.array([MASS, *CENTER, 0.02, 0.003, 0.015, 0.001, 0.002, 0.012])
+
+
+def recording(seed, load=None, urdf=ARM, seconds=20.0, rate=100.0):
+    """A motion of sines, with noise of 0.3 mrad, 3 mrad/s and 0.02 Nm."""
+    model = pinocchio.buildModelFromXML(urdf)
+    if load is not None:
+        mass, center, inertia = load
+        model.inertias[model.njoints - 1] += pinocchio.Inertia(mass, center, inertia)
+    generator, size = np.random.default_rng(seed), model.nq
+    t = np.arange(int(seconds * rate)) / rate
+    q, v, a = np.zeros((3, len(t), size))
+    for k in range(1, 9):
+        phase, height = generator.uniform(0, 6, size), generator.normal(size=size) * 0.6 / k**0.5
+        w = 2 * np.pi * 0.15 * k**1.1  # not periodic
+        angle = w * t[:, None] + phase
+        q += height * np.sin(angle)
+        v += height * w * np.cos(angle)
+        a -= height * w**2 * np.sin(angle)
+    data = model.createData()
+    tau = np.array([pinocchio.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
+    tau += 0.05 * a + 0.4 * v + 0.3 * np.tanh(v / 0.02)
+    noise = [s * generator.normal(size=q.shape) for s in (3e-4, 3e-3, 0.02)]
+    q, v, tau = (torch.from_numpy(x + e) for x, e in zip((q, v, tau), noise, strict=True))
+    return Trajectory(q, v, Signal(torch.from_numpy(t), tau))
+
+
+def identified(seed, load, urdf=ARM, samples=1000):
+    structure = RigidChain(urdf)
+    scales = statistics(structure.num_coordinates)
+    model = KnownMechanics(scales, structure, friction=CoulombFriction)
+    without, loaded = recording(seed, None, urdf), recording(seed + 1000, load, urdf)
+    return identify_payload(model, [without], [loaded], cutoff=6.0, samples=samples)
+
+
+def test_mass_center_and_inertia_of_a_load_are_identified():
+    table = identified(0, (MASS, CENTER, INERTIA)).table
+    print(table)
+    assert table.value[0] == pytest.approx(MASS, rel=0.02)
+    np.testing.assert_allclose(table.value[1:4], CENTER, atol=5e-3)
+    np.testing.assert_allclose(table.value[4:], TRUTH[4:], atol=4e-3)
+    assert (table.high[:4] - table.low[:4] < [0.1, 0.02, 0.02, 0.02]).all()
+    assert (table.determined == "yes").all()
+
+
+def test_no_load_has_an_interval_with_zero():
+    load = identified(2, None)
+    row = load.table.iloc[0]
+    assert row.low < 0 < row.high < 0.1
+    assert (load.table.determined[1:] == "not determined").all()
+
+
+def test_a_number_that_the_motions_do_not_determine_is_named():
+    """In a plane no motion depends on the center along the axes."""
+    load = identified(3, (MASS, CENTER, INERTIA), ARM.replace('"1 0 0"', '"0 1 0"'))
+    table = load.table.set_index("name")
+    assert table.determined["center y"] == "not determined"
+    assert table.determined[["mass", "center x", "center z", "Iyy"]].eq("yes").all()
+    assert table.value["mass"] == pytest.approx(MASS, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", [(MASS, CENTER, INERTIA), None])
+def test_the_intervals_contain_the_truth(load):
+    inside = []
+    for seed in range(20):
+        table = identified(10 + seed, load).table[: 10 if load else 1]
+        truth = TRUTH if load else 0
+        inside.append((table.low <= truth) & (truth <= table.high))
+    assert np.mean(inside) > 0.8
+    assert np.mean([row[0] for row in inside]) > 0.8
