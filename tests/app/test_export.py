@@ -25,6 +25,7 @@ ROBOTS = {
     "spatial": (TREE, ["fork", "slide"]),
     "panda": ("franka_panda/panda.urdf", FINGERS),
 }
+FORK = '<joint name="fork" type="revolute">'
 STATES = 10
 
 
@@ -93,6 +94,39 @@ def test_an_exported_robot_has_the_learned_dynamics_elsewhere(name, tmp_path):
     torch.testing.assert_close(again, structure.mass_matrix(torch.from_numpy(q), model.bodies()))
 
 
+@pytest.mark.parametrize("locked", [{"slide": 0.1, "wrist": -1.2}, {"turn": 0.7, "fork": 1.57}])
+def test_locked_joints_are_fixed_where_they_are_held(tmp_path, locked):
+    model = learned(TREE, locked)
+    structure, names = model.structure, model.structure.joint_names
+    q, v, a = states(len(names))
+    rigid = structure.rigid_force(q, v, a, model.bodies()).numpy()
+    motion = names, q.numpy(), v.numpy(), a.numpy()
+    np.testing.assert_allclose(
+        pinocchio_forces(export(model, tmp_path / "arm.urdf"), *motion), rigid, atol=1e-9
+    )
+    drives = (model.rotor_inertia() * a + model.viscous() * v).numpy()
+    np.testing.assert_allclose(
+        mujoco_forces(export(model, tmp_path / "arm.xml"), *motion), rigid + drives, atol=1e-9
+    )
+
+
+def test_a_joint_that_follows_another_still_does(tmp_path):
+    """The forces of both joints add up at the coordinate."""
+    mimic = '<mimic joint="turn" multiplier="-0.7" offset="0.2"/>'
+    urdf = TREE.replace(FORK, f"{FORK}{mimic}")
+    model = learned(urdf, ["slide", "bend", "wrist"])
+    assert model.structure.joint_names == ["turn"]
+    q, v, a = states(1)
+    rigid = model.structure.rigid_force(q, v, a, model.bodies())
+    again = RigidChain(str(export(model, tmp_path / "arm.urdf")))
+    torch.testing.assert_close(again.rigid_force(q, v, a), rigid)
+    drives = model.rotor_inertia() * a + model.viscous() * v
+    factors = np.array([1, -0.7])
+    both = [x.numpy() * factors for x in (q, v, a)]
+    forces = mujoco_forces(export(model, tmp_path / "arm.xml"), ["turn", "fork"], *both)
+    np.testing.assert_allclose(forces @ factors, (rigid + drives)[:, 0], atol=1e-9)
+
+
 def test_friction_gains_and_offsets_are_in_the_files(tmp_path):
     """MuJoCo computes the torque of the drives from the input."""
     model = learned(ARM, gain_spread=0.3, drive_gain=20.0, driven_joints=["elbow"])
@@ -124,12 +158,11 @@ def test_an_export_keeps_the_file_of_the_robot_while_it_is_the_same(tmp_path, ca
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "upper.stl").touch()
     file = tmp_path / "arm.urdf"
-    text = ARM.replace('<link name="upper">', f'<link name="upper"><!-- 3 mm -->{SHAPE}')
+    text = ARM.replace('<link name="upper">', f'<link name="upper">{SHAPE}')
     file.write_text(text)
     stored = with_structures({"_target_": "pinn_dyn.systems.RigidChain", "urdf": str(file)})["urdf"]
     model = learned(stored, friction=NoFriction)
     kept = export(model, tmp_path / "out" / "new.urdf").read_text()
-    assert "<!-- 3 mm -->" in kept
     assert 'filename="../meshes/upper.stl"' in kept
     assert 'velocity="0.5"' in kept
     file.write_text(text.replace("0 0 -0.5", "0 0 -0.6"))
