@@ -36,11 +36,12 @@ def export(model: Predictor, path: str | Path) -> Path:
     structure = structure.double()
     with torch.no_grad():
         drives = model.physical_constants()[_BODY_COLUMNS:]
+        fast = torch.full_like(model.viscous(), torch.inf)
         constants = RobotConstants(
             inertia=model.bodies(),
             armature=model.rotor_inertia(),
             damping=model.viscous(),
-            friction=model.friction.dry_level() + torch.zeros_like(model.viscous()),
+            friction=(model.friction(fast) - model.friction(-fast)) / 2,
             gain=model.input_gain() @ model.motors,
             offset=model.constant_force(),
             notes=[

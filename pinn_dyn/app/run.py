@@ -22,7 +22,7 @@ from pinn_dyn.app.predict_frame import predict_frame
 from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
-from pinn_dyn.evaluation.payload import Payload, identify_payload
+from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
@@ -151,7 +151,9 @@ class Run:
         """Write the identified robot to a URDF or an MJCF, see :func:`~.app.export.export`."""
         return export(self.model, path)
 
-    def identify_payload(self, loaded: DataSource | pd.DataFrame | str | Sequence[str]) -> Payload:
+    def identify_payload(
+        self, loaded: DataSource | pd.DataFrame | str | Sequence[str]
+    ) -> pd.DataFrame:
         """Identify the load of the robot in another log, see :func:`~.evaluation.identify_payload`.
 
         Args:

@@ -67,8 +67,9 @@ def train(cfg: DictConfig) -> float:
         raise SystemExit(stop.code or 128 + signal.SIGTERM) from interrupt
     if payload is not None:
         load = run.identify_payload(payload)
-        write_whole(folder / "payload.csv", load.table.to_csv(index=False, float_format="%.4g"))
-        print(f"\n{load}\n")
+        write_whole(folder / "payload.csv", load.to_csv(index=False, float_format="%.4g"))
+        text = load.to_string(index=False, na_rep="", float_format="{:.4g}".format)
+        print(f"Load in the frame of {load.attrs['frame']}, inertia about its center:\n{text}")
     return run.metrics["validation"].get(VALIDATION_ERROR, math.nan)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -23,27 +23,6 @@ _NAMES = ("mass", "center x", "center y", "center z", *INERTIAL[4:])
 _UNITS = ("kg", *3 * ["m"], *6 * ["kg m^2"])
 
 
-@dataclass(frozen=True)
-class Payload:
-    """A load that is rigidly attached to a body.
-
-    Attributes:
-        frame: link in whose frame the numbers are.
-        parameters, covariance: inertial parameters ``(10,)`` about the origin of the frame, in the
-            order of :data:`~pinn_dyn.models.known.INERTIAL`, and their covariance ``(10, 10)``.
-        table: mass, center of mass and inertia about the center, each with its 95 % interval.
-    """
-
-    frame: str
-    parameters: Tensor
-    covariance: Tensor
-    table: pd.DataFrame
-
-    def __str__(self) -> str:
-        text = self.table.to_string(index=False, na_rep="", float_format="{:.4g}".format)
-        return f"Load in the frame of {self.frame}, inertia about its center of mass:\n{text}"
-
-
 def identify_payload(
     model: KnownMechanics,
     without: Sequence[Trajectory],
@@ -51,7 +30,7 @@ def identify_payload(
     *,
     cutoff: float,
     samples: int = 4000,
-) -> Payload:
+) -> pd.DataFrame:
     """Fit motions with and without a load by shared constants, and by the load alone::
 
         Y(q, v, a) pi + lambda Y_k(q, v, a) pi_load + drive force(v, a, u) = 0
@@ -67,6 +46,10 @@ def identify_payload(
         without, loaded: motions without and with the load.
         cutoff: cutoff of the filter, Hz, see :class:`~pinn_dyn.training.LeastSquares`.
         samples: number of samples.
+
+    Returns:
+        Table of the mass, the center of mass and the inertia about it, with 95 % intervals, in the
+        frame ``attrs["frame"]``.
 
     Raises:
         ValueError: as :meth:`LeastSquares.fit <pinn_dyn.training.LeastSquares.fit>`, or if the tip
@@ -90,7 +73,8 @@ def identify_payload(
     columns = {"value": values, "low": values - width, "high": values + width}
     table = pd.DataFrame({"name": _NAMES} | {k: x.numpy() for k, x in columns.items()})
     table["unit"], table["determined"] = _UNITS, np.where(determined, "yes", "not determined")
-    return Payload(joint.frame, parameters, covariance, table)
+    table.attrs["frame"] = joint.frame
+    return table
 
 
 class _Loaded(nn.Module):
@@ -99,6 +83,7 @@ class _Loaded(nn.Module):
     def __init__(self, known: KnownMechanics):
         super().__init__()
         self.known = known
+        self.drive_gain, self.force_ratio = known.drive_gain, known.force_ratio
         structure: Any = known.structure
         body, pose = structure._tip_body, torch.eye(4, dtype=torch.float64)
         self.frame = structure.body_names[body]
@@ -123,14 +108,8 @@ class _Loaded(nn.Module):
     def physical_constants(self) -> list[Named]:
         return [*self.known.physical_constants(), self.load.named()]
 
-    def drive_gain(self) -> Tensor:
-        return self.known.drive_gain()
-
     def force_scale(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         return self.known.force_scale(q, v, a, u[:, :-1])
-
-    def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
-        return self.known.force_ratio(q, v, a)
 
     def slopes(self) -> _Loaded:
         return self

@@ -26,10 +26,6 @@ class Friction(nn.Module, abc.ABC):
     def slope(self, v: Tensor) -> Tensor:
         """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends on v_i alone."""
 
-    def dry_level(self) -> Tensor | float:
-        """Return the dry friction at high speed, mean of both directions, ``(N,)`` or zero."""
-        return 0.0
-
     def physical_constants(self) -> list[Named]:
         """Return the learned constants in physical units. The default has none."""
         return []
@@ -81,10 +77,6 @@ class CoulombFriction(Friction):
         self.level = scales.positive("Coulomb friction", level, scales.value, spread, forces)
         self.width = scales.positive("friction width", width, v_std, spread, speeds, floor)
         self._add_constants(scales)
-
-    def dry_level(self) -> Tensor:
-        fast = torch.full_like(self.level(), torch.inf)
-        return (self._level(fast)[0] + self._level(-fast)[0]) / 2
 
     def _add_constants(self, scales: Scales) -> None:
         """Add more constants in a subclass."""

@@ -52,7 +52,7 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
     the stored text if the file has changed. Meshes are relative to ``folder``.
     """
     file = _file(robot)
-    before = {_end(joint, "child"): _end(joint, "parent") for joint in file.joints.values()}
+    before = {behind: link for link, behind in file.ends.values()}
     bodies = central_parameters(constants.inertia)
     for name, link in file.links.items():
         body = name
@@ -74,14 +74,14 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
     locked = dict.fromkeys(robot.locked_joints, 0.0)
     locked |= robot.locked_joints if isinstance(robot.locked_joints, Mapping) else {}
     for name, joint in file.joints.items():
-        if file.child(name) in robot.body_names:
+        if file.ends[name][1] in robot.body_names:
             _remove(joint, "dynamics")  # that of a joint that follows another is in the other's
         if name in robot.joint_names:
             _remove(joint, "mimic")
             k = robot.joint_names.index(name)
             damping, friction = (repr(float(x[k])) for x in (constants.damping, constants.friction))
             ET.SubElement(joint, "dynamics", damping=damping, friction=friction)
-        elif joint.get("type") != "fixed" and file.child(name) not in robot.body_names:
+        elif joint.get("type") != "fixed" and file.ends[name][1] not in robot.body_names:
             driver, factor, offset = file.drive(name, (*robot.joint_names, *locked))
             position = offset + factor * locked.get(driver, 0.0)
             if position:
@@ -107,7 +107,7 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     follow others are coupled by equalities.
     """
     file, tree = UrdfFile(robot.urdf), robot.tree
-    names = {file.child(name): name for name in file.joints}
+    names = {file.ends[name][1]: name for name in file.joints}
     root = ET.Element("mujoco", model="identified")
     ET.SubElement(root, "compiler", angle="radian")
     ET.SubElement(root, "option", gravity=_text(robot.gravity))
@@ -155,11 +155,6 @@ def _file(robot: RigidChain) -> UrdfFile:
             pass
         log.warning("%s is missing or has changed: the export has no shapes", path)
     return UrdfFile(urdf)
-
-
-def _end(joint: ET.Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
 
 
 def _remove(parent: ET.Element, *tags: str) -> None:

@@ -43,5 +43,5 @@ def test_a_training_identifies_the_load_of_another_log(tmp_path, capsys):
     table = pd.read_csv(tmp_path / "run" / "payload.csv")
     assert table.value[0] == pytest.approx(MASS, rel=0.02)
     np.testing.assert_allclose(table.value[1:4], CENTER, atol=5e-3)
-    again = pinn_dyn.load(tmp_path / "run").identify_payload(loaded).table
+    again = pinn_dyn.load(tmp_path / "run").identify_payload(loaded)
     np.testing.assert_allclose(again.value, table.value, atol=1e-3)

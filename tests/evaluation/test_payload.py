@@ -52,8 +52,7 @@ def identified(seed, load, urdf=ARM, samples=1000):
 
 
 def test_mass_center_and_inertia_of_a_load_are_identified():
-    table = identified(0, (MASS, CENTER, INERTIA)).table
-    print(table)
+    table = identified(0, (MASS, CENTER, INERTIA))
     assert table.value[0] == pytest.approx(MASS, rel=0.02)
     np.testing.assert_allclose(table.value[1:4], CENTER, atol=5e-3)
     np.testing.assert_allclose(table.value[4:], TRUTH[4:], atol=4e-3)
@@ -63,15 +62,15 @@ def test_mass_center_and_inertia_of_a_load_are_identified():
 
 def test_no_load_has_an_interval_with_zero():
     load = identified(2, None)
-    row = load.table.iloc[0]
+    row = load.iloc[0]
     assert row.low < 0 < row.high < 0.1
-    assert (load.table.determined[1:] == "not determined").all()
+    assert (load.determined[1:] == "not determined").all()
 
 
 def test_a_number_that_the_motions_do_not_determine_is_named():
     """In a plane no motion depends on the center along the axes."""
     load = identified(3, (MASS, CENTER, INERTIA), ARM.replace('"1 0 0"', '"0 1 0"'))
-    table = load.table.set_index("name")
+    table = load.set_index("name")
     assert table.determined["center y"] == "not determined"
     assert table.determined[["mass", "center x", "center z", "Iyy"]].eq("yes").all()
     assert table.value["mass"] == pytest.approx(MASS, rel=0.02)
@@ -82,7 +81,7 @@ def test_a_number_that_the_motions_do_not_determine_is_named():
 def test_the_intervals_contain_the_truth(load):
     inside = []
     for seed in range(20):
-        table = identified(10 + seed, load).table[: 10 if load else 1]
+        table = identified(10 + seed, load)[: 10 if load else 1]
         truth = TRUTH if load else 0
         inside.append((table.low <= truth) & (truth <= table.high))
     assert np.mean(inside) > 0.8
