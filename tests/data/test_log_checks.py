@@ -82,7 +82,7 @@ BAD = {
     "name": (motion().rename(columns={"q2": "q_2"}), r"no column 'q2'.*mean q_2.*has t, q1"),
     "text": (put(41, "q2", "broken"), r"run.csv, line 43, column 'q2' \(q\): .*'broken'"),
     "1e300": (put(300, "v2", 1e300), r"line 302, column 'v2' \(v\): .*1e\+300 .*'no value'"),
-    "back": (clock(lambda t: np.where(t > 3, t - 2, t)), r"line 303.*from 3 to 1.01.*SplitGaps"),
+    "back": (clock(lambda t: np.arange(1001) % 40 / 100), r"line 42.*from 0.39 to 0 s.*trajectory"),
     "repeat": (clock(repeat), r"line 402, column 't': the time repeats from 3.99.*Deduplicate"),
     "jump": (clock(lambda t: np.where(t > 3, t + 1, t)), r"line 303.*from 3 to 4.01.*SplitGaps"),
     "unit": (clock(lambda t: 1000 * t), r"sample time would be 10 s.*write the unit ms"),

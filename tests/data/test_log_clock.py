@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pinn_dyn.data.logs import LogError
+from pinn_dyn.data.logs import Deduplicate, LogError, SplitGaps
 from tests.data.logs_files import motion, source, write
 
 SECONDS = motion()["t"]
@@ -109,7 +109,27 @@ def test_a_restart_of_the_clock_starts_a_run(tmp_path):
     write(tmp_path, pd.concat(runs))
     log = source(tmp_path)
     assert len(log.load().train) == 3
-    assert "the time restarts at 0 s (2 times)" in "\n".join(log.warnings)
-    write(tmp_path, pd.concat([motion(), motion()[300:]]))  # no restart
-    with pytest.raises(LogError, match="SplitGaps"):
+    assert "the time goes back to 0 s: a run is assumed to start" in "\n".join(log.warnings)
+
+
+def test_rows_out_of_order_are_sorted(tmp_path):
+    write(tmp_path, motion().iloc[np.r_[0:300, 305, 300:305, 306:1001]])
+    log = source(tmp_path)
+    np.testing.assert_allclose(log.load().train[0].q[:, 0], motion()["q1"][:602][:601])
+    assert "the time goes back to 3 s: rows out of order are sorted" in "\n".join(log.warnings)
+
+
+def test_a_logger_faster_than_its_source_is_no_burst(tmp_path):
+    write(tmp_path, motion().iloc[np.arange(10010) // 10])
+    with pytest.raises(LogError, match="Deduplicate") as error:
         source(tmp_path).load()
+    assert "RowClock" not in str(error.value)
+    log = source(tmp_path, steps={"once": Deduplicate()})
+    np.testing.assert_allclose(log.load().train[0].q[:, 0], motion()["q1"][:601])
+    assert not log.warnings
+
+
+def test_a_long_gap_is_no_burst(tmp_path):
+    write(tmp_path, motion().assign(t=lambda x: x["t"].where(x["t"] < 5, x["t"] + 3600)))
+    log = source(tmp_path, steps={"split": SplitGaps(longest=0.1)})
+    assert not log.warnings

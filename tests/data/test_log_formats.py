@@ -189,7 +189,7 @@ def test_episodes_are_told_apart_by_the_restart_of_the_clock(tmp_path):
     formats.write_lerobot(tmp_path, TABLE)
     log = source(tmp_path, **{**LEROBOT, "trajectory": None})
     assert len({part.raw.run for part in log.cleaned}) == 3
-    assert "the time restarts at 0 s (2 times)" in log.report
+    assert "the time goes back to 0 s: a run is assumed to start there (2 such rows)" in log.report
 
 
 def write_mat73(path, table):

@@ -55,7 +55,7 @@ class SplitGaps(Step):
 
     @property
     def repairs(self) -> Collection[str]:
-        return ("gaps", "backward times")
+        return ("gaps",)
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         spacing = np.diff(recording.t)

@@ -20,7 +20,7 @@ from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.table import Request, Table
 
 Files = str | Sequence[str] | Mapping[str, pd.DataFrame]
-_RESTART = 10  # samples after the first time up to which a clock restarts
+_OUT_OF_ORDER = 50  # rows by which a single row is late; rows of the shortest run
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,18 @@ class Layout:
         for run, mask in runs.items():
             rows = np.flatnonzero(mask)
             t, notes = self.time.seconds(table.select(rows))
-            starts = _restarts(t)[: None if "backward times" not in self.repairs else 0]
-            if len(starts):
-                report.warn(
-                    "clock",
-                    f"{table.place(rows[starts[0]], self.time.name)}: the time restarts at "
-                    f"{t[starts[0]]:.6g} s ({len(starts)} times): a run is assumed to start "
-                    "there; name a column of the runs in 'trajectory'",
-                )
+            order, starts = _in_order(t)
+            if len(starts) or (order[1:] < order[:-1]).any():
+                k = int((np.diff(t) < 0).argmax()) + 1
+                text = f"{table.place(rows[k], self.time.name)}: the time goes back to {t[k]:.6g} s"
+                cure = "rows out of order are sorted"
+                if len(starts):
+                    cure = (
+                        f"a run is assumed to start there ({len(starts)} such rows); name a column "
+                        "of the runs in 'trajectory'"
+                    )
+                report.warn("clock", f"{text}: {cure}")
+            rows, t = rows[order], t[order]
             pieces = np.split(np.arange(len(rows)), starts)
             for k, piece in enumerate(pieces):
                 name = f"{run}:{k + 1}" if len(pieces) > 1 else run
@@ -145,10 +149,12 @@ class Layout:
         return rows, Recording(run, t, values["q"], values.get("v"), values["u"])
 
 
-def _restarts(t: np.ndarray) -> np.ndarray:
-    """Return the rows at which the time goes back to the first times of the run."""
-    steps = np.diff(t)
-    if not (steps < 0).any() or not (steps > 0).any():
-        return np.array([], dtype=int)
-    early = t[0] + _RESTART * np.median(steps[steps > 0])
-    return np.flatnonzero((steps < 0) & (t[1:] <= early) & (t[:-1] > early)) + 1
+def _in_order(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the order of rows that sorts single rows, and the rows at which a run starts."""
+    order = np.argsort(t, kind="stable")
+    spacing = np.diff(t[order])
+    far = np.abs(order - np.arange(len(t))) > _OUT_OF_ORDER
+    if far.any() or (spacing < 0.5 * np.median(spacing)).any():
+        order = np.arange(len(t))
+    starts = np.flatnonzero(np.diff(t[order]) < 0) + 1
+    return order, starts if len(starts) * _OUT_OF_ORDER < len(t) else starts[:0]

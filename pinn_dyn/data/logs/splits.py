@@ -119,8 +119,6 @@ def _cut(
     for name, seconds in parts.items():
         if seconds is None:
             continue
-        if not (np.diff(t) >= 0).all():
-            raise LogError(f"{recording.run}: the time goes backwards: split by 'runs'")
         # From the row at or before the border, so that the stretch is not a row too short.
         first = int(np.searchsorted(t, end - seconds, side="right")) - 1
         border = end - seconds - guard

@@ -23,7 +23,7 @@ class Step(abc.ABC):
     def repairs(self) -> Collection[str]:
         """Faults that the step repairs, and that are then no errors.
 
-        ``"gaps"``, ``"repeated times"``, ``"backward times"``, ``"bursts"``, ``"jumps of q"``.
+        ``"gaps"``, ``"repeated times"``, ``"bursts"``, ``"jumps of q"``.
         """
         return ()
 
