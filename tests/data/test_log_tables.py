@@ -146,3 +146,11 @@ def test_rows_of_single_joints_become_columns(tmp_path, clock):
     log = source(tmp_path, long="joint", **signals, **({} if clock else {"time": {"rate": 100}}))
     assert_equal(log)
     assert not log.warnings
+
+
+def test_alternating_runs_with_empty_cells_are_told(tmp_path):
+    rows = np.argsort(np.r_[TABLE.index, TABLE.index], kind="stable")
+    runs = pd.concat([TABLE, motion(phase=1.0).assign(t=lambda x: x["t"] + 20)])
+    write(tmp_path, runs.iloc[rows].assign(u1=lambda x: x["u1"].where(x["t"] > 1)))
+    with pytest.raises(LogError, match=r"the time goes back .*name the column that tells runs"):
+        source(tmp_path).load()

@@ -55,7 +55,7 @@ def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[s
         )
     typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
     low, high = SAMPLE_TIMES
-    if not low <= typical <= high:
+    if not low <= typical <= high and (spacing >= 0).all():
         unit = clock.plausible_unit(table, typical)
         cure = f"write the unit {unit}, or " if unit else ""
         raise LogError(

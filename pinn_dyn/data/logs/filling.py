@@ -32,7 +32,7 @@ def fill(
     the column. Rows with such cells are dropped too.
 
     Args:
-        t: times of the rows, ``(T,)``, s.
+        t: times of the rows in order, ``(T,)``, s.
         values: values of each signal, ``(T, K)``, NaN in empty cells.
         signals: columns of each signal.
         table: the rows, for messages.
@@ -46,11 +46,6 @@ def fill(
         LogError: if a column has no value, no row stays, or rows are missing in the middle of a
             run that no step splits there.
     """
-    if (back := np.diff(t) < 0).any():
-        raise LogError(
-            f"{table.place(int(back.argmax()) + 1)}: the time goes back in a log with empty cells, "
-            "which are filled along the time: name the column of the runs in 'trajectory'"
-        )
     notes: list[str] = []
     warnings: list[str] = []
     clock = ~np.isnan(values["q"][:, 0])
