@@ -9,12 +9,13 @@ import pytest
 from google.protobuf import descriptor_pb2, message_factory
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pinn_dyn.data.logs import LogError, Request
 from pinn_dyn.data.logs.bags import read_bag
-from tests.data.log_formats import STORE
+from tests.data.log_formats import STORE, STORE1
 from tests.data.logs_files import motion
 
 TABLE = motion(3.0)
@@ -109,6 +110,27 @@ def test_a_gripper_on_the_topic_of_the_arm_is_named(tmp_path):
     (note,) = table.notes
     assert "151 of 452" in note
     assert "finger" in note
+
+
+def test_a_second_publisher_of_the_same_joints_is_left_out(tmp_path):
+    kind = "sensor_msgs/msg/JointState"
+    with Writer1(tmp_path / "run.bag") as writer:
+        nodes = [
+            writer.add_connection(STATES, kind, typestore=STORE1, callerid=name)
+            for name in ("/robot", "/simulation")
+        ]
+        for k, t in enumerate(T[:, 0]):
+            for node, delay in list(zip(nodes, (0, 3), strict=True))[: 1 + (k > 9)]:
+                time = START + round(1e9 * t) + delay * 10**6
+                stamp = STORE1.types["builtin_interfaces/msg/Time"](time // 10**9, time % 10**9)
+                header = STORE1.types["std_msgs/msg/Header"](k, stamp, "")
+                message = STORE1.types[kind](header, JOINTS, Q[k] + 0.1 * delay, NOTHING, U[k])
+                writer.write(node, time, STORE1.serialize_ros1(message, kind))
+    table = read(tmp_path / "run.bag")
+    assert_motion(table)
+    (note,) = table.notes
+    assert "291 of 592" in note
+    assert "291 are of another publisher" in note
 
 
 def test_messages_that_come_late_are_sorted(tmp_path):
@@ -253,5 +275,5 @@ def test_a_missing_joint_is_answered_with_the_joints(tmp_path):
     write(tmp_path / "bag", states())
     with pytest.raises(LogError, match=r"position/elbow': the messages name j1, j2"):
         read(tmp_path / "bag", [f"{STATES}/position/elbow"])
-    with pytest.raises(LogError, match=r"velocity/j1': its array is empty"):
+    with pytest.raises(LogError, match=r"velocity/j1': its array is shorter"):
         read(tmp_path / "bag", [f"{STATES}/velocity/j1"])

@@ -109,8 +109,8 @@ def _topic(
     for column, absent, numbers in zip(columns, missing.T, values.T, strict=True):
         if absent.all():
             joints = sorted({name for _, names in rows[:, 2] for name in names})
-            empty = column.rpartition("/")[2] in joints
-            reason = "its array is empty" if empty else f"the messages name {listed(joints)}"
+            short = column.rpartition("/")[2] in joints or not joints
+            reason = "its array is shorter" if short else f"the messages name {listed(joints)}"
             raise LogError(f"{path}: no message has a value of {column!r}: {reason}")
         if np.isnan(numbers).all():
             raise LogError(
@@ -162,8 +162,10 @@ def _number(message: Any, field: str, place: str) -> float | None:
         elif hasattr(node, step):
             node = getattr(node, step)
         else:
-            names = listed(name for name in dir(node) if name[0].islower())
+            names = listed(x for x in dir(node) if x[0] != "_" and not callable(getattr(node, x)))
             raise LogError(f"{place}: no {field!r} in its messages, which have {names}")
+    if node is None:  # of JSON
+        return None
     seconds = _seconds(node)
     if seconds is None and not isinstance(node, (int, float, np.number, np.bool_)):
         kind = type(node).__name__
@@ -184,13 +186,14 @@ def _merge(
     """Return the rows of the topic of the first column, with the last values of other topics."""
     clock = next(name for name, topic in topics.items() if first in topic.frame)
     frame, missing, publishers = topics.pop(clock)
-    sources = set(publishers[~missing])
-    if len(sources) > 1:
-        notes.append(f"{len(sources)} publishers of {clock} alternate: their clocks may differ")
+    nodes = publishers.str[0]
+    usual = nodes[~missing].mode()
+    second = ~missing & ~nodes.isin(usual[:1]).to_numpy()
     joints = {name for _, names in publishers[missing] for name in names}
-    joints -= {name for _, names in sources for name in names}
+    joints -= {name for _, names in publishers[~missing] for name in names}
     lack = f"lack an entry, being of {listed(sorted(joints))}," if joints else "lack an entry"
-    lost = {lack: missing, "are NaN": ~missing & frame.isna().any(axis=1).to_numpy()}
+    nan = ~missing & ~second & frame.isna().any(axis=1).to_numpy()
+    lost = {lack: missing, "are of another publisher": second, "are NaN": nan}
     times = frame.index
     frame.index = pd.RangeIndex(1, len(frame) + 1)
     for topic in topics.values():
@@ -198,7 +201,7 @@ def _merge(
         messages = messages[~messages.index.duplicated(keep="last")]
         latest = messages.reindex(times, method="ffill", tolerance=max_age)
         frame[messages.columns] = latest.to_numpy()
-    empty = frame.isna().any(axis=1).to_numpy()
+    empty = second | frame.isna().any(axis=1).to_numpy()
     age = f"have no message of {listed(topics)} in the {max_age:g} s before them"
     lost[age] = empty & ~np.any(list(lost.values()), axis=0)
     if empty.any():
