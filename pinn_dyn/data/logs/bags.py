@@ -46,7 +46,8 @@ def read_bag(path: Path, request: Request) -> Table:
     cached = folder / f"bag-{key}.parquet"
     if not cached.is_file():
         notes: list[str] = []
-        frame = _merge(path, _decode(path, fields, notes), fields[0], request.max_age, notes)
+        topics = _decode(path, fields, request.max_age, notes)
+        frame = _merge(path, topics, fields[0], request.max_age, notes)
         frame.attrs["notes"] = notes
         folder.mkdir(parents=True, exist_ok=True)
         with whole(cached) as partial:
@@ -55,7 +56,10 @@ def read_bag(path: Path, request: Request) -> Table:
     return Table(frame, str(path), "message", notes=frame.attrs["notes"])
 
 
-def _decode(path: Path, columns: Sequence[str], notes: list[str]) -> dict[str, _Topic]:
+def _decode(
+    path: Path, columns: Sequence[str], max_age: float, notes: list[str]
+) -> dict[str, _Topic]:
+    """Return the values by topic; at times of receipt if these alone are of the same clock."""
     with open_bag(path) as bag:
         kinds = listed(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
         fields = _fields_of_topics(path, sorted(bag.topics, key=len, reverse=True), columns, kinds)
@@ -68,12 +72,24 @@ def _decode(path: Path, columns: Sequence[str], notes: list[str]) -> dict[str, _
                 else _number(message, field, place)
                 for field in fields[topic].values()
             ]
-            names = tuple(sorted(map(str, getattr(message, "name", ()))))
-            times = _stamp(message), 1e-9 * received
-            rows[topic].append((*times, (publisher, names), *values))
+            names = getattr(message, "name", ())
+            joints = tuple(sorted(map(str, names))) if hasattr(names, "__len__") else ()
+            rows[topic].append((_stamp(message), 1e-9 * received, (publisher, joints), *values))
         notes += bag.notes
+    content = {topic: np.array(x, dtype=object) for topic, x in rows.items()}
+    if empty := [topic for topic, x in content.items() if not len(x)]:
+        raise LogError(f"{path}: {listed(empty)} has no message, choose another of {kinds}")
+    delays = {}
+    for topic, (stamps, times) in {x: y[:, :2].astype(float).T for x, y in content.items()}.items():
+        if (stamps > 0).any():
+            delays[topic] = float(np.median((times - stamps)[stamps > 0]))
+    far = [topic for topic, delay in delays.items() if abs(delay) > max_age]
+    if far and len(delays) < len(content):
+        notes.append(f"stamps of {listed(far)} are off by {delays[far[0]]:.4g} s: times of receipt")
+        for topic in delays:
+            content[topic][:, 0] = None
     return {
-        topic: _topic(path, topic, list(names), np.array(rows[topic], dtype=object), kinds, notes)
+        topic: _topic(path, topic, list(names), content[topic], kinds, notes)
         for topic, names in fields.items()
     }
 
@@ -82,8 +98,6 @@ def _topic(
     path: Path, topic: str, columns: list[str], rows: np.ndarray, kinds: str, notes: list[str]
 ) -> _Topic:
     """Return the values of a topic in the order of the times of its messages."""
-    if not len(rows):
-        raise LogError(f"{path}: the topic {topic} has no message, choose another of {kinds}")
     stamps, times = rows[:, :2].astype(float).T
     keep = np.arange(len(rows))
     if (stamps > 0).any():
