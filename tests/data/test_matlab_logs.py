@@ -158,7 +158,8 @@ def test_elements_are_runs(tmp_path, form, version):
         {name: x[: 200 + k] * (1 + k) ** (name != "t") for name, x in SIGNALS.items()}
         for k in range(4)
     ]
-    content = form(trials)
+    empty = {name: np.empty((0, 0)) for name in trials[0]}  # of a trial that was aborted
+    content = form([*trials, empty])
     matio.save_to_mat(str(tmp_path / "run.mat"), content, version=version)
     prefix = "trial." if "trial" in content else "trial_"
     part = dict(runs=1, piece=0.5)

@@ -46,10 +46,12 @@ def elements(
         runs.setdefault(run, {})[_INDEX.sub("", name)] = value
     common = runs.pop("", {})
     names = {*columns, *(column.rpartition("_")[0] for column in columns)}
-    if all({x, x.rpartition("_")[0]} & variables.keys() for x in columns):
-        return {"": dict(variables)}
-    runs = {run: values for run, values in runs.items() if names & values.keys()}
-    if not runs:
+    runs = {
+        run: values
+        for run, values in runs.items()
+        if any(np.size(values[name]) for name in names & values.keys())
+    }
+    if not runs or all({x, x.rpartition("_")[0]} & variables.keys() for x in columns):
         return {"": dict(variables)}
     used = [np.size(x) for values in runs.values() for name, x in values.items() if name in names]
     if max(used) < len(runs) and all(

@@ -1,0 +1,99 @@
+"""LeRobot's names, Parquet of structs and lists, compound data sets and attributes of HDF5."""
+
+import json
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+
+from pinn_dyn.data.logs import LogError
+from tests.data import log_formats as formats
+from tests.data.logs_files import motion, source
+
+TABLE = motion(6.0)
+Q, V, U = (TABLE.filter(regex=f"^{name}").to_numpy() for name in "qvu")
+LEROBOT = dict(
+    files="data/*/*.parquet",
+    trajectory="episode_index",
+    time=dict(columns="timestamp", unit="s"),
+    q=dict(columns=["observation.state_1", "observation.state_2"], unit="rad"),
+    v=None,
+    u=dict(columns=["action_1", "action_2"], unit="Nm"),
+)
+HDF5 = dict(
+    files="*.h5",
+    time=dict(columns="log/t", unit="s"),
+    q=dict(columns=["log/q_1", "log/q_2"], unit="rad"),
+    v=dict(columns=["log/v_1", "log/v_2"], unit="rad/s"),
+    u=dict(columns=["log/u_1", "log/u_2"], unit="Nm"),
+)
+
+
+def raw(log):
+    return log.cleaned[0].raw
+
+
+def assert_motion(log):
+    run = raw(log)
+    for ours, theirs in ((run.t, TABLE["t"]), (run.q, Q), (run.u, U)):
+        np.testing.assert_allclose(ours, theirs[: len(run)], atol=1e-9)
+
+
+def write_lerobot(folder, names):
+    formats.write_lerobot(folder, TABLE)
+    (folder / "meta").mkdir()
+    info = {"features": {"observation.state": {"names": names}, "timestamp": {"names": None}}}
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["main_shoulder_pan", "elbow.pos"],
+        {"motors": ["main_shoulder_pan", "elbow.pos"]},
+        {"axes": [["main_shoulder_pan"], ["elbow.pos"]]},
+        {"main_shoulder_pan": 0, "elbow.pos": 1},
+    ],
+)
+def test_lerobot_entries_have_the_names_of_the_data_set(tmp_path, names):
+    write_lerobot(tmp_path, names)
+    q = [f"observation.state/{name}" for name in ("elbow.pos", "main_shoulder_pan")]
+    run = raw(source(tmp_path, **LEROBOT | {"q": dict(columns=q, unit="rad")}))
+    np.testing.assert_allclose(run.q, Q[: len(run), ::-1])
+
+
+def test_lerobot_names_that_do_not_fit_are_answered_with_numbers_that_work(tmp_path):
+    write_lerobot(tmp_path, ["elbow"])
+    q = dict(columns=["observation.state/elbow"], unit="rad")
+    with pytest.raises(LogError, match=r"1 names .* 2 entries.* observation.state_1 to .*_2;"):
+        source(tmp_path, **LEROBOT | {"q": q}).load()
+    assert_motion(source(tmp_path, **LEROBOT))
+
+
+def test_parquet_of_structs_nested_lists_and_an_index(tmp_path):
+    frame = pd.DataFrame({"state": [{"q": {"a": x, "b": y}} for x, y in Q]})
+    frame["u"] = [[[x], [y]] for x, y in U]
+    frame.set_axis(pd.Index(TABLE["t"], name="t")).to_parquet(tmp_path / "run.parquet")
+    q = dict(columns=["state.q.a", "state.q.b"], unit="rad")
+    u = dict(columns=["u_1", "u_2"], unit="Nm")
+    assert_motion(source(tmp_path, files="run.parquet", q=q, v=None, u=u))
+
+
+def test_hdf5_of_compound_data_and_images(tmp_path):
+    rows = np.zeros(len(TABLE), [("t", "f8"), *((name, "f8", 2) for name in "qvu"), ("mode", "S4")])
+    rows["t"], rows["q"], rows["v"], rows["u"] = TABLE["t"], Q, V, U
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["log"] = rows
+        file.create_dataset("images", (len(TABLE), 9999, 9999, 3), "u1")  # 180 GB: not loaded
+    assert_motion(source(tmp_path, **HDF5))
+
+
+def test_the_rate_in_an_hdf5_file_without_clock_is_named(tmp_path):
+    formats.write_hdf5(tmp_path / "run.h5", TABLE)
+    with h5py.File(tmp_path / "run.h5", "a") as file:
+        del file["log/t"]
+        file["log"].attrs["fps"] = 100
+    with pytest.raises(LogError, match=r"write time: \{rate: 100\}.*log/q \(601, 2\).*log@fps"):
+        source(tmp_path, **HDF5).load()
+    assert_motion(source(tmp_path, **HDF5 | {"time": {"rate": 100}}))
