@@ -1,5 +1,6 @@
 """A motion in the forms of MATLAB and Simulink gives the trajectories of the same CSV."""
 
+import h5py
 import matio
 import numpy as np
 import pandas as pd
@@ -167,6 +168,14 @@ def test_elements_are_runs(tmp_path, form, version):
     recordings = {x.raw.run: x.raw for x in log.cleaned}
     assert len(recordings) == 4
     np.testing.assert_allclose(recordings["3"].q, trials[2]["q"])
+
+
+def test_an_hdf5_file_that_is_called_mat_is_read_as_hdf5(tmp_path, expected):
+    with h5py.File(tmp_path / "run.mat", "w") as file:
+        for name, values in SIGNALS.items():
+            file[f"log/{name}"] = values
+    (train,) = source(tmp_path, files="run.mat", **fields("log/")).load().train
+    np.testing.assert_allclose(train.q, expected[0].q, atol=1e-9)
 
 
 @pytest.mark.parametrize(

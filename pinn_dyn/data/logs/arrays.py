@@ -29,6 +29,8 @@ def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     if h5py.is_hdf5(path):  # version 7.3
         with h5py.File(path, "r") as file:
             _refuse(path, _visited(h5py, file)[1])
+            if not any("MATLAB_class" in item.attrs for item in file.values()):
+                return read_hdf5(path, request)
     runs = elements(matlab_variables(path), request.time, request.columns)
     return {run: table_of_arrays(path, request, variables) for run, variables in runs.items()}
 
@@ -129,9 +131,9 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
             problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
             problem += f"real numbers in {samples} rows."
         elif name not in columns and name == request.time:
-            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or ''}; "
+            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or '.'} "
             rate = next((y for x, y in scalars.items() if _RATE.search(x)), 100)
-            problem += f"without a clock write time: {{rate: {rate}}}, in Hz."
+            problem += f"Without a clock write time: {{rate: {rate}}}, in Hz."
         if problem:
             raise LogError(f"{path}: {problem} The file has {listed(sizes)}")
     return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
