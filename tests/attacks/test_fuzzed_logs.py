@@ -4,9 +4,10 @@ Some hundred here, the same ones each time. Others, for longer:
 ``pytest tests/attacks --hypothesis-profile=long -k fuzz``.
 """
 
+import contextlib
 import csv
 import functools
-import io
+import re
 import time
 
 import numpy as np
@@ -116,15 +117,19 @@ def read(source_of):
 
 
 def rows_of(content):
-    """The rows of a CSV file by Python's own reader, by their time."""
-    separator = max(",;\t", key=content.split("\n")[0].count)
-    lines = csv.reader(io.StringIO(content), delimiter=separator, skipinitialspace=True)
-    names = [name.strip() for name in next(lines)]
-    found = {}
-    for row in filter(any, lines):
+    """The numbers of a text by their time: each line below the header by Python's own reader."""
+    found, names, separator = {}, [], ","
+    for line in re.split("[\r\n]+", content):
+        if not set(COLUMNS) <= set(names):
+            separator = max(",;\t |", key=line.count)
+        row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+        if not set(COLUMNS) <= set(names):
+            names = [name.strip() for name in row]
+            continue
         values = dict(zip(names, row, strict=False))
-        t, *others = (number(values[name]) for name in COLUMNS)
-        found[t] = others
+        with contextlib.suppress(KeyError, ValueError):  # lines that hold no row
+            t, *others = (number(values[name]) for name in COLUMNS)
+            found[t] = others
     return found
 
 

@@ -239,7 +239,7 @@ def test_short_stretches_are_dropped_and_named(folder):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (dict(q=dict(columns=["q1"], unit="degree")), r"q: unit is 'degree': did you mean deg.*"),
+        (dict(q=dict(columns=["q1"], unit="dgr")), r"q: unit is 'dgr': did you mean deg.*"),
         (dict(q=dict(columns=["q1"], units="rad")), r"q.unit: .*q.units: Unexpected"),
         (dict(q=dict(columns=["q1", "q1"], unit="rad")), r"q: .*distinct names"),
         (dict(q=dict(columns=["q1", "q2"], unit=["rad"] * 3)), r"q: unit has 3 entries"),

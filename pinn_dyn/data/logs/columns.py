@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Annotated, Any, Literal, TypeVar
@@ -37,12 +38,29 @@ UNITS: dict[str, tuple[str, float]] = {
 """SI unit of each unit, and the factor to it: x_SI = factor * x."""
 
 
+_SPELLINGS = {
+    **dict.fromkeys(("°", "º", "degree", "degrees", "grad"), "deg"),
+    **dict.fromkeys(("sec", "second", "seconds"), "s"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **{"µs": "us", "μs": "us", "µm": "um", "μm": "um", "-": "1"},
+}
+"""Spellings of the parts of units in files."""
+
+
+def known_unit(text: str) -> str | None:
+    """Return the name of a unit that a file spells in its way, as ``[°/sec]``, or None."""
+    parts = re.sub(r"[][(){}\s·*⋅.]|(?<=N)-", "", text).split("/")
+    unit = "/".join(_SPELLINGS.get(part.lower(), part) for part in parts)
+    return unit if unit in UNITS else None
+
+
 def to_si(unit: str) -> tuple[str, float]:
     """Return the SI unit of a unit, and the factor to it."""
-    if unit not in UNITS:
+    name = known_unit(unit)
+    if name is None:
         hint = did_you_mean(unit, UNITS) or "."
         raise LogError(f"unit is {unit!r}{hint} Known units are {', '.join(UNITS)}")
-    return UNITS[unit]
+    return UNITS[name]
 
 
 STRICT = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
@@ -123,3 +141,23 @@ class Columns:
         for column, unit in zip(self.columns, self.units, strict=True):
             if unit not in expected:
                 raise LogError(f"{signal} has the column {column!r} in {unit}, expected {expected}")
+
+    def contradictions(self, signal: str, units: Mapping[str, str]) -> list[str]:
+        """Return a sentence for each column whose unit in the file, as in ``units``, differs."""
+        texts = []
+        for k, (column, unit) in enumerate(zip(self.columns, self.unit, strict=True)):
+            name = known_unit(units.get(column, ""))
+            if name in (None, "1") or self.units[k] in ("1", "1/s"):
+                continue
+            si, factor = UNITS[name]
+            # A letter in parentheses may be an index, and a factor may be a part of the scale.
+            if (len(name) == 1 and si != self.units[k]) or math.isclose(
+                abs(self.factors[k]), factor
+            ):
+                continue
+            if UNITS[name] != to_si(unit):
+                texts.append(
+                    f"column {column!r} ({signal}) is in {name} by the header of the file, but "
+                    f"the data set says {unit}: write unit: {name}"
+                )
+        return texts

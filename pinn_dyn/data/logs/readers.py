@@ -12,9 +12,6 @@ A reader of a file with several runs returns a mapping of their names to tables.
 
 from __future__ import annotations
 
-import csv
-import gzip
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -25,6 +22,8 @@ from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.parquet import read_parquet
 from pinn_dyn.data.logs.table import Request, Table
+from pinn_dyn.data.logs.tensors import read_npy, read_torch
+from pinn_dyn.data.logs.text import read_excel, read_text
 
 Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataFrame | Table]"]
 """Function that reads a file, or the runs of a file by name.
@@ -32,36 +31,15 @@ Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataF
 One row per sample; the index names a row in messages.
 """
 
-
-def read_csv(path: Path, request: Request) -> Table:
-    """Read a CSV file with a header line, separated by commas, semicolons or tabs."""
-    with (gzip.open if path.suffix == ".gz" else open)(path, "rt", encoding="utf-8-sig") as file:
-        header = file.readline()
-    separator = max(",;\t", key=header.count)
-    with warnings.catch_warnings():
-        # pandas would cut rows that are longer than the header, and only warn.
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        frame = pd.read_csv(
-            path,
-            sep=separator,
-            encoding="utf-8-sig",
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            low_memory=False,
-            index_col=False,
-        )
-    # pandas would number the columns of one name.
-    names = next(csv.reader([header], delimiter=separator, skipinitialspace=True))
-    frame.columns = pd.Index([name.strip() for name in names])
-    frame.index = pd.RangeIndex(2, len(frame) + 2)
-    return Table(frame.dropna(how="all"), str(path), "line")
-
-
 READERS: dict[str, Reader] = {
-    **dict.fromkeys((".csv", ".gz", ".txt", ".tsv", ".dat", ".log"), read_csv),
+    **dict.fromkeys((".csv", ".gz", ".txt", ".tsv", ".dat", ".log"), read_text),
+    **dict.fromkeys((".asc", ".lvm", ".mot", ".prn", ".sto", ".tab"), read_text),
     ".mat": read_mat,
     **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), read_excel),
     ".npz": read_npz,
+    ".npy": read_npy,
+    **dict.fromkeys((".pt", ".pth"), read_torch),
     ".parquet": read_parquet,
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }

@@ -95,6 +95,9 @@ class Layout:
             signal: columns.to_si(table.numbers(columns.columns, signal))
             for signal, columns in self.signals.items()
         }
+        for signal, columns in {"time": self.time, **self.signals}.items():
+            for text in columns.contradictions(signal, table.units):
+                report.warn("unit", f"{table.name}: {text}")
         results = []
         for run, mask in runs.items():
             rows = np.flatnonzero(mask)

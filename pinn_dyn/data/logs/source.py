@@ -85,6 +85,7 @@ class LogSource(DataSource):
         trajectory: str | None = None,
         long: str | None = None,
         max_age: PositiveFloat = 0.1,
+        sep: str | None = None,
         steps: Mapping[str, Step | None] | None = None,
         validation: Part | Mapping[str, Any] | None = None,
         test: Part | Mapping[str, Any] | None = None,
@@ -111,6 +112,7 @@ class LogSource(DataSource):
         self.trajectory = trajectory
         self.long = long
         self.max_age = max_age
+        self.sep = sep
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
         self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
         if (validation is None) != (test is None):
@@ -190,7 +192,7 @@ class LogSource(DataSource):
     def _layout(self) -> Layout:
         columns = [x for part in (self.time, *self._signals.values()) for x in part.columns]
         columns += [] if self.trajectory is None else [self.trajectory]
-        request = Request(next(iter(self.time.columns), ""), columns, self.max_age)
+        request = Request(next(iter(self.time.columns), ""), columns, self.max_age, self.sep)
         return Layout(self.time, self._signals, self.trajectory, self.long, request, self._repairs)
 
     @cached_property

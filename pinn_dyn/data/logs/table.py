@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +23,13 @@ class Request:
         time: first column of the time; empty if the log has a rate instead.
         columns: all columns, those of the time among them. A reader may return more.
         max_age: oldest message of another topic of a bag that a row may use, s.
+        sep: separator of the cells of a text file; None detects it.
     """
 
     time: str
     columns: Sequence[str]
     max_age: float = 0.1
+    sep: str | None = None
 
 
 def optional(name: str, path: Path) -> Any:
@@ -48,12 +50,16 @@ class Table:
         name: file or frame, for messages.
         row: word for a row: ``"line"`` of a text file, ``"row"`` otherwise.
         notes: remarks of the reader, such as dropped rows.
+        units: texts of the file for the units of columns; they need not be units.
+        hint: end of the message about a missing column.
     """
 
     frame: pd.DataFrame
     name: str
     row: str = "row"
     notes: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    hint: str = ""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -81,7 +87,7 @@ class Table:
             return (index if name == "index" else index.get_level_values(name)).to_series()
         if not count:
             hint = did_you_mean(name, map(str, self.frame.columns)) or "."
-            names = f"{hint} The log has {listed(self.frame.columns)}"
+            names = f"{self.hint or hint} The log has {listed(self.frame.columns)}"
             raise LogError(f"{self.name}: no column {name!r}, which {signal} reads{names}")
         return self.frame[name]
 
@@ -96,7 +102,7 @@ class Table:
         if bad.any():
             k = int(bad.argmax())
             text = f"{str(raw.iloc[k])!r}"[:80]
-            text += f", expected a number with a decimal point ({int(bad.sum())} such rows)"
+            text += f", expected a number such as 1234.5 ({int(bad.sum())} such rows)"
             raise LogError(f"{self.place(k, name, signal)}: the value is {text}")
         return values
 
