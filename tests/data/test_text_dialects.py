@@ -72,6 +72,7 @@ LABVIEW = (
 )
 DIALECTS = {
     "semicolons": CSV.replace(",", ";"),
+    "bars": CSV.replace(",", "|"),
     "tabs": CSV.replace(",", "\t"),
     "blanks": CSV.replace(",", " "),
     "columns of blanks": each_line(CSV, lambda k, x: " " + re.sub(",", "   ", x)),
@@ -85,6 +86,7 @@ DIALECTS = {
     "sep": "sep=;\n" + german(CSV),
     "BOM": CSV.encode("utf-8-sig"),
     "UTF-16": CSV.encode("utf-16"),
+    "UTF-16 without mark": CSV.encode("utf-16-le"),
     "UTF-16 big-endian": b"\xfe\xff" + german(CSV).encode("utf-16-be"),
     "CRLF": CSV.replace("\n", "\r\n"),
     "old Mac": CSV.replace("\n", "\r"),
@@ -117,6 +119,7 @@ DIALECTS = {
     "German dates": each_line(
         german(CSV), lambda k, x: (f"20.11.2026 12:00:00,{k};" if k else "stamp;") + x),
     "LabVIEW": LABVIEW + (HEADER.replace("\n", ",Comment\n") + PLAIN).replace(",", "\t"),
+    "serial monitor": each_line(CSV, lambda k, x: f"12:00:{k // 99:02}.{k:03} -> {x}"),
     "NULs at the end": CSV + "\0" * 100,
 }  # fmt: skip
 OTHER_COLUMNS = {
@@ -138,6 +141,8 @@ OTHER_COLUMNS = {
         {key: dict(part, columns=[f"{x} [{part['unit']}]" for x in part["columns"]])
          for key, part in named("{}{}").items()},
     ),
+    "rostopic echo -p": (
+        CSV.replace("t,", "%time,", 1), {"time": dict(columns="%time", unit="s")}),
     "Windows-1252": (
         CSV.replace("q1", "Gelenk 1 [°]").replace("q2", "Gelenk 2 [°]").encode("cp1252"),
         {"q": dict(columns=["Gelenk 1 [°]", "Gelenk 2 [°]"], unit="deg", scale=180 / np.pi)},
@@ -180,7 +185,7 @@ def spoiled(change):
 
 DROPPED = {
     "cut short": (CSV[: CSV.rindex(",")], "line 602 is dropped, it is cut short", 600),
-    "footer": (CSV + "end of file\n", "line 603 is dropped", 601),
+    "footer": (CSV + "\nTotal: 601 rows\nend of file\n", "line 603 is dropped", 601),
     "restarted": (
         spoiled(lambda x: x.insert(300, HEADER.strip())),
         "1 lines that repeat the header",
@@ -208,6 +213,15 @@ BAD = {
         spoiled(lambda x: x.__setitem__(9, '0.08,"1,234.5",,,,,')),
         "line 10.*1,234",
     ),
+    "thousands in each row": (
+        "t,q1,v1,u1,q2,v2,u2\n"
+        + "".join(
+            f'{k / 100},"{1000 + k:,.3f}",{",".join(map(repr, x[2:]))}\n'
+            for k, x in enumerate(ROWS)
+        ),
+        r"'q1' \(q\): the value is '1,000.000'",
+    ),
+    "one column": ("q1\n0,1\n0,2\n", "2 cells, but the header in line 1 has 1 names"),
     "two decimal marks": (spoiled(lambda x: x.__setitem__(9, '0.08,"0,5",0,0,0,0,0')), "line 10"),
     "commas for both": (HEADER + PLAIN.replace(".", ","), "line 2: 14 cells.*header.*7 names"),
     "prose": ("A letter\nwithout numbers\n", "no rows of numbers"),

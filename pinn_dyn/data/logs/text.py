@@ -11,6 +11,7 @@ import csv
 import gzip
 import io
 import re
+import warnings
 from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -31,10 +32,13 @@ _NUMBERS = {
     for mark in ".,"
 }
 _NUMBER = {mark: re.compile(text, re.ASCII | re.IGNORECASE) for mark, text in _NUMBERS.items()}
-_ITEMS = r"(?:[-+.\deE]+|nan)(?:[\s,;]+(?:[-+.\deE]+|nan))"
-_BRACKETS = rf"[\[({{]\s*{_ITEMS}*[\s,;]*[\])}}]"
+_ITEM = r"(?:[-+.\deE]+|nan)"
+_BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
+_SERIAL = re.compile(r"^(\d+:[\d:.]+) -> ([^,;\t ]*)([,;\t ])", re.MULTILINE)
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
-_VECTOR = re.compile(rf"(?:array\()?{_BRACKETS}\)?|{_ITEMS}+", re.ASCII | re.IGNORECASE)
+_VECTOR = re.compile(
+    rf"(?:array\()?{_BRACKETS}\)?|{_ITEM}(?:[\s;]+{_ITEM})+", re.ASCII | re.IGNORECASE
+)
 
 
 class _Dialect(NamedTuple):
@@ -86,7 +90,7 @@ def read_excel(path: Path, request: Request) -> Table:
 
 
 def _decoded(content: bytes) -> str:
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff") or content[1:2] == b"\0":
         return content.decode("utf-16")
     try:
         return content.decode("utf-8-sig")
@@ -99,12 +103,14 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
     text = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
     if _BARE_BRACKETS.search(text, 0, 10_000):
         text = _BARE_BRACKETS.sub(r'"\g<0>"', text)
+    if _SERIAL.search(text, 0, 10_000):  # stamps of the serial monitor of Arduino
+        text = _SERIAL.sub(r"\1\3\2\3", text)
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]
     dialect = _dialect(lines, request.sep)
     if dialect is None:
         raise LogError(f"{path}: has no rows of numbers in its first {_SAMPLE} lines")
     names, header, start = _header(lines, dialect, request.columns)
-    if 1 < len(names) < dialect.width:
+    if len(names) < dialect.width:
         raise LogError(
             f"{path}, line {start + 1}: {dialect.width} cells, but the header in line {header + 1} "
             f"has {len(names)} names: {listed(names)}"
@@ -112,19 +118,22 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
     # The lines above are empty, as quotes in them may be unbalanced.
     body = "\n" * start + text[sum(len(line) + 1 for line in lines[:start]) :]
     body, notes = _repaired(body, lines[:start], dialect)
-    frame = pd.read_csv(
-        io.BytesIO(body.encode()),
-        skiprows=start,
-        sep=r"\s+" if dialect.separator == " " else dialect.separator,
-        decimal=dialect.decimal,
-        header=None,
-        names=range(len(names)),
-        na_values=_NO_VALUES,
-        skipinitialspace=True,
-        skip_blank_lines=False,
-        low_memory=False,
-        index_col=False,
-    )
+    with warnings.catch_warnings():
+        # pandas would cut rows that are longer than the header, and only warn.
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        frame = pd.read_csv(
+            io.BytesIO(body.encode()),
+            skiprows=start,
+            sep=r"\s+" if dialect.separator == " " else dialect.separator,
+            decimal=dialect.decimal,
+            header=None,
+            names=range(len(names)),
+            na_values=_NO_VALUES,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            index_col=False,
+        )
     frame.index = pd.RangeIndex(start + 1, len(frame) + start + 1)
     frame = _with_vectors(frame.dropna(how="all"), names)
     units = _units(lines[header + 1 : start], dialect, names)
@@ -136,7 +145,7 @@ def _dialect(lines: Sequence[str], separator: str | None) -> _Dialect | None:
     """Return the dialect with which rows of equal width hold the largest number of numbers."""
     scores: Counter[_Dialect] = Counter()
     for decimal in ".,":
-        for mark in [separator] if separator else ",;\t ":
+        for mark in [separator] if separator else ",;\t| ":
             dialect = _Dialect(mark, decimal, 0)
             for line in lines[-100:] if mark != decimal else ():
                 weights = dialect.weights(line)
@@ -175,8 +184,8 @@ def _header(
     best = (len({str(k) for k in range(dialect.width)} & {*requested}), False, False, False, -1)
     names = [str(k) for k in range(dialect.width)]
     for k, line in enumerate(lines[:first]):
-        text = line.strip().lstrip("#%/") if _comment(line) else line
-        for candidate in _names(text, dialect):
+        bare = [line.lstrip(" \t#%/")] if _comment(line) else []
+        for candidate in [names for text in (line, *bare) for names in _names(text, dialect)]:
             if len(set(candidate)) < len(candidate) and k:
                 candidate = _grouped(dialect.cells(lines[k - 1]), candidate)
             matches = len({*candidate} & {*requested})
@@ -203,7 +212,7 @@ def _comment(line: str) -> bool:
 def _names(line: str, dialect: _Dialect) -> list[list[str]]:
     """Return the names that a header would hold, by the separators that it may have."""
     words = re.findall(r'"[^"]*"|[^\s\[(]+(?:[ \t]*[\[(][^\])]*[\])])?', line)
-    splits = [dialect.cells(line, mark) for mark in (dialect.separator, *",;\t") if mark != " "]
+    splits = [dialect.cells(line, mark) for mark in (dialect.separator, *",;\t|") if mark != " "]
     splits.append([word.strip('"') for word in words])
     for names in splits:
         while names and not names[-1]:
@@ -242,12 +251,17 @@ def _repaired(body: str, above: Sequence[str], dialect: _Dialect) -> tuple[str, 
             body = body.replace(f"\n{line}\n", "\n\n")
     if repeats:
         notes.append(f"{repeats} lines that repeat the header are dropped: a restarted recorder?")
-    end = body[-100_000:].rstrip("\n\0")
-    _, _, last = end.rpartition("\n")
-    if last != end and len(dialect.cells(last)) < dialect.width:
-        body = body[: body.rindex(last)]
-        notes.append(f"line {body.count(chr(10)) + 1} is dropped, it is cut short: {last[:80]}")
-    return body.rstrip("\0") if "\0" in end[-1:] + body[-1:] else body, notes
+    body = body.rstrip("\n\0 ")
+    end = body[-100_000:].split("\n")
+    cut = len(end)
+    while cut > 1 and len(weights := dialect.weights(end[cut - 1])) < dialect.width:
+        if cut < len(end) and any(weights):
+            break
+        cut -= 1
+    if end[cut:]:
+        body = body[: len(body) - len("\n".join(end[cut:]))]
+        notes.append(f"line {body.count(chr(10)) + 1} is dropped, it is cut short: {end[cut][:80]}")
+    return body, notes
 
 
 def _with_vectors(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
