@@ -116,6 +116,8 @@ DIALECTS = {
         CSV, lambda k, x: x[:-1] + (f",{3 * (k % 2) or ''}\n" if k else ",n\n")),
     "dates": each_line(
         CSV, lambda k, x: (f"2026-11-20 12:00:00.{k}," if k else "stamp,") + x),
+    "dates with points": each_line(
+        CSV, lambda k, x: (f"2026-11-20 12.00.{k}," if k else "stamp,") + x),
     "German dates": each_line(
         german(CSV), lambda k, x: (f"20.11.2026 12:00:00,{k};" if k else "stamp;") + x),
     "LabVIEW": LABVIEW + (HEADER.replace("\n", ",Comment\n") + PLAIN).replace(",", "\t"),

@@ -32,7 +32,7 @@ _NUMBERS = {
     for mark in ".,"
 }
 _NUMBER = {mark: re.compile(text, re.ASCII | re.IGNORECASE) for mark, text in _NUMBERS.items()}
-_ITEM = r"(?:[-+.\deE]+|nan)"
+_ITEM = rf"(?:{_NUMBERS['.']}|nan)"
 _BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
 _SERIAL = re.compile(r"^(\d+:[\d:.]+) -> ([^,;\t ]*)([,;\t ])", re.MULTILINE)
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
@@ -243,7 +243,7 @@ def _repaired(body: str, above: Sequence[str], dialect: _Dialect) -> tuple[str, 
     """Return the rows without comments, repeated headers and a last line cut short, with notes."""
     notes = []
     if any(mark in body for mark in _COMMENTS):
-        body = re.sub(rf"(?m)^(?:{'|'.join(_COMMENTS)}).*$", "", body)
+        body = re.sub(rf"(?m)^[ \t]*(?:{'|'.join(_COMMENTS)}).*$", "", body)
     repeats = 0
     for line in filter(str.strip, dict.fromkeys(above)):
         if repeat := body.count(f"\n{line}\n"):
