@@ -83,6 +83,7 @@ def hush() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")
     warnings.filterwarnings("ignore", r".*torch\._prims_common\.check")
+    warnings.filterwarnings("ignore", r"The `srun` command is available")
 
 
 COMMANDS = ("train", "evaluate", "control", "gather", "check", "excite")

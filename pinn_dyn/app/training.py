@@ -242,9 +242,11 @@ def train(
                 learner.covariance = start_from.covariance
             batches = EnsembleData(windows, ensemble) if ensemble > 1 else windows
             record = _fit(loop, learner, batches, checkpoint, run_folder, source, recorder)
+            error = record["validation"].get(VALIDATION_ERROR, float("nan"))
+            diverged = record["validation"].get("val/diverged", 0)
             log.info(
-                "%s seed %d: validation error %.5f over %s after %.0f s of training, in %s",
-                *(name, seed, record["validation"].get(VALIDATION_ERROR, float("nan"))),
+                "%s seed %d: validation error %s over %s after %.0f s of training, in %s",
+                *(name, seed, f"{diverged:g} diverged" if diverged else f"{error:.5f}"),
                 *(rollouts, record["training_seconds"], run_folder),
             )
     # The builder of a built model gives a model for the weights of the checkpoint.
@@ -314,7 +316,7 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
     if model.input_history > windows.history:
         raise ValueError(
             f"delay.longest is {model.input_history} s, and data.history {windows.history} s: set "
-            "both to the same time"
+            f"data.history={model.input_history}"
         )
 
 

@@ -51,7 +51,7 @@ class EnsembleLearner(DynamicsLearner):
         if type(optimizer) not in ELEMENTWISE:
             raise ValueError(
                 f"optimizer is {type(optimizer).__name__}, which mixes the weights of different "
-                "members: use optimizer=adamw or soap, or train.py -m seed=0,1,2"
+                "members: use optimizer=adamw or optimizer=soap"
             )
         return optimizer
 

@@ -68,7 +68,7 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         self.inverse_mass = inverse_mass(self._scales(statistics, inverse_mass_scale.sqrt()))
         if self.inverse_mass.transposed:
             raise ValueError(
-                "inverse_mass.transposed is true, expected false: M^-1 = L L^T suits chains already"
+                "M^-1 = L L^T suits chains already: set model.inverse_mass.transposed=false"
             )
 
     def inverse_mass_matrix(self, q: Tensor) -> Tensor:

@@ -153,7 +153,7 @@ class PhysicalBodies(Constants):
             if not smallest > 0:
                 raise ValueError(
                     f"body {name!r} has a pseudo-inertia with the eigenvalue {smallest:.3g}, "
-                    "expected positive ones: correct its <inertial>, or use start='generic'"
+                    "expected positive ones: correct its <inertial>, or use model.start=generic"
                 )
         parts = ["mass", "x extent", "y extent", "z extent", "xy shear", "xz shear", "yz shear"]
         parts += ["x centre", "y centre", "z centre"]

@@ -163,7 +163,7 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
         ("data.history=0.1 dataset.interpolation=hold", ["held between its samples"]),
         (
             "model/delay=learned data.history=0.05",
-            ["delay.longest is 0.1 s", "set both to the same time"],
+            ["delay.longest is 0.1 s", "set data.history=0.1"],
         ),
     ],
 )

@@ -130,7 +130,7 @@ def test_the_masked_passes_are_those_of_automatic_differentiation(angles):
 
 
 def test_a_lagrangian_chain_needs_the_transposed_form():
-    with pytest.raises(ValueError, match="transposed is false, expected both"):
+    with pytest.raises(ValueError, match="transposed=true"):
         make_structured("lnn", **CHAIN["hnn"])
     assert isinstance(make_structured("lnn", **CHAIN["lnn"]), LagrangianNetwork)
 

@@ -60,5 +60,5 @@ def test_a_step_and_its_gradients_are_those_of_the_scalar_function(kind, variant
 
 
 def test_a_transposed_head_is_refused_by_the_hamiltonian_network():
-    with pytest.raises(ValueError, match="transposed is true, expected false"):
+    with pytest.raises(ValueError, match="transposed=false"):
         make_structured("hnn", **TRANSPOSED)
