@@ -13,6 +13,7 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from pinn_dyn import check
 from pinn_dyn.data.simulation import has_cpp_compiler
 from tests.app.entry import ROOT, compose, own_logging
 
@@ -113,6 +114,17 @@ def test_ensemble_with_spread():
     lines = run("ensemble_with_spread.py", "--members", "2", "--steps", "2").splitlines()
     head = next(k for k, line in enumerate(lines) if line.split() == ["t", "error", "spread"])
     assert float(lines[head + 1].split()[2]) < float(lines[-1].split()[2])  # common start
+
+
+def test_write_servo_log(home):
+    """servo_arm.yaml reads the log, whose check proposes servos."""
+    main = runpy.run_path("write_servo_log.py")["main"]
+    main.__globals__["EPISODES"] = 5  # of 12
+    main("servo_arm.parquet")
+    place = f"hydra.searchpath=[file://{ROOT / 'examples' / 'conf'}]"
+    config = compose(place, "dataset=servo_arm").dataset
+    source = instantiate(OmegaConf.to_container(config, resolve=True), _convert_="all")
+    assert "model/input=servo" in check(source).options
 
 
 def test_write_example_bag(home):
