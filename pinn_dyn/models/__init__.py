@@ -8,6 +8,7 @@ from pinn_dyn.models.cholesky import (
     NetworkCholesky,
 )
 from pinn_dyn.models.delay import LearnedDelay
+from pinn_dyn.models.elastic import ElasticJoints
 from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
     CoulombFriction,
@@ -48,6 +49,7 @@ __all__ = [
     "ConstantCholesky",
     "ConstantInput",
     "CoulombFriction",
+    "ElasticJoints",
     "FixedCholesky",
     "FixedInput",
     "Friction",

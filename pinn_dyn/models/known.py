@@ -12,6 +12,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from pinn_dyn.mechanics import RK4, Integrator
+from pinn_dyn.models.elastic import ElasticJoints, Springs
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
 from pinn_dyn.models.known_slopes import KnownSamples, KnownSlopes
@@ -70,7 +71,8 @@ class KnownMechanics(LearnedConstants):
     force of the initial bodies at typical states.
 
     With servos (:class:`Servo`) the inputs are targets, and A u is the force of the servos. k is
-    their stiffness, and D contains their damping.
+    their stiffness, and D contains their damping. With :class:`ElasticJoints` the coordinates are
+    link and motor angles, and the inputs drive the motors.
 
     Args:
         statistics: scales of the data.
@@ -84,7 +86,7 @@ class KnownMechanics(LearnedConstants):
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
         integrator: the integration method; Rosenbrock if friction dominates inertia.
         driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
-            default is all joints.
+            default is all joints, or the motors of elastic joints.
         input: builder of the servos, if the inputs are targets; k is then ``input.stiffness``.
 
     Raises:
@@ -111,7 +113,8 @@ class KnownMechanics(LearnedConstants):
                 "RigidChain: use model=known_system for the constants of other systems"
             )
         names, size = structure.joint_names, structure.num_coordinates
-        driven = list(driven_joints or names)
+        elastic = structure if isinstance(structure, ElasticJoints) else None
+        driven = list(driven_joints or (elastic.driven if elastic else names))
         inputs = statistics.num_inputs
         if input is not None and inputs == 2 * len(driven):
             inputs //= 2  # targets and feed-forward forces
@@ -155,6 +158,7 @@ class KnownMechanics(LearnedConstants):
             [joint.force for joint in motors.joints],
         )
         self.friction = friction(scales)
+        self.elastic = Springs(elastic) if elastic else None
         self.gain: Constants | None = None
         if gain_spread > 0 and self.servo is None:
             units = [f"{joint.force}/u" for joint in motors.joints]
@@ -179,6 +183,8 @@ class KnownMechanics(LearnedConstants):
             q = q + statistics.q_mean.to(q)
             rigid = self.structure.rigid_force(q, v, a, bodies.to(q), gravity=True)
             force = rigid.double().square().mean(0).sqrt()
+        if isinstance(self.structure, ElasticJoints):
+            force = force + self.structure.motor_forces(force)
         if driven is not None:
             force[self.driven] = driven
         return force
@@ -211,6 +217,8 @@ class KnownMechanics(LearnedConstants):
             lower = 0.0 if label in ("mass", "Ixx", "Iyy", "Izz") else -float("inf")
             constants.append(Named(names, [unit] * len(names), table[:, column], lower))
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
+        if self.elastic is not None:
+            drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
         gains = [] if self.gain is None else [self.gain.named()]
         if self.servo is not None:
             gains = self.servo.physical_constants()
@@ -226,7 +234,10 @@ class KnownMechanics(LearnedConstants):
         return force @ self.motors
 
     def drive_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return r a + D v + F(v) - o - motor force, ``(*batch, N)``, all terms except Y pi."""
+        """Return r a + D v + F(v) - o - motor force, ``(*batch, N)``.
+
+        The terms Y pi and the forces of elastic joints are not in this force.
+        """
         resistance = self.rotor_inertia() * a + self.viscous() * v + self.friction(v)
         return resistance - self.constant_force() - self.motor_force(q, v, u)
 
@@ -238,6 +249,7 @@ class KnownMechanics(LearnedConstants):
         fitted = self.structure.rigid_force(q, v, a, self.bodies(), gravity=True)
         initial = self.structure.rigid_force(q, v, a, self.bodies.start(), gravity=True)
         ratio = (fitted + self.rotor_inertia() * a).norm(dim=0) / initial.norm(dim=0)
+        ratio = torch.where(initial.norm(dim=0) > 0, ratio, 1.0)  # a motor has no body
         return ratio[self.driven] * self.fixed_gain / self.input_gain(), self._largest_ratio
 
     def slopes(self) -> KnownSlopes:
@@ -253,13 +265,16 @@ class KnownMechanics(LearnedConstants):
     def potential_energy(self, q: Tensor) -> Tensor:
         self._check(q=q)
         energy = self.structure.potential_energy(q, self.bodies())
-        return energy + ((0.5 * self._springs() * q - self.constant_force()) * q).sum(-1)
+        return energy + ((0.5 * self._spring_force(q) - self.constant_force()) * q).sum(-1)
 
     def damping_matrix(self, q: Tensor) -> Tensor:
         rates = self.viscous()
         if self.servo is not None:
             rates = rates + self.servo.damping_rates()
-        return torch.diag_embed(rates.expand_as(q))
+        matrix = torch.diag(rates)
+        if self.elastic is not None:
+            matrix = matrix + self.elastic.matrices()[1]
+        return matrix.expand(*q.shape, -1)
 
     def input_matrix(self, q: Tensor) -> Tensor:
         if self.servo is not None:
@@ -274,11 +289,16 @@ class KnownMechanics(LearnedConstants):
         return force if self.input_affine or not self.servo else force + self.servo.excess(q, v, u)
 
     def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
-        return torch.diag(self._springs()) if self.servo else None
+        servo = torch.diag(self.servo.springs()) if self.servo else None
+        if self.elastic is None:
+            return servo
+        joints = self.elastic.matrices()[0]
+        return joints if servo is None else joints + servo
 
-    def _springs(self) -> Tensor:
-        """Return the stiffness of springs, ``(N,)``."""
-        return self.servo.springs() if self.servo else torch.zeros_like(self.viscous())
+    def _spring_force(self, q: Tensor) -> Tensor:
+        """Return the part of G from servos and elastic joints, ``(*batch, N)``."""
+        stiffness = self._stiffness_matrix(q)
+        return torch.zeros_like(q) if stiffness is None else q @ stiffness
 
     def _inertial_force(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
         force = self.structure.rigid_force(q, v, a, self.bodies(), gravity=False)
@@ -287,11 +307,11 @@ class KnownMechanics(LearnedConstants):
     def _potential_force(self, q: Tensor) -> Tensor:
         zero = torch.zeros_like(q)
         gravity = self.structure.rigid_force(q, zero, zero, self.bodies(), gravity=True)
-        return gravity + self._springs() * q - self.constant_force()
+        return gravity + self._spring_force(q) - self.constant_force()
 
     def _mass_and_bias(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         mass, bias = self.structure.mass_and_bias(q, v, self.bodies())
-        bias = bias + self._springs() * q - self.constant_force()
+        bias = bias + self._spring_force(q) - self.constant_force()
         return mass + torch.diag(self.rotor_inertia()), bias
 
     def _friction_force(self, v: Tensor) -> Tensor:

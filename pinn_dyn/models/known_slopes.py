@@ -31,7 +31,7 @@ class KnownSlopes(Slopes):
         return self.by_regressor(self.model.structure.regressor(q, v, a), q, v, a, u)
 
     def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
-        drives = self._drive_slopes(lambda m: m.drive_force(*at), at[0])
+        drives = self._drive_slopes(lambda m: _elements(m, *at), at[0])
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
@@ -41,6 +41,9 @@ class KnownSlopes(Slopes):
             force = self.model.drive_force(*state, a, u).sum()
             drives = torch.autograd.grad(force, state, materialize_grads=True)
         by_q, by_v = (x + torch.diag_embed(y) for x, y in zip((by_q, by_v), drives, strict=True))
+        if self.model.elastic is not None:
+            stiffness, damping = self.model.elastic.matrices()
+            by_q, by_v = by_q + stiffness, by_v + damping
         return torch.cat([by_q, by_v], dim=-1)
 
     def gain(self) -> Tensor:
@@ -70,16 +73,23 @@ class KnownSlopes(Slopes):
             total = functional_call(called, values, ()).sum()
             slopes = torch.autograd.grad(total, list(values.values()), materialize_grads=True)
         # Constants of drives have an entry for each driven joint instead of each joint.
-        driven = "model.armature", "model.offset", "model.gain", "model.servo."
+        sides = dict.fromkeys(("armature", "offset", "gain", "servo"), self.model.motors)
+        if self.model.elastic is not None:
+            sides["elastic"] = self.model.elastic.stretch
+        parts = [name.split(".")[1] for name in values]
         return torch.cat(
             [
-                self.model.motors.mT * slope.unsqueeze(-2)
-                if name.startswith(driven)
-                else torch.diag_embed(slope)
-                for name, slope in zip(values, slopes, strict=True)
+                sides[part].mT * slope.unsqueeze(-2) if part in sides else torch.diag_embed(slope)
+                for part, slope in zip(parts, slopes, strict=True)
             ],
             dim=-1,
         )
+
+
+def _elements(model: Any, q: Tensor, v: Tensor, *at: Tensor) -> Tensor:
+    """Return the forces of all drives, and then of all springs, ``(*batch, N + S)``."""
+    force = model.drive_force(q, v, *at)
+    return force if model.elastic is None else torch.cat([force, model.elastic.forces(q, v)], -1)
 
 
 class KnownSamples(Samples):
@@ -91,7 +101,11 @@ class KnownSamples(Samples):
 
     def missing_force(self) -> Tensor:
         bodies = self._regressor @ self.model.body_parameters().flatten()
-        return bodies + self.model.drive_force(*self.at)
+        force = bodies + self.model.drive_force(*self.at)
+        if self.model.elastic is None:
+            return force
+        q, v, *_ = self.at
+        return force + self.model.elastic.forces(q, v) @ self.model.elastic.stretch
 
     def by_parameters(self) -> Tensor:
         return self.model.slopes().by_regressor(self._regressor, *self.at)

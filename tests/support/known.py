@@ -7,7 +7,7 @@ import torch
 
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.models import KnownMechanics, KnownSystem, Scales, Statistics, Stribeck
+from pinn_dyn.models import ElasticJoints, KnownMechanics, KnownSystem, Scales, Statistics, Stribeck
 from pinn_dyn.systems import RigidChain, SoftArm
 from tests.support.cart_pole import CartPole
 from tests.support.rigid_chains import TREE
@@ -44,6 +44,17 @@ def known_model(urdf=TREE, locked_joints=("wrist",), friction=Stribeck, **settin
     model = KnownMechanics(scales, structure, **heads, **settings).double()
     # The model is built in single precision, in which rotations are no longer exact.
     model.structure = RigidChain(urdf, locked_joints=locked_joints)
+    return model
+
+
+def elastic_model(urdf=TREE, locked_joints=("wrist",), joints=("turn", "bend"), **settings):
+    """Generic bodies with chosen elastic joints, in float64."""
+    chain = RigidChain(urdf, locked_joints=locked_joints)
+    structure = ElasticJoints(chain, joints=joints, stiffness=10.0)
+    data, inputs = statistics(structure.num_coordinates), statistics(chain.num_coordinates)
+    data = replace(data, u_mean=inputs.u_mean, u_std=inputs.u_std)
+    model = KnownMechanics(data, structure, **settings).double()
+    model.structure.chain = RigidChain(urdf, locked_joints=locked_joints)
     return model
 
 

@@ -10,13 +10,14 @@ from pinn_dyn.mechanics import RK4
 from pinn_dyn.models import Servo, Stribeck
 from pinn_dyn.models.learned_constants import Slopes
 from pinn_dyn.training.sensitivity import rollout_slopes
-from tests.support.known import known_arm, known_model, windows_of
+from tests.support.known import elastic_model, known_arm, known_model, windows_of
 
 MODELS = {
     "Stribeck": lambda: known_model(gain_spread=0.3, friction=Stribeck),
     "servos": lambda: known_model(
         friction=Stribeck, input=partial(Servo, stiffness=3.0, limit="learned")
     ),
+    "elastic joints": lambda: elastic_model(friction=Stribeck, gain_spread=0.3),
     "soft arm": known_arm,
     "two segments": lambda: known_arm(2),
 }
@@ -52,12 +53,17 @@ def some_directions(model):
     return torch.randn(3, count, generator=torch.Generator().manual_seed(4)).double()
 
 
+def sample(model):
+    q, v, a = torch.randn(3, 6, model.num_coordinates).double()
+    return q, v, a, torch.randn(6, model.num_inputs).double()
+
+
 def assert_close(actual, expected, tolerance=1e-6):
     assert (actual - expected).abs().max() <= tolerance * expected.abs().max()
 
 
 def test_the_force_and_the_gains_by_the_parameters(model):
-    q, v, a, u = torch.randn(4, 6, model.num_coordinates).double()
+    q, v, a, u = sample(model)
     slopes = model.slopes()
     directions = some_directions(model)
     force = differences(model, lambda: model.missing_force(q, v, a, u), directions)
@@ -67,7 +73,7 @@ def test_the_force_and_the_gains_by_the_parameters(model):
 
 
 def test_closed_formulas_are_the_slopes_of_every_model(model):
-    at = torch.randn(4, 6, model.num_coordinates).double()
+    at = sample(model)
     own, plain = model.slopes(), Slopes(model)
     assert_close(own.by_parameters(*at), plain.by_parameters(*at))
     assert_close(own.by_state(*at), plain.by_state(*at))
@@ -76,7 +82,7 @@ def test_closed_formulas_are_the_slopes_of_every_model(model):
 
 def test_samples_follow_the_parameters(model):
     """Of fixed samples, whose regressor was computed before."""
-    at = torch.randn(4, 6, model.num_coordinates).double()
+    at = sample(model)
     samples = model.samples(*at)
     with torch.no_grad():
         for part in model.parameters():
