@@ -19,10 +19,15 @@ mujoco = pytest.importorskip("mujoco", reason="the mujoco extra is not installed
 pinocchio = pytest.importorskip("pinocchio", reason="the dev extra is not installed")
 FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
 BOX = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+MJCF = """<mujoco><worldbody><body name="arm" pos="0 0 1" euler="20 30 40">
+  <joint name="pitch" axis="0 1 0"/><joint name="roll" axis="1 0 0" pos="0 0 0.1"/>
+  <geom size="0.1"/><body pos="0.3 0 0" euler="10 0 5"><geom type="box" size="0.1 0.2 0.1"/>
+  <joint name="slide" type="slide" axis="0 0 1"/></body></body></worldbody></mujoco>"""
 # Branches, prismatic and reversed joints, fixed links and locked joints.
 ROBOTS = {
     "tree": (TREE.replace('<link name="bracket">', f'<link name="bracket">{BOX}'), ["wrist"]),
     "spatial": (TREE, ["fork", "slide"]),
+    "mjcf": (MJCF, []),
     "panda": ("franka_panda/panda.urdf", FINGERS),
 }
 FORK = '<joint name="fork" type="revolute">'
