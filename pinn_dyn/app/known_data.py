@@ -78,11 +78,11 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
     if structure.tree.held:
         log.info("the base is fixed, joints that are held: %s", ", ".join(structure.tree.held))
     names = structure.joint_names
-    for key, others in signals[1:-1]:
-        if (order := _joints_of(list(others), names)) not in (None, names):
-            columns = [list(others)[order.index(name)] for name in names]
+    for key, speeds in signals[1:-1]:
+        if (order := _joints_of(list(speeds), names)) not in (None, names):
+            columns = [list(speeds)[order.index(name)] for name in names]
             raise ConfigError(
-                f"{key} has the order {', '.join(others)}, and q that of the joints "
+                f"{key} has the order {', '.join(speeds)}, and q that of the joints "
                 f"{', '.join(names)}: expected {key}=[{','.join(columns)}]"
             )
     for (column, unit), joint, turns in zip(units.items(), names, structure.turning, strict=True):
@@ -104,11 +104,9 @@ def _check_order(key: str, columns: Sequence[str], structure: RigidChain) -> Non
     steps = {_number(x) - _number(y) for x, y in zip(columns, names, strict=False)}
     crossed = any(x not in (None, k) for k, x in enumerate(matches)) and len(steps) > 1
     if len(columns) != len(names) or (crossed and structure.joints is None):
-        others = iter([name for k, name in enumerate(names) if k not in matches])
-        guess = [next(others, "?") if k is None else names[k] for k in matches]
-        way = (
-            f"name the joints of the columns in their order, as {_PATH}.joints=[{','.join(guess)}]"
-        )
+        free = iter([name for k, name in enumerate(names) if k not in matches])
+        guess = ",".join(next(free, "?") if k is None else names[k] for k in matches)
+        way = f"name the joints of the columns in their order, as {_PATH}.joints=[{guess}]"
         raise ConfigError(
             f"{key} has the columns {', '.join(columns)}, and {_PATH} the joints "
             f"{', '.join(names)}: {'leave out columns' if '?' in guess else way}"

@@ -83,9 +83,9 @@ def read_urdf(
     movable = [name for name in file.order if file.moves(name) and name not in locked]
     if joints is None:
         joints = [name for name in movable if file.drive(name)[0] == name]
-    for key, names, known in (("locked_joints", locked, file.order), ("joints", joints, movable)):
-        if wrong := [name for name in names if name not in known or [*names].count(name) > 1]:
-            raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {known}")
+    for key, names, allowed in (("locked_joints", locked, file.order), ("joints", joints, movable)):
+        if wrong := [name for name in names if name not in allowed or [*names].count(name) > 1]:
+            raise ValueError(f"{file.path}: {key} has {wrong}, expected once each of {allowed}")
     if not joints:
         raise ValueError(f"{file.path} has no joint that moves (locked: {list(locked)})")
     children = [file.ends[name][1] for name in file.joints]
