@@ -50,7 +50,7 @@ class KnownAndNetwork(Sum):
         first = known(statistics=statistics)
         # The network computes forces, so its scales are those of torques instead of currents.
         force = first.typical_force[first.driven].to(statistics.u_mean)
-        force = force.repeat(statistics.num_inputs // len(force))
+        force = force.repeat(statistics.num_inputs // max(len(force), 1))
         forces = replace(statistics, u_mean=0 * force, u_std=force)
         second = network(statistics=forces)
         drives = second.input(statistics.q_mean[None].float()).any()

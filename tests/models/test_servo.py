@@ -1,5 +1,6 @@
 """Position servos: passive mechanical systems whose inputs are targets."""
 
+from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -112,6 +113,15 @@ def test_an_implicit_step_is_stable_with_a_stiff_servo(kind):
     implicit, explicit = (model.predict(x0, t, Signal(t, target.expand(51, 2))) for model in models)
     assert float((implicit[-1, :2] - target).abs().max()) < 1e-3
     assert not float(explicit.nan_to_num(torch.inf).abs().max()) < 10
+
+
+def test_the_network_of_a_sum_has_the_scales_of_the_servos_forces():
+    """Feed-forward forces double the inputs, but not the forces."""
+    scales = replace(statistics(5), u_mean=torch.zeros(10), u_std=torch.ones(10))
+    part = partial(KnownMechanics, structure=RigidChain(TREE), input=Servo)
+    model = KnownAndNetwork(scales, part, partial(LagrangianNetwork, input=NoInput))
+    assert model.num_inputs == 10
+    assert_near(model.force, model.known.typical_force, 1e-6)
 
 
 MASS, LENGTH, STIFFNESS, DAMPING, LIMIT = 0.05, 0.1, 0.8, 0.02, 0.12
