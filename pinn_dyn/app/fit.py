@@ -33,7 +33,7 @@ def fit(
     frame: pd.DataFrame,
     *,
     q: Signals,
-    u: Signals,
+    u: Signals | None,
     v: Signals | None = None,
     time: Signals = "t",
     run: str | None = None,
@@ -67,9 +67,9 @@ def fit(
         ValueError: if columns, units, clocks or settings cannot be used; names them.
         NonFiniteLossError: if the loss becomes NaN or infinite.
     """
-    signals = {"time": time, "q": q, "u": u} | ({} if v is None else {"v": v})
+    signals = {"time": time, "q": q, "u": u, "v": v}
     columns: dict[str, Any] = {
-        name: value if isinstance(value, Mapping) else {"columns": value, "unit": _SI[name]}
+        name: {"columns": value, "unit": _SI[name]} if isinstance(value, (str, Sequence)) else value
         for name, value in signals.items()
     }
     source = LogSource(

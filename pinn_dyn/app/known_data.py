@@ -133,7 +133,7 @@ def check_known(model: Predictor, source: DataSource) -> None:
     names = model.structure.joint_names
     driven = [names[k] for k in model.driven]
     (key, q), *_, (input_key, u) = _signals(source)
-    halves = [list(u)[k : k + len(driven)] for k in range(0, len(u), len(driven))]
+    halves = [list(u)[k : k + len(driven)] for k in range(0, len(u), len(driven) or 1)]
     for name, columns, expected in (
         (key, list(q), names),
         *((input_key, x, driven) for x in halves),

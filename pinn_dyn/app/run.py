@@ -185,7 +185,7 @@ class Run:
     def predict(self, start: pd.DataFrame) -> pd.DataFrame: ...
 
     @overload
-    def predict(self, start: Values, u: Values, t: Values) -> np.ndarray: ...
+    def predict(self, start: Values, u: Values | None, t: Values) -> np.ndarray: ...
 
     def predict(
         self,
@@ -204,7 +204,7 @@ class Run:
 
         Args:
             start: (q, v), ``(*batch, 2N)``, or (q, p) if ``model.state`` is ``"qp"``; or a frame.
-            u: inputs at the times t, ``(*batch, T, M)``.
+            u: inputs at the times t, ``(*batch, T, M)``; None for a model without inputs.
             t: increasing times, ``(T,)``, s.
 
         Raises:
@@ -255,10 +255,11 @@ class Run:
         self, start: Values, u: Values | None, t: Values | None
     ) -> tuple[Tensor, Tensor, Signal]:
         x0 = self._array("start", start, 2 * self.model.num_coordinates, "2N")
-        if u is None or t is None:
-            raise TypeError("the input is missing: expected predict(start, u, t)")
         size = self.model.num_inputs
-        times, samples = _tensor("t", t), self._array("u", u, size, "M")
+        if t is None or (u is None and size):
+            raise TypeError("the input is missing: expected predict(start, u, t)")
+        times = _tensor("t", t)
+        samples = self._array("u", np.empty((times.numel(), 0)) if u is None else u, size, "M")
         if times.ndim != 1 or samples.ndim < 2 or samples.shape[-2] != len(times):
             shapes = f"u has shape {tuple(samples.shape)} and t {tuple(times.shape)}"
             raise ValueError(f"{shapes}, expected (*batch, T, {size}) and (T,)")

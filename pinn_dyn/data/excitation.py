@@ -50,8 +50,8 @@ class Excitation(abc.ABC):
 
 @dataclass(frozen=True)
 class _Bounded(Excitation):
-    offset: Annotated[Sequence[float], Field(min_length=1)]
-    amplitude: Annotated[Sequence[NonNegativeFloat], Field(min_length=1)]
+    offset: Sequence[float]
+    amplitude: Sequence[NonNegativeFloat]
 
     def _scaled(self, shape: np.ndarray, peak: np.ndarray) -> np.ndarray:
         """Return offset + peak * shape, for a shape ``(count, T, M)`` within [-1, 1]."""

@@ -107,6 +107,8 @@ class Windows:
         """Return means, standard deviations and ranges over the windows."""
 
         def spread(values: Tensor) -> Tensor:
+            if not values.numel():
+                return values.new_ones(values.shape[1:])
             std = values.std(0, correction=0)
             return torch.where(std > 1e-12, std, torch.ones_like(std))
 

@@ -238,15 +238,15 @@ def evaluate_models(
                 if result.corrected is not None:
                     row[f"{name}_within_corrected"] = result.within_corrected
                     row[f"{name}_factor"] = result.factor
-        if isinstance(model, MechanicalSystem):
+        if isinstance(model, MechanicalSystem) and model.num_inputs:
             try:
                 error = torque_error(model, truth, system=source.system)
                 row |= {"torque_error": error.mean, "torque_share": error.share}
                 torque.append(error.to_frame(source.labels).assign(run=run))
             except ValueError as message:
                 log.warning("no torque error: %s", message)
-            if model.has_residual:
-                row["residual_share"] = residual_share(model, truth)
+        if isinstance(model, MechanicalSystem) and model.has_residual:
+            row["residual_share"] = residual_share(model, truth)
         if isinstance(model, Sum):
             parts.append(part_shares(model, truth).assign(run=run))
         rows.append(row)

@@ -84,7 +84,7 @@ def constants_covariance(model: LearnedConstants, fit: Fit) -> tuple[Tensor, Ten
 
 def _units(item: Named, input_units: Sequence[str]) -> list[str]:
     """Return the units of constants; the unit of a drive gain contains the unit of its input."""
-    if not (item.names[0].startswith("drive gain of ") and input_units and all(input_units)):
+    if not (input_units and all(input_units) and item.names[0].startswith("drive gain of ")):
         return item.units
     pairs = zip(item.units, input_units, strict=True)
     return [unit.removesuffix("u") + input_unit for unit, input_unit in pairs]

@@ -40,8 +40,9 @@ class TermComparison:
         """
         versions = {}
         for name, *pair in zip(Terms._fields, self.true, self.learned, strict=True):
-            true, learned = (x.reshape(*self.q.shape, -1) for x in pair)
-            versions[name] = (true, learned, self.P @ true)
+            if pair[0].numel():  # no A without inputs
+                true, learned = (x.reshape(*self.q.shape, -1) for x in pair)
+                versions[name] = (true, learned, self.P @ true)
         mass = versions.pop("M")
         inverse = (_inverse(mass[0]), _inverse(mass[1]), _inverse(mass[2]))
         return {"M": mass, "M_inverse": inverse, **versions}

@@ -96,6 +96,8 @@ class LogCheck:
             tables[f"Rigid bodies, not determined: {self.rigid.undetermined}"] = self.rigid.joints
         lines = [f"{self.source.name}: check of the log"]
         for title, frame in tables.items():
+            if frame.empty:
+                continue
             text = frame.to_string(
                 index=False, na_rep="", float_format="{:.3g}".format, max_rows=_ROWS
             )
@@ -148,8 +150,9 @@ def check(
     coordinates = _coordinates(source, training, splits.test)
     noise = coordinates["noise of q"].to_numpy()
     highest = numbers.bandwidth(training, step, noise)
-    explained = numbers.explained_share(training, delays, step)
-    measurements = [*source.measurements, *_measured(coordinates, explained)]
+    measurements = [*source.measurements, *_limited(coordinates)]
+    if inputs:
+        measurements.append(_explained(numbers.explained_share(training, delays, step)))
     same_units = source.u.units[: len(source.q.units)] == source.q.units
     servo = same_units and numbers.target_distance(training, step, longest_delay) < _TARGET
     # The lag of a servo is no delay.
@@ -241,19 +244,22 @@ def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
     return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
 
-def _measured(coordinates: pd.DataFrame, explained: float) -> list[Measurement]:
+def _limited(coordinates: pd.DataFrame) -> list[Measurement]:
     results = []
     for name, limit, text in _LIMITS:
         for label, value in zip(coordinates["coordinate"], coordinates[name], strict=True):
             message = f"{label}: {text.format(100 * value)}"
             results.append(_judged(name, label, value, f"below {limit}", value > limit, message))
+    return results
+
+
+def _explained(share: float) -> Measurement:
     text = (
-        f"the inputs explain {100 * explained:.2g} % of the motion, at any delay: are these the "
+        f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
         "inputs of this robot, on the same clock?"
     )
     name, expected = "share of the motion that inputs add to (1, q, v)", f"at least {_EXPLAINED}"
-    bad = explained < _EXPLAINED
-    return [*results, _judged(name, "inputs", explained, expected, bad, text, "stop")]
+    return _judged(name, "inputs", share, expected, share < _EXPLAINED, text, "stop")
 
 
 def _filter(

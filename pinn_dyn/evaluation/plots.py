@@ -60,13 +60,16 @@ def panels(
 ) -> tuple[Figure, list[list[Axes]]]:
     """Create columns of panels over the times t in s; return the axes of each column.
 
-    ``columns`` has the label of the vertical axis of each panel, for each column.
+    ``columns`` has the label of the vertical axis of each panel, for each column. A column without
+    panels takes no place.
     """
-    rows = max(map(len, columns))
-    figure = Figure(figsize=(5.8 * len(columns), 1.55 * rows + 1.3), layout="constrained")
-    grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
-    axes = [list(column[: len(labels)]) for column, labels in zip(grid.T, columns, strict=True)]
-    for column, used, labels in zip(grid.T, axes, columns, strict=True):
+    filled = [labels for labels in columns if labels]
+    rows = max(map(len, filled))
+    figure = Figure(figsize=(5.8 * len(filled), 1.55 * rows + 1.3), layout="constrained")
+    grid = figure.subplots(rows, len(filled), sharex=True, squeeze=False)
+    shown = iter(grid.T)
+    axes = [list(next(shown)[: len(labels)]) if labels else [] for labels in columns]
+    for column, used, labels in zip(grid.T, filter(None, axes), filled, strict=True):
         for ax, label in zip(used, labels, strict=True):
             ax.set_ylabel(label)
             ax.grid(True, alpha=0.3)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TypeVar, final
 
 import torch
-from pydantic import PositiveInt
+from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from pinn_dyn.mechanics.arrays import require_last_dim
@@ -33,7 +33,9 @@ class Predictor(nn.Module, abc.ABC):
     penalized: bool = False
     input_history: float = 0.0
 
-    def __init__(self, num_coordinates: PositiveInt, num_inputs: PositiveInt, state: State = "qv"):
+    def __init__(
+        self, num_coordinates: PositiveInt, num_inputs: NonNegativeInt, state: State = "qv"
+    ):
         super().__init__()
         self.num_coordinates = num_coordinates
         self.num_inputs = num_inputs

@@ -204,8 +204,11 @@ class MechanicalSystem(ContinuousPredictor):
         """Check that the force is A(q) u at the same time, so that A^+ gives u.
 
         Raises:
-            ValueError: on a delayed input, a force that is not linear in the input, or a residual.
+            ValueError: on a delayed input, a force that is not linear in the input, a residual, or
+                no input.
         """
+        if not self.num_inputs:
+            raise ValueError("the model has no inputs (u: []), so no control law can move it")
         for present, problem, remedy in (
             (self.input_history, "a learned input delay", "~model/delay"),
             (

@@ -32,8 +32,9 @@ class InputMatrix(nn.Module, abc.ABC):
         return matvec(self(q), u)
 
     def typical_force(self, u_rms: Tensor) -> Tensor:
-        """Return the initial root mean square of each generalized force, ``(N,)``."""
-        return u_rms.square().mean().sqrt().expand(self.shape[0])
+        """Return the initial root mean square of each force, ``(N,)``; 1 without an input."""
+        force = u_rms.square().mean().sqrt() if len(u_rms) else u_rms.new_ones(())
+        return force.expand(self.shape[0])
 
 
 class NetworkInput(InputMatrix):

@@ -86,7 +86,7 @@ class KnownMechanics(LearnedConstants):
         gain_spread: prior standard deviation of log k; 0 if the input is a torque.
         integrator: the integration method; Rosenbrock if friction dominates inertia.
         driven_joints: names of the joints that the inputs drive, in the order of the inputs. The
-            default is all joints, or the motors of elastic joints.
+            default is all joints, the motors of elastic joints, or none if the data have no inputs.
         input: builder of the servos, if the inputs are targets; k is then ``input.stiffness``.
 
     Raises:
@@ -115,6 +115,7 @@ class KnownMechanics(LearnedConstants):
         names, size = structure.joint_names, structure.num_coordinates
         elastic = structure if isinstance(structure, ElasticJoints) else None
         driven = list(driven_joints or (elastic.driven if elastic else names))
+        driven = driven if statistics.num_inputs else []
         inputs = statistics.num_inputs
         if input is not None and inputs == 2 * len(driven):
             inputs //= 2  # targets and feed-forward forces

@@ -55,13 +55,15 @@ class Scales:
     statistics: Statistics
     value: Tensor
     angles: tuple[int, ...] = ()
-    named: tuple[Joint, ...] = ()
+    named: tuple[Joint, ...] | None = None
     prior: bool = False
 
     @property
     def joints(self) -> tuple[Joint, ...]:
         """The joint of each coordinate. Unnamed joints are numbered."""
-        return self.named or tuple(Joint(f"joint {k + 1}") for k in range(self.size))
+        if self.named is not None:
+            return self.named
+        return tuple(Joint(f"joint {k + 1}") for k in range(self.size))
 
     @property
     def size(self) -> int:

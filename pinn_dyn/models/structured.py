@@ -12,7 +12,7 @@ from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
 from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky
 from pinn_dyn.models.delay import DelayedPredictor, LearnedDelay
 from pinn_dyn.models.friction import Friction
-from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput
+from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput, NoInput
 from pinn_dyn.models.positivity import Positive
 from pinn_dyn.models.potential import NetworkPotential, Potential
 from pinn_dyn.models.residual import ResidualHead
@@ -38,6 +38,7 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
 
     The scales of the heads come from the data: with the root mean square f of the input, A ~ f/u;
     with the resulting typical force f_i of coordinate i, D ~ f_i/v_i, F ~ f_i, r ~ f_i and V ~ f q.
+    Without an input f is 1: the motion determines M, V, D and F up to a common factor.
     """
 
     def __init__(
@@ -58,7 +59,8 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         self.delay = delay
         self.angles = tuple(angles)
         u_rms = statistics.u_rms
-        self.input = input(self._scales(statistics, u_rms.square().mean().sqrt() / u_rms))
+        head = input if len(u_rms) else NoInput
+        self.input = head(self._scales(statistics, u_rms.square().mean().sqrt() / u_rms))
         force = self.input.typical_force(u_rms)
         energy = force.square().mean().sqrt() * statistics.q_std.mean()
         self.potential = potential(self._scales(statistics, energy))

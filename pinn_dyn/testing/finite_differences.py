@@ -24,11 +24,16 @@ def partial_derivatives(
     return slope(lambda e: function(x + e * directions), step).movedim(0, -1)
 
 
+def largest(values: Tensor) -> float:
+    """Return the largest magnitude, 0 without entries."""
+    return max(values.detach().abs().flatten().tolist(), default=0.0)
+
+
 def assert_near(
     actual: Tensor, expected: Tensor, tolerance: float, scale: float | Tensor | None = None
 ) -> None:
     """Compare with an error of ``tolerance`` times ``scale``, by default the largest entry."""
-    scale = float(expected.detach().abs().max()) if scale is None else float(scale)
+    scale = largest(expected) if scale is None else float(scale)
     torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance * scale)
 
 

@@ -146,7 +146,7 @@ def doubtful_units(ratio: Tensor, largest: float, unexplained: Tensor) -> str | 
         unexplained: spread of the force errors of the fit over that of the input, ``(N,)``.
     """
     middle, share = float(ratio.median()), float(unexplained.median())
-    if not 1 / largest < middle < largest:
+    if len(ratio) and not 1 / largest < middle < largest:
         return (
             f"the fitted forces are {middle:.3g} times those of the initial bodies, expected less "
             f"than {largest:g} times more or fewer: check the units of u (Nm, N, or the drive "
@@ -154,7 +154,8 @@ def doubtful_units(ratio: Tensor, largest: float, unexplained: Tensor) -> str | 
         )
     if share > _UNEXPLAINED:
         return (
-            f"the errors of the fit have {share:.0%} of the spread of the inputs: check the signs, "
-            "the order and the units of the columns of q, v and u"
+            f"the errors of the fit have {share:.0%} of the spread of the "
+            f"{'inputs' if len(ratio) else 'accelerations'}: check the signs, the order and the "
+            "units of the columns of q, v and u"
         )
     return None

@@ -45,6 +45,9 @@ _BLOCKS = 30  # blocks of the motion, and neighborhoods of windows
 _SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
+_SCALE = (
+    100.0  # root of the prior precision of the last mass, which sets the unit of passive robots
+)
 _DIVERGED = 1e4  # residual of a diverged roll-out
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
@@ -65,7 +68,9 @@ class LeastSquares:
 
     1. Inverse dynamics: r = k^-1 (M a + C v + G + D v + F - A u), in units of the spread of the
        forces, at samples of the motion after a zero-phase low-pass filter of ``cutoff`` Hz. Joints
-       at rest are excluded, since dry friction may then have any value up to its level.
+       at rest are excluded, since dry friction may then have any value up to its level. Without
+       inputs r is the error of the acceleration, which no common factor of the forces changes:
+       the mass of the last body stays that of the prior.
     2. Roll-outs: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first roll-outs use a quarter of the steps of the windows.
 
@@ -173,7 +178,15 @@ class LeastSquares:
         if covariance is None:
             if self.changed:
                 raise ValueError(f"changed is {self.changed}, but there is no earlier fit")
-            return Prior(0 * z, torch.eye(len(z)).to(z))
+            root = torch.eye(len(z)).to(z)
+            masses = [k for k, name in enumerate(names) if name.startswith("mass of")]
+            if masses and not model.num_inputs:
+                text = (
+                    "no inputs: the motion leaves a common factor of all constants, kept is the %s"
+                )
+                log.info(text, names[masses[-1]])
+                root[masses[-1], masses[-1]] = _SCALE
+            return Prior(0 * z, root)
         owners = [name.split(" of ", 1)[-1] for name in names]
         if unknown := [owner for owner in self.changed if owner not in owners]:
             expected = ", ".join(dict.fromkeys(owners))
@@ -195,8 +208,9 @@ class LeastSquares:
         self, model: LearnedConstants, prior: Prior, runs: Sequence[Trajectory], earlier: bool
     ) -> Fit:
         q, v, a, u = filtered_motion(runs, self.cutoff, self.samples)
+        passive = not model.num_inputs
         with torch.no_grad():
-            spread = model.force_scale(q, v, a, u)
+            spread = a.std(0) if passive else model.force_scale(q, v, a, u)
         moves = v.abs() > REST * v.std(0)
         if not moves.any():
             raise ValueError("least squares: no joint moves in the training trajectories")
@@ -206,12 +220,18 @@ class LeastSquares:
         samples = model.samples(q, v, a, u)
 
         def errors() -> Tensor:
+            if passive:
+                return (a - model.forward_dynamics(q, v, u)) / spread
             return samples.missing_force() / model.drive_gain() / spread
 
         def residuals(derivative: bool) -> Tensor:
             error = errors()
             if not derivative:
                 return error[moves]
+            if passive:
+                # The missing force is zero at the predicted acceleration.
+                by_z = model.slopes().by_parameters(q, v, a - error * spread, u)
+                return (torch.linalg.solve(model.mass_matrix(q), by_z) / spread[:, None])[moves]
             by_gain = (error * spread).unsqueeze(-1) * model.slopes().gain()
             by_z = samples.by_parameters() - by_gain
             return (by_z / (model.drive_gain() * spread).unsqueeze(-1))[moves]
@@ -224,7 +244,7 @@ class LeastSquares:
         solve = partial(self._solve, IDENTIFICATION, model, prior, residuals)
         result = solve(partitions, group, limit, 1e-6)
         with torch.no_grad():
-            scale = model.force_scale(q, v, a, u)
+            scale = spread if passive else model.force_scale(q, v, a, u)
         if not torch.allclose(scale, spread):
             # The scale of a passive joint is the force of the bodies, which were a guess.
             spread.copy_(scale)

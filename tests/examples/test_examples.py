@@ -99,6 +99,10 @@ def test_simulate_and_learn():
     assert "mean error over 2 s: {'Δx [rad]'" in text
 
 
+def test_passive_pendulum():
+    assert "constant within" in run("passive_pendulum.py", "--steps", "2")
+
+
 def test_own_robot():
     assert "M learned" in run("own_robot.py", "--steps", "2")
 

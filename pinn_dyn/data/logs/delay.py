@@ -88,6 +88,8 @@ def input_delays(
     """
     step = recordings[0].sample_time("a delay")
     inputs = recordings[0].u.shape[1]
+    if not inputs:
+        return []
     stride = max(1, round(longest / step / _CANDIDATES))
     lags = stride * np.arange(-2, max(round(longest / step / stride), 3) + 1)
     forms: dict[str, list[list[DelayCurve]]] = {}

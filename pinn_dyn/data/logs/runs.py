@@ -3,6 +3,7 @@
     inverse dynamics    u = f(q, v, a),            with at most as many inputs as coordinates
     increments          v = f(q) + B u,            with more inputs
     acceleration        a = f(q, v) + B u,         with more inputs, if it leaves less unexplained
+                        a = f(q, v),               with no inputs
 
 f is linear in its parameters. Stretches that disagree with the others lose their weight
 (iteratively reweighted least squares with the loss of Geman and McClure 1985).
@@ -108,7 +109,9 @@ def check_runs(
     data = Smoothed(motion, v, a, sign, sign[:, :0], sign != 0, inputs, np.ones(size), blocks)
     inverse = size <= n
     if inverse:
-        sides = [(_inverse(data), data.u - np.median(data.u, axis=0))]
+        driven = _inverse(data), data.u - np.median(data.u, axis=0)
+        passive = np.hstack([terms(data, "acceleration"), sign]), data.a
+        sides = [driven if size else passive]
     else:
         inputs = (data.u - data.u.mean(axis=0)) / data.u.std(axis=0).clip(min=1e-300)
         forms = (("increments", data.v), ("acceleration", data.a))
@@ -118,7 +121,7 @@ def check_runs(
     fit = min((_fit(data, *side) for side in sides), key=lambda fit: np.median(fit.residual))
     results = []
     if len(runs) >= 3:
-        labels = u.columns if inverse else q.columns
+        labels = u.columns if inverse and size else q.columns
         results = _bad_runs(fit, data, list(runs), signals[0][:, 0], labels, inverse)
     return [*results, *(_signs(fit, data, u) if inverse and set(u.units) <= {"Nm", "N"} else [])]
 
@@ -157,7 +160,8 @@ def _cause(
     fit: _Fit, data: Smoothed, rows: np.ndarray, j: int, labels: Sequence[str], inverse: bool
 ) -> str:
     """Return the likely cause in rows whose left side j does not fit."""
-    for i in [j] if inverse else range(data.u.shape[1]):
+    inputs = range(data.u.shape[1])
+    for i in inputs[j : j + 1] if inverse else inputs:
         u = data.u[rows, i]
         if np.ptp(data.u[:, i]) > 0 and np.isclose(u, np.median(u), 1e-6, 0).mean() > 0.5:
             return f"input {i + 1} is constant there: is a sensor stuck?"

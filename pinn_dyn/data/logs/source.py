@@ -53,7 +53,7 @@ class LogSource(DataSource):
         root: folder of the files.
         time: columns of the time, or ``{rate: 100}`` for a log without time, see :class:`Clock`.
         q: columns of the configuration, N.
-        u: columns of the input, M.
+        u: columns of the input, M; None or [] for a robot that nothing drives.
         v: columns of the velocity, N, or None.
         max_age: oldest message of another topic, or value of a slower column, of a row, s.
         trajectory: column that tells the runs of a file apart, or None where a file is one run.
@@ -80,7 +80,7 @@ class LogSource(DataSource):
         root: str = ".",
         time: Clock | Columns | Mapping[str, Any] | str,
         q: Columns | Mapping[str, Any],
-        u: Columns | Mapping[str, Any],
+        u: Columns | Mapping[str, Any] | Sequence[str] | None,
         v: Columns | Mapping[str, Any] | None = None,
         trajectory: str | None = None,
         long: str | None = None,
@@ -104,7 +104,7 @@ class LogSource(DataSource):
             time = asdict(time)
         self.time: Clock = described(Clock, "time", time)
         self.q: Columns = described(Columns, "q", q)
-        self.u: Columns = described(Columns, "u", u)
+        self.u: Columns = described(Columns, "u", u or {"columns": [], "unit": []})
         self.v: Columns | None = None if v is None else described(Columns, "v", v)
         signals = {"q": self.q, "v": self.v, "u": self.u}
         self._signals = {key: columns for key, columns in signals.items() if columns is not None}

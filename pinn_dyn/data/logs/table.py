@@ -93,7 +93,8 @@ class Table:
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
         """Return columns as finite numbers, ``(T, K)``, NaN for empty cells."""
-        return np.column_stack([self._numbers(name, signal) for name in columns])
+        values = [self._numbers(name, signal) for name in columns]
+        return np.reshape(values, (len(columns), len(self))).T
 
     def _numbers(self, name: str, signal: str) -> np.ndarray:
         raw = self.column(name, signal)

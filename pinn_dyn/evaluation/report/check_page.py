@@ -28,16 +28,10 @@ def check_report(check: LogCheck, *, command: str) -> str:
         verdict += [paragraph(text), preformatted(check.block)]
     if check.options:
         verdict.append(paragraph(f"Options of a training: model=lnn {' '.join(check.options)}"))
-    inputs = (
-        "The curve shows the share of the equation of motion that stays unexplained if an input is "
-        "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
-        "Dry friction is a share of the standard deviation of the input."
-    )
     cleaning = cleaning_figure(
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
-    curves = drawing(_delays(check), "unexplained share over the delay")
     notes = details("Notes of each step", from_markdown(source.report))
     sections = [
         Section("Verdict", verdict),
@@ -45,10 +39,22 @@ def check_report(check: LogCheck, *, command: str) -> str:
         Section("Clock", [table(check.runs)]),
         Section("Coordinates", [table(check.coordinates)]),
         *_rigid(check),
-        Section("Inputs and their delays", [paragraph(inputs), table(check.inputs), curves]),
+        *_inputs(check),
         Section("Cleaning", [drawing(cleaning, "raw and cleaned signals"), notes]),
     ]
     return page(f"{source.name}: check of the log", command, sections)
+
+
+def _inputs(check: LogCheck) -> list[Section]:
+    if not check.delays:
+        return []
+    text = (
+        "The curve shows the share of the equation of motion that stays unexplained if an input is "
+        "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
+        "Dry friction is a share of the standard deviation of the input."
+    )
+    curves = drawing(_delays(check), "unexplained share over the delay")
+    return [Section("Inputs and their delays", [paragraph(text), table(check.inputs), curves])]
 
 
 def _rigid(check: LogCheck) -> list[Section]:
