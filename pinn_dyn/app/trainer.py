@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
@@ -15,6 +16,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
@@ -118,7 +120,20 @@ def compiles(compile: bool | Literal["auto"], steps: int, trainer: Mapping[str, 
 
 
 class _MovableCheckpoint(ModelCheckpoint):
-    """Checkpoints that keep their best score if the run folder was moved or copied."""
+    """Checkpoints that keep their best score if the run folder was moved or copied.
+
+    Of equal scores, as where all rollouts diverge, the smaller loss counts.
+    """
+
+    _loss = math.inf
+
+    def check_monitor_top_k(self, trainer: L.Trainer, current: Tensor | None = None) -> bool:
+        """Tell whether a score is better than the best, or as good with a smaller loss."""
+        loss = float(getattr(trainer.lightning_module, "latest_loss", math.nan))
+        tied = current is not None and current == self.best_model_score and loss < self._loss
+        better = tied or super().check_monitor_top_k(trainer, current)
+        self._loss = loss if better else self._loss
+        return better
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the score and the paths, in the present folder."""

@@ -218,7 +218,7 @@ def train(
                 write_whole(run_folder / "log_report.md", source.report)
             with naming("validator"):
                 rollouts = validator(training_step=statistics.step)
-                rollouts.check(stack_until(windows.splits.validation))
+                rollouts.check(stack_until(windows.splits.validation), windows.splits.train)
             with naming("model"):
                 predictor = build_predictor(model, statistics, seed, ensemble)
                 _check_windows(predictor, windows)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import lightning as L
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -24,6 +27,7 @@ from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
 _PARTS = (1 / 20, 1 / 4)  # of the longest window
 _LARGEST_RATIO = 10.0
+_LAGS = 8  # in a window, at which the motion of the training is measured
 
 
 class RolloutValidator:
@@ -32,11 +36,13 @@ class RolloutValidator:
     ``error_windowed`` selects the best checkpoint. It is the mean over the windows W of a
     twentieth, a quarter and the whole of ``window`` (of ``horizon`` if that is None) of::
 
-        mean over trajectories of min(10, mean over t of e_W(t) / mean of f_W)
+        mean over trajectories of limited(mean over t of e_W(t) / mean of f_W)
 
     Here e_W is the error with the state reset to the measured state every W seconds, and f_W the
-    same error of the baseline that holds its position, over all times and trajectories. A diverged
-    trajectory counts as 10. Windows are rounded to whole steps.
+    same error of the baseline that holds its position, over all times and trajectories. Where the
+    training moves further than that in W, its motion counts, so that rest is no unit. Ratios r
+    above 5 are limited to 10 - 25/r, and a diverged trajectory counts as 10. Windows are rounded
+    to whole steps.
 
     Args:
         horizon: length of the trajectories, s.
@@ -59,6 +65,7 @@ class RolloutValidator:
         self.horizon = horizon
         self.window = window
         self.step = training_step if step is None else step
+        self._training: Sequence[Trajectory] = ()
         if not self.step <= (horizon if window is None else window) <= horizon:
             raise ValueError(
                 f"window is {window} s, step {self.step} s and horizon {horizon} s, "
@@ -70,8 +77,9 @@ class RolloutValidator:
             return f"{self.horizon:g} s open loop"
         return f"{self.horizon:g} s, reset every {self.window:g} s"
 
-    def check(self, truth: Trajectory) -> None:
-        """Raise ValueError for data that do not fit horizon, window and step."""
+    def check(self, truth: Trajectory, training: Sequence[Trajectory] = ()) -> None:
+        """Raise ValueError for data that do not fit horizon, window and step; keep the training."""
+        self._training = training
         t = truth.until(self.horizon).t
         if self.window is None:
             samples_of("step", self.step, t)
@@ -110,13 +118,31 @@ class RolloutValidator:
         span = self.window or self.horizon
         steps = {max(1, round(part * span / step)) for part in _PARTS} - {round(span / step)}
         still = HoldPosition(model.num_coordinates, model.num_inputs)
-        pairs = [(longest, self.predict(still, truth))]
+        trials = [(span, longest, self.predict(still, truth))]
         for n in steps:
             both = [predict_windows(x, truth, window=n * step, step=step) for x in (model, still)]
-            pairs.append((both[0], both[1]))
-        ratios = [item.error().mean(dim=1) / baseline.error().mean() for item, baseline in pairs]
-        limited = torch.stack(ratios).nan_to_num(_LARGEST_RATIO).clamp(max=_LARGEST_RATIO)
+            trials.append((n * step, both[0], both[1]))
+        ratios = [
+            item.error().mean(dim=1) / max(float(held.error().mean()), self._motion(window))
+            for window, item, held in trials
+        ]
+        ratio = torch.stack(ratios).nan_to_num(torch.inf)
+        largest = _LARGEST_RATIO
+        limited = torch.where(ratio > largest / 2, largest - largest**2 / (4 * ratio), ratio)
         return float(limited.mean())
+
+    def _motion(self, window: float) -> float:
+        """Return the mean distance in the training from the start of windows in s."""
+        errors = [torch.zeros(1)]
+        for item in self._training:
+            samples = window / float(item.t[1] - item.t[0])
+            lags = [
+                min(math.ceil(k * samples / _LAGS), len(item.t) - 1) for k in range(1, _LAGS + 1)
+            ]
+            errors += [
+                (item.q[lag:] - item.q[:-lag]).norm(dim=-1).mean().reshape(1) for lag in lags
+            ]
+        return float(torch.cat(errors[1:] or errors).mean())
 
 
 class RolloutFigures(L.Callback):

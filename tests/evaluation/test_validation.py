@@ -78,3 +78,22 @@ def test_a_diverged_trajectory_counts_as_ten_times_standing_still():
     figures = validator(None)(Drift(float("nan")), truth())
     assert figures["error_windowed"] == 10.0
     assert figures["error_mean"] == float("inf")
+
+
+def still(offset=0.0):
+    q = torch.full((2, 17, 1), offset, dtype=torch.float64)
+    return Trajectory(q, 0 * q, Signal(T, 0 * q))
+
+
+def test_epochs_are_ranked_where_the_validation_rests():
+    """Both drifts are far more than standing still, and little of the motion of the training."""
+    item = validator(None)
+    training = [Trajectory(x, x, Signal(T, 0 * x)) for x in truth().q]
+    item.check(still(), training)
+    errors = [item(Drift(rate), still())["error_windowed"] for rate in (0.02, 0.01, 0.5)]
+    assert 0 < errors[1] < errors[0] < errors[2] < 1
+
+
+def test_large_errors_are_ranked_below_those_of_diverged_rollouts():
+    errors = [validator(None)(Drift(x), truth())["error_windowed"] for x in (20.0, 100.0)]
+    assert 9 < errors[0] < errors[1] < 10
