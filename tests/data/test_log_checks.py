@@ -246,6 +246,36 @@ def test_a_robot_at_rest(tmp_path):
     assert "at rest for 95 % of the training" in warned(tmp_path, table)
 
 
+@pytest.mark.parametrize("part", ["validation", "test"])
+def test_a_robot_at_rest_outside_the_training(tmp_path, part):
+    still = motion()
+    still.loc[:, ["q1", "q2"]] += -still[["q1", "q2"]] + 0.1 + 1e-6 * np.arange(len(still))[:, None]
+    still[["v1", "v2"]] = 1e-4
+    text = warned_of_runs(tmp_path, {"b" if part == "validation" else "c": still})
+    assert f"at rest for 100 % of the {part} samples" in text
+
+
+def ticks(rate=500.0, resolution=2 * np.pi / 4096):
+    """A slow motion, as an encoder of 12 bits measures it, with 1e-9 rad of rounding."""
+    t = np.arange(0, 20, 1 / rate)
+    q = np.round(0.1 * np.sin(0.9 * t) / resolution) * resolution
+    q += 1e-9 * np.random.default_rng(0).normal(size=len(t))
+    u = np.round(np.sin(0.9 * t) / 0.0269) * 0.0269
+    table = {"t": t, "q1": q, "q2": q[::-1], "u1": u, "u2": -u}
+    return pd.DataFrame(table | {f"v{k}": np.gradient(table[f"q{k}"], t) for k in (1, 2)})
+
+
+def test_the_resolution_of_an_encoder_stands_for_no_missing_value(tmp_path):
+    assert "no value" not in warned(tmp_path, ticks())
+
+
+@pytest.mark.parametrize("value", [-1.0, 999.0, 65535.0])
+def test_placeholders_among_the_ticks_of_an_encoder_are_named(tmp_path, value):
+    table = ticks()
+    table.loc[300:9000:700, "v1"] = value
+    assert f"column 'v1' (v): a spike to {value:.5g}" in warned(tmp_path, table)
+
+
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [("q1", 1.0, "a jump to 1 rad"), ("v1", 50.0, "a spike to 50"), ("u1", -400.0, "a spike")],

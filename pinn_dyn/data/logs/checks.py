@@ -21,6 +21,9 @@ BURSTS = 0.4
 # A row is a jump if its distance from its neighbors exceeds this multiple of the usual distance.
 _JUMP_FACTOR = {"q": 10.0, "v": 10.0, "u": 20.0}
 _NEIGHBORS = 7
+_FEWEST_TICKS, _TICK_ERROR = 10, 0.1  # steps of a resolution; deviation from multiples of a half
+# Numbers that stand for "no value", in the unit of the file.
+_NO_VALUE = {-1, *(sign * x for sign in (1, -1) for x in (99, 999, 9999, 99999, 32767, 65535))}
 _LARGEST = 1e12  # SI units
 
 
@@ -152,9 +155,18 @@ def _jumps(
         return ""
     first = int((bad & (distance > 0.5 * distance.max())).argmax())  # a spike goes and comes back
     row = first + 1 if steps else first
+    if _are_ticks(distance[bad]) and table.frame[name].iloc[row] not in _NO_VALUE:
+        return ""
     return (
         f"{table.place(row, name, signal)}: a {'jump' if steps else 'spike'} to {x[row]:.5g} "
         f"{unit}, {distance[first]:.3g} from the value that its neighbors make likely "
         f"({int(bad.sum())} such rows in this run): does it stand for 'no value'? Add a "
         "RemoveJumps step, or name a new run that begins there in 'trajectory'"
     )
+
+
+def _are_ticks(sizes: np.ndarray) -> bool:
+    """Tell whether sizes are multiples of a resolution, as of encoders or velocities of ticks."""
+    halves = 2 * sizes / np.median(sizes)
+    even = np.abs(halves - halves.round()) < _TICK_ERROR
+    return len(sizes) >= _FEWEST_TICKS and bool(even.mean() > 0.9 and halves.max() < 20)

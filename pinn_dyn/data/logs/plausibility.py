@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -61,23 +61,36 @@ def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
     return results
 
 
-def check_rest(training: list[Recording], q: Columns) -> list[Measurement]:
-    """Measure the motion of each coordinate, and the share of the training at rest."""
-    results = []
+def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measurement]:
+    """Measure the motion of each coordinate in the training, and the share of each split at rest.
+
+    At rest no coordinate moves faster than a hundredth of its fastest motion in the training.
+    """
+    results, training = [], splits["train"]
     for k, name in enumerate(q.columns):
         spread = np.concatenate([item.q[:, k] for item in training]).std()
         text = f"column {name!r} (q): moves no more than its noise, {spread:.3g} {q.units[k]}"
         measured = ("spread of q in the training", name, spread, "above noise")
         results.append(judged(*measured, not moves(training, k), text))
-    steps = np.vstack([np.abs(np.diff(item.q, axis=0)) for item in training])
-    share = (steps < 0.01 * steps.max(axis=0).clip(min=1e-300)).all(axis=1).mean()
-    text = (
-        f"the robot is at rest for {100 * share:.0f} % of the training samples: windows drawn "
-        "there teach little; use data.coverage, or cut the rest out"
-    )
-    verdict: Verdict = "stop" if share > _ALL_AT_REST else "warning"
-    expected, bad = f"below {_AT_REST}", share > _AT_REST
-    return [*results, judged("share at rest", "training", share, expected, bad, text, verdict)]
+    steps = {
+        name: np.vstack([np.abs(np.diff(item.q, axis=0)) for item in items])
+        for name, items in splits.items()
+    }
+    slow = 0.01 * steps["train"].max(axis=0).clip(min=1e-300)
+    for name, sizes in steps.items():
+        share, part = (sizes < slow).all(axis=1).mean(), "training" if name == "train" else name
+        text = f"the robot is at rest for {100 * share:.0f} % of the {part} samples: "
+        if name == "train":
+            text += "windows drawn there teach little; use data.coverage, or cut the rest out"
+        else:
+            text += (
+                f"errors there tell little of a model; take another part or run for dataset.{part}"
+            )
+        stop = name == "train" and share > _ALL_AT_REST
+        verdict: Verdict = "stop" if stop else "warning"
+        expected, bad = f"below {_AT_REST}", share > _AT_REST
+        results.append(judged("share at rest", part, share, expected, bad, text, verdict))
+    return results
 
 
 def check_velocities(

@@ -223,7 +223,7 @@ class LogSource(DataSource):
             measurements += plausibility.check_velocities(everything, self.q, self.v, step)
         measurements += check_runs(everything, self.q, self.u, step)
         measurements += plausibility.check_inputs(training, self.u)
-        measurements += plausibility.check_rest(training, self.q)
+        measurements += plausibility.check_rest(stretches, self.q)
         report.add("Splits", "train", summary(training, step))
         rollouts = {"train": training}
         for name, part in (("validation", self.validation), ("test", self.test)):
