@@ -12,13 +12,20 @@ import pandas as pd
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from pandas.api.types import is_numeric_dtype
 
 from pinn_dyn.app.config import ConfigError, checked
 from pinn_dyn.app.run_folder import CONFIG, METRICS
 from pinn_dyn.app.sweep import ERROR, first_line
 from pinn_dyn.data.whole import read_regular
 from pinn_dyn.evaluation import save, sweep_figure
-from pinn_dyn.evaluation.tables import over_seeds, to_text, varied_settings, write_table
+from pinn_dyn.evaluation.tables import (
+    competing,
+    over_seeds,
+    to_text,
+    varied_settings,
+    write_table,
+)
 
 _RECORDED = ("training_seconds", "steps", "pairs", "parameters")
 _SHOWN = ("val/error_mean", "val/diverged", "test/error_mean", "test/diverged", "training_seconds")
@@ -84,7 +91,9 @@ def gather(cfg: DictConfig) -> None:
         for key in ("sort", "plot"):
             if config[key] not in (None, *runs, *table):
                 raise ConfigError(f"{key} is '{config[key]}', expected one of {', '.join(runs)}")
-        table = table.sort_values(config["sort"], kind="stable", ignore_index=True)
+        order = table[config["sort"]]
+        order = competing(table, config["sort"]) if is_numeric_dtype(order) else order
+        table = table.loc[order.sort_values(kind="stable").index].reset_index(drop=True)
         write_table(runs, folder, "runs")
         write_table(table, folder, "sweep")
         figures = [k for k in _SHOWN if k in table and (k[-8:] != "diverged" or table[k].any())]

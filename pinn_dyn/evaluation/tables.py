@@ -123,8 +123,8 @@ def formatted(
 ) -> pd.DataFrame:
     """Return a table as text under its headings, numbers with three significant digits.
 
-    A mean is followed by ± and its standard deviation. Instead of an infinite error stands the
-    number of diverged trajectories. Names of baselines are in brackets.
+    A mean is followed by ± and its standard deviation. The number of diverged trajectories, which
+    an error leaves out, follows, or replaces an infinite error. Names of baselines are in brackets.
 
     Args:
         frame: table.
@@ -140,9 +140,13 @@ def formatted(
         if deviation in frame:
             column += frame[deviation].map(lambda x: "" if pd.isna(x) else f" ± {number(x)}")
         diverged = _diverged(name)
-        if diverged in frame and "trajectories" in frame:
-            lost, total = (frame[key].map(number) for key in (diverged, "trajectories"))
-            column = column.mask(frame[name] == math.inf, "diverged: " + lost + " of " + total)
+        if diverged in frame:
+            lost = frame[diverged].map(number)
+            if "trajectories" in frame:
+                lost += " of " + frame["trajectories"].map(number)
+            lost = lost.where(frame[diverged] > 0)
+            column = column.mask(frame[name] == math.inf, "diverged: " + lost.fillna("all"))
+            column += (" (diverged: " + lost + ")").where(frame[name] < math.inf).fillna("")
         if star:
             column += best(frame, name).map({True: star, False: ""})
         if name in ("run", "model") and "baseline" in frame:
@@ -169,14 +173,14 @@ def number(value: object) -> str:
 def best(frame: pd.DataFrame, name: str) -> pd.Series:
     """Return the rows with the best entry of a column, bool.
 
-    Among errors, only the rows with the fewest diverged trajectories compete, since a mean leaves
-    diverged trajectories out. No row is best unless it beats all baselines.
+    Among errors, only rows without diverged trajectories compete, since a mean leaves these out.
+    No row is best unless it beats all baselines.
     """
     none = pd.Series(False, index=frame.index)
     valid_time = "valid_time_" in name
     if not (valid_time or re.fullmatch(_LOWER_IS_BETTER, name)) or frame[name].nunique() < 2:
         return none
-    figures = _competing(frame, name) * (-1 if valid_time else 1)
+    figures = competing(frame, name) * (-1 if valid_time else 1)
     baseline = frame["baseline"].astype(bool) if "baseline" in frame else none
     smallest = figures[~baseline].min()
     if not math.isfinite(smallest) or (figures[baseline] <= smallest).any():
@@ -184,11 +188,11 @@ def best(frame: pd.DataFrame, name: str) -> pd.Series:
     return (figures == smallest) & ~baseline
 
 
-def _competing(frame: pd.DataFrame, name: str) -> pd.Series:
-    """Return a column, infinite where more trajectories diverged than in the best row."""
+def competing(frame: pd.DataFrame, name: str) -> pd.Series:
+    """Return a column of numbers, an error as infinite where trajectories diverged."""
     figures, diverged = frame[name].astype(float), _diverged(name)
     if diverged in frame:
-        return figures.where(frame[diverged] == frame[diverged].min(), math.inf)
+        return figures.where(~(frame[diverged] > 0), math.inf)
     return figures
 
 
@@ -201,8 +205,9 @@ def unbeaten_baselines(summary: pd.DataFrame) -> list[str]:
     """Return a sentence for each error in which a baseline is as accurate as all models."""
     lines, baseline = [], summary["baseline"].astype(bool)
     for name in (x for x in summary if re.fullmatch(f"error_mean|{_WINDOW}", x)):
-        figures = _competing(summary, name)
-        if baseline.any() and not figures[~baseline].min() < figures[baseline].min():
+        figures = competing(summary, name)
+        bar = figures[baseline].min()
+        if bar < math.inf and not figures[~baseline].min() < bar:
             row = summary.loc[figures[baseline].idxmin()]
             lines.append(
                 f"No model is more accurate than the baseline '{row['run']}': {name} "

@@ -107,13 +107,16 @@ BASELINES = {"hold position": 0.9, "ARX": 0.3}
         # A baseline with diverged rollouts is no bar.
         ({"lnn": 0.35, "mlp": 0.5}, ("ARX",), "lnn"),
         ({"lnn": math.inf, "mlp": 0.25}, ("lnn",), "mlp"),
+        # Means over other trajectories are no comparison, even if all rows have diverged rollouts.
+        ({"lnn": 0.2, "mlp": 0.5}, ("lnn", "mlp", "ARX", "hold position"), "nobody"),
     ],
 )
 def test_the_best_model_beats_all_baselines(models, lost, winner):
     frame = summary(models, BASELINES, lost)
+    none_complete, winner = winner == "nobody", None if winner == "nobody" else winner
     assert frame["run"][best(frame, "error_mean")].tolist() == ([winner] if winner else [])
     sentences = unbeaten_baselines(frame)
-    assert len(sentences) == (winner is None)
+    assert len(sentences) == (winner is None and not none_complete)
     assert all("'ARX': error_mean 0.3" in sentence for sentence in sentences)
     text = to_text(frame, summary_columns(frame))
     assert text.count("*") == (winner is not None)
@@ -128,3 +131,10 @@ def test_a_longer_valid_time_is_better_and_other_columns_have_no_best_entry():
     assert frame["run"][best(frame, "window_1s_error_mean")].tolist() == ["mlp"]
     assert not best(frame, "parameters").any()
     assert unbeaten_baselines(frame) == []
+
+
+def test_an_error_over_the_surviving_rollouts_shows_the_lost_ones():
+    frame = summary({"lnn": 0.2, "mlp": 0.5}, BASELINES, lost=("lnn",)).assign(trajectories=4)
+    lines = to_text(frame, summary_columns(frame)).splitlines()
+    assert "0.2 ± 0.5 (diverged: 1 of 4)" in lines[1]
+    assert all("diverged" not in line for line in lines[2:])
