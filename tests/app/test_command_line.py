@@ -1,12 +1,13 @@
 """Mistakes on the command line: what is said, and that nothing is left behind."""
 
 import re
+from datetime import datetime
 
 import pytest
 import torch
 
 from pinn_dyn.app.command import COMMANDS, main
-from tests.app.entry import NO_FIGURES, TINY, fails, run_script
+from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, run_script
 
 
 @pytest.fixture(autouse=True)
@@ -124,3 +125,14 @@ def test_help_shows_examples_and_the_configuration(elsewhere, capsys, script, ex
         assert example in text
     assert "seed: 0" in text or "runs: ???" in text
     assert not list(elsewhere.iterdir())
+
+
+def test_commands_of_the_same_second_write_into_different_folders():
+    patterns = [
+        pattern
+        for path in (ROOT / "conf").rglob("*.yaml")
+        for pattern in re.findall(r"\$\{now:(.*?)\}", path.read_text())
+    ]
+    second = [datetime(2026, 1, 2, 3, 4, 5, microsecond) for microsecond in (1, 2)]
+    assert len(patterns) >= 7
+    assert all(second[0].strftime(x) != second[1].strftime(x) for x in patterns)

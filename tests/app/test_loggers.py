@@ -1,10 +1,14 @@
 """Figures, settings and errors of a run, read back from its TensorBoard log."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+
+from pinn_dyn.app.trainer import _MovableCheckpoint
 
 FIGURES = {"rollout/trajectory", "rollout/error", "terms/bent", "terms/strongly_bent"}
 
@@ -25,3 +29,21 @@ def test_settings_are_logged_beside_the_validation_error(hnn_run):
     (error,) = (item.value for item in log.Scalars("hp/validation_error"))
     record = json.loads((hnn_run / "metrics.json").read_text())
     assert error == pytest.approx(record["validation"]["val/error_mean"], rel=1e-6)
+
+
+def test_of_equal_scores_the_smaller_loss_is_kept(tmp_path):
+    """All rollouts of a training may diverge."""
+    checkpoint = _MovableCheckpoint(tmp_path, monitor="score")
+    checkpoint.best_model_score = score = torch.tensor(10.0)
+    checkpoint.best_k_models, checkpoint.kth_best_model_path = {"best": score}, "best"
+    kept = [
+        checkpoint.check_monitor_top_k(
+            SimpleNamespace(
+                lightning_module=SimpleNamespace(latest_loss=loss),
+                strategy=SimpleNamespace(reduce_boolean_decision=lambda x: x),
+            ),
+            score,
+        )
+        for loss in (0.5, 0.7, 0.2)
+    ]
+    assert kept == [True, False, True]
