@@ -82,7 +82,7 @@ class _Loaded(nn.Module):
 
     def __init__(self, known: KnownMechanics):
         super().__init__()
-        self.known = known
+        self.known, self.num_inputs = known, known.num_inputs
         self.drive_gain, self.force_ratio = known.drive_gain, known.force_ratio
         structure: Any = known.structure
         body, pose = structure._tip_body, torch.eye(4, dtype=torch.float64)
