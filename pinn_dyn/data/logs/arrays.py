@@ -1,4 +1,4 @@
-"""Files of named arrays as tables: MATLAB, HDF5 and NPZ.
+"""Files of arrays as tables: MATLAB, HDF5, NumPy and PyTorch.
 
 An array with as many rows as the time is a column; a matrix is the columns ``name_1``, ``name_2``
 and so on. Fields of structs and groups are joined: ``log.q`` in MATLAB, ``log/q`` in HDF5. Groups
@@ -7,13 +7,15 @@ that are runs have the columns ``data/*/q``.
 
 from __future__ import annotations
 
+import pickle
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.matlab import elements, matlab_variables
@@ -28,7 +30,7 @@ def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     h5py = optional("h5py", path)
     if h5py.is_hdf5(path):  # version 7.3
         with h5py.File(path, "r") as file:
-            _refuse(path, _visited(h5py, file)[1])
+            _data_sets(path, h5py, file, [x.replace(".", "/") for x in request.columns])
             if not any("MATLAB_class" in item.attrs for item in file.values()):
                 return read_hdf5(path, request)
     runs = elements(matlab_variables(path), request.time, request.columns)
@@ -42,8 +44,7 @@ def read_hdf5(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """
     h5py = optional("h5py", path)
     with h5py.File(path, "r") as file:
-        names, outside = _visited(h5py, file)
-        _refuse(path, [x for x in outside if any(y.startswith(x) for y in request.columns)])
+        names = _data_sets(path, h5py, file, request.columns)
         variables = {name: file[name] for name in names}
         groups = {name.rpartition("/")[0] for name in names}
         for name in sorted({"/", *groups, *names}):
@@ -66,36 +67,66 @@ def _runs(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, dic
     return dict(sorted(runs.items(), key=lambda x: [len(x[0]), x[0]]))
 
 
-def _visited(h5py: Any, file: Any) -> tuple[list[str], list[str]]:
-    """Return the names of plain data sets, and of links and data sets with values elsewhere."""
-    plain: list[str] = []
-    outside: list[str] = []
-
-    def link(name: str, item: Any) -> None:
-        if isinstance(item, h5py.ExternalLink):
-            outside.append(name)
-
-    def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            (outside if item.external or item.is_virtual else plain).append(name)
-
-    file.visititems_links(link)
-    file.visititems(visit)
-    return plain, outside
-
-
-def _refuse(path: Path, outside: list[str]) -> None:
-    if outside:
+def _data_sets(path: Path, h5py: Any, file: Any, columns: Collection[str]) -> list[str]:
+    """Return the names of plain data sets; refuse columns whose values lie in other files."""
+    links: dict[str, Any] = {}
+    file.visititems_links(links.__setitem__)
+    items = {x: file[x] for x, link in links.items() if isinstance(link, h5py.HardLink)}
+    sets = {x: item for x, item in items.items() if isinstance(item, h5py.Dataset)}
+    plain = [x for x, item in sets.items() if not item.external and not item.is_virtual]
+    outside = {x for x, link in links.items() if isinstance(link, h5py.ExternalLink)}
+    outside |= sets.keys() - {*plain}
+    if refused := [x for x in outside if any(y.startswith(x) for y in columns)]:
         raise LogError(
-            f"{path}: {listed(outside)}: values of other files or virtual data sets are not read, "
+            f"{path}: {listed(refused)}: values of other files or virtual data sets are not read, "
             "expected plain data sets: copy the values into the file"
         )
+    return plain
 
 
 def read_npz(path: Path, request: Request) -> pd.DataFrame:
     """Read an NPZ file. One with Python objects is refused, never unpickled."""
     with np.load(path, allow_pickle=False) as file:
         return table_of_arrays(path, request, file)
+
+
+def read_npy(path: Path, request: Request) -> pd.DataFrame:
+    """Read a matrix with the columns ``0``, ``1`` and so on, or a structured array by its names."""
+    return _table(path, request, np.load(path, allow_pickle=False))
+
+
+def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
+    """Read a file of ``torch.save``: a matrix, a dictionary of tensors, or a list of these: runs.
+
+    Other objects are refused, never unpickled.
+    """
+    try:
+        content = torch.load(path, weights_only=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        raise LogError(
+            f"{path}: holds Python objects, which are not loaded: save plain tensors, as in "
+            "torch.save({'t': t, 'q': q, 'u': u}, path)"
+        ) from error
+    runs = dict(enumerate(content)) if isinstance(content, list) else {"": content}
+    return {str(run): _table(path, request, values) for run, values in runs.items()}
+
+
+def _table(path: Path, request: Request, content: Any) -> pd.DataFrame:
+    variables = dict(_nested("", content))
+    if "" in variables and not variables[""].dtype.names:
+        columns = np.atleast_2d(variables[""]).T
+        variables = {str(k): column for k, column in enumerate(columns)}
+    return table_of_arrays(path, request, variables)
+
+
+def _nested(name: str, content: Any) -> Iterator[tuple[str, Any]]:
+    """Return the arrays of nested mappings, as ``name.name``."""
+    if isinstance(content, Mapping):
+        for key, value in content.items():
+            yield from _nested(f"{name}.{key}".strip("."), value)
+    else:
+        is_tensor = isinstance(content, torch.Tensor)
+        yield name, content.numpy(force=True) if is_tensor else np.asarray(content)
 
 
 def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) -> pd.DataFrame:
@@ -143,7 +174,7 @@ def _fields(variables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Return the variables by name; of a compound data set its fields, ``log/q``."""
     for name, value in variables.items():
         if value.dtype.names:
-            yield from ((f"{name}/{field}", value[field]) for field in value.dtype.names)
+            yield from ((f"{name}/{field}".strip("/"), value[field]) for field in value.dtype.names)
         else:
             yield name, value
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.table import Request, optional
+from pinn_dyn.data.logs.table import Request, optional, vector_columns
 
 
 def read_parquet(path: Path, request: Request) -> pd.DataFrame:
@@ -32,14 +32,16 @@ def read_parquet(path: Path, request: Request) -> pd.DataFrame:
     columns: dict[str, Any] = {}
     labels = _labels(path)
     for name, column in content.to_pandas(ignore_metadata=True).items():
-        vectors = _vectors(column)
-        if vectors is None:
+        rows = np.flatnonzero(column.notna())
+        if not len(rows) or not isinstance(column.iloc[rows[0]], np.ndarray):
             columns[str(name)] = column
             continue
-        columns |= {f"{name}_{k}": values for k, values in enumerate(vectors, start=1)}
+        cells = column.map(lambda x: np.concatenate(x) if x.dtype == object else x, "ignore")
+        vectors = vector_columns(str(name), cells)
+        columns |= vectors
         names = [f"{name}/{label}" for label in labels.get(str(name), [])]
         if len(names) == len(vectors):
-            columns |= dict(zip(names, vectors, strict=True))
+            columns |= dict(zip(names, vectors.values(), strict=True))
         elif {*names} & {*request.columns}:
             raise LogError(
                 f"{path}: meta/info.json has {len(names)} names of {name!r}, which has "
@@ -47,18 +49,6 @@ def read_parquet(path: Path, request: Request) -> pd.DataFrame:
                 f"the names are {listed(names)}"
             )
     return pd.DataFrame(columns).set_axis(pd.RangeIndex(1, len(content) + 1))
-
-
-def _vectors(column: pd.Series) -> np.ndarray | None:
-    """Return the entries of vectors or matrices, ``(K, T)``; None for other columns."""
-    rows = np.flatnonzero(column.notna())
-    if column.dtype != object or not len(rows) or not isinstance(column.iloc[rows[0]], np.ndarray):
-        return None
-    cells = [np.concatenate(x) if x.dtype == object else x for x in column.iloc[rows]]
-    vectors = np.full((len(column), max(map(len, cells))), np.nan)
-    for row, cell in zip(rows, cells, strict=True):
-        vectors[row, : len(cell)] = cell
-    return vectors.T
 
 
 def _labels(path: Path) -> dict[str, list[str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,6 +31,14 @@ class Request:
     columns: Sequence[str]
     max_age: float = 0.1
     sep: str | None = None
+
+
+def vector_columns(name: str, cells: pd.Series) -> dict[str, pd.Series]:
+    """Return the entries of vectors as columns ``name_1``, ``name_2`` and so on."""
+    vectors = cells.dropna()
+    entries = itertools.zip_longest(*vectors, fillvalue=np.nan)
+    columns = [pd.Series(x, vectors.index, float).reindex(cells.index) for x in entries]
+    return {f"{name}_{k}": column for k, column in enumerate(columns, start=1)}
 
 
 def optional(name: str, path: Path) -> Any:

@@ -21,7 +21,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.columns import known_unit
 from pinn_dyn.data.logs.errors import LogError, listed
-from pinn_dyn.data.logs.table import Request, Table
+from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
 _SAMPLE = 300  # lines from which the dialect and the header are detected
 _COMMENTS = ("#", "%", "//")
@@ -268,12 +268,11 @@ def _with_vectors(frame: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Name the columns; a column of vectors becomes ``name_1``, ``name_2`` and so on."""
     frames = []
     for name, (_, column) in zip(names, frame.items(), strict=True):
-        part = column.to_frame(name)
+        part = {name: column}
         if not pd.api.types.is_numeric_dtype(column):
             cells = column.dropna().astype(str).str.strip()
             if len(cells) and cells.map(_VECTOR.fullmatch).notna().all():
-                part = cells.str.strip("aryARY[](){} ,;").str.split(r"[\s,;]+", expand=True)
-                part = part.astype(float).reindex(frame.index)
-                part.columns = pd.Index([f"{name}_{k + 1}" for k in part.columns])
-        frames.append(part)
+                vectors = cells.str.strip("aryARY[](){} ,;").str.split(r"[\s,;]+")
+                part = vector_columns(name, vectors.reindex(column.index))
+        frames.append(pd.DataFrame(part))
     return pd.concat(frames, axis=1)
