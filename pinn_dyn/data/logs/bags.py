@@ -9,6 +9,7 @@ is not older than ``max_age``; rows without such a message are dropped.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,11 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pinn_dyn.data.cache import cache_key
+from pinn_dyn.data.cache import load_or_make
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.messages import open_bag
-from pinn_dyn.data.logs.table import Request, Table, optional
-from pinn_dyn.data.whole import whole
+from pinn_dyn.data.logs.table import Request, Table
 
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")
@@ -37,23 +37,21 @@ class _Topic(NamedTuple):
 
 def read_bag(path: Path, request: Request) -> Table:
     """Read columns of a bag, one row per message of the topic of the time."""
-    optional("pyarrow", path)
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
-    key = cache_key([2, str(path.absolute()), stats, fields, request.max_age])
-    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
-    cached = folder / f"bag-{key}.parquet"
-    if not cached.is_file():
+    description = [3, str(path.absolute()), stats, fields, request.max_age]
+
+    def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
         topics = _decode(path, fields, request.max_age, notes)
-        frame = _merge(path, topics, fields[0], request.max_age, notes)
-        frame.attrs["notes"] = notes
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole(cached) as partial:
-            frame.to_parquet(partial)
-    frame = pd.read_parquet(cached)
-    return Table(frame, str(path), "message", notes=frame.attrs["notes"])
+        frame = _merge(path, topics, fields[0], request.max_age, notes)[fields]
+        return {"rows": frame.index, "values": frame, "notes": np.array(notes, dtype=str)}
+
+    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
+    arrays = load_or_make(folder, "bag", description, decode)
+    frame = pd.DataFrame(arrays["values"], arrays["rows"], fields)
+    return Table(frame, str(path), "message", arrays["notes"].tolist())
 
 
 def _decode(
@@ -66,12 +64,7 @@ def _decode(
         rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in fields}
         for topic, publisher, received, message in bag.messages(list(fields)):
             place = f"{path}, topic {topic}"
-            values = [
-                None
-                if field == "t" and not hasattr(message, "t")
-                else _number(message, field, place)
-                for field in fields[topic].values()
-            ]
+            values = [_number(message, field, place) for field in fields[topic].values()]
             names = getattr(message, "name", ())
             joints = tuple(sorted(map(str, names))) if hasattr(names, "__len__") else ()
             rows[topic].append((_stamp(message), 1e-9 * received, (publisher, joints), *values))
@@ -164,6 +157,8 @@ def _stamp(message: Any) -> float | None:
 
 def _number(message: Any, field: str, place: str) -> float | None:
     """Return the number at a path such as ``position/joint1``; None for a missing entry."""
+    if field == "t" and not hasattr(message, "t"):
+        return None  # the time of the message follows
     node = message
     parents: list[Any] = []
     for step in field.split("/"):
@@ -200,28 +195,28 @@ def _merge(
     """Return the rows of the topic of the first column, with the last values of other topics."""
     clock = next(name for name, topic in topics.items() if first in topic.frame)
     frame, missing, publishers = topics.pop(clock)
-    nodes = publishers.str[0]
-    usual = nodes[~missing].mode()
-    second = ~missing & ~nodes.isin(usual[:1]).to_numpy()
+    times, nodes = frame.index, publishers.str[0]
     joints = {name for _, names in publishers[missing] for name in names}
     joints -= {name for _, names in publishers[~missing] for name in names}
     lack = f"lack an entry, being of {listed(sorted(joints))}," if joints else "lack an entry"
-    nan = ~missing & ~second & frame.isna().any(axis=1).to_numpy()
-    lost = {lack: missing, "are of another publisher": second, "are NaN": nan}
-    times = frame.index
     frame.index = pd.RangeIndex(1, len(frame) + 1)
+    faults = {
+        lack: missing,
+        "are of another publisher": ~nodes.isin(nodes[~missing].mode()[:1]),
+        "are NaN": frame.isna().any(axis=1),
+    }
     for topic in topics.values():
         messages = topic.frame.dropna().sort_index(kind="stable")
         messages = messages[~messages.index.duplicated(keep="last")]
         latest = messages.reindex(times, method="ffill", tolerance=max_age)
         frame[messages.columns] = latest.to_numpy()
-    empty = second | frame.isna().any(axis=1).to_numpy()
     age = f"have no message of {listed(topics)} in the {max_age:g} s before them"
-    lost[age] = empty & ~np.any(list(lost.values()), axis=0)
-    if empty.any():
-        reasons = ", ".join(f"{rows.sum()} {text}" for text, rows in lost.items() if rows.any())
-        dropped = f"{empty.sum()} of {len(frame)} messages of {clock} are dropped: {reasons}"
-        if empty.all():
-            raise LogError(f"{path}: no row is left: {dropped}")
-        notes.append(dropped)
-    return frame[~empty]
+    faults[age] = frame.isna().any(axis=1)
+    reasons = np.select([*faults.values()], [*faults], "")
+    if dropped := Counter(reasons[reasons != ""].tolist()):
+        text = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+        text = f"{dropped.total()} of {len(frame)} messages of {clock} are dropped: {text}"
+        if dropped.total() == len(frame):
+            raise LogError(f"{path}: no row is left: {text}")
+        notes.append(text)
+    return frame[reasons == ""]

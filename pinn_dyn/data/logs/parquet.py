@@ -24,9 +24,7 @@ def read_parquet(path: Path, request: Request) -> pd.DataFrame:
     Raises:
         LogError: if LeRobot's names of a vector are asked for and do not fit its width.
     """
-    optional("pyarrow", path)
-    pyarrow = optional("pyarrow.parquet", path)
-    content = pyarrow.ParquetFile(path).read()
+    content = optional("pyarrow.parquet", path).ParquetFile(path).read()
     while any(str(kind).startswith("struct") for kind in content.schema.types):
         content = content.flatten()
     columns: dict[str, Any] = {}
