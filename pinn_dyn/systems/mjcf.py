@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from torch import Tensor
 
 _KINDS = ("floating", "spherical", "prismatic", "revolute")  # free, ball, slide and hinge
-_STRIPPED = (
-    "keys",
-    "sensors",
-    "actuators",
-    "tendons",
-    "pairs",
-    "skins",
-    "materials",
-    "textures",
-    "hfields",
-)
+_LOOKS = ("skins", "materials", "textures", "hfields")
+_UNUSED = (*_LOOKS, "keys", "sensors", "actuators", "tendons", "pairs")
 
 
 def mjcf_to_urdf(source: Path | str) -> str:
@@ -66,7 +59,7 @@ def mjcf_to_urdf(source: Path | str) -> str:
             kind = "continuous" if is_free else kinds[j]
             low, high = model.jnt_range[j]
             effort = model.jnt_actfrcrange[j, 1]
-            details = f'<axis xyz="{_text(data.xaxis[j])}"/>{mimics.get(j, "")}'
+            details = f'<axis xyz="{exact_text(data.xaxis[j])}"/>{mimics.get(j, "")}'
             details += f'<limit lower="{low}" upper="{high}" velocity="0" effort="{effort}"/>'
             parts.append(_joint(joints[j], kind, link, child, anchor - origin, details))
             link, origin = child, anchor
@@ -93,7 +86,7 @@ def _compiled(mujoco: Any, source: Path | str) -> tuple[Any, set[str]]:
     """
     is_file = isinstance(source, Path)
     spec = mujoco.MjSpec.from_file(str(source)) if is_file else mujoco.MjSpec.from_string(source)
-    for kind in _STRIPPED:
+    for kind in _UNUSED:
         for element in list(getattr(spec, kind)):
             spec.delete(element)
     forced = int(spec.compiler.inertiafromgeom) == 1  # always
@@ -145,7 +138,7 @@ def _joint(
 ) -> str:
     return (
         f'<joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
-        f'<child link={quoteattr(child)}/><origin xyz="{_text(origin)}"/>{details}</joint>'
+        f'<child link={quoteattr(child)}/><origin xyz="{exact_text(origin)}"/>{details}</joint>'
     )
 
 
@@ -156,9 +149,10 @@ def _inertial(model: Any, data: Any, body: int, origin: np.ndarray) -> str:
     text = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{moments[i, j]}"' for i, j in pairs)
     return (
         f'<inertial><mass value="{model.body_mass[body]}"/><inertia {text}/>'
-        f'<origin xyz="{_text(data.xipos[body] - origin)}"/></inertial>'
+        f'<origin xyz="{exact_text(data.xipos[body] - origin)}"/></inertial>'
     )
 
 
-def _text(values: np.ndarray) -> str:
+def exact_text(values: Iterable[float] | Tensor) -> str:
+    """Return numbers for an attribute in XML, without rounding."""
     return " ".join(repr(float(value)) for value in values)

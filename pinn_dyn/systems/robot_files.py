@@ -6,7 +6,7 @@ import logging
 import os
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pinn_dyn.systems.inertia import central_parameters
+from pinn_dyn.systems.mjcf import exact_text
 from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.systems.urdf_file import UrdfFile
@@ -67,12 +68,11 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
             link.append(ET.Comment(f" in the inertia of {body} "))
         _remove(link, "inertial")
         inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "origin", xyz=_text(numbers[:3]), rpy="0 0 0")
+        ET.SubElement(inertial, "origin", xyz=exact_text(numbers[:3]), rpy="0 0 0")
         ET.SubElement(inertial, "mass", value=repr(mass))
         moments = zip(_MOMENTS, map(repr, numbers[3:]), strict=True)
         ET.SubElement(inertial, "inertia", dict(moments))
-    locked = dict.fromkeys(robot.locked_joints, 0.0)
-    locked |= robot.locked_joints if isinstance(robot.locked_joints, Mapping) else {}
+    locked = robot.tree.locked
     for name, joint in file.joints.items():
         if file.ends[name][1] in robot.body_names:
             _remove(joint, "dynamics")  # that of a joint that follows another is in the other's
@@ -90,7 +90,7 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # at a gimbal lock any angles are right
                     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
-                ET.SubElement(joint, "origin", xyz=_text(pose[:3, 3]), rpy=_text(rpy))
+                ET.SubElement(joint, "origin", xyz=exact_text(pose[:3, 3]), rpy=exact_text(rpy))
             _remove(joint, *_OF_MOVING_JOINTS)
             joint.set("type", "fixed")
     for mesh in file.robot.iter("mesh"):
@@ -111,34 +111,36 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     names = {file.ends[name][1]: name for name in file.joints}
     root = ET.Element("mujoco", model="identified")
     ET.SubElement(root, "compiler", angle="radian")
-    ET.SubElement(root, "option", gravity=_text(robot.gravity))
+    ET.SubElement(root, "option", gravity=exact_text(robot.gravity))
     elements = [ET.SubElement(root, "worldbody")]
     actuators, equalities = (ET.SubElement(root, tag) for tag in ("actuator", "equality"))
     poses, bodies = tree.placements.numpy(), central_parameters(constants.inertia)
     for k, (pose, body) in enumerate(zip(poses, tree.bodies, strict=True)):
         w, x, y, z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
-        place = {"pos": _text(pose[:3, 3]), "quat": _text([w, x, y, z])}
+        place = {"pos": exact_text(pose[:3, 3]), "quat": exact_text([w, x, y, z])}
         element = ET.SubElement(elements[tree.parents[k] + 1], "body", place, name=body)
         elements.append(element)
         mass, x, y, z, xx, xy, yy, xz, yz, zz = bodies[k].tolist()
-        full = _text([xx, yy, zz, xy, xz, yz])
-        ET.SubElement(element, "inertial", mass=repr(mass), pos=_text([x, y, z]), fullinertia=full)
+        full = exact_text([xx, yy, zz, xy, xz, yz])
+        ET.SubElement(
+            element, "inertial", mass=repr(mass), pos=exact_text([x, y, z]), fullinertia=full
+        )
         turns = bool(tree.revolute[k])
-        settings = {"type": "hinge" if turns else "slide", "axis": _text(tree.axes[k])}
+        settings = {"type": "hinge" if turns else "slide", "axis": exact_text(tree.axes[k])}
         joint, number = names[body], robot.body_joints[k]
         driver = robot.joint_names[number]
         if joint != driver:
             factors = f"0 {float(tree.coupling[k, number])!r} 0 0 0"
             ET.SubElement(equalities, "joint", joint1=joint, joint2=driver, polycoef=factors)
         else:
-            settings["armature"] = _text(constants.armature[[number]])
-            settings["damping"] = _text(constants.damping[[number]])
-            settings["frictionloss"] = _text(constants.friction[[number]])
+            settings["armature"] = exact_text(constants.armature[[number]])
+            settings["damping"] = exact_text(constants.damping[[number]])
+            settings["frictionloss"] = exact_text(constants.friction[[number]])
             low, high = robot.limits[number, :2]
             if low < high and not (turns and high - low > 6.28):
-                settings |= {"range": _text([low, high]), "limited": "true"}
+                settings |= {"range": exact_text([low, high]), "limited": "true"}
             if gain := float(constants.gain[number]):
-                law = {"gainprm": repr(gain), "biasprm": _text(constants.offset[[number]])}
+                law = {"gainprm": repr(gain), "biasprm": exact_text(constants.offset[[number]])}
                 ET.SubElement(actuators, "general", law, name=joint, joint=joint, biastype="affine")
         ET.SubElement(element, "joint", settings, name=joint)
     return _written(root, constants.notes)
@@ -161,10 +163,6 @@ def _file(robot: RigidChain) -> UrdfFile:
 def _remove(parent: ET.Element, *tags: str) -> None:
     for element in [child for child in parent if child.tag in tags]:
         parent.remove(element)
-
-
-def _text(values: Iterable[float] | Tensor) -> str:
-    return " ".join(repr(float(value)) for value in values)
 
 
 def _written(root: ET.Element, notes: Iterable[str]) -> str:

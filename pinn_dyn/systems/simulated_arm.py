@@ -14,6 +14,7 @@ import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
+from pinn_dyn.systems.mjcf import exact_text
 from pinn_dyn.systems.rigid_chain import RigidChain
 
 
@@ -127,8 +128,8 @@ class SimulatedArm(RigidChain, abc.ABC):
             kind = "continuous" if self.turning[k] else "prismatic"
             parts.append(
                 f'<joint name={quoteattr(name)} type="{kind}"><parent link="{_link(parent)}"/>'
-                f'<child link="{_link(k)}"/><origin xyz="{_text(origin)}"/>'
-                f'<axis xyz="{_text(axis)}"/>'
+                f'<child link="{_link(k)}"/><origin xyz="{exact_text(origin)}"/>'
+                f'<axis xyz="{exact_text(axis)}"/>'
                 # PyBullet needs limits of a sliding joint; lower > upper means that there are none.
                 '<limit lower="1" upper="-1" effort="0" velocity="0"/></joint>'
             )
@@ -136,7 +137,7 @@ class SimulatedArm(RigidChain, abc.ABC):
             ixx, iyy, izz = (repr(float(moment)) for moment in moments)
             parts.append(
                 f'<link name="{_link(k)}"><inertial><mass value="{mass!r}"/>'
-                f'<origin xyz="{_text(centre)}" rpy="{_text(turn.as_euler("xyz"))}"/>'
+                f'<origin xyz="{exact_text(centre)}" rpy="{exact_text(turn.as_euler("xyz"))}"/>'
                 f'<inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/>'
                 "</inertial></link>"
             )
@@ -161,7 +162,3 @@ def _principal_inertia(
 
 def _link(body: int) -> str:
     return "base" if body < 0 else f"body{body}"
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(repr(float(value)) for value in values)

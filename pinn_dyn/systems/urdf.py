@@ -26,6 +26,7 @@ class Tree(NamedTuple):
         path: the file.
         joints: names of the joints whose positions are the coordinates.
         movable: names of all joints that can be coordinates.
+        locked: positions of the locked joints by name.
         bodies: names of the links behind the B joints.
         parents: index of the joint before each joint, -1 at the base; parents come first.
         placements: pose of each joint's frame at q = 0 in its parent's frame, ``(B, 4, 4)``.
@@ -45,6 +46,7 @@ class Tree(NamedTuple):
     path: Path
     joints: list[str]
     movable: list[str]
+    locked: dict[str, float]
     bodies: list[str]
     parents: list[int]
     placements: Tensor
@@ -128,6 +130,7 @@ def read_urdf(
         path=file.path,
         joints=list(joints),
         movable=movable,
+        locked=locked,
         bodies=[file.ends[name][1] for name in moving],
         parents=parents,
         placements=torch.from_numpy(np.stack(placements)),

@@ -92,23 +92,21 @@ def _topic(
 ) -> _Topic:
     """Return the values of a topic in the order of the times of its messages."""
     stamps, times = rows[:, :2].astype(float).T
-    keep = np.arange(len(rows))
     if (stamps > 0).any():
         # In a simulation 0 is the first time.
         zero = (stamps == 0) & (stamps[stamps > 0].min() > _LATEST)
-        keep, times = np.flatnonzero(~zero), np.where(np.isnan(stamps), times, stamps)[~zero]
         if zero.any():
-            notes.append(
-                f"{zero.sum()} of {len(rows)} messages of {topic} with stamp 0 are dropped"
-            )
+            text = f"{zero.sum()} of {len(rows)} messages of {topic} with stamp 0 are dropped"
+            notes.append(text)
+        rows, times = rows[~zero], np.where(np.isnan(stamps), times, stamps)[~zero]
     elif (stamps == 0).any():
         notes.append(f"the stamps of {topic} are 0: its times are those of receipt")
     late = np.maximum.accumulate(times) - times
     if 0 < late.max() < _LATEST:
         notes.append(f"{(late > 0).sum()} messages of {topic} came late: sorted by their times")
         order = times.argsort(kind="stable")
-        keep, times = keep[order], times[order]
-    content = rows[keep, 3:]
+        rows, times = rows[order], times[order]
+    content = rows[:, 3:]
     if f"{topic}/t" in columns and content[0, columns.index(f"{topic}/t")] is None:
         content[:, columns.index(f"{topic}/t")] = times
     missing = np.array(content == None)  # noqa: E711
@@ -125,7 +123,7 @@ def _topic(
                 f"measure it. Choose another signal, such as commands; the bag has {kinds}"
             )
     frame = pd.DataFrame(values, columns=columns, index=times)
-    return _Topic(frame, np.any(missing, axis=1), pd.Series(rows[keep, 2]))
+    return _Topic(frame, np.any(missing, axis=1), pd.Series(rows[:, 2]))
 
 
 def _fields_of_topics(
