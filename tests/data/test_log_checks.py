@@ -219,6 +219,21 @@ def test_suspicious_signals_are_warned_of(tmp_path, columns, message):
     assert re.search(message, warned(tmp_path, motion().assign(**columns)), re.DOTALL)
 
 
+def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
+    """A pendulum that turns over and back, and a wheel that rolls on; in degrees they swing."""
+    rows = [(0.0, 9.0)]
+    for force in np.repeat(motion(20.0)["u1"], 20):
+        q, v = rows[-1]
+        v += (15 * force - 9.81 * np.sin(q) - 0.5 * v) / 2000
+        rows.append((q + v / 2000, v))
+    q, v = np.transpose(rows[:-1:20])
+    wheel = 5 * T + np.sin(T)
+    table = motion().assign(q1=q[:1001], v1=v[:1001], q2=wheel, v2=5 + np.cos(T))
+    assert np.ptp(q[:1001]) > 4 * np.pi
+    assert "degrees" not in warned(tmp_path, table)
+    assert "'q1': an angle" in warned(tmp_path, motion().assign(q1=50 * motion()["q1"]))
+
+
 @pytest.mark.parametrize(("factor", "ratio"), [(180 / np.pi, 0.01745), (-1.0, -1.0), (0.5, 2.0)])
 def test_velocity_that_disagrees_by_a_factor(tmp_path, factor, ratio):
     text = warned(tmp_path, motion().assign(v2=factor * motion()["v2"]))

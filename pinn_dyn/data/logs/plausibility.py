@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import gaussian_filter1d
 
 from pinn_dyn.data.logs.checks import BURSTS, burst_share
 from pinn_dyn.data.logs.columns import Columns
@@ -18,6 +19,7 @@ _CLEAR = 0.8  # correlation from which the factor is determined
 _AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and of a stop
 _STILL = 1e-12  # range of a coordinate that does not move, m or rad
 _TENTHS, _MOST_ODD = 10, 0.6  # parts of a stretch; largest share of parts that disagree
+_SMOOTH, _PERIODIC = 0.03, 0.6  # s; of the acceleration: largest share that periodic terms leave
 _MOVING, _LEFT = 0.05, 0.7  # of a tenth: share of the mean square, share of Δq² that k v leaves
 
 
@@ -47,7 +49,7 @@ def check_inputs(training: list[Recording], u: Columns) -> list[Measurement]:
     ]
 
 
-def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
+def check_angles(recordings: list[Recording], q: Columns, step: float) -> list[Measurement]:
     """Measure the largest angles; an angle beyond 4 pi rad is probably in degrees."""
     results = []
     for k in (k for k, unit in enumerate(q.units) if unit == "rad"):
@@ -56,9 +58,30 @@ def check_angles(recordings: list[Recording], q: Columns) -> list[Measurement]:
             f"{run}, column {q.columns[k]!r}: an angle of {angle:.4g} rad is more than two turns: "
             f"is it in degrees? Its unit is configured as {q.unit[k]!r}"
         )
-        measured = ("largest angle [rad]", q.columns[k], angle, "below 4 pi")
-        results.append(judged(*measured, angle > 4 * math.pi, text))
+        bad = angle > 4 * math.pi and not _turns(recordings, k, step)
+        results.append(judged("largest angle [rad]", q.columns[k], angle, "below 4 pi", bad, text))
     return results
+
+
+def _turns(recordings: list[Recording], k: int, step: float) -> bool:
+    """Tell whether angle k grows up to the end, or its acceleration has the period of a turn."""
+    steps = [np.diff(item.q[:: max(1, len(item) // 50), k]) for item in recordings]
+    path, last = sum(np.abs(x).sum() for x in steps), sum(abs(x[-1]) * len(x) for x in steps)
+    if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
+        return True
+    samples = max(_SMOOTH / step, 1.5)
+    parts = []
+    for item in recordings:
+        v = np.gradient(item.q, step, axis=0)
+        smooth = [gaussian_filter1d(v, samples, 0, order) for order in (1, 0)]
+        parts.append(np.hstack([smooth[0][:, [k]], smooth[1], np.sin(item.q), np.cos(item.q)]))
+    a, v, trig = np.split(np.vstack(parts), [1, 1 + recordings[0].q.shape[1]], axis=1)
+    plain = np.hstack([v, np.ones_like(a)])
+    left = [
+        ((a - x @ np.linalg.lstsq(x, a, rcond=None)[0]) ** 2).sum()
+        for x in (plain, np.hstack([plain, trig]))
+    ]
+    return bool(left[1] < _PERIODIC * left[0])
 
 
 def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measurement]:

@@ -201,7 +201,6 @@ class LogSource(DataSource):
         recordings = self._layout.read(self.files, self.root, report)
         measurements = report.measurements
         measurements += plausibility.check_stamps(recordings, self._repairs)
-        measurements += plausibility.check_angles(recordings, self.q)
         if self.test is None:
             times = {item.run: item.t for item in recordings}
             self.validation, self.test, self.guard = default_split(times, self.seed)
@@ -219,6 +218,7 @@ class LogSource(DataSource):
         training = stretches["train"]
         everything = [item for items in stretches.values() for item in items]
         step = one_sample_time(everything)
+        measurements += plausibility.check_angles(everything, self.q, step)
         if self.v is not None:
             measurements += plausibility.check_velocities(everything, self.q, self.v, step)
         measurements += check_runs(everything, self.q, self.u, step)
