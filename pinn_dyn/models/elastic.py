@@ -56,6 +56,8 @@ class ElasticJoints(nn.Module):
         self.joint_names = [*names, *(f"{name}_motor" for name in elastic)]
         self.turning = [*chain.turning, *(chain.turning[k] for k in links)]
         self.body_names, self.body_joints = chain.body_names, chain.body_joints
+        self.generic_inertia, self.prior_inertia = chain.generic_inertia, chain.prior_inertia
+        self.parameters_of = chain.parameters_of
         self.driven = [f"{name}_motor" if name in elastic else name for name in names]
         unit = torch.eye(self.num_coordinates)
         self.stretch = unit[self.size :] - unit[links]
@@ -68,15 +70,6 @@ class ElasticJoints(nn.Module):
     def motor_forces(self, force: Tensor) -> Tensor:
         """Return the forces of links at their motors, ``(N + S,)``, from forces on (q, theta)."""
         return self.stretch.clamp(min=0).to(force).mT @ (self.stretch.abs().to(force) @ force)
-
-    def generic_inertia(self) -> Tensor:
-        return self.chain.generic_inertia()
-
-    def prior_inertia(self) -> Tensor:
-        return self.chain.prior_inertia()
-
-    def parameters_of(self, inertia: Tensor) -> Tensor:
-        return self.chain.parameters_of(inertia)
 
     def mass_matrix(self, q: Tensor, inertia: Tensor) -> Tensor:
         return self._matrix(self.chain.mass_matrix(self._links(q), inertia))

@@ -114,9 +114,8 @@ class KnownMechanics(LearnedConstants):
             )
         names, size = structure.joint_names, structure.num_coordinates
         elastic = structure if isinstance(structure, ElasticJoints) else None
-        driven = list(driven_joints or (elastic.driven if elastic else names))
-        driven = driven if statistics.num_inputs else []
         inputs = statistics.num_inputs
+        driven = list(driven_joints or (elastic.driven if elastic else names)) if inputs else []
         if input is not None and inputs == 2 * len(driven):
             inputs //= 2  # targets and feed-forward forces
         sizes = statistics.num_coordinates, inputs
@@ -220,10 +219,9 @@ class KnownMechanics(LearnedConstants):
         drives = [part.named() for part in (self.armature, self.viscous, self.offset)]
         if self.elastic is not None:
             drives += [self.elastic.stiffness.named(), self.elastic.damping.named()]
-        gains = [] if self.gain is None else [self.gain.named()]
-        if self.servo is not None:
-            gains = self.servo.physical_constants()
-        return [*constants, *drives, *self.friction.physical_constants(), *gains]
+        drives += self.friction.physical_constants()
+        drives += [] if self.gain is None else [self.gain.named()]
+        return [*constants, *drives, *(self.servo.physical_constants() if self.servo else [])]
 
     def body_parameters(self) -> Tensor:
         """Return the inertial parameters pi ``(n, 10)``, with M a + C v + G = Y(q, v, a) pi."""

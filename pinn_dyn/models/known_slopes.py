@@ -31,7 +31,12 @@ class KnownSlopes(Slopes):
         return self.by_regressor(self.model.structure.regressor(q, v, a), q, v, a, u)
 
     def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
-        drives = self._drive_slopes(lambda m: _elements(m, *at), at[0])
+        def elements(m: Any) -> Tensor:
+            """Return the forces of all drives, and then of all springs, ``(*batch, N + S)``."""
+            force = m.drive_force(*at)
+            return force if m.elastic is None else torch.cat([force, m.elastic.forces(*at[:2])], -1)
+
+        drives = self._drive_slopes(elements, at[0])
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
     def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
@@ -86,12 +91,6 @@ class KnownSlopes(Slopes):
         )
 
 
-def _elements(model: Any, q: Tensor, v: Tensor, *at: Tensor) -> Tensor:
-    """Return the forces of all drives, and then of all springs, ``(*batch, N + S)``."""
-    force = model.drive_force(q, v, *at)
-    return force if model.elastic is None else torch.cat([force, model.elastic.forces(q, v)], -1)
-
-
 class KnownSamples(Samples):
     """Samples whose regressor Y is computed once, since Y does not depend on the parameters."""
 
@@ -102,10 +101,9 @@ class KnownSamples(Samples):
     def missing_force(self) -> Tensor:
         bodies = self._regressor @ self.model.body_parameters().flatten()
         force = bodies + self.model.drive_force(*self.at)
-        if self.model.elastic is None:
-            return force
-        q, v, *_ = self.at
-        return force + self.model.elastic.forces(q, v) @ self.model.elastic.stretch
+        if self.model.elastic is not None:
+            force = force + self.model.elastic.forces(*self.at[:2]) @ self.model.elastic.stretch
+        return force
 
     def by_parameters(self) -> Tensor:
         return self.model.slopes().by_regressor(self._regressor, *self.at)

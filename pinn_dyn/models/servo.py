@@ -85,9 +85,8 @@ class Servo(InputMatrix):
         motors = replace(scales, named=tuple(scales.joints[k] for k in index))
         units = [joint.force + ("/rad" if joint.turns else "/m") for joint in motors.joints]
         build = partial(motors.positive, spread=spread or 1.5)
-        self.stiffness = self.damping = self.limit = None
-        if spread > 0:
-            self.stiffness = build("servo stiffness", 1.0, start, units=units)
+        self.stiffness = build("servo stiffness", 1.0, start, units=units) if spread > 0 else None
+        self.damping = self.limit = None
         self.affine = limit is None
         if not self.affine:
             units = [joint.damping for joint in motors.joints]
@@ -116,7 +115,8 @@ class Servo(InputMatrix):
 
     def damping_rates(self) -> Tensor:
         """Return d of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
-        return self._rate() @ self.selection
+        rate = torch.zeros_like(self.gain()) if self.damping is None else self.damping()
+        return rate @ self.selection
 
     def forward(self, q: Tensor) -> Tensor:
         """Return A, ``(*batch, N, M)``."""
@@ -144,15 +144,12 @@ class Servo(InputMatrix):
         parts = self.stiffness, self.damping, self.limit
         return [part.named() for part in parts if part is not None]
 
-    def _rate(self) -> Tensor:
-        return torch.zeros_like(self.gain()) if self.damping is None else self.damping()
-
     def _linear_torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return s, ``(*batch, n)``."""
         target, *feedforward = u.split(len(self.selection), dim=-1)
-        torque = self.gain() * (target - q @ self.selection.mT)
-        torque = sum(feedforward, torque)
-        return torque if self.affine else torque - self._rate() * (v @ self.selection.mT)
+        side = self.selection.mT
+        torque = sum(feedforward, self.gain() * (target - q @ side))
+        return torque if self.damping is None else torque - self.damping() * (v @ side)
 
     def _largest(self) -> Tensor:
         """Return L, ``(n,)``."""
