@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import io
 import logging
@@ -10,7 +9,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from contextlib import nullcontext, redirect_stdout
 from functools import partial
 from pathlib import Path
 
@@ -32,6 +31,7 @@ def main(command: str) -> None:
     options = [word for word in sys.argv[1:] if word not in flags.overrides]
     shows = flags.help or flags.hydra_help or flags.cfg or flags.info or flags.shell_completion
     installed = Path(sys.argv[0]).name.startswith("pinn-dyn-")
+    help_text = io.StringIO()  # names the scripts of a checkout
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print a traceback of
     hush()
     try:
@@ -41,7 +41,7 @@ def main(command: str) -> None:
             composed(command, flags.overrides, flags.config_dir)
         folder = str(config_folder(command))
         run = partial(_run, command)
-        with _help_of_installed() if flags.help and installed else contextlib.nullcontext():
+        with redirect_stdout(help_text) if flags.help and installed else nullcontext():
             hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
@@ -49,17 +49,8 @@ def main(command: str) -> None:
         raise SystemExit(f"Error: {explained(error)}") from error
     except ConfigError as error:
         raise SystemExit(f"Error: {error}") from error
-
-
-@contextlib.contextmanager
-def _help_of_installed() -> Iterator[None]:
-    """Replace the scripts in the help by the installed commands."""
-    text = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(text):
-            yield
     finally:
-        print(re.sub(r"python (\w+)\.py", r"pinn-dyn-\1", text.getvalue()), end="")
+        print(re.sub(r"python (\w+)\.py", r"pinn-dyn-\1", help_text.getvalue()), end="")
 
 
 def _run(command: str, cfg: DictConfig) -> object:
