@@ -35,8 +35,8 @@ def check(cfg: DictConfig) -> None:
     write_config(folder, config)
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if report.options:
-        heads = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
-        effects = " and ".join(heads[option] for option in report.options)
+        names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
+        effects = " and ".join(names[option] for option in report.options)
         print(f"a training with {effects}: {_training(report.options)}")
         print("with a URDF, model=known is often more accurate: docs/known_mechanics.md")
     if report.problems:

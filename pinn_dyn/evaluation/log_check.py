@@ -95,9 +95,7 @@ class LogCheck:
         if self.rigid is not None:
             tables[f"Rigid bodies, not determined: {self.rigid.undetermined}"] = self.rigid.joints
         lines = [f"{self.source.name}: check of the log"]
-        for title, frame in tables.items():
-            if frame.empty:
-                continue
+        for title, frame in ((k, x) for k, x in tables.items() if len(x)):
             text = frame.to_string(
                 index=False, na_rep="", float_format="{:.3g}".format, max_rows=_ROWS
             )
@@ -152,7 +150,14 @@ def check(
     highest = numbers.bandwidth(training, step, noise)
     measurements = [*source.measurements, *_limited(coordinates)]
     if inputs:
-        measurements.append(_explained(numbers.explained_share(training, delays, step)))
+        share = numbers.explained_share(training, delays, step)
+        text = (
+            f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
+            "inputs of this robot, on the same clock?"
+        )
+        name, bad = "share of the motion that inputs add to (1, q, v)", share < _EXPLAINED
+        expected = f"at least {_EXPLAINED}"
+        measurements.append(_judged(name, "inputs", share, expected, bad, text, "stop"))
     same_units = source.u.units[: len(source.q.units)] == source.q.units
     servo = same_units and numbers.target_distance(training, step, longest_delay) < _TARGET
     # The lag of a servo is no delay.
@@ -191,7 +196,6 @@ def check(
     }
     dry = any(x.dry for x in delays)
     sharp = dry and source.v is not None  # a filter smears reversals of dry friction
-    late_inputs = _delay(source, clear, step)
     return LogCheck(
         source,
         measurements,
@@ -199,7 +203,10 @@ def check(
         coordinates,
         pd.DataFrame(table),
         delays,
-        [*([] if sharp else _filter(source, training, step, noise, highest)), *late_inputs],
+        [
+            *([] if sharp else _filter(source, training, step, noise, highest)),
+            *_delay(source, clear, step),
+        ],
         ["model/input=servo"] * servo + ["model/friction=coulomb"] * dry,
         excitation,
     )
@@ -251,15 +258,6 @@ def _limited(coordinates: pd.DataFrame) -> list[Measurement]:
             message = f"{label}: {text.format(100 * value)}"
             results.append(_judged(name, label, value, f"below {limit}", value > limit, message))
     return results
-
-
-def _explained(share: float) -> Measurement:
-    text = (
-        f"the inputs explain {100 * share:.2g} % of the motion, at any delay: are these the "
-        "inputs of this robot, on the same clock?"
-    )
-    name, expected = "share of the motion that inputs add to (1, q, v)", f"at least {_EXPLAINED}"
-    return _judged(name, "inputs", share, expected, share < _EXPLAINED, text, "stop")
 
 
 def _filter(

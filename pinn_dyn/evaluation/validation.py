@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 from pydantic import PositiveFloat, PositiveInt
+from torch import Tensor
 
 from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
@@ -126,23 +127,18 @@ class RolloutValidator:
             item.error().mean(dim=1) / max(float(held.error().mean()), self._motion(window))
             for window, item, held in trials
         ]
-        ratio = torch.stack(ratios).nan_to_num(torch.inf)
-        largest = _LARGEST_RATIO
+        ratio, largest = torch.stack(ratios).nan_to_num(torch.inf), _LARGEST_RATIO
         limited = torch.where(ratio > largest / 2, largest - largest**2 / (4 * ratio), ratio)
         return float(limited.mean())
 
     def _motion(self, window: float) -> float:
         """Return the mean distance in the training from the start of windows in s."""
-        errors = [torch.zeros(1)]
+        distances: list[Tensor] = []
         for item in self._training:
-            samples = window / float(item.t[1] - item.t[0])
-            lags = [
-                min(math.ceil(k * samples / _LAGS), len(item.t) - 1) for k in range(1, _LAGS + 1)
-            ]
-            errors += [
-                (item.q[lag:] - item.q[:-lag]).norm(dim=-1).mean().reshape(1) for lag in lags
-            ]
-        return float(torch.cat(errors[1:] or errors).mean())
+            samples, last = window / float(item.t[1] - item.t[0]), len(item.t) - 1
+            lags = [min(math.ceil(k * samples / _LAGS), last) for k in range(1, _LAGS + 1)]
+            distances += [(item.q[lag:] - item.q[:-lag]).norm(dim=-1).mean() for lag in lags]
+        return float(torch.stack(distances).mean()) if distances else 0.0
 
 
 class RolloutFigures(L.Callback):

@@ -45,9 +45,7 @@ _BLOCKS = 30  # blocks of the motion, and neighborhoods of windows
 _SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
-_SCALE = (
-    100.0  # root of the prior precision of the last mass, which sets the unit of passive robots
-)
+_SCALE = 100.0  # root of the prior precision of the last mass of a robot without inputs
 _DIVERGED = 1e4  # residual of a diverged roll-out
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
@@ -181,10 +179,7 @@ class LeastSquares:
             root = torch.eye(len(z)).to(z)
             masses = [k for k, name in enumerate(names) if name.startswith("mass of")]
             if masses and not model.num_inputs:
-                text = (
-                    "no inputs: the motion leaves a common factor of all constants, kept is the %s"
-                )
-                log.info(text, names[masses[-1]])
+                log.info("no inputs: all constants are relative to the %s", names[masses[-1]])
                 root[masses[-1], masses[-1]] = _SCALE
             return Prior(0 * z, root)
         owners = [name.split(" of ", 1)[-1] for name in names]

@@ -17,6 +17,12 @@ from pinn_dyn.evaluation.report.page import (
     table,
 )
 
+_INPUTS = (
+    "The curve shows the share of the equation of motion that stays unexplained if an input is "
+    "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
+    "Dry friction is a share of the standard deviation of the input."
+)
+
 
 def check_report(check: LogCheck, *, command: str) -> str:
     """Return the HTML page of a check: verdict, measurements, delay curves, cleaning."""
@@ -38,34 +44,21 @@ def check_report(check: LogCheck, *, command: str) -> str:
         Section("Measurements", [table(measurements)]),
         Section("Clock", [table(check.runs)]),
         Section("Coordinates", [table(check.coordinates)]),
-        *_rigid(check),
-        *_inputs(check),
-        Section("Cleaning", [drawing(cleaning, "raw and cleaned signals"), notes]),
     ]
+    if check.rigid is not None:
+        text = (
+            f"The regressor of {check.rigid.count} base parameters has the condition number "
+            f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. "
+            f"Not determined: {check.rigid.undetermined}."
+        )
+        sections.append(Section("Rigid bodies", [paragraph(text), table(check.rigid.joints)]))
+    if check.delays:
+        curves = drawing(_delays(check), "unexplained share over the delay")
+        parts = [paragraph(_INPUTS), table(check.inputs), curves]
+        sections.append(Section("Inputs and their delays", parts))
+    drawn = drawing(cleaning, "raw and cleaned signals")
+    sections.append(Section("Cleaning", [drawn, notes]))
     return page(f"{source.name}: check of the log", command, sections)
-
-
-def _inputs(check: LogCheck) -> list[Section]:
-    if not check.delays:
-        return []
-    text = (
-        "The curve shows the share of the equation of motion that stays unexplained if an input is "
-        "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
-        "Dry friction is a share of the standard deviation of the input."
-    )
-    curves = drawing(_delays(check), "unexplained share over the delay")
-    return [Section("Inputs and their delays", [paragraph(text), table(check.inputs), curves])]
-
-
-def _rigid(check: LogCheck) -> list[Section]:
-    if check.rigid is None:
-        return []
-    text = (
-        f"The regressor of {check.rigid.count} base parameters has the condition number "
-        f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. "
-        f"Not determined: {check.rigid.undetermined}."
-    )
-    return [Section("Rigid bodies", [paragraph(text), table(check.rigid.joints)])]
 
 
 def _delays(check: LogCheck) -> Figure:
