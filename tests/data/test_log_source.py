@@ -241,11 +241,11 @@ def test_short_stretches_are_dropped_and_named(folder):
     [
         (dict(q=dict(columns=["q1"], unit="dgr")), r"q: unit is 'dgr': did you mean deg.*"),
         (dict(q=dict(columns=["q1"], units="rad")), r"q.unit: .*q.units: Unexpected"),
-        (dict(q=dict(columns=["q1", "q1"], unit="rad")), r"q: .*distinct names"),
+        (dict(q=dict(columns=["q1", "q1"], unit="rad")), "'q1' is twice in q, v and u"),
         (dict(q=dict(columns=["q1", "q2"], unit=["rad"] * 3)), r"q: unit has 3 entries"),
         (dict(q=dict(columns=["q1", "q2"], unit="rad", sign=2)), r"q.sign.*1 or -1"),
         (dict(q=dict(columns=["q1"], unit="Nm"), v=None), "q has the column 'q1' in Nm"),
-        (dict(q=dict(columns=["u1"], unit="rad"), v=None), "'u1' is in two of q, v and u"),
+        (dict(q=dict(columns=["u1"], unit="rad"), v=None), "'u1' is twice in q, v and u"),
         (dict(v=dict(columns=["v1", "v2"], unit="m/s")), r"v has the units .*m/s.*per second"),
         (dict(test=dict(piece=1.0)), r"test: expected either runs or seconds"),
         (dict(test=dict(run=1, piece=2.0)), r"test.run: Unexpected"),

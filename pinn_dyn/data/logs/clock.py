@@ -123,10 +123,7 @@ class InputDelay(Step):
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         step = recording.sample_time("InputDelay")
         lags = np.atleast_1d(np.round(np.asarray(self.delay) / step).astype(int))
-        inputs = recording.u.shape[1]
-        if len(lags) not in (1, inputs):
-            raise LogError(f"InputDelay: {len(lags)} delays, expected one or {inputs}")
-        lags = np.broadcast_to(lags, inputs)
+        lags = np.broadcast_to(lags, recording.u.shape[1])
         longest, samples = int(lags.max()), len(recording)
         if samples - longest < 2:
             raise LogError(f"{recording.place}: shorter than the input delay: drop the run")

@@ -108,8 +108,6 @@ class Columns:
 
     def __post_init__(self) -> None:
         size = len(self.columns)
-        if len(set(self.columns)) < size:
-            raise LogError(f"columns is {self.columns}, expected distinct names")
         for key in ("unit", "sign", "scale", "offset"):
             values = getattr(self, key)
             if len(values) not in (1, size):

@@ -8,7 +8,7 @@ import numpy as np
 
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.recording import clock_steps
+from pinn_dyn.data.logs.recording import Recording, Report, clock_steps
 from pinn_dyn.data.logs.table import Table
 
 _SLOWER = 0.1  # share of empty cells from which a signal has a slower clock
@@ -17,14 +17,14 @@ _MISSED = 3  # usual sample times of a signal that are filled in any case
 
 
 def fill(
-    t: np.ndarray,
-    values: dict[str, np.ndarray],
+    recording: Recording,
     signals: Mapping[str, Columns],
     table: Table,
     max_age: float,
+    report: Report,
     *,
     splits: bool,
-) -> tuple[np.ndarray, list[str], list[str]]:
+) -> np.ndarray:
     """Fill the empty cells of a run in place: hold u, interpolate q and v linearly.
 
     Rows between two samples of the first column of q are dropped. No cell is filled
@@ -32,23 +32,22 @@ def fill(
     the column. Rows with such cells are dropped too.
 
     Args:
-        t: times of the rows in order, ``(T,)``, s.
-        values: values of each signal, ``(T, K)``, NaN in empty cells.
+        recording: rows in the order of their times, with NaN in empty cells.
         signals: columns of each signal.
         table: the rows, for messages.
         max_age: see above, s.
+        report: gets notes and warnings.
         splits: a later step splits runs where rows are missing.
 
     Returns:
-        The rows that stay, a mask ``(T,)``, notes, and warnings.
+        The rows that stay, a mask ``(T,)``.
 
     Raises:
         LogError: if a column has no value, no row stays, or rows are missing in the middle of a
             run that no step splits there.
     """
-    notes: list[str] = []
-    warnings: list[str] = []
-    clock = ~np.isnan(values["q"][:, 0])
+    t, run = recording.t, recording.run
+    clock = ~np.isnan(recording.q[:, 0])
     if len(times := t[clock]) > 1:  # rows between samples of q are of other signals
         age, _ = _filled(t, times, times, np.ones(len(t), dtype=bool), hold=False)
         clock |= age > _LOST * np.median(np.diff(times))
@@ -56,7 +55,7 @@ def fill(
     for signal, columns in signals.items():
         counts, ages, names = [0], [0.0], []
         for k, name in enumerate(columns.columns):
-            x = values[signal][:, k]
+            x = getattr(recording, signal)[:, k]
             present = ~np.isnan(x)
             if not present.any():
                 raise LogError(f"{table.name}: the column {name!r} ({signal}) has no values")
@@ -81,20 +80,22 @@ def fill(
                 )
                 if not splits:
                     raise LogError(f"{text}: split the run there, as in{clock_steps(t[clock])}")
-                warnings.append(f"{text}: {inside.sum()} rows are dropped")
+                report.warn("empty cells", f"{text}: {inside.sum()} rows are dropped")
         if names:
             way = "held" if signal == "u" else "interpolated"
             text = (
                 f"{max(counts)} of {clock.sum()} values of {signal} ({', '.join(names)}) are "
                 f"missing and {way}, over at most {max(ages):.3g} s"
             )
-            slower = max(counts) > _SLOWER * clock.sum()
-            (notes if slower else warnings).append(text if slower else f"{table.name}: {text}")
+            if max(counts) > _SLOWER * clock.sum():
+                report.add("Read", run, text)
+            else:
+                report.warn("empty cells", f"{table.name}: {text}")
     if not stays.any():
         raise LogError(f"{table.name}: no row has values of {', '.join(signals)}: raise max_age")
     if dropped := int((clock & ~stays).sum()):
-        notes.append(f"{dropped} of {clock.sum()} rows lack a value and are dropped")
-    return stays, notes, warnings
+        report.add("Read", run, f"{dropped} of {clock.sum()} rows lack a value and are dropped")
+    return stays
 
 
 def _filled(

@@ -44,11 +44,7 @@ class Layout:
     repairs: Collection[str]
 
     def read(self, files: Files, root: str, report: Report) -> list[Recording]:
-        """Read all runs of a log.
-
-        Raises:
-            LogError: on a file that cannot be used.
-        """
+        """Read all runs of a log."""
         recordings: list[Recording] = []
         tables = self._tables(files, root)
         if self.long is not None:
@@ -61,10 +57,9 @@ class Layout:
         for stem, table in tables.items():
             for note in table.notes:
                 report.warn("rows", f"{stem}: {note}")
-            prefix = f"{stem}:" if self.trajectory is not None and len(tables) > 1 else ""
-            runs = {
-                f"{prefix}{run}": rows for run, rows in table.runs(self.trajectory, stem).items()
-            }
+            runs = table.runs(self.trajectory, stem)
+            if self.trajectory is not None and len(tables) > 1:
+                runs = {f"{stem}:{run}": rows for run, rows in runs.items()}
             recordings += [item for _, item in self.recordings(table, runs, report)]
         return recordings
 
@@ -118,39 +113,27 @@ class Layout:
             for k, piece in enumerate(pieces):
                 name = f"{run}:{k + 1}" if len(pieces) > 1 else run
                 part = {signal: x[rows[piece]] for signal, x in values.items()}
-                kept, item = self._recording(name, t[piece], part, table, rows[piece], report)
+                item = Recording(name, t[piece], part["q"], part.get("v"), part["u"])
+                read, item = self._checked(item, table, rows[piece], report)
                 text = f"{len(item)} rows, {item.duration:.6g} s, from {Path(table.name).name}"
                 report.add("Read", name, "; ".join([text, *notes]))
-                results.append((kept, item))
+                results.append((read, item))
         return results
 
-    def _recording(
-        self,
-        run: str,
-        t: np.ndarray,
-        values: dict[str, np.ndarray],
-        table: Table,
-        rows: np.ndarray,
-        report: Report,
+    def _checked(
+        self, item: Recording, table: Table, rows: np.ndarray, report: Report
     ) -> tuple[np.ndarray, Recording]:
+        """Fill the empty cells of the rows of a table, and check them."""
         part = table.select(rows)
-        empty = any(np.isnan(x).any() for x in values.values())
-        if empty and (np.diff(t) >= 0).all():  # otherwise check_clock raises
+        if np.isnan(item.values()).any() and (np.diff(item.t) >= 0).all():  # or check_clock raises
             splits = "gaps" in self.repairs
-            stays, notes, warnings = fill(
-                t, values, self.signals, part, self.request.max_age, splits=splits
-            )
-            for text in notes:
-                report.add("Read", run, text)
-            for text in warnings:
-                report.warn("empty cells", text)
-            rows, t = rows[stays], t[stays]
-            part, values = part.select(stays), {key: x[stays] for key, x in values.items()}
-        check_clock(t, part, self.time, self.repairs)
-        for signal, x in values.items():
-            columns = self.signals[signal]
-            report.measurements += check_rows(part, t, signal, columns, x, self.repairs)
-        return rows, Recording(run, t, values["q"], values.get("v"), values["u"])
+            stays = fill(item, self.signals, part, self.request.max_age, report, splits=splits)
+            rows, item, part = rows[stays], item.rows(stays), part.select(stays)
+        check_clock(item.t, part, self.time, self.repairs)
+        for signal, columns in self.signals.items():
+            x = getattr(item, signal)
+            report.measurements += check_rows(part, item.t, signal, columns, x, self.repairs)
+        return rows, item
 
 
 def _in_order(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -138,7 +138,7 @@ class LogSource(DataSource):
             raise LogError(f"v has the units {self.v.units}, expected {self.q.units} per second")
         names = pd.Index([x for columns in self._signals.values() for x in columns.columns])
         if names.has_duplicates:
-            raise LogError(f"column {names[names.duplicated()][0]!r} is in two of q, v and u")
+            raise LogError(f"column {names[names.duplicated()][0]!r} is twice in q, v and u")
 
     def load(self) -> Splits:
         """Return the cleaned trajectories, or raise a LogError on a file that cannot be used."""
