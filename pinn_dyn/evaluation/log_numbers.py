@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 from scipy.signal import welch
 
 from pinn_dyn.data.logs import DelayCurve, Recording
+from pinn_dyn.data.logs.delay_regression import CUT, averages
 
 _LAGS = 30  # of a target that are tried
 _STILL = 0.01  # variance of a coordinate at rest as a share of the largest
@@ -23,15 +23,15 @@ def explained_share(
     The result is 1 where the rows are too few to tell.
     """
     width = max(_SMOOTH / step, 1.5)
-    edge = int(4 * width) + 1
+    edge = int(CUT * width) + 1
     lags = [round((curve.delay or 0.0) / step) for curve in delays]
     parts = []
     for item in training:
         # At this distance the averages of two rows are independent.
         rows = np.arange(edge + max(lags), len(item) - edge, max(1, int(3.5 * width)))
-        smooth = gaussian_filter1d(item.u, width, axis=0)
+        smooth = averages(item.u, width)
         acting = np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)])
-        motion = [gaussian_filter1d(item.q, width, axis=0, order=k)[rows] for k in range(3)]
+        motion = [averages(item.q, width, order=k)[rows] for k in range(3)]
         parts.append([*motion, acting])
     q, v, a, u = map(np.vstack, zip(*parts, strict=True))
     if len(q) < 6 * (3 * q.shape[1] + len(lags)):

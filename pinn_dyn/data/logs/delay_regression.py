@@ -15,7 +15,8 @@ BLOCKS = 10
 """Number B of parts of the data that are left out in turn."""
 _FEW = 3  # inputs up to which their products are terms too
 _ROWS = 8_000  # largest number of rows of the regression
-_CUT = 4.0  # width at which the kernel ends
+CUT = 4.0
+"""Widths of the Gaussian kernel at which it ends."""
 _SHORT = 0.005  # width of the kernel of the sign of v, s
 _REST = 0.03  # shortest rest, s
 _SLOW = 0.02  # speed at rest as a share of a high speed
@@ -56,7 +57,7 @@ class Smoothed:
     ) -> Smoothed | None:
         """Return the averages with a kernel of this width in s; None if there are too few rows."""
         samples = width / step
-        edge = int(np.ceil(_CUT * samples))
+        edge = int(np.ceil(CUT * samples))
         first, end = edge + int(lags[-1]), edge - int(lags[0])
         total = sum(max(len(item) - first - end, 0) for item in recordings)
         # Averages a quarter of a width apart are all but the same.
@@ -68,7 +69,7 @@ class Smoothed:
             return None
 
         def smooth(x: np.ndarray, order: int = 0) -> np.ndarray:
-            return gaussian_filter1d(x, samples, axis=0, order=order, truncate=_CUT) / step**order
+            return averages(x, samples, step, order)
 
         q, v, a = (np.vstack([smooth(item.q, order)[r] for item, r in pairs]) for order in range(3))
         friction = [signs(item.q, step) for item, _ in pairs]
@@ -85,6 +86,11 @@ class Smoothed:
         return cls(q, v, a, sign, stribeck, moving, _standard(inputs), spread, block)
 
 
+def averages(x: np.ndarray, samples: float, step: float = 1.0, order: int = 0) -> np.ndarray:
+    """Return averages of x by a Gaussian kernel of this width, or their slopes of an order."""
+    return gaussian_filter1d(x, samples, axis=0, order=order, truncate=CUT) / step**order
+
+
 def white_noise(x: np.ndarray) -> np.ndarray:
     """Return the standard deviation of white noise on smooth motions, from third differences."""
     return 1.4826 * np.median(np.abs(np.diff(x, n=3, axis=0)), axis=0) / np.sqrt(20)
@@ -93,7 +99,7 @@ def white_noise(x: np.ndarray) -> np.ndarray:
 def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the smooth sign of v, that of slow v ``(T, 2N)``, and 1 for samples at rest."""
     samples = max(_SHORT / step, 1.5)
-    v = gaussian_filter1d(q, samples, axis=0, order=1) / step
+    v = averages(q, samples, step, order=1)
     # Deviation of the derivative of white noise that a Gaussian kernel averages.
     noise = white_noise(q) / step / np.sqrt(4 * np.sqrt(np.pi) * samples**3)
     high = np.percentile(np.abs(v), 95, axis=0)

@@ -16,10 +16,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay_regression import Smoothed, signs, terms
+from pinn_dyn.data.logs.delay_regression import CUT, Smoothed, averages, signs, terms
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
@@ -88,14 +87,14 @@ def check_runs(
     """
     size, n = len(u.columns), len(q.columns)
     samples = max(_WIDTH / step, 1.5)
-    edge = int(np.ceil(3 * samples))
+    edge = int(np.ceil(CUT * samples))
     stride = max(1, int(samples), sum(map(len, recordings)) / _ROWS)
     parts: dict[str, list[np.ndarray]] = {}
     for item in sorted(recordings, key=lambda item: item.t[0]):
         rows = np.arange(edge, len(item) - edge, stride).astype(int)
         orders = *((item.q, order) for order in range(3)), (item.u[:, :size], 0)
         smooth = [
-            gaussian_filter1d(x, samples, 0, order, truncate=3.0)[rows] / step**order
+            averages(x, samples, step, order)[rows]
             for x, order in (*orders, (signs(item.q, step)[0], 0))
         ]
         parts.setdefault(item.run, []).append(np.hstack([item.t[rows, None], *smooth]))

@@ -20,7 +20,7 @@ SAMPLE_TIMES = (1e-5, 0.5)
 """Plausible sample times, s."""
 _SINCE_1970 = 1e8  # s; later times count from 1970, and are counted from the first
 _COUNTERS = (2**16, 2**32)  # values of a counter of 16 or 32 bits
-_CYCLES = (86400, 604800, *(2**bits * unit for bits in (16, 32) for unit in (1e-3, 1e-6)))  # s
+_CYCLES = (86400, 2**32 * 1e-3, 2**32 * 1e-6)  # s, of a day and of milliseconds and microseconds
 _WRAP_SAMPLES = 10  # longest step over the end of a counter
 
 
