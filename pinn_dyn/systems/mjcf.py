@@ -73,9 +73,9 @@ def mjcf_to_urdf(source: Path | str) -> str:
     for k in range(model.nsite):
         if (site := model.site(k).name) and site not in links:
             body = model.site_bodyid[k]
-            place = data.site_xpos[k] - frames[body]
+            offset = data.site_xpos[k] - frames[body]
             parts.append(f"<link name={quoteattr(site)}/>")
-            parts.append(_joint(f"place of {site}", "fixed", links[body], site, place))
+            parts.append(_joint(f"place of {site}", "fixed", links[body], site, offset))
     return f"<robot>{''.join(parts)}</robot>"
 
 

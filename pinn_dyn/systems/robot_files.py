@@ -117,8 +117,8 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     poses, bodies = tree.placements.numpy(), central_parameters(constants.inertia)
     for k, (pose, body) in enumerate(zip(poses, tree.bodies, strict=True)):
         w, x, y, z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
-        place = {"pos": exact_text(pose[:3, 3]), "quat": exact_text([w, x, y, z])}
-        element = ET.SubElement(elements[tree.parents[k] + 1], "body", place, name=body)
+        frame = {"pos": exact_text(pose[:3, 3]), "quat": exact_text([w, x, y, z])}
+        element = ET.SubElement(elements[tree.parents[k] + 1], "body", frame, name=body)
         elements.append(element)
         mass, x, y, z, xx, xy, yy, xz, yz, zz = bodies[k].tolist()
         full = exact_text([xx, yy, zz, xy, xz, yz])

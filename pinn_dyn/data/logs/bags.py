@@ -63,8 +63,8 @@ def _decode(
         fields = _fields_of_topics(path, sorted(bag.topics, key=len, reverse=True), columns, kinds)
         rows: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in fields}
         for topic, publisher, received, message in bag.messages(list(fields)):
-            place = f"{path}, topic {topic}"
-            values = [_number(message, field, place) for field in fields[topic].values()]
+            location = f"{path}, topic {topic}"
+            values = [_number(message, field, location) for field in fields[topic].values()]
             names = getattr(message, "name", ())
             joints = tuple(sorted(map(str, names))) if hasattr(names, "__len__") else ()
             rows[topic].append((_stamp(message), 1e-9 * received, (publisher, joints), *values))
@@ -101,9 +101,9 @@ def _topic(
         rows, times = rows[~zero], np.where(np.isnan(stamps), times, stamps)[~zero]
     elif (stamps == 0).any():
         notes.append(f"the stamps of {topic} are 0: its times are those of receipt")
-    late = np.maximum.accumulate(times) - times
-    if 0 < late.max() < _LATEST:
-        notes.append(f"{(late > 0).sum()} messages of {topic} came late: sorted by their times")
+    delay = np.maximum.accumulate(times) - times
+    if 0 < delay.max() < _LATEST:
+        notes.append(f"{(delay > 0).sum()} messages of {topic} came late: sorted by their times")
         order = times.argsort(kind="stable")
         rows, times = rows[order], times[order]
     content = rows[:, 3:]
@@ -153,7 +153,7 @@ def _stamp(message: Any) -> float | None:
     return _seconds(getattr(header, "stamp", getattr(message, "timestamp", None)))
 
 
-def _number(message: Any, field: str, place: str) -> float | None:
+def _number(message: Any, field: str, location: str) -> float | None:
     """Return the number at a path such as ``position/joint1``; None for a missing entry."""
     if field == "t" and not hasattr(message, "t"):
         return None  # the time of the message follows
@@ -170,13 +170,13 @@ def _number(message: Any, field: str, place: str) -> float | None:
             node = getattr(node, step)
         else:
             names = listed(x for x in dir(node) if x[0] != "_" and not callable(getattr(node, x)))
-            raise LogError(f"{place}: no {field!r} in its messages, which have {names}")
+            raise LogError(f"{location}: no {field!r} in its messages, which have {names}")
     if node is None:  # of JSON
         return None
     seconds = _seconds(node)
     if seconds is None and not isinstance(node, (int, float, np.number, np.bool_)):
         kind = type(node).__name__
-        raise LogError(f"{place}: {field!r} is a {kind}, expected a number, or '<topic>/t'")
+        raise LogError(f"{location}: {field!r} is a {kind}, expected a number, or '<topic>/t'")
     return float(node) if seconds is None else seconds
 
 

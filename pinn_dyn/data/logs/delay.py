@@ -151,8 +151,8 @@ def _agreed(forms: Sequence[list[DelayCurve]], step: float) -> list[DelayCurve]:
     left = [np.mean([x.residual.min() for x in curves]) for curves in forms]
     good = [x for x, share in zip(forms, left, strict=True) if share <= _WORSE * min(left)]
     curves = min(good, key=lambda x: tuple(np.mean([_rank(c) for c in x], axis=0)))
-    for others in good:
-        for k, (x, y) in enumerate(zip(curves, others, strict=True)):
+    for alternative in good:
+        for k, (x, y) in enumerate(zip(curves, alternative, strict=True)):
             width = step + INTERVAL * np.hypot(x.spread, y.spread)
             if x.delay is not None and y.delay is not None and abs(x.delay - y.delay) > width:
                 reason = f"{x.form} and {y.form} disagree, {x.delay:.3g} and {y.delay:.3g} s"

@@ -104,8 +104,8 @@ def signs(q: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
     noise = white_noise(q) / step / np.sqrt(4 * np.sqrt(np.pi) * samples**3)
     high = np.percentile(np.abs(v), 95, axis=0)
     slow = np.maximum(_SLOW * high, 3 * noise).clip(min=1e-300)
-    rest = max(round(_REST / step), 3)  # a reversal of v is no rest
-    still = binary_opening(np.abs(v) < slow, np.ones((rest, 1)))
+    shortest = max(round(_REST / step), 3)  # a reversal of v is no rest
+    still = binary_opening(np.abs(v) < slow, np.ones((shortest, 1)))
     sign = np.tanh(v / slow)
     falls = [np.exp(-((v / np.maximum(x * high, slow)) ** 2)) for x in _STRIBECK]
     return sign, np.hstack([sign * x for x in falls]), still.astype(float)
@@ -158,17 +158,17 @@ def input_shares(data: Smoothed, inputs: int, rigid: Regressor | None = None) ->
         parts = [[*range(inputs)]]
     for part in parts:
         mask = np.asarray(rows if len(parts) == 1 and rigid is None else data.moving[:, part[0]])
-        known, joints = basis, [*range(size)]
+        explained, joints = basis, [*range(size)]
         if rigid is not None:
             drive = [data.a[:, part[0]], data.v[:, part[0]], np.ones(len(mask))]
-            known, joints = np.column_stack([basis[:, part[0]], *drive]), part
+            explained, joints = np.column_stack([basis[:, part[0]], *drive]), part
         u, sign = data.u[mask][..., part], data.sign[mask][:, joints]
         slow = data.stribeck[mask][:, [i + k for k in (0, size) for i in joints]]
         if len(u) < 20 * BLOCKS:
             continue
         m = lags * len(part)
         x = np.hstack([u.reshape(len(u), m), sign, slow])
-        left, squares = _remainders(known[mask], x, np.arange(len(u)) * BLOCKS // len(u))
+        left, squares = _remainders(explained[mask], x, np.arange(len(u)) * BLOCKS // len(u))
         gram = left[:, m:, m:] + 1e-9 * len(u) * np.eye(left.shape[1] - m)
         force = np.linalg.solve(gram, left[:, m:, :m])
         remainder = np.diagonal(left, axis1=1, axis2=2)[:, :m] - (force * left[:, m:, :m]).sum(1)

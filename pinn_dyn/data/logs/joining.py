@@ -34,8 +34,8 @@ def widened(table: Table, key: str, time: Sequence[str], trajectory: str | None)
     index = [*(time or ["row"]), *([trajectory] if trajectory else [])]
     frame = table.frame.assign(row=table.frame.groupby(joints.to_numpy()).cumcount())
     if (repeats := frame.duplicated([*index, key])).any():
-        place = table.place(int(repeats.argmax()), key, "long")
-        raise LogError(f"{place}: a second row of this joint at the same time: drop the row")
+        location = table.place(int(repeats.argmax()), key, "long")
+        raise LogError(f"{location}: a second row of this joint at the same time: drop the row")
     wide = frame.set_index([*index, key]).unstack(key)
     wide.columns = pd.Index([f"{name}/{joint}" for name, joint in wide.columns])
     rows = frame[index].drop_duplicates()
@@ -62,14 +62,14 @@ def joined(
         if not any(column in part for part in kinds):
             next(iter(tables.values())).column(column, "the log")
     for pattern in _PARTS:
-        words = {name: re.findall(pattern, name) for name in tables}
+        words_of = {name: re.findall(pattern, name) for name in tables}
         runs: dict[str, list[str]] = {}
         for kind in kinds:
             names = [name for name in tables if parts[name] == kind]
-            others = {word for name in tables.keys() - names for word in words[name]}
-            usual = set.intersection(*(set(words[name]) for name in names)) - others
+            elsewhere = {word for name in tables.keys() - names for word in words_of[name]}
+            usual = set.intersection(*(set(words_of[name]) for name in names)) - elsewhere
             for name in names:
-                run = "_".join(word for word in words[name] if word not in usual)
+                run = "_".join(word for word in words_of[name] if word not in usual)
                 runs.setdefault(run, []).append(name)
         if all([parts[name] for name in names] == kinds for names in runs.values()):
             return {
@@ -84,8 +84,8 @@ def joined(
 
 def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Table:
     """Join the rows of tables with the same stamps, otherwise those of all clocks, with gaps."""
-    first, *others = tables
-    name = " + ".join([first.name, *(Path(x.name).name for x in others)])
+    first, *further = tables
+    name = " + ".join([first.name, *(Path(x.name).name for x in further)])
     notes = [note for table in tables for note in table.notes]
     times = [
         clock.seconds(table, first)[0] if all(x in table for x in clock.columns) else None
@@ -104,8 +104,8 @@ def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Tabl
                 "the same rows, or a clock in both (and a single run)"
             )
         if (back := np.diff(x) < 0).any():
-            place = table.place(int(back.argmax()) + 1, clock.name)
-            raise LogError(f"{place}: the time goes back, expected a single run in each file")
+            location = table.place(int(back.argmax()) + 1, clock.name)
+            raise LogError(f"{location}: the time goes back, expected a single run in each file")
     frame = pd.concat(
         [
             frame.set_axis([f"{row} of {Path(table.name).name}" for row in frame.index])

@@ -138,7 +138,7 @@ def check_velocities(
         match = int(correlations.argmax())
         product, x, y = (z[~odd].sum() for z in (products[:, k, k], dq[:, k], dv[:, k]))
         ratio, correlation = product / max(y, 1e-300), abs(product) / max(math.sqrt(x * y), 1e-300)
-        place = cause = ""
+        where = cause = ""
         if match != k and correlations[match] >= _CLEAR > correlations[k] and moves(recordings, k):
             cause = f"{v.columns[match]!r} fits it: are columns of v exchanged?"
             correlation = correlations[k]
@@ -154,13 +154,13 @@ def check_velocities(
             within = tenths[tenths // _TENTHS == tenths[0] // _TENTHS] % _TENTHS
             edges = np.linspace(item.t[0], item.t[-1], _TENTHS + 1)[[within[0], within[-1] + 1]]
             more = len({recordings[int(i) // _TENTHS].run for i in tenths} - {item.run})
-            place = f"{item.run} ({edges[0]:.4g} to {edges[1]:.4g} s)"
-            place += f" and {more} more runs, " if more else ", "
+            where = f"{item.run} ({edges[0]:.4g} to {edges[1]:.4g} s)"
+            where += f" and {more} more runs, " if more else ", "
             ratio = products[odd, k, k].sum() / max(dv[odd, k].sum(), 1e-300)
             cause = "is v reversed, stuck or in another unit there?"
         text = (
-            f"{place}columns {a!r} and {b!r}: the derivative of q is {ratio:.4g} times v, expected "
-            f"1, with a correlation of {correlation:.2f}{' elsewhere' if place else ''}: {cause}"
+            f"{where}columns {a!r} and {b!r}: the derivative of q is {ratio:.4g} times v, expected "
+            f"1, with a correlation of {correlation:.2f}{' elsewhere' if where else ''}: {cause}"
         )
         expected = f"{low} to {high}"
         results.append(judged("dq/dt over v", f"{a}, {b}", ratio, expected, bool(cause), text))

@@ -122,7 +122,7 @@ class Table:
             return {name: np.ones(len(self), dtype=bool)}
         names = self.column(column, "trajectory")
         if names.isna().any():
-            place = self.place(int(names.isna().to_numpy().argmax()), column, "trajectory")
-            raise LogError(f"{place}: expected the name of a run")
+            location = self.place(int(names.isna().to_numpy().argmax()), column, "trajectory")
+            raise LogError(f"{location}: expected the name of a run")
         names = names.astype(str)
         return {run: (names == run).to_numpy() for run in names.unique()}

@@ -211,9 +211,9 @@ def _comment(line: str) -> bool:
 
 def _names(line: str, dialect: _Dialect) -> list[list[str]]:
     """Return the names that a header would hold, by the separators that it may have."""
-    words = re.findall(r'"[^"]*"|[^\s\[(]+(?:[ \t]*[\[(][^\])]*[\])])?', line)
+    cells = re.findall(r'"[^"]*"|[^\s\[(]+(?:[ \t]*[\[(][^\])]*[\])])?', line)
     splits = [dialect.cells(line, mark) for mark in (dialect.separator, *",;\t|") if mark != " "]
-    splits.append([word.strip('"') for word in words])
+    splits.append([word.strip('"') for word in cells])
     for names in splits:
         while names and not names[-1]:
             names.pop()
