@@ -53,7 +53,7 @@ def fill(
         clock |= age > _LOST * np.median(np.diff(times))
     stays = clock.copy()
     for signal, columns in signals.items():
-        counts, ages, names = [0], [0.0], []
+        filled: dict[str, np.ndarray] = {}
         for k, name in enumerate(columns.columns):
             x = getattr(recording, signal)[:, k]
             present = ~np.isnan(x)
@@ -68,9 +68,7 @@ def fill(
             good = age <= longest
             stays[np.flatnonzero(empty)[~good]] = False
             if good.any():
-                names.append(name)
-                counts.append(int(good.sum()))
-                ages.append(float(age[good].max()))
+                filled[name] = age[good]
             inside = np.isfinite(age) & ~good
             if inside.any():
                 row = int(np.flatnonzero(empty)[inside.argmax()])
@@ -81,13 +79,14 @@ def fill(
                 if not splits:
                     raise LogError(f"{text}: split the run there, as in{clock_steps(t[clock])}")
                 report.warn("empty cells", f"{text}: {inside.sum()} rows are dropped")
-        if names:
+        if filled:
+            count, distance = max(map(len, filled.values())), max(map(np.max, filled.values()))
             way = "held" if signal == "u" else "interpolated"
             text = (
-                f"{max(counts)} of {clock.sum()} values of {signal} ({', '.join(names)}) are "
-                f"missing and {way}, over at most {max(ages):.3g} s"
+                f"{count} of {clock.sum()} values of {signal} ({', '.join(filled)}) are "
+                f"missing and {way}, over at most {distance:.3g} s"
             )
-            if max(counts) > _SLOWER * clock.sum():
+            if count > _SLOWER * clock.sum():
                 report.add("Read", run, text)
             else:
                 report.warn("empty cells", f"{table.name}: {text}")

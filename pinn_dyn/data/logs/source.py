@@ -56,6 +56,7 @@ class LogSource(DataSource):
         u: columns of the input, M; None or [] for a robot that nothing drives.
         v: columns of the velocity, N, or None.
         max_age: oldest message of another topic, or value of a slower column, of a row, s.
+        sep: separator of the cells of a text file; None detects it.
         trajectory: column that tells the runs of a file apart, or None where a file is one run.
         long: column that names the joint, of a log with a row per joint and time. Other columns
             are then ``<name>/<joint>``.
