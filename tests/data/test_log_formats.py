@@ -1,5 +1,6 @@
 """Bags, HDF5, MATLAB 7.3, NPZ and Parquet give the trajectories that the same CSV gives."""
 
+import os
 import re
 import shutil
 from pathlib import Path
@@ -70,6 +71,10 @@ def test_a_bag_is_decoded_once_until_it_changes(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.delattr(AnyReader, "deserialize")
         again = read_bag(tmp_path / "run", QUERY)
+    pd.testing.assert_frame_equal(again.frame, table.frame)
+    (cached,) = Path(os.environ["PINN_DYN_CACHE"]).glob("bag-*.npz")
+    cached.write_bytes(cached.read_bytes()[:100])  # a damaged file is decoded again
+    again = read_bag(tmp_path / "run", QUERY)
     pd.testing.assert_frame_equal(again.frame, table.frame)
     shutil.rmtree(tmp_path / "run")
     formats.write_bag(tmp_path / "run", TABLE[:300])
