@@ -219,6 +219,15 @@ def test_a_format_is_one_function(tmp_path, expected, monkeypatch):
         source(tmp_path, files="*.foo").load()
 
 
+def test_the_call_that_converts_lines_of_json_works(tmp_path, expected, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    TABLE.to_json("run.jsonl", orient="records", lines=True, double_precision=15)
+    with pytest.raises(LogError) as error:
+        source(tmp_path, files="*.jsonl").load()
+    eval(str(error.value).split("(pandas: ")[1].split("), expected")[0], vars(pd))
+    assert_same(trajectories(source(tmp_path)), expected)
+
+
 def test_other_formats_are_named_with_the_call_that_converts_them(tmp_path):
     """The calls were run on files that asammdf, npTDMS and pyulog write."""
     for name, call in (

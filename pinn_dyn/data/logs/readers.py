@@ -47,6 +47,7 @@ READERS: dict[str, Reader] = {
 
 # Commands that convert a file of another format, and its name without the suffix.
 _CONVERSIONS = {
+    ".jsonl": " (pandas: read_json('{}', lines=True).to_csv('{}.csv', index=False))",
     ".mf4": " (asammdf: MDF('{}').to_dataframe().to_parquet('{}.parquet'))",
     ".tdms": " (npTDMS: TdmsFile('{}').as_dataframe().to_parquet('{}.parquet'))",
     ".ulg": " (pyulog: ulog2csv {})",
