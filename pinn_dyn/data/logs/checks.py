@@ -59,11 +59,12 @@ def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[s
     typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
     low, high = SAMPLE_TIMES
     if not low <= typical <= high and (spacing >= 0).all():
-        unit = clock.plausible_unit(table, typical)
+        shared = int(np.median(np.unique(t, return_counts=True)[1]))  # stamps in whole seconds
+        unit = clock.plausible_unit(table, typical) if shared == 1 else ""
         cure = f"write the unit {unit}, or " if unit else ""
         raise LogError(
             f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s, "
-            f"expected {low:g} to {high:g} s: {cure}{rate.format(1 / typical)}"
+            f"expected {low:g} to {high:g} s: {cure}{rate.format(shared / typical)}"
         )
     row_clock = ""
     same = spacing == 0
