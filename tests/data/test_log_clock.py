@@ -83,9 +83,16 @@ def test_the_index_of_a_frame_is_its_clock(index):
     np.testing.assert_allclose(log.load().train[0].t.diff(), 0.01, atol=1e-9)
 
 
+def test_the_numbers_of_lines_are_no_clock(tmp_path):
+    write(tmp_path, motion())
+    with pytest.raises(LogError, match="no column 'index', which time reads"):
+        source(tmp_path, time="index").load()
+
+
 ADVICE = {
     "no clock": (motion().drop(columns="t"), dict(rate=100)),
     "constant": (motion().assign(t=7.0), dict(rate=100)),
+    "whole seconds": (motion().assign(t=np.floor(SECONDS)), dict(rate=100)),
     "ms": (motion().assign(t=1000 * SECONDS), dict(columns="t", unit="ms")),
     "us": (motion().assign(t=1e6 * SECONDS), dict(columns="t", unit="us")),
     "UNIX ns": (motion().assign(t=NS), dict(columns="t", unit="ns")),

@@ -110,7 +110,8 @@ def test_rare_commands_between_the_samples_are_no_samples(tmp_path):
 
 
 def test_single_missing_cells_are_filled_with_a_warning(tmp_path):
-    write(tmp_path, TABLE.assign(q1=TABLE["q1"].where(TABLE.index != 17)))
+    q1 = TABLE["q1"].astype(object)
+    write(tmp_path, TABLE.assign(q1=q1.where(TABLE.index != 17, "-nan(ind)")))
     log = source(tmp_path)
     assert_equal(log, atol=1e-3)
     assert "1 of 1001 values of q (q1) are missing and interpolated" in "\n".join(log.warnings)

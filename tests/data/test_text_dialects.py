@@ -122,6 +122,12 @@ DIALECTS = {
         german(CSV), lambda k, x: (f"20.11.2026 12:00:00,{k};" if k else "stamp;") + x),
     "LabVIEW": LABVIEW + (HEADER.replace("\n", ",Comment\n") + PLAIN).replace(",", "\t"),
     "serial monitor": each_line(CSV, lambda k, x: f"12:00:{k // 99:02}.{k:03} -> {x}"),
+    "terminal": "[2026-11-20 11:59:59.900] ready\n" + each_line(
+        CSV.replace(",", "\t"), lambda k, x: f"[2026-11-20 12:00:{k // 99:02}.{k:03}] {x}"),
+    "serial plotter": each_line(
+        PLAIN, lambda _, x: ",".join(map("{}:{}".format, NAMES, x.split(",")))),
+    "index of two levels": (
+        "," + ",".join("q" * 6) + "\n," + ",".join(NAMES[1:]) + "\nt,,,,,,\n" + PLAIN),
     "NULs at the end": CSV + "\0" * 100,
 }  # fmt: skip
 OTHER_COLUMNS = {
@@ -134,6 +140,19 @@ OTHER_COLUMNS = {
     "lists": (vectors('"[', ']"', ", "), VECTORS),
     "lists without quotes": (vectors("[", "]", ", "), VECTORS),
     "arrays": (vectors("[", "]", " "), VECTORS),
+    "index without a name": (CSV[1:], {"time": dict(columns="index", unit="s")}),
+    "names that are numbers": (
+        "No.,1,2,3,4,5,6\n" + each_line(PLAIN, lambda _, x: f"2026-11-20 12:00:0{x}"),
+        by_number(0) | {"time": dict(columns="No.", unit="s")},
+    ),
+    "time beside each column, settings below the header": (
+        "\t".join(f"Name\t{x}" for x in NAMES[1:]) + "\n"
+        + "\t".join(["SampleTime[ms]\t10"] * 6) + "\n"
+        + "".join("\t".join(f"{t!r}\t{x!r}" for x in row) + "\n" for t, *row in ROWS),
+        {"time": dict(columns="Name", unit="s")},
+    ),
+    "names with units, named without": (
+        german(",".join(map("{} [{}]".format, NAMES, UNITS)) + "\n" + PLAIN), {}),
     "tuples": (vectors('"(', ')"', ","), VECTORS),
     "bare vectors": (vectors("", "", ";"), VECTORS),
     "lists, semicolons": (vectors("[", "]", ", ", ";"), VECTORS),
@@ -226,7 +245,7 @@ BAD = {
     "one column": ("q1\n0,1\n0,2\n", "2 cells, but the header in line 1 has 1 names"),
     "two decimal marks": (spoiled(lambda x: x.__setitem__(9, '0.08,"0,5",0,0,0,0,0')), "line 10"),
     "commas for both": (HEADER + PLAIN.replace(".", ","), "line 2: 14 cells.*header.*7 names"),
-    "prose": ("A letter\nwithout numbers\n", "no rows of numbers"),
+    "prose": ("A letter\nwithout numbers\n", "no rows of numbers.* found 'without numbers'"),
     "no header": (PLAIN, "no column 'q1'.*no header.* 0, 1, 2"),
     "unit in the name": (CSV.replace("q1", "'Q1 [rad]'"), r"'q1'.*did you mean 'Q1 \[rad\]'\?"),
     "long row": (spoiled(lambda x: x.__setitem__(500, x[500] + ",5")), "line 501"),

@@ -84,12 +84,14 @@ class Table:
         return text + (f" ({signal})" if signal else "")
 
     def __contains__(self, name: str) -> bool:
-        return name in self.frame.columns or name in ("index", *self.frame.index.names)
+        index = () if self.row == "line" else ("index", *self.frame.index.names)
+        return name in self.frame.columns or name in index
 
     def column(self, name: str, signal: str) -> pd.Series:
         """Return one column, or a level of the index, as it is."""
         count = list(self.frame.columns).count(name)
-        if count > 1:
+        matches = self.frame.loc[:, self.frame.columns == name]
+        if any(not matches.iloc[:, 0].equals(other) for _, other in matches.items()):
             raise LogError(f"{self.name}: {count} columns have the name {name!r}")
         if not count and name in self:
             index = self.frame.index
@@ -98,7 +100,7 @@ class Table:
             hint = did_you_mean(name, map(str, self.frame.columns)) or "."
             names = f"{self.hint or hint} The log has {listed(self.frame.columns)}"
             raise LogError(f"{self.name}: no column {name!r}, which {signal} reads{names}")
-        return self.frame[name]
+        return matches.iloc[:, 0]
 
     def numbers(self, columns: Sequence[str], signal: str) -> np.ndarray:
         """Return columns as finite numbers, ``(T, K)``, NaN for empty cells."""

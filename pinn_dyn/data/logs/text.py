@@ -25,7 +25,7 @@ from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
 _SAMPLE = 300  # lines from which the dialect and the header are detected
 _COMMENTS = ("#", "%", "//")
-_NO_VALUES = ["-", "--"]  # beside those of pandas
+_NO_VALUES = ["-", "--", "nan(ind)", "-nan(ind)"]  # beside those of pandas
 _MISSING = {"", "nan", "na", "n/a", "null", "none", *_NO_VALUES}
 _NUMBERS = {
     mark: rf"[+-]?(?:\d+[{mark}]?\d*|[{mark}]\d+)(?:[eE][+-]?\d+)?|[+-]?inf|true|false"
@@ -34,7 +34,9 @@ _NUMBERS = {
 _NUMBER = {mark: re.compile(text, re.ASCII | re.IGNORECASE) for mark, text in _NUMBERS.items()}
 _ITEM = rf"(?:{_NUMBERS['.']}|nan)"
 _BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
-_SERIAL = re.compile(r"^(\d+:[\d:.]+) -> ([^,;\t ]*)([,;\t ])", re.MULTILINE)
+_SERIAL = re.compile(r"^(?:\[(\d[^]\n]*)\]|(\d+:[\d:.]+) ->) ([^,;\s]*)([,;\t ])", re.MULTILINE)
+_LABEL = re.compile(r"(?<![^\s,;])([^\W\d]\w*):[ \t]*(?=[+-]?[.\d])")
+_LABELED = re.compile(rf"(?:{_LABEL.pattern}[^\s,;]+[ \t,;]*)+")
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
 _VECTOR = re.compile(
     rf"(?:array\()?{_BRACKETS}\)?|{_ITEM}(?:[\s;]+{_ITEM})+", re.ASCII | re.IGNORECASE
@@ -103,12 +105,17 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
     text = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
     if _BARE_BRACKETS.search(text, 0, 10_000):
         text = _BARE_BRACKETS.sub(r'"\g<0>"', text)
-    if _SERIAL.search(text, 0, 10_000):  # stamps of the serial monitor of Arduino
-        text = _SERIAL.sub(r"\1\3\2\3", text)
+    if _SERIAL.search(text, 0, 10_000):  # stamps of a terminal
+        text = _SERIAL.sub(r'"\1\2"\4\3\4', text)
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]
+    if labels := _LABELED.fullmatch(lines[len(lines) // 2]):  # serial plotter of Arduino
+        text = ",".join(_LABEL.findall(labels[0])) + "\n" + _LABEL.sub("", text)
+        lines = text.split("\n", _SAMPLE)[:_SAMPLE]
     dialect = _dialect(lines, request.sep)
     if dialect is None:
-        raise LogError(f"{path}: has no rows of numbers in its first {_SAMPLE} lines")
+        line = next(filter(None, map(str.strip, reversed(lines))), "")[:80]
+        text = f"has no rows of numbers in its first {_SAMPLE} lines"
+        raise LogError(f"{path}: {text}: expected numbers such as 1234.5, but found {line!r}")
     names, header, start = _header(lines, dialect, request.columns)
     if len(names) < dialect.width:
         raise LogError(
@@ -134,9 +141,15 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
             low_memory=False,
             index_col=False,
         )
-    frame.index = pd.RangeIndex(start + 1, len(frame) + start + 1)
-    frame = _with_vectors(frame.dropna(how="all"), names)
+    frame.index = pd.RangeIndex(len(frame)) + (start if labels else start + 1)
+    bare = [re.sub(r"\s*[\[(][^\])]*[\])]$", "", name) for name in names]
+    short = [
+        x if x in {*request.columns} - {*names} and bare.count(x) == 1 else name
+        for x, name in zip(bare, names, strict=True)
+    ]
+    frame = _with_vectors(frame.dropna(how="all"), short)
     units = _units(lines[header + 1 : start], dialect, names)
+    units |= {x: units[name] for x, name in zip(short, names, strict=True) if name in units}
     hint = "" if header >= 0 else ": it has no header, so its columns are numbered from 0."
     return Table(frame, str(path), "line", notes, units, hint)
 
@@ -171,14 +184,17 @@ def _header(
 
     def is_row(k: int) -> bool:
         cells = [rows[k][n] for n in numeric if n < len(rows[k])]
-        return len(cells) == len(numeric) and any(cells) and not _texts(cells)
+        if len(cells) < len(numeric) or not any(cells) or _texts(cells):
+            return False
+        matches = {*dialect.cells(lines[k])} & {*requested}  # names of columns may be numbers
+        return len(matches) < 2 or all(name.isdigit() for name in matches)
 
     def is_text(k: int) -> bool:
         units = [known_unit(cell) for cell in dialect.cells(lines[k]) if cell]
         numbers = [weight for weight in rows[k] if weight]
-        return (
-            not numbers or (None not in units and len(numbers) < len(units)) or _comment(lines[k])
-        )
+        texts = _texts([rows[k][n] for n in numeric if n < len(rows[k])])
+        is_units = None not in units and len(numbers) < len(units)
+        return not numbers or is_units or texts >= max(2, len(numeric) / 2) or _comment(lines[k])
 
     first = next((k for k in range(len(rows)) if is_row(k)), len(rows))
     best = (len({str(k) for k in range(dialect.width)} & {*requested}), False, False, False, -1)
@@ -195,6 +211,11 @@ def _header(
             if (exact or matches) and score > best:
                 best, names = score, candidate
     header = best[-1]
+    for line in lines[:first]:  # names of the index, which pandas writes in a line of their own
+        for k, cell in enumerate(dialect.cells(line)[: len(names)]):
+            if not names[k] and cell in {*requested} - {*names}:
+                names[k] = cell
+    names[0] = names[0] or "index"
     if header < 0 and dialect.cells("".join(lines[first : first + 1])) == names:
         header = first  # pandas numbers columns without names
     start = next((k for k in range(header + 1, len(rows)) if not is_text(k)), len(rows))
