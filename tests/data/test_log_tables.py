@@ -28,9 +28,12 @@ def assert_equal(log, table=TABLE, atol=0.0):
             np.testing.assert_allclose(getattr(part.raw, key), values, atol=atol + 1e-11)
 
 
-@pytest.mark.parametrize("clock", [True, False])
+@pytest.mark.parametrize("clock", ["all files", "file of q", "own file"])
 def test_signals_in_files_with_the_same_rows_are_one_run(tmp_path, clock):
-    for name, table in parts(TABLE, clock).items():
+    tables = parts(TABLE, clock == "all files")
+    if clock == "own file":
+        tables |= {"pos": TABLE[Q], "time": TABLE[T]}
+    for name, table in tables.items():
         write(tmp_path, table, f"{name}.csv")
     log = source(tmp_path)
     assert_equal(log)

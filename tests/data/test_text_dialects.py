@@ -140,6 +140,11 @@ OTHER_COLUMNS = {
     "lists": (vectors('"[', ']"', ", "), VECTORS),
     "lists without quotes": (vectors("[", "]", ", "), VECTORS),
     "arrays": (vectors("[", "]", " "), VECTORS),
+    "serial plotter, stamps": (
+        each_line(PLAIN, lambda k, x: f"12:00:{k // 100:02}.{k % 100:02} -> "
+                  + ",".join(map("{}:{}".format, NAMES, x.split(",")))),
+        {"time": dict(columns="index")},
+    ),
     "index without a name": (CSV[1:], {"time": dict(columns="index", unit="s")}),
     "names that are numbers": (
         "No.,1,2,3,4,5,6\n" + each_line(PLAIN, lambda _, x: f"2026-11-20 12:00:0{x}"),

@@ -87,9 +87,11 @@ def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Tabl
     first, *further = tables
     name = " + ".join([first.name, *(Path(x.name).name for x in further)])
     notes = [note for table in tables for note in table.notes]
+    clocks = [all(x in table for x in clock.columns) for table in tables]
+    origin = tables[clocks.index(True)] if any(clocks) else first
     times = [
-        clock.seconds(table, first)[0] if all(x in table for x in clock.columns) else None
-        for table in tables
+        clock.seconds(table, origin)[0] if has_clock else None
+        for table, has_clock in zip(tables, clocks, strict=True)
     ]
     frames = [table.frame for table in tables]
     stamps = [x for x in times if x is not None]

@@ -36,7 +36,7 @@ _ITEM = rf"(?:{_NUMBERS['.']}|nan)"
 _BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
 _SERIAL = re.compile(r"^(?:\[(\d[^]\n]*)\]|(\d+:[\d:.]+) ->) ([^,;\s]*)([,;\t ])", re.MULTILINE)
 _LABEL = re.compile(r"(?<![^\s,;])([^\W\d]\w*):[ \t]*(?=[+-]?[.\d])")
-_LABELED = re.compile(rf"(?:{_LABEL.pattern}[^\s,;]+[ \t,;]*)+")
+_LABELED = re.compile(rf'("[^"]*"[\t,; ])?(?:{_LABEL.pattern}[^\s,;]+[ \t,;]*)+')
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
 _VECTOR = re.compile(
     rf"(?:array\()?{_BRACKETS}\)?|{_ITEM}(?:[\s;]+{_ITEM})+", re.ASCII | re.IGNORECASE
@@ -109,7 +109,8 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
         text = _SERIAL.sub(r'"\1\2"\4\3\4', text)
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]
     if labels := _LABELED.fullmatch(lines[len(lines) // 2]):  # serial plotter of Arduino
-        text = ",".join(_LABEL.findall(labels[0])) + "\n" + _LABEL.sub("", text)
+        names = ([""] if labels[1] else []) + _LABEL.findall(labels[0])
+        text = ",".join(names) + "\n" + _LABEL.sub("", text)
         lines = text.split("\n", _SAMPLE)[:_SAMPLE]
     dialect = _dialect(lines, request.sep)
     if dialect is None:
