@@ -88,7 +88,7 @@ BAD = {
     "unit": (clock(lambda t: 1000 * t), r"sample time would be 10 s.*write the unit ms"),
     "clock": (motion().drop(columns="t"), r"no column 't', which time reads.*rate: 100"),
     "jitter": (clock(lambda t: t + 0.004 * np.sin(40 * t)), r"needs a uniform clock.*Resample"),
-    "bursts": (in_bursts(), r"line 3, column 't': the time repeats .*bursts.*RowClock"),
+    "bursts": (in_bursts(), r"line 3, column 't': .* repeats .*RowClock \(rate: .*, longest: "),
     "empty": (motion()[:0], r"has no rows"),
     "short": (motion(2.0), r"too short to keep 2.0 s for test"),
     "wraps": (wrapped(2 * np.pi), r"run.csv, line \d+, column 'q2' \(q\): the angle wraps from"),

@@ -141,7 +141,7 @@ OTHER_COLUMNS = {
     "lists without quotes": (vectors("[", "]", ", "), VECTORS),
     "arrays": (vectors("[", "]", " "), VECTORS),
     "serial plotter, stamps": (
-        each_line(PLAIN, lambda k, x: f"12:00:{k // 100:02}.{k % 100:02} -> "
+        each_line(PLAIN, lambda k, x: f"00:00:{k // 100:02}.{k % 100:02} -> "
                   + ",".join(map("{}:{}".format, NAMES, x.split(",")))),
         {"time": dict(columns="index")},
     ),

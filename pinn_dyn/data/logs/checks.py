@@ -71,7 +71,10 @@ def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[s
     if same.any():  # a logger that is faster than its source repeats whole rows
         same[same] = table.frame.duplicated().to_numpy()[1:][same]
     if burst_share(t[np.r_[True, ~same]]) > BURSTS:
-        row_clock = "its stamps come in bursts: use the step examples.cleaning_steps.RowClock, or "
+        options = f"rate: <of the rows, Hz>, longest: {2 * spacing.max():.2g}"
+        row_clock = (
+            f"its stamps come in bursts: use examples.cleaning_steps.RowClock ({options}), or "
+        )
     steps = f"as in{clock_steps(t)}"
     split = "name the column that tells runs apart in 'trajectory' (run=... of pinn_dyn.fit)"
     once = f"{row_clock}add a Deduplicate step, which keeps the first row, {steps}"

@@ -89,10 +89,8 @@ def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Tabl
     notes = [note for table in tables for note in table.notes]
     clocks = [all(x in table for x in clock.columns) for table in tables]
     origin = tables[clocks.index(True)] if any(clocks) else first
-    times = [
-        clock.seconds(table, origin)[0] if has_clock else None
-        for table, has_clock in zip(tables, clocks, strict=True)
-    ]
+    pairs = zip(tables, clocks, strict=True)
+    times = [clock.seconds(table, origin)[0] if stamped else None for table, stamped in pairs]
     frames = [table.frame for table in tables]
     stamps = [x for x in times if x is not None]
     if all(len(x) == len(first) for x in tables) and all(_same(stamps[0], x) for x in stamps):
