@@ -27,6 +27,7 @@ _EXPLAINED = 0.1  # share of the motion that inputs explain, below which a train
 _NOISE, _STILL = 0.02, 0.25  # noise of q as a share of its range; the same of a joint at rest
 _TARGET = 0.3  # part of the variance of q that the targets of servos leave
 _OUTSIDE = 0.05  # share of the test outside the range of the training
+_TURNED = np.pi / 2  # rad per sample, above which no step fits
 _ROWS = 50  # of a table in the terminal
 _RANK = {"stop": 0, "warning": 1, "ok": 2}
 # Column of the table of coordinates, its upper limit, and the text beyond it.
@@ -47,7 +48,8 @@ class LogCheck:
         runs, coordinates, inputs: tables of stretches, coordinates and inputs.
         delays: delay curve of each input.
         steps: entries for ``steps`` of the data set in YAML: filter cutoff and delay, if needed.
-        options: options of a training: heads for dry friction or servos, if needed.
+        options: options of a training: heads for dry friction or servos, if needed; none if an
+            angle turns too far in a sample for a step.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
     """
 
@@ -159,6 +161,8 @@ def check(
         expected = f"at least {_EXPLAINED}"
         measurements.append(_judged(name, "inputs", share, expected, bad, text, "stop"))
     same_units = source.u.units[: len(source.q.units)] == source.q.units
+    angles = [unit == "rad" for unit in source.q.units]
+    fast = (coordinates["fastest [/s]"] * step > _TURNED)[angles].any()
     servo = same_units and numbers.target_distance(training, step, longest_delay) < _TARGET
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else logs.clear_delays(delays, step)
@@ -207,7 +211,7 @@ def check(
             *([] if sharp else _filter(source, training, step, noise, highest)),
             *_delay(source, clear, step),
         ],
-        ["model/input=servo"] * servo + ["model/friction=coulomb"] * dry,
+        [] if fast else ["model/input=servo"] * servo + ["model/friction=coulomb"] * dry,
         excitation,
     )
 

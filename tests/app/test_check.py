@@ -83,6 +83,18 @@ def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
     assert isinstance(model.input, Servo)
 
 
+def test_no_training_is_printed_where_an_angle_turns_too_far_in_a_sample(tmp_path, capsys):
+    item = resting(0.3)
+    q = 60 * item.q  # up to 370 rad/s at 200 Hz
+    table = {"t": item.t, "q1": q[:, 0], "q2": q[:, 1], "u1": item.u[:, 0], "u2": item.u[:, 1]}
+    words = arguments(tmp_path)
+    pd.DataFrame(table).to_csv(tmp_path / "arm.csv", index=False)
+    run_script("check.py", *words)
+    text = capsys.readouterr().out
+    assert "Options of a training" not in text
+    assert "a training with" not in text
+
+
 def test_only_the_program_changes_in_the_printed_training(monkeypatch):
     monkeypatch.setattr("sys.argv", ["checks/check.py", "dataset=check_1"])
     command = (

@@ -231,6 +231,7 @@ def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
     table = motion().assign(q1=q[:1001], v1=v[:1001], q2=wheel, v2=5 + np.cos(T))
     assert np.ptp(q[:1001]) > 4 * np.pi
     assert "degrees" not in warned(tmp_path, table)
+    assert warned(tmp_path, motion().assign(q1=628 * T, v1=628.0)) == ""  # 6.28 rad in each row
     assert "'q1': an angle" in warned(tmp_path, motion().assign(q1=50 * motion()["q1"]))
 
 
