@@ -5,6 +5,8 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from hydra.utils import instantiate
 
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs import LogError, LogSource
@@ -48,17 +50,19 @@ STEPS = {
 }
 
 
-def load(frame, steps):
-    return LogSource(
+def read(files, **changes):
+    arguments = dict(
         name="joint",
-        files=frame,
+        files=files,
         time={"columns": "t", "unit": "s"},
         q={"columns": ["q"], "unit": "rad"},
         u={"columns": ["u"], "unit": "Nm"},
         validation={"seconds": 1.0, "piece": 0.5},
         test={"seconds": 1.0, "piece": 0.5},
-        steps=steps,
-    ).load()
+    )
+    source = LogSource(**arguments | changes)
+    assert source.load().train
+    return source
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -67,7 +71,7 @@ def test_the_suggested_steps_repair_the_log(name):
     messages = set()
     while True:  # a repaired log may have a second problem
         try:
-            assert load(frame, steps).train
+            read(frame, steps=steps)
             break
         except LogError as error:
             message = str(error)
@@ -78,3 +82,95 @@ def test_the_suggested_steps_repair_the_log(name):
         key = step[1] or step[2]
         steps = {key: STEPS[key], **steps}
     assert messages
+
+
+def changed(**columns):
+    return table().assign(**columns)
+
+
+def spike(column):
+    frame = table()
+    frame.loc[[300, 700, 701], column] = 50.0
+    return frame
+
+
+def append(step):
+    return {"steps": {"new": instantiate(yaml.safe_load(step))}}
+
+
+def runs(text):
+    """Put a copy and its original, ``c, in test, is a copy of b``, into one split."""
+    both = re.findall(r"(\w), in", text)
+    return {part: {"runs": x, "piece": 0.5} for part, x in (("test", both), ("validation", ["d"]))}
+
+
+def apart(files):
+    return {name: table().iloc[100 * k :] for k, name in enumerate(files)}
+
+
+def parts(names):
+    return {name: table()[["t", name[-1] if "_" in name else "qu"[k % 2]]] for k, name in names}
+
+
+ALTERNATING = table()
+ALTERNATING.loc[1::2, "q"] -= 2 * ALTERNATING.loc[1::2, "q"]
+SLOW = {"a": table(), "b": table(), "c": table()[::2].reset_index(drop=True)}
+COPIED = apart("abcd") | {"c": apart("abcd")["b"]}
+SPLIT = {part: {"runs": [run], "piece": 0.5} for part, run in (("test", "c"), ("validation", "b"))}
+LONG = table().rename(columns={"q": "x", "u": "y"}).assign(joint="arm")
+LONG = pd.concat([LONG, LONG.iloc[[50]]], ignore_index=True)
+OF_LONG = {"long": "joint", "q": {"columns": "x/arm", "unit": "rad"}}
+OF_LONG["u"] = {"columns": "y/arm", "unit": "Nm"}
+WRAPPED = np.linspace(0, 30, 1200)
+MEASURED = {"v": {"columns": "w", "unit": "rad/s"}, "steps": {"v": logs.SavitzkyGolayVelocity()}}
+# Log, its description, the advice as a pattern, and the log and description that follow it.
+ADVICE = {
+    "wrapped angle": (
+        changed(q=WRAPPED % (2 * np.pi)), {}, r"unwrap the column \(numpy.(\w+)\)",
+        lambda name: (changed(q=getattr(np, name)(WRAPPED % (2 * np.pi))), {}),
+    ),
+    "two runs, row by row": (
+        ALTERNATING, {}, r"the column that tells (?:them|runs) apart in '(\w+)'",
+        lambda key: (ALTERNATING.assign(run=np.arange(1200) % 2), {key: "run"}),
+    ),
+    "another rate": (
+        SLOW, {}, r"add a (\w+) step", lambda name: (SLOW, {"steps": {name: STEPS[name]}}),
+    ),
+    "copied run": (
+        COPIED, SPLIT, r"(\w, in test, .* in validation), .* put both into one split",
+        lambda text: (COPIED, runs(text)),
+    ),
+    "pieces too long": (
+        table(), {"test": {"seconds": 1.0, "piece": 1.5}}, r"lower (\w+) or",
+        lambda key: (table(), {"test": {"seconds": 1.0, key: 0.5}}),
+    ),
+    "joint twice": (
+        LONG, OF_LONG, r"same time: drop the (row)", lambda _: (LONG.iloc[:-1], OF_LONG),
+    ),
+    "parts without names": (
+        parts(enumerate("abcd")), {}, r"name them as (.*)",
+        lambda names: (parts(enumerate(names.split(", "))), {}),
+    ),
+    "derived and measured v": (
+        changed(w=np.gradient(table()["q"], 0.01)), MEASURED, r"leave out (\w+), or v",
+        lambda _: (changed(w=np.gradient(table()["q"], 0.01)), MEASURED | {"steps": {}}),
+    ),
+    "spike of q": (spike("q"), {}, r"Add the step (.*?}), or", lambda x: (spike("q"), append(x))),
+    "spike of u": (spike("u"), {}, r"Add the step (.*?}), or", lambda x: (spike("u"), append(x))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ADVICE)
+def test_the_advice_repairs_the_log_or_its_description(name):
+    files, description, pattern, follow = ADVICE[name]
+    try:
+        message = "\n".join(read(files, **description).warnings)
+    except LogError as error:
+        message = str(error)
+    advice = re.search(pattern, message)
+    assert advice, message
+    files, description = follow(advice[1])
+    source = read(files, **description)
+    assert not re.search(pattern, "\n".join(source.warnings))
+    assert max(item.input.u.abs().max() for item in source.load().train) < 2
+    assert name == "wrapped angle" or max(x.q.abs().max() for x in source.load().train) < 2

@@ -166,8 +166,9 @@ def _jumps(
     return (
         f"{table.place(row, name, signal)}: a {'jump' if steps else 'spike'} to {x[row]:.5g} "
         f"{unit}, {distance[first]:.3g} from the value that its neighbors make likely "
-        f"({int(bad.sum())} such rows in this run): does it stand for 'no value'? Add a "
-        "RemoveJumps step, or name a new run that begins there in 'trajectory'"
+        f"({int(bad.sum())} such rows in this run): does it stand for 'no value'? Add the step "
+        f"{{_target_: pinn_dyn.data.logs.RemoveJumps, threshold: {distance[first] / 2:.2g}, "
+        f"window: 5, signals: [{signal}]}}, or name a new run that begins there in 'trajectory'"
     )
 
 

@@ -91,7 +91,7 @@ def fill(
             else:
                 report.warn("empty cells", f"{table.name}: {text}")
     if not stays.any():
-        raise LogError(f"{table.name}: no row has values of {', '.join(signals)}: raise max_age")
+        raise LogError(f"{table.name}: no row has values of {', '.join(signals)}, on one clock")
     if dropped := int((clock & ~stays).sum()):
         report.add("Read", run, f"{dropped} of {clock.sum()} rows lack a value and are dropped")
     return stays
