@@ -345,7 +345,8 @@ def _fit(
     solver = learner if isinstance(learner, LeastSquaresLearner) else None
     last = folder / CHECKPOINTS / "last.ckpt"
     try:
-        with naming("optimizer") if solver else contextlib.nullcontext():
+        builds = solver or isinstance(learner.model, Ensemble)  # the optimizer, inside of fit
+        with naming("optimizer") if builds else contextlib.nullcontext():
             trainer.fit(learner, data, ckpt_path=checkpoint, weights_only=True)
         if checkpoint is not None and not trainer.callback_metrics:  # ended just before its record
             trainer.validate(learner, data, verbose=False)

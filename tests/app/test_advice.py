@@ -2,9 +2,11 @@
 
 import re
 
+import pandas as pd
 import pytest
 
 from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, run_script
+from tests.support.delayed_robots import log
 
 OVERRIDE = re.compile(r"~[\w/]+|\b[a-z]\w*(?:[./]\w+)*=(?:\[[^]]*\]|[^\s,;:'\"]+)")
 ADVICE = re.compile(r"(?::|,|;) (?=set|use|give|write|such as|expected|train|add)")
@@ -12,6 +14,11 @@ LOG = ["dataset=example_log", "data.pairs=64", "data.batch_size=32", "data.strid
 LOG += ["validator.horizon=0.1", "validator.window=null", "validator.step=null"]
 LOG += ["trainer.steps=2", "trainer.validations=1"]
 PENDULUM = ROOT / "examples" / "double_pendulum.urdf"
+KNOWN = ["dataset=csv_log", "dataset.root={folder}", "dataset.files=arm.csv", *LOG[1:]]
+KNOWN += ["dataset.q.columns=[q1,q2]", "dataset.q.unit=rad", "dataset.u.columns=[u1,u2]"]
+for part in ("validation", "test"):
+    KNOWN += [f"+dataset.{part}.seconds=2.0", f"dataset.{part}.piece=1.0"]
+KNOWN += ["model=known", "model/structure=urdf", f"model.structure.urdf={PENDULUM}"]
 SHORT = ["steps=2", "duration=3"]
 COMMANDS = {
     "no momenta": ["train.py", *LOG, "model=hnn"],
@@ -21,6 +28,11 @@ COMMANDS = {
         *("train.py", *TINY, "model=lnn", "loss=midpoint", "model/initial_velocity=learned"),
     ],
     "least squares of a network": ["train.py", *TINY, "model=lnn", "optimizer=least_squares"],
+    "inputs in ampere": ["train.py", *KNOWN, "dataset.u.unit=A"],
+    "optimizer that mixes members": [
+        *("train.py", *TINY, "model=lnn", "ensemble=2", "optimizer=soap"),
+        "optimizer._target_=torch.optim.Adafactor",
+    ],
     "delay of a held input": [
         *("train.py", *LOG, "model=lnn", "model/delay=learned", "data.history=0.1"),
         "dataset.interpolation=hold",
@@ -63,7 +75,10 @@ def applied(words, overrides):
 def test_the_suggested_override_works(name, tmp_path, monkeypatch):
     if name == "no compiler":
         monkeypatch.setattr("pinn_dyn.app.trainer.has_cpp_compiler", lambda: False)
-    script, *words = COMMANDS[name]
+    arm = log("arm", 0, 0.05)
+    table = {"t": arm.t, "q1": arm.q[:, 0], "q2": arm.q[:, 1], "u1": arm.u[:, 0], "u2": arm.u[:, 1]}
+    pd.DataFrame(table).to_csv(tmp_path / "arm.csv", index=False)
+    script, *words = [word.replace("{folder}", str(tmp_path)) for word in COMMANDS[name]]
     if script == "train.py":
         words.append(NO_FIGURES)
     message = str(fails(script, *words, f"hydra.run.dir={tmp_path / 'refused'}").code)
