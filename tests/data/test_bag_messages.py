@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pinn_dyn.data.logs import LogError, Request
 from pinn_dyn.data.logs.bags import read_bag
+from pinn_dyn.data.logs.readers import find_files
 from tests.data.log_formats import STORE, STORE1
 from tests.data.logs_files import motion
 
@@ -131,6 +132,18 @@ def test_a_gripper_on_the_topic_of_the_arm_is_named(tmp_path):
     assert "finger" in note
 
 
+def test_numbers_of_joints_that_change_their_order_are_refused(tmp_path):
+    items = states()
+    for k in range(0, len(T), 3):
+        q = np.ascontiguousarray(Q[k, ::-1])
+        items[k] = (T[k, 0], joint_state(k, names=JOINTS[::-1], q=q))
+    write(tmp_path / "bag", items)
+    with pytest.raises(LogError, match=r"is of j1, j2 by turns: write /joint_states/position/j1"):
+        read(tmp_path / "bag", [f"{STATES}/position/0"])
+    table = read(tmp_path / "bag", COLUMNS[:2])
+    np.testing.assert_allclose(table.frame[COLUMNS[:2]], Q)
+
+
 def test_a_second_publisher_of_the_same_joints_is_left_out(tmp_path):
     kind = "sensor_msgs/msg/JointState"
     with Writer1(tmp_path / "run.bag") as writer:
@@ -216,6 +229,10 @@ float64[] values
         for joint in JOINTS
     ]
     assert_motion(read(tmp_path / "bag", columns, "/arm"))
+    with pytest.raises(LogError, match=r"which have interface_values/j1/values/effort, ") as error:
+        read(tmp_path / "bag", ["/arm/position/j1"], "/arm")
+    paths = str(error.value).partition("which have ")[2].split(", ")
+    assert sorted(f"/arm/{path}" for path in paths) == sorted(columns)
 
 
 def write_mcap(path, schema, encoding, messages):
@@ -288,6 +305,15 @@ def test_an_mcap_of_a_crashed_recorder_is_read_to_its_end(tmp_path):
     assert 100 < len(table) < 200
     assert_motion(table, slice(len(table)))
     assert "no end" in table.notes[0]
+
+
+def test_the_files_of_a_bag_without_metadata_are_found(tmp_path):
+    write(tmp_path / "run_1", states())
+    write(tmp_path / "run_2", states())
+    (tmp_path / "run_2" / "metadata.yaml").unlink()  # as after a crash
+    whole, file = find_files(str(tmp_path), "run_*")
+    assert (whole.name, file.name) == ("run_1", "run_2.mcap")
+    assert_motion(read(file))
 
 
 def test_a_missing_joint_is_answered_with_the_joints(tmp_path):

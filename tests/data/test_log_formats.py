@@ -170,6 +170,8 @@ def test_npz_without_unpickling(tmp_path, expected):
     formats.write_npz(tmp_path / "run.npz", TABLE)
     assert_same(trajectories(source(tmp_path, files="*.npz", **renamed(""))), expected)
     formats.write_npz(tmp_path / "objects.npz", TABLE, q=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(LogError, match=r"cannot be read as \.npz, save plain arrays: Object"):
+        source(tmp_path, files="objects.npz", **renamed("")).load()
 
 
 LEROBOT = dict(

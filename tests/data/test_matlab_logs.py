@@ -178,6 +178,19 @@ def test_an_hdf5_file_that_is_called_mat_is_read_as_hdf5(tmp_path, expected):
     np.testing.assert_allclose(train.q, expected[0].q, atol=1e-9)
 
 
+@pytest.mark.parametrize("longer", ["t", "tqv"])
+def test_times_or_states_at_both_ends_of_the_steps(tmp_path, longer):
+    ends = {name: np.concatenate([SIGNALS[name], SIGNALS[name][:1]]) for name in longer}
+    ends["t"][-1] = 2 * T[-1] - T[-2]
+    matio.save_to_mat(str(tmp_path / "run.mat"), {**SIGNALS, **ends}, version="v7")
+    log = source(tmp_path, files="run.mat", **fields(""))
+    assert log.warnings == ["run: the last of 602 rows is left out: some have 601"]
+    for part in log.cleaned:
+        rows = np.searchsorted(T[:, 0], part.raw.t - 1e-6)
+        np.testing.assert_allclose(part.raw.q, Q[rows])
+        np.testing.assert_allclose(part.raw.u, U[rows])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

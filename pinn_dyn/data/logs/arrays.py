@@ -22,6 +22,7 @@ from pinn_dyn.data.logs.matlab import elements, matlab_variables
 from pinn_dyn.data.logs.table import Request, optional
 from pinn_dyn.spelling import did_you_mean
 
+_KINDS = "fiubmMUTO"  # of arrays that may be columns
 _RATE = re.compile(r"(^|[._@/])(fs|fps|hz|(sampl\w*?)?_?(rate|freq\w*)(_hz)?)$", re.IGNORECASE)
 
 
@@ -141,11 +142,12 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
     names = dict.fromkeys(filter(None, [request.time, *request.columns]))
     bases = {x: next((y for y in (x, x.rpartition("_")[0]) if y in arrays), "") for x in names}
     lengths = [max(arrays[base].shape) for base in bases.values() if base]
-    samples = next((length for length in lengths if length > 1), 0)
+    longest = next((length for length in lengths if length > 1), 0)
+    samples = longest - 1 if 1 < longest - 1 in lengths else longest  # N + 1 states of N steps
     columns: dict[str, Any] = {}
     for name, value in arrays.items():
-        if value.ndim == 2 and samples in value.shape and value.dtype.kind in "fiubmMUTO":
-            rows = value.T if len(value) == samples else value
+        if value.ndim == 2 and {samples, longest} & {*value.shape} and value.dtype.kind in _KINDS:
+            rows = (value.T if len(value) in (samples, longest) else value)[:, :samples]
             numbered = len(rows) > 1
             columns |= {f"{name}_{k}" if numbered else name: x for k, x in enumerate(rows, start=1)}
     scalars = {name: value.item() for name, value in arrays.items() if value.size == 1}
@@ -167,7 +169,10 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
             problem += f"Without a clock write time: {{rate: {rate}}}, in Hz."
         if problem:
             raise LogError(f"{path}: {problem} The file has {listed(sizes)}")
-    return pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+    table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
+    if samples < longest:
+        table.attrs["notes"] = [f"the last of {longest} rows is left out: some have {samples}"]
+    return table
 
 
 def _fields(variables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -186,9 +191,8 @@ def _matrix(value: Any) -> Any:
     array = np.asarray(value[()])
     array = array.squeeze() if array.ndim > 2 else array
     if array.dtype.kind in "SO":
-        array = np.reshape(
-            [x.decode() if isinstance(x, bytes) else x for x in array.flat], array.shape
-        )
+        texts = [x.decode() if isinstance(x, bytes) else x for x in array.flat]
+        array = np.reshape(texts, array.shape)
     if np.iscomplexobj(array) and not array.imag.any():
         array = array.real
     return array.reshape(-1, 1) if array.ndim < 2 else array

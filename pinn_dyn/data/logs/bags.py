@@ -40,7 +40,7 @@ def read_bag(path: Path, request: Request) -> Table:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
-    description = [3, str(path.absolute()), stats, fields, request.max_age]
+    description = [4, str(path.absolute()), stats, fields, request.max_age]
 
     def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
@@ -66,7 +66,7 @@ def _decode(
             location = f"{path}, topic {topic}"
             values = [_number(message, field, location) for field in fields[topic].values()]
             names = getattr(message, "name", ())
-            joints = tuple(sorted(map(str, names))) if hasattr(names, "__len__") else ()
+            joints = tuple(map(str, names)) if hasattr(names, "__len__") else ()
             rows[topic].append((_stamp(message), 1e-9 * received, (publisher, joints), *values))
         notes += bag.notes
     content = {topic: np.array(x, dtype=object) for topic, x in rows.items()}
@@ -110,6 +110,7 @@ def _topic(
     if f"{topic}/t" in columns and content[0, columns.index(f"{topic}/t")] is None:
         content[:, columns.index(f"{topic}/t")] = times
     missing = np.array(content == None)  # noqa: E711
+    complete = rows[~missing.any(axis=1), 2]
     values = content.astype(float)
     for column, absent, numbers in zip(columns, missing.T, values.T, strict=True):
         if absent.all():
@@ -122,6 +123,10 @@ def _topic(
                 f"{path}: {column!r} is NaN in all {len(rows)} messages: the driver does not "
                 f"measure it. Choose another signal, such as commands; the bag has {kinds}"
             )
+        k = column.rpartition("/")[2]
+        if k.isdigit() and len(mixed := {x[int(k)] for _, x in complete if int(k) < len(x)}) > 1:
+            turns = f"is of {listed(sorted(mixed))} by turns"
+            raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(k)]}{min(mixed)}")
     frame = pd.DataFrame(values, columns=columns, index=times)
     return _Topic(frame, np.any(missing, axis=1), pd.Series(rows[:, 2]))
 
@@ -169,8 +174,8 @@ def _number(message: Any, field: str, location: str) -> float | None:
         elif hasattr(node, step):
             node = getattr(node, step)
         else:
-            names = listed(x for x in dir(node) if x[0] != "_" and not callable(getattr(node, x)))
-            raise LogError(f"{location}: no {field!r} in its messages, which have {names}")
+            paths = listed(path[1:] for path in _paths(message))
+            raise LogError(f"{location}: no {field!r} in its messages, which have {paths}")
     if node is None:  # of JSON
         return None
     seconds = _seconds(node)
@@ -182,9 +187,26 @@ def _number(message: Any, field: str, location: str) -> float | None:
 
 def _index(name: str, node: Any, parents: Sequence[Any]) -> int:
     """Return the position of a name among those beside an array or in its elements."""
+    return next((list(x).index(name) for x in _names(node, parents) if name in x), len(node))
+
+
+def _names(node: Any, parents: Sequence[Any]) -> list[Any]:
     lists = [getattr(parent, x) for parent in parents for x in _NAMES if hasattr(parent, x)]
-    lists.append([getattr(element, "name", None) for element in node])
-    return next((list(x).index(name) for x in lists if name in x), len(node))
+    return [*lists, [getattr(element, "name", None) for element in node]]
+
+
+def _paths(node: Any, parents: Sequence[Any] = ()) -> list[str]:
+    """Return the paths of the numbers of a message, with the names of entries."""
+    if isinstance(node, (int, float, np.number)):
+        return [""]
+    if isinstance(node, (str, bytes)) or callable(node) or _seconds(node) is not None:
+        return []
+    if hasattr(node, "__len__"):
+        named = (x for x in _names(node, parents) if len(x) == len(node) and None not in x)
+        parts = dict(zip(next(named, range(len(node))), node, strict=True))
+    else:
+        parts = {x: getattr(node, x) for x in dir(node) if x[0] != "_" and x != "DESCRIPTOR"}
+    return [f"/{x}{y}" for x, part in parts.items() for y in _paths(part, [node, *parents])]
 
 
 def _merge(

@@ -76,12 +76,15 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
         if isinstance(error, LogError):
             raise
         text = " ".join(str(error).split()) or type(error).__name__
-        raise LogError(f"{path}: cannot be read as {suffix}, is it cut short? {text}") from error
+        cause = "save plain arrays" if "allow_pickle" in text else "is it cut short?"
+        raise LogError(f"{path}: cannot be read as {suffix}, {cause}: {text}") from error
     tables = content if isinstance(content, Mapping) else {"": content}
     if not any(map(len, tables.values())):
         raise LogError(f"{path}: has no rows")
     return {
-        run: x if isinstance(x, Table) else Table(x, f"{path}{run and f', run {run}'}")
+        run: x
+        if isinstance(x, Table)
+        else Table(x, f"{path}{run and f', run {run}'}", notes=x.attrs.get("notes", ()))
         for run, x in tables.items()
         if len(x)
     }
@@ -98,7 +101,10 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
         raise LogError(f"root is {str(folder.absolute())!r}, which is no folder (PINN_DYN_LOGS)")
     files: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        matches = [path for path in folder.glob(pattern) if path.is_file() or _is_bag(path)]
+        matches = []
+        for path in folder.glob(pattern):
+            parts = [*path.glob("*.mcap"), *path.glob("*.db3")]  # of a bag without metadata
+            matches += [path] if path.is_file() or _is_bag(path) else parts
         if not matches:
             names = listed(sorted(path.name for path in folder.iterdir()))
             raise LogError(
