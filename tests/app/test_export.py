@@ -99,9 +99,20 @@ def test_an_exported_robot_has_the_learned_dynamics_elsewhere(name, tmp_path):
     torch.testing.assert_close(again, structure.mass_matrix(torch.from_numpy(q), model.bodies()))
 
 
-@pytest.mark.parametrize("locked", [{"slide": 0.1, "wrist": -1.2}, {"turn": 0.7, "fork": 1.57}])
-def test_locked_joints_are_fixed_where_they_are_held(tmp_path, locked):
-    model = learned(TREE, locked)
+BEND = '<joint name="bend" type="continuous">'
+MIMIC = '<mimic joint="turn" multiplier="-0.7" offset="0.2"/>'
+
+
+@pytest.mark.parametrize(
+    ("urdf", "locked"),
+    [
+        (TREE, {"slide": 0.1, "wrist": -1.2}),
+        (TREE, {"turn": 0.7, "fork": 1.57}),
+        (TREE.replace(BEND, BEND + MIMIC), {"turn": 0.7}),
+    ],
+)
+def test_locked_joints_are_fixed_where_they_are_held(tmp_path, urdf, locked):
+    model = learned(urdf, locked)
     structure, names = model.structure, model.structure.joint_names
     q, v, a = states(len(names))
     rigid = structure.rigid_force(q, v, a, model.bodies()).numpy()
@@ -117,9 +128,7 @@ def test_locked_joints_are_fixed_where_they_are_held(tmp_path, locked):
 
 def test_a_joint_that_follows_another_still_does(tmp_path):
     """The forces of both joints add up at the coordinate."""
-    mimic = '<mimic joint="turn" multiplier="-0.7" offset="0.2"/>'
-    urdf = TREE.replace(FORK, f"{FORK}{mimic}")
-    model = learned(urdf, ["slide", "bend", "wrist"])
+    model = learned(TREE.replace(FORK, FORK + MIMIC), ["slide", "bend", "wrist"])
     assert model.structure.joint_names == ["turn"]
     q, v, a = states(1)
     rigid = model.structure.rigid_force(q, v, a, model.bodies())

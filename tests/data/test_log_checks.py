@@ -206,7 +206,7 @@ SUSPICIOUS = {
     "v of noise": (dict(v1=NOISE[0]), "columns 'q1' and 'v1': .*correlation.*the right column"),
     "exchanged v": (dict(v1=SWAPPED["v1"], v2=SWAPPED["v2"]), "'v2' fits it.*\n.*'v1' fits it"),
     "noisy v": (dict(v1=motion()["v1"] + 0.5 * motion()["v1"].std() * NOISE[0]), "^$"),
-    "still": (dict(q1=0.3, v1=0.0), r"^column 'q1' \(q\): moves no more than its noise"),
+    "still": (dict(q1=0.3, v1=0.0), r"^column 'q1' \(q\): moves no more than its noise[^\n]*$"),
     "only noise": (dict(q1=1e-3 * NOISE[0], v1=NOISE[1]), r"no more than its noise, 0.000997"),
     "degrees": (dict(q2=DEGREES["q2"], v2=DEGREES["v2"]), "^run, column 'q2': an angle of [^\n]*$"),
     "inputs": (dict(u1=1.0, u2=0.0), "'u1' is constant.*\n.*'u2' is constant"),
@@ -269,6 +269,8 @@ def test_a_robot_at_rest_outside_the_training(tmp_path, part):
     still[["v1", "v2"]] = 1e-4
     text = warned_of_runs(tmp_path, {"b" if part == "validation" else "c": still})
     assert f"at rest for 100 % of the {part} samples" in text
+    shares = [x for x in source(tmp_path, **RUNS).measurements if x.name == "share at rest"]
+    assert {x.place: x.verdict for x in shares if x.verdict != "ok"} == {part: "warning"}
 
 
 def ticks(rate=500.0, resolution=2 * np.pi / 4096):

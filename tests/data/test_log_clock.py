@@ -5,6 +5,8 @@ import pandas as pd
 import pytest
 
 from pinn_dyn.data.logs import Deduplicate, LogError, SplitGaps
+from pinn_dyn.data.logs.stamps import Clock
+from pinn_dyn.data.logs.table import Table
 from tests.data.logs_files import motion, source, write
 
 SECONDS = motion()["t"]
@@ -46,6 +48,7 @@ CLOCKS = {
         {"t": (2**31 - 4_000_000 + (1e6 * SECONDS).round().astype(int) + 2**31) % 2**32 - 2**31},
         "us",
     ),
+    "32 bits of ns": ({"t": (4 * 10**9 + (1e9 * SECONDS).round().astype(np.int64)) % 2**32}, "ns"),
     "16 bits": ({"t": (65_000 + (1e3 * SECONDS).round().astype(int)) % 2**16}, "ms"),
     "micros() / 1e6": ({"t": (2**32 / 1e6 - 4 + SECONDS) % (2**32 / 1e6)}, "s"),
     "sample time": ({"t": 0.01 + 0 * SECONDS}, {}),
@@ -64,6 +67,12 @@ def test_every_clock_gives_the_same_times(tmp_path, clock):
     np.testing.assert_allclose(np.median(np.diff(times)), 0.01, atol=1e-5)
     np.testing.assert_allclose(np.ptp(times), 10.0, atol=1e-4)
     assert len(log.load().train[0].t) == 601
+
+
+def test_the_time_is_the_sum_of_its_scaled_columns():
+    clock = Clock(["s", "ms"], ["s", "ms"], sign=[1, -1], scale=[1.0, 0.5], offset=[10.0, 4.0])
+    table = Table(pd.DataFrame({"s": [10, 11, 13], "ms": [4.0, 8.0, 0.0]}), "log")
+    np.testing.assert_allclose(clock.seconds(table)[0], [0, 0.998, 3.002])
 
 
 FRAMES = {

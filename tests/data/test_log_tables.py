@@ -71,7 +71,7 @@ def test_signals_with_clocks_of_their_own_are_joined_on_the_clock_of_q(tmp_path)
     epoch = pd.Timestamp("2026-11-27T14:00:00").value
     for name, table in {
         "pos": TABLE[T + Q],
-        "vel": fast[T + V][1::7],  # 114 Hz
+        "vel": fast[T + V][301::7],  # 114 Hz, from 0.38 s on
         "eff": fast[T + U][0::4],  # 200 Hz: every second at a sample of q
     }.items():
         ns = epoch + (1e9 * table["t"]).round().astype(np.int64)
@@ -80,6 +80,20 @@ def test_signals_with_clocks_of_their_own_are_joined_on_the_clock_of_q(tmp_path)
     assert_equal(log, atol=2e-4)
     assert "values of u (u1, u2) are missing and held, over at most" in log.report
     assert not log.warnings
+
+
+def test_clocks_of_their_own_may_have_as_many_rows(tmp_path):
+    late = motion().assign(t=TABLE["t"] + 0.005)
+    for name, table in {"pos": TABLE[T + Q + V], "eff": late[T + U]}.items():
+        write(tmp_path, table, f"{name}.csv")
+    assert_equal(source(tmp_path), TABLE.assign(**TABLE[U].shift(1)))
+
+
+def test_a_restart_in_a_joined_file_is_named(tmp_path):
+    write(tmp_path, TABLE[T + Q + V], "pos.csv")
+    write(tmp_path, pd.concat([TABLE[T + U][:600], TABLE[T + U][:600]]), "eff.csv")
+    with pytest.raises(LogError, match=r"eff.csv, line 602.*expected a single run in each file"):
+        source(tmp_path).load()
 
 
 def outer_join(u_rate=125):
@@ -128,26 +142,42 @@ def test_a_sensor_that_fails_splits_the_run(tmp_path, column):
     message = rf"column '{column}' .* no value for 2\.0\d* s(?s:.*)SplitGaps"
     with pytest.raises(LogError, match=message):
         source(tmp_path).load()
+    assert len(source(tmp_path, max_age=3.0).load().train) == 1
     log = source(tmp_path, steps={"split": SplitGaps(longest=0.1)})
     assert len(log.load().train) == 2
     assert "rows are dropped" in "\n".join(log.warnings)
     assert all(not (2.05 < t < 3.95) for part in log.cleaned for x in part.clean for t in x.t)
 
 
+def test_inputs_that_end_early_are_not_held_for_long(tmp_path):
+    table = outer_join()
+    write(tmp_path, table.assign(**table[U].where(table["t"] < 8)))
+    with pytest.raises(LogError, match=r"\(u\): no value for 2.* s, more than 0.1 s"):
+        source(tmp_path).load()
+
+
 def long_table(table):
     rows = [table[T].assign(joint=f"j{k}", **{x: table[f"{x}{k}"] for x in "qvu"}) for k in (1, 2)]
-    return pd.concat(rows).sort_values(["t", "joint"])
+    return pd.concat(rows).sort_values(["t", "joint"], ascending=[True, False])
+
+
+LONG = {
+    key: dict(columns=[f"{key}/j1", f"{key}/j2"], unit=unit)
+    for key, unit in zip("qvu", ("rad", "rad/s", "Nm"), strict=True)
+}
+
+
+def test_a_second_row_of_a_joint_is_named(tmp_path):
+    write(tmp_path, long_table(TABLE).iloc[np.r_[:4, 3:2002]])
+    with pytest.raises(LogError, match=r"line 6.*second row of this joint"):
+        source(tmp_path, long="joint", **LONG).load()
 
 
 @pytest.mark.parametrize("clock", [True, False])
 def test_rows_of_single_joints_become_columns(tmp_path, clock):
     table = long_table(TABLE)
     write(tmp_path, table if clock else table.drop(columns="t"))
-    signals = {
-        key: dict(columns=[f"{key}/j1", f"{key}/j2"], unit=unit)
-        for key, unit in zip("qvu", ("rad", "rad/s", "Nm"), strict=True)
-    }
-    log = source(tmp_path, long="joint", **signals, **({} if clock else {"time": {"rate": 100}}))
+    log = source(tmp_path, long="joint", **LONG, **({} if clock else {"time": {"rate": 100}}))
     assert_equal(log)
     assert not log.warnings
 

@@ -279,6 +279,12 @@ def test_units_of_the_file_are_compared(tmp_path, units, columns, warns):
     assert bool(texts) == warns
 
 
+def test_the_unit_of_a_reversed_column_may_be_a_part_of_its_scale(tmp_path):
+    q = dict(columns=["q1", "q2"], unit="rad", sign=-1, scale=np.pi / 180)
+    log, _ = loaded(tmp_path, HEADER + "s,deg,,,deg,,\n" + PLAIN, q=q, v=None)
+    assert not [text for text in log.warnings if "by the header" in text]
+
+
 def test_a_unit_in_a_name_is_compared_and_an_index_is_none(tmp_path):
     text = CSV.replace("q1", "q1 (deg)").replace("q2", "q(2)").replace("u1", "u (m)")
     q = dict(columns=["q1 (deg)", "q(2)"], unit="rad")

@@ -9,6 +9,7 @@ import yaml
 from scipy.interpolate import BPoly
 
 import pinn_dyn
+from pinn_dyn.evaluation.motion_limits import Envelope, MotionLimits
 from pinn_dyn.evaluation.rigid_excitation import motion_excitation
 from pinn_dyn.systems import RigidChain
 from tests.support.rigid_chains import joint, link, robot
@@ -66,6 +67,7 @@ def test_limits_hold_at_1_khz_and_the_motion_starts_and_ends_at_rest(design):
     np.testing.assert_allclose(np.gradient(v, t, axis=0)[1:-1], a[1:-1], atol=1e-3)
     assert (np.abs(q) <= 1.8).all()
     assert (np.abs(v) <= VELOCITY).all()
+    assert (np.abs(a) <= 3 * VELOCITY).all()
     assert (np.abs(tau) <= TORQUE).all()
     np.testing.assert_allclose([q[0], q[-1], v[0], v[-1], a[0], a[-1]], 0, atol=1e-9)
     # The velocities or the positions are used up.
@@ -170,6 +172,30 @@ def test_other_limits_by_joint_and_the_height_of_the_tip_hold():
     assert height.min() >= 0.35
     np.testing.assert_allclose(motion.q[0], [0, 0.8, -0.5], atol=1e-12)
     assert motion.excitation.condition < motion.random_condition
+
+
+def test_a_motion_to_either_limit_uses_it_up_from_any_start():
+    envelope = Envelope(RigidChain(ARM), MotionLimits(), {"lift": 0.8})
+    for end in (envelope.low, envelope.high):
+        q = (end - envelope.start)[None]
+        torch.testing.assert_close(envelope.scale(q, 0 * q, 0 * q), torch.ones(3).double())
+
+
+def test_limits_that_the_urdf_lacks_are_named_and_joints_have_friction(caplog):
+    rail = joint("rail", "prismatic", "base", "car").replace('effort="10" velocity="3"', "")
+    arm = joint("arm", "revolute", "car", "rod").replace('effort="10" velocity="3"', "")
+    tip = joint("massless", "revolute", "rod", "tip")
+    parts = [link("base"), link("car"), link("rod"), '<link name="tip"/>', rail, arm, tip]
+    chain = RigidChain(robot(*parts), damping=2.0)
+    envelope = Envelope(chain, MotionLimits(share=0.5))
+    assert envelope.velocity.tolist() == [0.1, 0.5, 1.5]
+    assert envelope.acceleration.tolist() == pytest.approx([0.3, 1.5, 4.5])
+    first, second = (record.getMessage() for record in caplog.records)
+    assert "no velocity limit of rail, arm:" in first
+    assert "the torque of rail, arm, massless is not limited" in second
+    q, v = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(0)).double()
+    friction = envelope.torque_for(q, v, 0 * q) - chain.rigid_force(q, v, 0 * q)
+    torch.testing.assert_close(friction, 2 * v)
 
 
 def test_ctrl_c_returns_the_best_motion_so_far(monkeypatch):

@@ -83,6 +83,17 @@ def test_motions_of_all_joints_leave_nothing_open():
     assert excitation.open_joints == []
 
 
+def test_constants_count_at_the_joints_that_move_their_bodies():
+    """Whatever the order of the coordinates is."""
+    names, run = ["fork", "turn", "bend", "slide"], motion(4)
+    chains = RigidChain(TREE, locked_joints=["wrist"]), RigidChain(TREE, joints=names)
+    usual, other = (
+        rigid_excitation(chain, [run], cutoff=10.0).joints.set_index("joint")["base parameters"]
+        for chain in chains
+    )
+    assert other[usual.index].tolist() == usual.tolist()
+
+
 def test_a_joint_that_rests_is_named_despite_noise():
     chain = RigidChain(TREE, locked_joints=["wrist"])
     run = motion(4, seconds=60.0, still=[3])

@@ -13,7 +13,7 @@ from pinn_dyn.evaluation.identification import constants_table
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory
 from pinn_dyn.models import ElasticJoints, KnownMechanics, Servo
 from pinn_dyn.systems import RigidChain
-from pinn_dyn.testing import MechanicalSystemContract
+from pinn_dyn.testing import MechanicalSystemContract, assert_near
 from pinn_dyn.training import LeastSquares
 from tests.support.known import elastic_model
 from tests.support.rigid_chains import joint, link, robot
@@ -26,6 +26,19 @@ class TestElasticJoints(MechanicalSystemContract):
     @pytest.fixture
     def system(self, settings):
         return elastic_model(**settings)
+
+
+def test_each_spring_is_between_a_link_and_its_motor():
+    model = elastic_model(joints=("bend", "turn"))
+    names = model.structure.joint_names
+    pairs = [[names.index(joint), names.index(f"{joint}_motor")] for joint in ("bend", "turn")]
+    for k, pair in enumerate(pairs):
+        q = torch.zeros(len(names)).double()
+        q[pair] = 0.1
+        assert not model.elastic.forces(q, q).any()
+        q[pair[0]] = 0
+        force = 0.1 * (model.elastic.stiffness() + model.elastic.damping())
+        assert_near(model.elastic.forces(q, q), force * torch.eye(2)[k], 1e-9)
 
 
 ARM = robot(

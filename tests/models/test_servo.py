@@ -115,6 +115,30 @@ def test_an_implicit_step_is_stable_with_a_stiff_servo(kind):
     assert not float(explicit.nan_to_num(torch.inf).abs().max()) < 10
 
 
+def test_targets_are_in_the_order_of_their_joints():
+    servo = make_structured("lnn", 3, 2, input=partial(Servo, joints=[2, 0], limit=1e6)).servo
+    q, v, _, u = random_batch(3, 2)
+    (k, d), (k0, d0) = zip(servo.gain(), servo.damping(), strict=True)
+    pull = [k * (u[:, 0] - q[:, 2]) - d * v[:, 2], k0 * (u[:, 1] - q[:, 0]) - d0 * v[:, 0]]
+    assert_near(servo.torque(q, v, u), torch.stack(pull, dim=-1), 1e-6)
+    assert_near(servo.springs(), torch.stack([k0, 0 * k, k]), 1e-6)
+
+
+def test_typical_forces_and_units_follow_from_the_stiffness():
+    """The coordinates have a spread of 1, and a typical error of a tenth of that."""
+    head = Servo(unit_scales(2), stiffness=[20.0, 40.0], limit=4.0, spread=0)
+    assert_near(head.typical_force(torch.ones(2)), torch.tensor([2.0, 4.0]), 1e-6)
+    assert_near(head.strength(), 1 / torch.tensor([1 / 20 + 0.1 / 4, 1 / 40 + 0.1 / 4]), 1e-6)
+    constants = known_model(input=partial(Servo, limit="learned")).servo.physical_constants()
+    units = {
+        name: unit for part in constants for name, unit in zip(part.names, part.units, strict=True)
+    }
+    assert units["servo stiffness of turn"] == "Nm/rad"
+    assert units["servo stiffness of slide"] == "N/m"
+    assert units["servo damping of slide"] == "Ns/m"
+    assert units["servo limit of slide"] == "N"
+
+
 def test_the_network_of_a_sum_has_the_scales_of_the_servos_forces():
     """Feed-forward forces double the inputs, but not the forces."""
     scales = replace(statistics(5), u_mean=torch.zeros(10), u_std=torch.ones(10))

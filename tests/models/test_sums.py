@@ -18,6 +18,7 @@ from pinn_dyn.models import (
     NetworkResidual,
     NoInput,
     Positive,
+    Servo,
 )
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.testing import MechanicalSystemContract, assert_near
@@ -51,6 +52,14 @@ def both(**settings):
 
 def with_network(**heads):
     return KnownAndNetwork(statistics(4), known(), network(**heads))
+
+
+def test_a_sum_has_the_stiffness_of_both_parts():
+    """Of servos, which the parts of a sum share with their inputs."""
+    parts = [make_structured("lnn", input=Servo) for _ in range(2)]
+    matrices = [part._stiffness_matrix(torch.zeros(part.num_coordinates)) for part in parts]
+    total = Sum(dict(a=parts[0], b=parts[1]))._stiffness_matrix(torch.zeros(len(matrices[0])))
+    assert_near(total, matrices[0] + matrices[1], 1e-9)
 
 
 def exact(model):

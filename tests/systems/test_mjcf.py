@@ -20,11 +20,12 @@ ARM = """<mujoco><compiler angle="degree" autolimits="true"/>
   <asset><texture name="t" type="2d" file="missing.png"/><material name="m" texture="t"/></asset>
   <worldbody><geom type="plane" size="1 1 1" material="m"/>
     <body name="column" pos="0.1 0 0.2" euler="10 20 30">
-      <joint name="pan" axis="0 0 1"/><joint name="tilt" axis="0 1 0.2" pos="0 0 0.05" ref="15"/>
+      <joint name="pan" axis="0 0 1" actuatorfrcrange="-3 7"/>
+      <joint name="tilt" axis="0 1 0.2" pos="0 0 0.05" ref="15"/>
       <geom type="capsule" size="0.03" fromto="0 0 0 0.02 0 0.3" material="m"/>
       <body name="tool" pos="0 0 0.3" euler="0 40 0">
         <geom type="box" size="0.05 0.04 0.03" pos="0.03 0 0"/>
-        <body pos="0.1 0 0"><joint name="rail" type="slide" axis="1 0 1" range="0 0.1"/>
+        <body pos="0.1 0 0"><joint name="rail" type="slide" axis="1 0 1" range="0 0.1" ref="0.05"/>
           <inertial mass="0.4" pos="0 0.01 0.02" fullinertia="1e-3 2e-3 2.5e-3 1e-4 2e-4 -1e-4"/>
           <geom type="sphere" size="0.3"/><site name="tcp" pos="0.1 0 0"/>
           <body name="finger"><joint name="grip" type="slide" axis="0 1 0" ref="0.01"/>
@@ -68,6 +69,13 @@ def test_a_chain_of_an_mjcf_equals_mujoco(model):
     free = ["pan", "tilt", "rail", "grip"]
     assert_equals_mujoco(RigidChain(ARM, joints=free), model)
     assert_equals_mujoco(RigidChain(ARM, joints=free[::-1]), model)
+    chain, data = RigidChain(ARM, joints=free, tip="tcp"), mujoco.MjData(model)
+    q = data.qpos[model.jnt_qposadr[[model.joint(name).id for name in free]]] = [1, -1, 0.2, 0.1]
+    mujoco.mj_forward(model, data)
+    tip = chain.tip_position(torch.tensor(q).double())
+    np.testing.assert_allclose(tip, data.site("tcp").xpos, atol=1e-12)
+    np.testing.assert_allclose(chain.limits[[0, 2], :2], [[-np.pi, np.pi], [0, 0.1]])
+    assert chain.limits[0, 3] == 7
 
 
 def test_an_equality_of_joints_is_a_mimic_joint(model):
@@ -75,10 +83,10 @@ def test_an_equality_of_joints_is_a_mimic_joint(model):
     assert (chain.joint_names, len(chain.body_names)) == (["pan", "tilt", "rail"], 4)
     assert len(chain.tree.held) == 1  # the free joint of the cup
     q, v = np.random.default_rng(1).uniform(-0.1, 0.1, (2, 3))
-    # q_grip - 0.01 = 0.02 - 0.5 q_rail
+    # q_grip - 0.01 = 0.02 - 0.5 (q_rail - 0.05)
     jacobian = np.vstack([np.eye(3), [0, 0, -0.5]])
     names = ["pan", "tilt", "rail", "grip"]
-    mass, bias = forces_of(model, names, jacobian @ q + [0, 0, 0, 0.03], jacobian @ v)
+    mass, bias = forces_of(model, names, jacobian @ q + [0, 0, 0, 0.055], jacobian @ v)
     ours = chain.mass_and_bias(torch.from_numpy(q), torch.from_numpy(v))
     np.testing.assert_allclose(ours[0], jacobian.T @ mass @ jacobian, rtol=0, atol=1e-12)
     np.testing.assert_allclose(ours[1], jacobian.T @ bias, rtol=0, atol=1e-12)

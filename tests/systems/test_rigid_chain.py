@@ -152,7 +152,10 @@ def dynamics_of(chain, q, v, u):
 
 def test_a_payload_is_not_scaled_with_the_links():
     settings = {"locked_joints": ["wrist"], "tip": "hand"}
-    plain = RigidChain(TREE, **settings).inertia[:, 3, 3]
+    chain, other = (RigidChain(TREE, **settings, payload=x) for x in (0.0, 0.8))
+    q, energy = states(4)[0], 0.8 * 9.81 * chain.tip_position(states(4)[0])[:, 2]
+    assert_same(other.potential_energy(q) - chain.potential_energy(q), energy)
+    plain = chain.inertia[:, 3, 3]
     loaded = RigidChain(TREE, **settings, mass_scale=1.5, payload=0.8).inertia[:, 3, 3]
     added = torch.where(plain == plain[2], 0.8, 0.0).double()  # the wrist is locked to the elbow
     torch.testing.assert_close(loaded, 1.5 * plain + added)

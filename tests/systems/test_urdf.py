@@ -1,5 +1,6 @@
 """URDFs: odd ones that are right, wrong ones that are refused by name, and random damage."""
 
+import math
 import xml.etree.ElementTree as ET
 
 import pytest
@@ -41,6 +42,7 @@ def test_the_links_may_come_in_any_order_and_an_axis_may_have_any_length():
     tree = read_urdf(ET.tostring(robot, encoding="unicode"))
     assert tree.axes[0].tolist() == pytest.approx([0, 0.6, 0.8])
     assert tree.limits[0].tolist() == [-1.5, 1.5, 0.5, 30]
+    assert tree.limits[1, :2].tolist() == [-math.pi, math.pi]
 
 
 WRONG = {
