@@ -86,9 +86,11 @@ class Smoothed:
         return cls(q, v, a, sign, stribeck, moving, _standard(inputs), spread, block)
 
 
-def averages(x: np.ndarray, samples: float, step: float = 1.0, order: int = 0) -> np.ndarray:
+def averages(
+    x: np.ndarray, samples: float, step: float = 1.0, order: int = 0, cut: float = CUT
+) -> np.ndarray:
     """Return averages of x by a Gaussian kernel of this width, or their slopes of an order."""
-    return gaussian_filter1d(x, samples, axis=0, order=order, truncate=CUT) / step**order
+    return gaussian_filter1d(x, samples, axis=0, order=order, truncate=cut) / step**order
 
 
 def white_noise(x: np.ndarray) -> np.ndarray:

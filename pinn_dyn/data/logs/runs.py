@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.delay_regression import CUT, Smoothed, averages, signs, terms
+from pinn_dyn.data.logs.delay_regression import Smoothed, averages, signs, terms
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
-_WIDTH = 0.03  # of the averages, s
+_WIDTH, _CUT = 0.03, 3.0  # of the averages, s; widths at which their kernel ends
 _ROWS, _FEWEST, _PER_TERM = 7_000, 40, 6  # rows at most, of a run at least, per term at least
 _BLOCKS = 8  # of a run
 _RESIDUAL, _RATIO = 0.3, 3.0  # of a bad run: share of the signal, and of the median run's residual
@@ -87,14 +87,14 @@ def check_runs(
     """
     size, n = len(u.columns), len(q.columns)
     samples = max(_WIDTH / step, 1.5)
-    edge = int(np.ceil(CUT * samples))
+    edge = int(np.ceil(_CUT * samples))
     stride = max(1, int(samples), sum(map(len, recordings)) / _ROWS)
     parts: dict[str, list[np.ndarray]] = {}
     for item in sorted(recordings, key=lambda item: item.t[0]):
         rows = np.arange(edge, len(item) - edge, stride).astype(int)
         orders = *((item.q, order) for order in range(3)), (item.u[:, :size], 0)
         smooth = [
-            averages(x, samples, step, order)[rows]
+            averages(x, samples, step, order, _CUT)[rows]
             for x, order in (*orders, (signs(item.q, step)[0], 0))
         ]
         parts.setdefault(item.run, []).append(np.hstack([item.t[rows, None], *smooth]))
