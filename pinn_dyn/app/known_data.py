@@ -77,6 +77,8 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
         log.info("%s are the joints %s; held at zero: %s", key, ", ".join(joints), held)
     if structure.tree.held:
         log.info("the base is fixed, joints that are held: %s", ", ".join(structure.tree.held))
+    if structure.tree.unread:
+        log.warning("the model leaves out of the MJCF: %s", "; ".join(structure.tree.unread))
     names = structure.joint_names
     for key, speeds in signals[1:-1]:
         if (order := _joints_of(list(speeds), names)) not in (None, names):

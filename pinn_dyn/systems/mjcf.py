@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from torch import Tensor
@@ -21,7 +21,7 @@ def mjcf_to_urdf(source: Path | str) -> str:
     All frames are parallel to the world's at qpos = 0. A body with several joints gets massless
     links between them. Bodies without ``<inertial>`` have the inertia of their geoms, and none if
     meshes are missing on this machine. A site is a link without mass. An equality between two
-    joints, if it is linear, is a ``<mimic>``.
+    joints, if it is linear, is a ``<mimic>``. A ``<note>`` lists what a URDF cannot express.
 
     Raises:
         ImportError: without MuJoCo.
@@ -39,12 +39,14 @@ def mjcf_to_urdf(source: Path | str) -> str:
         raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
     data = mujoco.MjData(model)
     kinds = [_KINDS[k] for k in model.jnt_type]
+    notes = _unread(mujoco, model)
     data.qpos[[model.jnt_qposadr[j] for j, x in enumerate(kinds) if x not in _KINDS[:2]]] = 0
     mujoco.mj_kinematics(model, data)
     links = [model.body(k).name for k in range(model.nbody)]
     joints = [model.joint(j).name or f"joint{j}" for j in range(model.njnt)]
     mimics = _mimics(mujoco, model, joints)
-    frames, parts = data.xpos.copy(), ['<link name="world"/>']
+    parts = ['<link name="world"/>', *(f"<note>{escape(note)}</note>" for note in notes)]
+    frames = data.xpos.copy()
     for body in range(1, model.nbody):
         parent = model.body_parentid[body]
         link, origin = links[parent], frames[parent]
@@ -116,6 +118,22 @@ def _compiled(mujoco: Any, source: Path | str) -> tuple[Any, set[str]]:
             unknown.add(body.name)
             body.explicitinertial, body.mass, body.inertia = True, 1.0, [1.0, 1.0, 1.0]
     return spec.compile(), unknown
+
+
+def _unread(mujoco: Any, model: Any) -> list[str]:
+    """Return what acts on the robot in MuJoCo but is not part of a URDF."""
+    is_joint = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
+    closed = model.eq_active0.astype(bool) & ~(is_joint & ~model.eq_data[:, 2:5].any(1))
+    found = {
+        "springs of joints": model.jnt_stiffness.any(),
+        "gravity compensation": model.body_gravcomp.any(),
+        "closed loops and nonlinear equalities": closed.any(),
+    }
+    notes = [name for name, is_found in found.items() if is_found]
+    if not np.allclose(gravity := model.opt.gravity, [0, 0, -9.81], atol=0.02):
+        text = ",".join(f"{x:g}" for x in gravity)
+        notes.append(f"gravity (set model.structure.gravity=[{text}])")
+    return notes
 
 
 def _mimics(mujoco: Any, model: Any, joints: list[str]) -> dict[int, str]:

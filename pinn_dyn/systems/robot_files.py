@@ -97,6 +97,7 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
         name = mesh.get("filename", "")
         if not os.path.isabs(name) and (file.path.parent / name).is_file():
             mesh.set("filename", os.path.relpath(file.path.parent / name, folder))
+    _remove(file.robot, "note")
     file.robot.set("name", file.robot.get("name") or "robot")  # readers refuse a robot without
     return _written(file.robot, constants.notes)
 

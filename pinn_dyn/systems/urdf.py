@@ -40,6 +40,7 @@ class Tree(NamedTuple):
         tip_body: index of the body that carries the tip, -1 for the base.
         tip_pose: pose of the tip in that body's frame, ``(4, 4)``.
         held: joints that cannot be coordinates, with their types.
+        unread: effects of an MJCF that the model leaves out, such as springs.
         problems: masses and inertias of moving links that no body has.
     """
 
@@ -59,6 +60,7 @@ class Tree(NamedTuple):
     tip_body: int
     tip_pose: Tensor
     held: list[str]
+    unread: list[str]
     problems: list[str]
 
 
@@ -143,6 +145,7 @@ def read_urdf(
         tip_body=visited[tip][0],
         tip_pose=torch.from_numpy(visited[tip][1]),
         held=file.held,
+        unread=[note.text or "" for note in file.robot.findall("note")],
         problems=file.problems,
     )
 

@@ -75,7 +75,9 @@ class UrdfFile:
         elements = self.robot.findall(kind)
         by_name = {element.get("name", ""): element for element in elements}
         if len(by_name) != len(elements):
-            mistakes.append(f"several {kind}s have the same name")
+            counts = Counter(element.get("name", "") for element in elements)
+            double = [name for name, count in counts.items() if count > 1]
+            mistakes.append(f"several {kind}s have the same name: {double}")
         if not elements:
             mistakes.append(f"there is no <{kind}>, expected a <robot> with links and joints")
         return by_name
@@ -167,10 +169,12 @@ class UrdfFile:
         xx, xy, yy, xz, yz, zz = values
         moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         slack = _TOLERANCE * np.abs(moments).max() + _ROUNDING
-        if mass < 0 or moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
+        limit = 100 * mass if mass > 0 else math.inf  # radius of gyration of 10 m
+        if mass < 0 or moments[0] < -slack or moments[2] > min(limit, sum(moments[:2])) + slack:
             mistakes.append(
                 f"link {name!r} has mass {mass:g} kg and moments {moments.tolist()} kg m^2, "
-                "expected none negative and no moment larger than the sum of the other two"
+                "expected none negative, no moment larger than the sum of the other two, and none "
+                "of a body of 10 m or more (units: kg, m)"
             )
         pose = _pose(name, inertial, mistakes)
         self.problems += mistakes

@@ -74,6 +74,12 @@ def test_joints_that_no_column_names_are_held_with_a_line(caplog):
     assert "the joints joint1, elbow_joint; held at zero: shoulder_pan_joint" in caplog.text
 
 
+def test_effects_of_an_mjcf_that_the_model_leaves_out_are_a_warning(caplog):
+    noted = RigidChain(urdf(["a", "b"]).replace("<link", "<note>springs</note><link", 1))
+    match_structure(noted, log_of(["a", "b"]))
+    assert "the model leaves out of the MJCF: springs" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("columns", "names"),
     [

@@ -119,6 +119,25 @@ def test_missing_meshes_leave_the_kinematics_and_are_a_problem_of_a_prior_only()
     assert not whole.tree.problems
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "effect"),
+    [
+        ('name="tilt"', 'name="tilt" stiffness="3"', "springs"),
+        ('<body name="tool"', '<body name="tool" gravcomp="1"', "gravity compensation"),
+        ("0.02 -0.5 0 0 0", "0.02 -0.5 1 0 0", "nonlinear equalities"),
+        ("<equality>", '<equality><connect body1="finger" body2="cup" anchor="0 0 0"/>', "closed"),
+        ("<default>", '<option gravity="0 -9.81 0"/><default>', "structure.gravity=[0,-9.81,0]"),
+    ],
+)
+def test_effects_that_no_urdf_has_are_listed(old, new, effect, tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.replace(old, new, 1))
+    stored = RigidChain(urdf_text(str(path)))  # without the file
+    assert len(stored.tree.unread) == 1
+    assert effect in stored.tree.unread[0]
+    assert not RigidChain(ARM).tree.unread
+
+
 def test_an_mjcf_that_mujoco_refuses_is_named(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM.replace('axis="1 0 1"', 'axis="0 0 0"'))

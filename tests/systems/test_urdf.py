@@ -52,7 +52,7 @@ WRONG = {
     "xacro": ("<link", '<x:arg xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
     "a xacro number": ('value="1.5"', 'value="${m}"', "is a xacro file"),
     "no joint": (ARM, '<robot name="x"><link name="a"/></robot>', "there is no <joint>"),
-    "two links of a name": ('name="lower"', 'name="upper"', "several links have the same name"),
+    "two links of a name": ('name="lower"', 'name="upper"', r"the same name: \['upper'\]"),
     "an unknown parent": (ELBOW, ELBOW.replace("upper", "uper"), r"the links \['uper'\]"),
     "a circle": (
         "</robot>",
@@ -152,6 +152,13 @@ def test_inertias_that_a_fit_starts_from_are_physical_or_refused():
         RigidChain(changed(UNUSED["a negative mass"])).prior_inertia()
     with pytest.raises(ValueError, match=r"M has the eigenvalue .*link 'upper' has mass -15 kg"):
         RigidChain(changed(('value="1.5"', 'value="-15"'))).check_domain([], [])
+
+
+def test_moments_in_kg_mm2_are_a_problem():
+    (problem,) = read_urdf(
+        changed(('ixx="0.09"', 'ixx="9e4"'), ('iyy="0.05"', 'iyy="9e4"'))
+    ).problems
+    assert "10 m or more (units: kg, m)" in problem
 
 
 def test_round_off_of_a_massless_link_is_no_problem():
