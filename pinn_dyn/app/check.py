@@ -45,11 +45,11 @@ def check(cfg: DictConfig) -> None:
 
 def _training(options: list[str]) -> str:
     """Return the command that trains a Lagrangian network on this data set, for a shell."""
-    words = shlex.split(command_line())
-    program = Path(words.pop(words[0] == "python"))  # behind the name of the interpreter
-    words = [x for x in words if not x.startswith(("hydra.", "longest_delay=", "model"))]
+    parts = shlex.split(command_line())
+    program = Path(parts.pop(parts[0] == "python"))  # behind the name of the interpreter
+    parts = [x for x in parts if not x.startswith(("hydra.", "longest_delay=", "model"))]
     name = program.with_name(program.name.replace("check", "train"))
-    words.insert(words[:1] == ["python"], str(name))
-    if not any(x.startswith("dataset=") for x in words):
-        words.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
-    return shlex.join([*words, "model=lnn", "data=multi_step", *options])
+    parts.insert(parts[:1] == ["python"], str(name))
+    if not any(x.startswith("dataset=") for x in parts):
+        parts.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
+    return shlex.join([*parts, "model=lnn", "data=multi_step", *options])

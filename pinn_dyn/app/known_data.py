@@ -32,8 +32,8 @@ def match_model(model: Any, source: DataSource) -> tuple[ModelBuilder, dict[str,
     """
     settings = getattr(model, "keywords", {})
     if "known" in settings:
-        known, inner = match_model(settings["known"], source)
-        return partial(model, known=known), {"known": inner}
+        mechanics, inner = match_model(settings["known"], source)
+        return partial(model, known=mechanics), {"known": inner}
     structure, driven = settings.get("structure"), settings.get("driven_joints")
     if not isinstance(structure, RigidChain):
         return model, {}
@@ -178,7 +178,7 @@ def _signals(source: DataSource) -> list[tuple[str, dict[str, str]]]:
 
 
 def _joints_of(columns: Sequence[str], joints: Sequence[str]) -> list[str] | None:
-    """Return the joint of each column, or None unless each names one of its own.
+    """Return the joint of each column, or None unless the columns name different joints.
 
     A column contains the name of its joint. Otherwise the names of joints may end as the columns do
     or with their numbers, all behind the same prefix: panda_joint1 and q1.

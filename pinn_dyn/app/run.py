@@ -171,8 +171,8 @@ class Run:
         if not isinstance(loaded, DataSource):
             part = self.config.get("log") or self.config["dataset"]
             files = "*" if isinstance(loaded, pd.DataFrame) else loaded
-            whole = {"files": files, "validation": None, "test": None}
-            source: Any = build_source({"dataset": {**part, **whole}})
+            unsplit = {"files": files, "validation": None, "test": None}
+            source: Any = build_source({"dataset": {**part, **unsplit}})
             if isinstance(loaded, pd.DataFrame):
                 source.files = {"frame": loaded}
             loaded = source

@@ -84,8 +84,8 @@ class DataRegion:
     def _features(self, q: Tensor, v: Tensor) -> np.ndarray:
         x = torch.cat([q, v], dim=-1).detach().cpu().double().numpy()
         angles = x[..., self.angles]
-        others = np.delete(x, self.angles, axis=-1)
-        return np.concatenate([others, np.sin(angles), np.cos(angles)], axis=-1)
+        linear = np.delete(x, self.angles, axis=-1)
+        return np.concatenate([linear, np.sin(angles), np.cos(angles)], axis=-1)
 
 
 class Guarded(Controller):

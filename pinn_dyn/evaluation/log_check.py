@@ -166,13 +166,13 @@ def check(
     servo = same_units and numbers.target_distance(training, step, longest_delay) < _TARGET
     # The lag of a servo is no delay.
     clear = [0.0] * inputs if servo else logs.clear_delays(delays, step)
-    for name, curve, late in zip(source.u.columns, delays, clear, strict=True):
+    for name, curve, lag in zip(source.u.columns, delays, clear, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (
-            f"input {name!r} acts {1e3 * late:.3g} ms after it is logged: add the "
+            f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the "
             "InputDelay step below or learn the delay with the model (model/delay=learned)"
         )
-        measurements.append(_judged("delay [ms]", name, delay, "no clear delay", late > 0, text))
+        measurements.append(_judged("delay [ms]", name, delay, "no clear delay", lag > 0, text))
     excitation = None
     if structure is not None:
         longest = max(item.duration for item in splits.train)

@@ -20,7 +20,6 @@ log = logging.getLogger(__name__)
 
 JointValues = float | Sequence[float] | Mapping[str, float] | None
 """A number for all joints, N numbers, or numbers by joint name; else the default."""
-USES = ("position", "velocity", "acceleration", "torque")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +74,6 @@ class Envelope:
         torque = self._filled("torque", limits.torque, torque)
         acceleration = self._filled("acceleration", limits.acceleration, 3 * velocity)
         self.start = torch.from_numpy(self._filled("start", start, middle))
-        rest = torch.zeros_like(self.start)
         massless = robot.mass_matrix(self.start).diagonal().numpy() < 1e-9
         if unlimited := self._names(massless | ~(torque > 0)):
             log.warning(
@@ -92,7 +90,8 @@ class Envelope:
             raise ValueError(
                 f"the start of {outside} is outside the limits: set start to a pose within them"
             )
-        tau = self.torque_for(self.start, rest, rest)
+        zero = torch.zeros_like(self.start)
+        tau = self.torque_for(self.start, zero, zero)
         if heavy := self._names((tau.abs() > self.torque).numpy()):
             raise ValueError(
                 f"holding the arm at the start takes more torque than the limits of {heavy}: set "
@@ -124,7 +123,8 @@ class Envelope:
         """Return the part of each limit that a motion uses, ``(*batch, T, N)`` each."""
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         values = ((q - middle) / half, v / self.velocity, a / self.acceleration, tau / self.torque)
-        return {name: x.abs() for name, x in zip(USES, values, strict=True)}
+        names = ("position", "velocity", "acceleration", "torque")
+        return {name: x.abs() for name, x in zip(names, values, strict=True)}
 
     def _names(self, mask: np.ndarray) -> str:
         return ", ".join(x for x, bad in zip(self.robot.joint_names, mask, strict=True) if bad)

@@ -80,18 +80,18 @@ def identify_payload(
 class _Loaded(nn.Module):
     """Known mechanics with a load where the last input is 1."""
 
-    def __init__(self, known: KnownMechanics):
+    def __init__(self, mechanics: KnownMechanics):
         super().__init__()
-        self.known, self.num_inputs = known, known.num_inputs
-        self.drive_gain, self.force_ratio = known.drive_gain, known.force_ratio
-        structure: Any = known.structure
+        self.known, self.num_inputs = mechanics, mechanics.num_inputs
+        self.drive_gain, self.force_ratio = mechanics.drive_gain, mechanics.force_ratio
+        structure: Any = mechanics.structure
         body, pose = structure._tip_body, torch.eye(4, dtype=torch.float64)
         self.frame = structure.body_names[body]
         if structure.tip is not None:
             self.frame, pose = structure.tip, structure._tip_pose
         if body < 0:
             raise ValueError("the tip is fixed to the base: set structure.tip to a moving link")
-        start = known.bodies.start()
+        start = mechanics.bodies.start()
         mass = start[:, 3, 3]
         second = start.diagonal(dim1=1, dim2=2)[:, :3].sum(-1)
         length = 2 * float((second / mass).max() ** 0.5)
