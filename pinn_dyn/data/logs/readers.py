@@ -76,8 +76,8 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
         if isinstance(error, LogError):
             raise
         text = " ".join(str(error).split()) or type(error).__name__
-        cause = "save plain arrays" if "allow_pickle" in text else "is it cut short?"
-        raise LogError(f"{path}: cannot be read as {suffix}, {cause}: {text}") from error
+        cause = "save plain arrays:" if "allow_pickle" in text else "is it cut short?"
+        raise LogError(f"{path}: cannot be read as {suffix}, {cause} {text}") from error
     tables = content if isinstance(content, Mapping) else {"": content}
     if not any(map(len, tables.values())):
         raise LogError(f"{path}: has no rows")
