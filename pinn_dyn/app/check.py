@@ -36,9 +36,11 @@ def check(cfg: DictConfig) -> None:
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if report.options:
         names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
-        effects = " and ".join(names[option] for option in report.options)
+        effects = " and ".join(names[option] for option in report.options if option in names)
         print(f"a training with {effects}: {_training(report.options)}")
-        print("with a URDF, model=known is often more accurate: docs/known_mechanics.md")
+        print(
+            "with a URDF, model=known with these options is often better: docs/known_mechanics.md"
+        )
     if report.problems:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
 

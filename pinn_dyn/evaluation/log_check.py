@@ -211,7 +211,10 @@ def check(
             *([] if sharp else _filter(source, training, step, noise, highest)),
             *_delay(source, clear, step),
         ],
-        [] if fast else ["model/input=servo"] * servo + ["model/friction=coulomb"] * dry,
+        []
+        if fast
+        else ["model/input=servo", "model/integrator=rosenbrock"] * servo
+        + ["model/friction=coulomb"] * dry,
         excitation,
     )
 

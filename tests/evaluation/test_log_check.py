@@ -186,7 +186,8 @@ def servo_arm(gain=60.0, *, late=0, seconds=30.0, seed=0):
 def test_targets_of_servos_are_told_from_forces(settings):
     signals = {name: dict(columns=[f"{name}1", f"{name}2"], unit="rad") for name in "qu"}
     result = checked(servo_arm(**settings), **signals)
-    assert "model/input=servo" in result.options
+    # Servos with light joints are stiff: RK4 diverges at the usual sample times.
+    assert {"model/input=servo", "model/integrator=rosenbrock"} <= set(result.options)
     assert not any("InputDelay" in line for line in result.steps)
     assert not [text for text in result.warnings if "acts" in text]
     torques = signals | {"u": dict(columns=["u1", "u2"], unit="Nm")}
