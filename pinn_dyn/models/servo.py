@@ -35,7 +35,8 @@ class Servo(InputMatrix):
 
     Args:
         scales: scales of the data. With a prior, the value is the typical force, ``(N,)``.
-        stiffness: initial k, one number or n. The default follows from the data.
+        stiffness: initial k, one number or n. The default follows from the data, and from
+            the limit if it is a number.
         spread: prior standard deviation of the logarithm of the constants; 0 fixes k.
         limit: L, one number or n; ``"learned"``; or None for a servo that does not saturate.
         joints: coordinates with a servo, in the order of the targets. The default is all.
@@ -76,6 +77,8 @@ class Servo(InputMatrix):
         if not scales.prior:
             force = super().typical_force(data.u_rms[-len(index) :]).double()
         spread_of_q = data.q_std[index].double()
+        if stiffness is None and limit not in (None, "learned"):
+            stiffness = (torch.as_tensor(limit) / spread_of_q).tolist()  # saturates at that error
         if stiffness is None:
             start = _START * force[index] / spread_of_q
         else:

@@ -50,6 +50,15 @@ class TestServo(MechanicalSystemContract):
         return make_structured(kind, input=servo, friction=CoulombFriction)
 
 
+def test_a_known_limit_gives_the_scale_of_the_servos():
+    """The weight of light links says nothing of it: k can start a hundred times too small."""
+    scales = unit_scales(2)
+    head = Servo(scales, limit=[3.0, 0.5])
+    limits = torch.tensor([3.0, 0.5]).double()
+    assert_near(head.gain().double() * scales.statistics.q_std.double(), limits, 1e-5)
+    assert_near(head.typical_force(torch.ones(2)).double(), limits / 10, 1e-5)
+
+
 @pytest.mark.parametrize("limit", [None, 0.8])
 def test_the_force_is_that_of_a_position_actuator_with_a_limit(limit):
     """MuJoCo's actuator ``position`` with a force range, away from the rounded corner."""
