@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from pinn_dyn import load
 from pinn_dyn.app.check import _training
-from pinn_dyn.models import CoulombFriction, Servo
+from pinn_dyn.models import CoulombFriction, KnownMechanics, Servo
 from tests.app.entry import ROOT, fails, run_script
 from tests.support.delayed_robots import log, resting
 
@@ -55,10 +55,13 @@ def printed_training(folder, capsys, table, effects, *settings):
     table.to_csv(folder / "joints.csv", index=False)
     words = ["dataset=csv_log", f"dataset.root='{folder}'", "dataset.files=joints.csv", *COLUMNS]
     run_script("check.py", *words, *settings, f"hydra.run.dir={folder / 'out'}")
-    (command,) = re.findall(rf"a training with {effects}: python (.*)", capsys.readouterr().out)
+    (command,) = re.findall(
+        rf"a training (?:with|of) {effects}: python (.*)", capsys.readouterr().out
+    )
     script, *words = shlex.split(command)
     small = ["trainer.steps=1", "trainer.validations=1", "data.pairs=64", "data.batch_size=64"]
-    small += ["compile=false", "validator.horizon=0.1", f"hydra.run.dir={folder / 'run'}"]
+    small += ["compile=false"] if "model=lnn" in words else ["optimizer.rollouts=false"]
+    small += ["validator.horizon=0.1", f"hydra.run.dir={folder / 'run'}"]
     run_script(script, *words, *small)
     return load(folder / "run").model
 
@@ -81,6 +84,16 @@ def test_the_printed_training_has_the_servos_of_the_log(tmp_path, capsys):
     effects, unit = "targets of servos.*", "dataset.u.unit=rad"
     model = printed_training(tmp_path, capsys, pd.DataFrame(table), effects, unit)
     assert isinstance(model.input, Servo)
+
+
+def test_the_printed_training_identifies_the_structure_of_the_check(tmp_path, capsys):
+    item = resting(0.3)
+    table = {"t": item.t, "q1": item.q[:, 0], "q2": item.q[:, 1]}
+    table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
+    settings = structure("double_pendulum")
+    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "its constants", *settings)
+    assert isinstance(model, KnownMechanics)
+    assert len(model.structure.joint_names) == 2
 
 
 def test_no_training_is_printed_where_an_angle_turns_too_far_in_a_sample(tmp_path, capsys):
