@@ -156,7 +156,7 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
             "dataset.q.columns=[bend_x,bend_y,strech]",
             ["example_log.csv: no column 'strech'", "did you mean stretch", "torque_y"],
         ),
-        ("dataset.q.unit=degree", ["dataset: q: unit is 'degree'", "did you mean deg"]),
+        ("dataset.q.unit=dge", ["dataset: q: unit is 'dge'", "did you mean deg"]),
         ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
         ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
         ("dataset.test.piece=7.0", ["test: ", "no stretch lasts 7 s"]),

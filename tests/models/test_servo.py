@@ -125,7 +125,9 @@ def test_an_implicit_step_is_stable_with_a_stiff_servo(kind):
 
 
 def test_targets_are_in_the_order_of_their_joints():
-    servo = make_structured("lnn", 3, 2, input=partial(Servo, joints=[2, 0], limit=1e6)).servo
+    servo = make_structured(
+        "lnn", 3, 2, input=partial(Servo, joints=[2, 0], stiffness=[4.0, 9.0], limit=1e6)
+    ).servo
     q, v, _, u = random_batch(3, 2)
     (k, d), (k0, d0) = zip(servo.gain(), servo.damping(), strict=True)
     pull = [k * (u[:, 0] - q[:, 2]) - d * v[:, 2], k0 * (u[:, 1] - q[:, 0]) - d0 * v[:, 0]]
