@@ -78,18 +78,23 @@ def composed(
     """Compose and check the configuration of a command; of a sweep the first value counts.
 
     ``config_dir`` is a folder with further options of groups. A ConfigError is that of
-    :func:`checked`, or has the message of Hydra.
+    :func:`checked`, has the message of Hydra, or names an option that the shipped one hides.
     """
-    search_path = [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"] if config_dir else []
-    folder, before = str(config_folder(command)), HydraConfig.instance().cfg
+    options = Path(config_dir or "").resolve()
+    search_path = [f"hydra.searchpath=[file://{options}]"] if config_dir else []
+    folder, before = Path(config_folder(command)), HydraConfig.instance().cfg
     try:
-        with hydra.initialize_config_dir(version_base="1.3", config_dir=folder):
+        with hydra.initialize_config_dir(version_base="1.3", config_dir=str(folder)):
             texts = [*search_path, *_first_of_sweeps(completed(command, overrides))]
             try:
                 cfg = hydra.compose(command, overrides=texts, return_hydra_config=True)
             except (ValueError, TypeError, AttributeError) as error:  # of Hydra, without a message
                 raise ConfigError(f"Hydra cannot use {' '.join(overrides)}: {error}") from error
             HydraConfig.instance().set_config(cfg)  # resolves ${hydra:...}
+            for group, option in cfg.hydra.runtime.choices.items() if config_dir else ():
+                file = Path(str(group).partition("@")[0], f"{option}.yaml")
+                if (options / file).is_file() and (folder / file).is_file() and options != folder:
+                    raise ConfigError(f"{options / file} is hidden by {folder / file}: rename it")
             with open_dict(cfg):
                 del cfg["hydra"]
             return checked(command, cfg)

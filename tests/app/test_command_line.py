@@ -23,6 +23,14 @@ def said(error, capsys):
     return f"{captured.out}\n{captured.err}\n{error.code if isinstance(error.code, str) else ''}"
 
 
+def test_an_option_that_a_shipped_option_hides_is_refused(elsewhere, capsys):
+    """Hydra would read the shipped file without a word."""
+    (elsewhere / "conf" / "dataset").mkdir(parents=True)
+    (elsewhere / "conf" / "dataset" / "panda.yaml").write_text("defaults: [csv_log, _self_]\n")
+    error = fails("train.py", "--config-dir", str(elsewhere / "conf"), "dataset=panda")
+    assert f"{elsewhere / 'conf' / 'dataset' / 'panda.yaml'} is hidden by" in said(error, capsys)
+
+
 @pytest.mark.parametrize(
     ("script", "mistake", "meant"),
     [
