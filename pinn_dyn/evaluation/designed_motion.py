@@ -78,7 +78,12 @@ class DesignedMotion:
         """Draw positions, velocities and torques, with dashed limits."""
         limits, short = self.envelope, slice(None, None, self._stride(100.0))
         bounds = [(limits.low, limits.high), *((-x, x) for x in (limits.velocity, limits.torque))]
-        columns = [[f"{x} {name}" for name in self.joint_names] for x in ("q", "v", "tau")]
+        turning = self.envelope.robot.turning
+        units = {"q": ("m", "rad"), "v": ("m/s", "rad/s"), "tau": ("N", "Nm")}
+        columns = [
+            [f"{x} {name} [{pair[k]}]" for name, k in zip(self.joint_names, turning, strict=True)]
+            for x, pair in units.items()
+        ]
         figure, axes = panels(columns, self.t, title=self._summary())
         for column, values, (low, high) in zip(
             axes, (self.q, self.v, self.tau), bounds, strict=True
