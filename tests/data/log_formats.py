@@ -17,6 +17,14 @@ BAG = dict(
     v=dict(columns=[f"/joint_states/velocity/{j}" for j in reversed(JOINTS)], unit="rad/s"),
     u=dict(columns=["/commands/data/0", "/commands/data/1"], unit="Nm"),
 )
+LEROBOT = dict(
+    files="data/*/*.parquet",
+    trajectory="episode_index",
+    time=dict(columns="timestamp", unit="s"),
+    q=dict(columns=["observation.state_1", "observation.state_2"], unit="rad"),
+    v=None,
+    u=dict(columns=["action_1", "action_2"], unit="Nm"),
+)
 
 
 def time_of(t, store):

@@ -13,14 +13,6 @@ from tests.data.logs_files import motion, source
 
 TABLE = motion(6.0)
 Q, V, U = (TABLE.filter(regex=f"^{name}").to_numpy() for name in "qvu")
-LEROBOT = dict(
-    files="data/*/*.parquet",
-    trajectory="episode_index",
-    time=dict(columns="timestamp", unit="s"),
-    q=dict(columns=["observation.state_1", "observation.state_2"], unit="rad"),
-    v=None,
-    u=dict(columns=["action_1", "action_2"], unit="Nm"),
-)
 HDF5 = dict(
     files="*.h5",
     time=dict(columns="log/t", unit="s"),
@@ -59,7 +51,7 @@ def write_lerobot(folder, names):
 def test_lerobot_entries_have_the_names_of_the_data_set(tmp_path, names):
     write_lerobot(tmp_path, names)
     q = [f"observation.state/{name}" for name in ("elbow.pos", "main_shoulder_pan")]
-    run = raw(source(tmp_path, **LEROBOT | {"q": dict(columns=q, unit="rad")}))
+    run = raw(source(tmp_path, **formats.LEROBOT | {"q": dict(columns=q, unit="rad")}))
     np.testing.assert_allclose(run.q, Q[: len(run), ::-1])
 
 
@@ -67,8 +59,8 @@ def test_lerobot_names_that_do_not_fit_are_answered_with_numbers_that_work(tmp_p
     write_lerobot(tmp_path, ["elbow"])
     q = dict(columns=["observation.state/elbow"], unit="rad")
     with pytest.raises(LogError, match=r"1 names .* 2 entries.* observation.state_1 to .*_2;"):
-        source(tmp_path, **LEROBOT | {"q": q}).load()
-    assert_motion(source(tmp_path, **LEROBOT))
+        source(tmp_path, **formats.LEROBOT | {"q": q}).load()
+    assert_motion(source(tmp_path, **formats.LEROBOT))
 
 
 def test_parquet_of_structs_nested_lists_and_an_index(tmp_path):

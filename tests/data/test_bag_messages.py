@@ -102,7 +102,8 @@ def test_a_simulation_starts_at_0_without_a_note(tmp_path):
     assert not table.notes
 
 
-def test_stamps_of_a_simulation_beside_commands_without_stamps(tmp_path):
+@pytest.mark.parametrize(("first", "delay"), [(10**9, "1.7e+09"), (START + 5 * 10**9, "-5")])
+def test_stamps_of_another_clock_beside_commands_without_stamps(tmp_path, first, delay):
     kind = "std_msgs/msg/Float64MultiArray"
     layout = STORE.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     with Writer(tmp_path / "bag", version=9) as writer:
@@ -112,13 +113,13 @@ def test_stamps_of_a_simulation_beside_commands_without_stamps(tmp_path):
         )
         for k, t in enumerate(T[:, 0]):
             time = START + round(1e9 * t)
-            message = joint_state(k, stamp=round(1e9 * t) + 10**9)
+            message = joint_state(k, stamp=round(1e9 * t) + first)
             writer.write(states, time, STORE.serialize_cdr(message, states.msgtype))
             message = STORE.types[kind](layout=layout, data=U[k])
             writer.write(commands, time, STORE.serialize_cdr(message, kind))
     table = read(tmp_path / "bag", [*COLUMNS[:2], "/commands/data/0", "/commands/data/1"])
     assert_motion(table)
-    assert table.notes == ["stamps of /joint_states are off by 1.7e+09 s: times of receipt"]
+    assert table.notes == [f"stamps of /joint_states are off by {delay} s: times of receipt"]
 
 
 def test_a_gripper_on_the_topic_of_the_arm_is_named(tmp_path):

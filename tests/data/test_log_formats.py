@@ -175,19 +175,9 @@ def test_npz_without_unpickling(tmp_path, expected):
         source(tmp_path, files="objects.npz", **renamed("")).load()
 
 
-LEROBOT = dict(
-    files="data/*/*.parquet",
-    trajectory="episode_index",
-    time=dict(columns="timestamp", unit="s"),
-    q=dict(columns=["observation.state_1", "observation.state_2"], unit="rad"),
-    v=None,
-    u=dict(columns=["action_1", "action_2"], unit="Nm"),
-)
-
-
 def test_lerobot_files_have_episodes_and_vectors(tmp_path):
     formats.write_lerobot(tmp_path, TABLE)
-    parts = source(tmp_path, **LEROBOT).cleaned
+    parts = source(tmp_path, **formats.LEROBOT).cleaned
     assert len({part.raw.run for part in parts}) == 3
     np.testing.assert_allclose(parts[0].raw.q[:, 0], TABLE["q1"][: len(parts[0].raw)])
     np.testing.assert_allclose(parts[0].raw.u[:, 1], TABLE["u2"][: len(parts[0].raw)])
@@ -195,7 +185,7 @@ def test_lerobot_files_have_episodes_and_vectors(tmp_path):
 
 def test_episodes_are_told_apart_by_the_restart_of_the_clock(tmp_path):
     formats.write_lerobot(tmp_path, TABLE)
-    log = source(tmp_path, **{**LEROBOT, "trajectory": None})
+    log = source(tmp_path, **{**formats.LEROBOT, "trajectory": None})
     assert len({part.raw.run for part in log.cleaned}) == 3
     assert "the time goes back to 0 s: a run is assumed to start there (2 such rows)" in log.report
 

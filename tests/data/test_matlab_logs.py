@@ -46,7 +46,7 @@ def opaque(classname, **properties):
 
 
 def timeseries(data, *, uniform=False):
-    """As MATLAB saves a time series: a uniform clock by its start, step and length."""
+    """Return a time series as MATLAB saves it; a uniform clock has a start, a step and a length."""
     none = np.empty((0, 0))
     step = np.array([[T[1, 0] - T[0, 0]]])
     info = dict(Start_=T[:1], Increment_=step, Length=np.array([[float(len(T))]]))

@@ -55,7 +55,7 @@ def with_network(**heads):
 
 
 def test_a_sum_has_the_stiffness_of_both_parts():
-    """Of servos, which the parts of a sum share with their inputs."""
+    """Servos stiffen a joint, and the parts of a sum share their targets."""
     parts = [make_structured("lnn", input=Servo) for _ in range(2)]
     matrices = [part._stiffness_matrix(torch.zeros(part.num_coordinates)) for part in parts]
     total = Sum(dict(a=parts[0], b=parts[1]))._stiffness_matrix(torch.zeros(len(matrices[0])))

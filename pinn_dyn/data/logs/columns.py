@@ -39,7 +39,7 @@ UNITS: dict[str, tuple[str, float]] = {
 
 
 _SPELLINGS = {
-    **dict.fromkeys(("°", "º", "degree", "degrees", "grad"), "deg"),
+    **dict.fromkeys(("°", "º", "degree", "degrees"), "deg"),
     **dict.fromkeys(("sec", "second", "seconds"), "s"),
     **dict.fromkeys(("radian", "radians"), "rad"),
     **{"µs": "us", "μs": "us", "µm": "um", "μm": "um", "-": "1"},
