@@ -46,9 +46,10 @@ def explained_share(
 
 
 def target_distance(training: Sequence[Recording], step: float, longest: float) -> float:
-    """Return the largest part of the variance of q that a late target u leaves, over coordinates.
+    """Return the share of the variance of q that delayed targets u do not explain.
 
-    Each coordinate has the lag, ``longest`` or less, that leaves least. An offset does not count.
+    The delay of each coordinate is the best one up to ``longest``, s. A constant offset between
+    target and q does not count. The result is that of the worst coordinate.
     """
     size = training[0].q.shape[1]
     if training[0].u.shape[1] not in (size, 2 * size):
