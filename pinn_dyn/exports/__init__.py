@@ -1,0 +1,1 @@
+"""Models, control laws and observers as code for other programs."""

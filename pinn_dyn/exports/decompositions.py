@@ -1,0 +1,92 @@
+"""Matrix factorizations as elementary operations, for matrices of a few rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def cholesky(matrix: Tensor) -> Tensor:
+    """Return the lower L with L L^T = matrix, ``(*batch, n, n)``; NaN where it has none."""
+    columns: list[Tensor] = []
+    size = matrix.shape[-1]
+    for j in range(size):
+        column = matrix[..., j:, j]
+        for previous in columns:
+            column = column - previous[..., j:] * previous[..., j : j + 1]
+        column = column / column[..., :1].sqrt()
+        columns.append(torch.nn.functional.pad(column, (j, 0)))
+    return torch.stack(columns, dim=-1)
+
+
+def solve_triangular(matrix: Tensor, right: Tensor, upper: bool) -> Tensor:
+    """Return X ``(*batch, n, k)`` with matrix X = right, for a triangular matrix."""
+    size = matrix.shape[-1]
+    rows: dict[int, Tensor] = {}
+    for i in reversed(range(size)) if upper else range(size):
+        row = right[..., i, :]
+        for j, solved in rows.items():
+            row = row - matrix[..., i, j : j + 1] * solved
+        rows[i] = row / matrix[..., i, i : i + 1]
+    return torch.stack([rows[i] for i in range(size)], dim=-2)
+
+
+def qr(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return Q ``(*batch, n, k)`` and R ``(*batch, k, k)`` by Householder reflections, n >= k."""
+    rows, columns = matrix.shape[-2:]
+    R = matrix
+    reflections = []
+    for j in range(min(columns, rows - 1)):
+        x = R[..., j:, j]
+        sign = torch.where(x[..., :1] < 0, -1.0, 1.0)
+        norm = (x * x).sum(-1, keepdim=True).sqrt()
+        w = torch.cat([x[..., :1] + sign * norm, x[..., 1:]], dim=-1)
+        w = torch.nn.functional.pad(w, (j, 0))
+        scale = 2 / (w * w).sum(-1, keepdim=True)
+        reflections.append((w, scale))
+        R = R - (scale * w).unsqueeze(-1) * (w.unsqueeze(-1) * R).sum(-2, keepdim=True)
+    Q = torch.eye(rows, columns, dtype=matrix.dtype).expand(matrix.shape)
+    for w, scale in reversed(reflections):
+        Q = Q - (scale * w).unsqueeze(-1) * (w.unsqueeze(-1) * Q).sum(-2, keepdim=True)
+    return Q, R[..., :columns, :].triu()
+
+
+def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> Any:
+    failed = torch.zeros(matrix.shape[:-2], dtype=torch.int32)  # the factor is NaN where it fails
+    return cholesky(matrix), failed
+
+
+def _cholesky_solve(right: Tensor, factor: Tensor, upper: bool = False) -> Tensor:
+    lower = factor.mT if upper else factor
+    return solve_triangular(lower.mT, solve_triangular(lower, right, upper=False), upper=True)
+
+
+def _solve_ex(A: Tensor, B: Tensor, *, left: bool = True, check_errors: bool = False) -> Any:
+    # By reflections, which need no pivots, so that the operations do not depend on the numbers.
+    Q, R = qr(A)
+    vector = B.ndim == A.ndim - 1
+    right = B.unsqueeze(-1) if vector else B
+    result = solve_triangular(R, Q.mT @ right, upper=True)
+    failed = torch.zeros(A.shape[:-2], dtype=torch.int32)
+    return (result.squeeze(-1) if vector else result), A, failed, failed
+
+
+def _solve_triangular(
+    A: Tensor, B: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
+) -> Tensor:
+    if not left:
+        return solve_triangular(A.mT, B.mT, not upper).mT
+    return solve_triangular(A, B, upper)
+
+
+_aten = torch.ops.aten
+DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
+    _aten.linalg_cholesky_ex.default: _cholesky_ex,
+    _aten.cholesky_solve.default: _cholesky_solve,
+    _aten._linalg_solve_ex.default: _solve_ex,
+    _aten.linalg_qr.default: lambda A, mode="reduced": qr(A),
+    _aten.linalg_solve_triangular.default: _solve_triangular,
+}

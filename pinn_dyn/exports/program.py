@@ -1,0 +1,119 @@
+"""A function of small tensors as a list of elementary operations of fixed shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, fx
+from torch._decomp import core_aten_decompositions
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from pinn_dyn.exports.decompositions import DECOMPOSITIONS
+
+_OF_SHAPES_ALONE = (torch.ops.aten.full_like.default, torch.ops.aten.new_zeros.default)
+
+
+class Program:
+    """The operations of a function for one state, without control flow and random numbers.
+
+    All numbers are float64. Every node of the graph has ``meta["val"]``, its value at the example
+    inputs, of which shapes and strides hold for all inputs. Operations on constants alone are
+    evaluated and stored.
+
+    Attributes:
+        graph_module: the operations, by name in :data:`torch.ops.aten`.
+        inputs, outputs: shape of each input and output by its name, in the order of the function.
+    """
+
+    def __init__(
+        self,
+        graph_module: fx.GraphModule,
+        inputs: Mapping[str, torch.Size],
+        outputs: Mapping[str, torch.Size],
+    ):
+        self.graph_module = graph_module
+        self.inputs, self.outputs = dict(inputs), dict(outputs)
+
+    def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
+        """Return the outputs in eager PyTorch."""
+        return self.graph_module(*arguments)
+
+    def nodes(self) -> list[tuple[fx.Node, Tensor]]:
+        """Return the operations and constants in order, each with its example value."""
+        return [
+            (node, node.meta["val"])
+            for node in self.graph_module.graph.nodes
+            if node.op in ("call_function", "get_attr") and isinstance(node.meta["val"], Tensor)
+        ]
+
+    def results(self) -> list[fx.Node]:
+        """Return the nodes of the outputs."""
+        (output,) = self.graph_module.graph.find_nodes(op="output")
+        return list(output.args[0])
+
+
+def trace(
+    function: Callable[..., Tensor | tuple[Tensor, ...]],
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+) -> Program:
+    """Record a function at example inputs, without a batch dimension, in float64.
+
+    Args:
+        function: takes the inputs by position, and returns a tensor for each output.
+        inputs: example value of each input by its name.
+        outputs: names of the outputs.
+    """
+
+    def run(*arguments: Tensor) -> tuple[Tensor, ...]:
+        with torch.no_grad():
+            result = function(*arguments)
+        return (result,) if isinstance(result, Tensor) else tuple(result)
+
+    table = {**core_aten_decompositions(), **DECOMPOSITIONS}
+    values = tuple(value.clone() for value in inputs.values())  # make_fx merges equal tensors
+    module = make_fx(torch.func.functionalize(run), table)(*values)
+    _fold_constants(module, values)
+    results = module(*values)
+    shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}
+    return Program(module, {name: value.shape for name, value in inputs.items()}, shapes)
+
+
+class _Values(fx.Interpreter):
+    """Interpreter that stores the value of each node, and whether it depends on an input."""
+
+    def run_node(self, node: fx.Node) -> Any:
+        value = super().run_node(node)
+        node.meta["val"] = value
+        node.meta["constant"] = node.op == "get_attr" or (
+            node.op == "call_function"
+            and (
+                node.target in _OF_SHAPES_ALONE
+                or all(x.meta["constant"] for x in node.all_input_nodes)
+            )
+        )
+        return value
+
+
+def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> None:
+    graph = module.graph
+    for node in graph.nodes:
+        if node.target is torch.ops.aten.squeeze_.dim:
+            node.target = torch.ops.aten.squeeze.dim
+    graph.eliminate_dead_code()
+    _Values(module).run(*arguments)
+    for node in list(graph.nodes):
+        if node.op != "call_function" or not node.meta["constant"]:
+            continue
+        value = node.meta["val"]
+        if isinstance(value, Tensor) and not all(user.meta["constant"] for user in node.users):
+            name = f"constant_{node.name}"
+            module.register_buffer(name, value.detach().clone().contiguous())
+            with graph.inserting_before(node):
+                replacement = graph.get_attr(name)
+            node.replace_all_uses_with(replacement)
+    graph.eliminate_dead_code()
+    module.recompile()
+    _Values(module).run(*arguments)
