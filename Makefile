@@ -89,7 +89,7 @@ $(VENV)/.installed $(VENV)/.installed-all: pyproject.toml setup.py constraints.t
 	@if $(INSTALL) --dry-run --no-deps --only-binary pybullet pybullet >/dev/null 2>&1; then \
 	    $(INSTALL) --only-binary pybullet -e '.[panda$(MORE:%=,%)]'; \
 	else \
-	    echo "no PyBullet wheel for this Python: the PyBullet parts (Panda) are skipped"; \
+	    echo "no PyBullet wheel for this Python: PyBullet is skipped, MuJoCo simulates the Panda"; \
 	    $(INSTALL) -e '.$(MORE:%=[%])'; \
 	fi
 	@touch $(STAMPS) $@

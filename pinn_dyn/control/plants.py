@@ -80,7 +80,7 @@ class SystemPlant(Plant):
 
 
 class SimulatorPlant(Plant):
-    """K copies of a robot that a simulator such as PyBullet moves in time steps, in turn.
+    """K copies of a robot that a simulator such as MuJoCo moves in time steps, in turn.
 
     Args:
         arm: the robot, which applies its damping itself.

@@ -75,7 +75,7 @@ class RobotSource(DataSource):
         if unlimited := [joint for joint, speed, torque in limits if not min(speed, torque) > 0]:
             raise ValueError(
                 f"{self.name}: the joints {', '.join(unlimited)} have no velocity or torque limit: "
-                "set <limit velocity=... effort=...> in the URDF"
+                "set v_max and u_max of the robot, or <limit velocity=... effort=...> in the URDF"
             )
         self.configurations = self.configurations or {
             "middle": ((arm.q_low + arm.q_high) / 2).tolist()

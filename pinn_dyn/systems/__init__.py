@@ -1,6 +1,7 @@
 """Analytic and simulated robots, the truth that models are compared with."""
 
 from pinn_dyn.systems.bullet_arm import BulletArm
+from pinn_dyn.systems.mujoco_arm import MujocoArm
 from pinn_dyn.systems.protocols import Drawable, HasDomain, HasLimits, HasTip, Stepped
 from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.simulated_arm import SimulatedArm
@@ -12,6 +13,7 @@ __all__ = [
     "HasDomain",
     "HasLimits",
     "HasTip",
+    "MujocoArm",
     "RigidChain",
     "SimulatedArm",
     "SoftArm",

@@ -54,8 +54,8 @@ class RigidChain(MechanicalSystem):
     homogeneous matrix approach to 3D kinematics and dynamics".
 
     Args:
-        urdf: path of a URDF or MJCF, one that ships with PyBullet (``franka_panda/panda.urdf``), or
-            the text of the file.
+        urdf: path of a URDF or MJCF, one that ships with pinn_dyn (``franka_panda/panda.urdf``) or
+            PyBullet, or the text of the file.
         joints: names of the joints that move, in the order of the coordinates, the others are held
             at zero; None for all that mimic no other joint, in the order of the file.
         locked_joints: names of joints that are held at zero, or positions by name, rad or m.

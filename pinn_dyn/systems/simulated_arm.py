@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import abc
+import functools
 import hashlib
+import importlib
 import math
+import os
 from collections.abc import Sequence
-from typing import Annotated
+from importlib.metadata import version
+from typing import Annotated, ClassVar, Protocol
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -18,27 +21,59 @@ from pinn_dyn.systems.mjcf import exact_text
 from pinn_dyn.systems.rigid_chain import RigidChain
 
 
-class SimulatedArm(RigidChain, abc.ABC):
+class World(Protocol):
+    """A simulation of one arm, where only gravity and the applied forces act.
+
+    It has no joint motors, damping, friction, joint limits or contacts.
+
+    Args:
+        text: the URDF of the arm.
+        gravity: gravitational acceleration, m/s^2.
+
+    Attributes:
+        velocity: velocities of the joints, ``(N,)``.
+    """
+
+    velocity: np.ndarray
+
+    def __init__(self, text: str, gravity: tuple[float, ...]): ...
+
+    def put(self, q: np.ndarray, v: np.ndarray) -> None:
+        """Set the positions and velocities of the joints, ``(N,)`` each."""
+
+    def step(self, force: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Apply the forces ``(N,)`` over one step; return positions and velocities after it."""
+
+
+class SimulatedArm(RigidChain):
     """A rigid chain with joint limits that a simulator moves in time steps of its own.
 
-    A subclass gives :meth:`set_state` and :meth:`step`. The simulator loads :meth:`to_urdf`, and
-    must not add joint motors, damping, friction, joint limits or contacts.
+    A subclass names the ``simulator`` (a Python package), how to ``install`` it, and the class of
+    its :class:`World`. Arms of the same URDF and gravity
+    share a world: set the state of each before its steps.
 
     Args:
         urdf, locked_joints, gravity, tip, mass_scale, payload: arguments of :class:`RigidChain`.
         damping: viscous friction of the joints, Nms/rad or Ns/m, one number or N.
+        v_max, u_max: limits of speed (rad/s or m/s) and torque or force, one number or N; None for
+            those of the file. An MJCF has no limits of speed.
 
     Attributes:
         text: the URDF that the simulator loads.
         gravity: gravitational acceleration, m/s^2, 3 numbers.
         q_low, q_high: joint limits, ``(N,)``, rad or m; -pi and pi for a continuous joint.
-        v_max: speed limits, ``(N,)``, rad/s or m/s; 0 where the URDF has none.
-        u_max: torque or force limits, ``(N,)``, Nm or N; 0 where the URDF has none.
+        v_max: speed limits, ``(N,)``, rad/s or m/s; 0 where the file has none.
+        u_max: torque or force limits, ``(N,)``, Nm or N; 0 where the file has none.
         angles: indices of the joints that turn.
 
     Raises:
+        ImportError: without the simulator.
         ValueError: as :class:`RigidChain`, or on a joint without limits or a body without mass.
     """
+
+    simulator: ClassVar[str]
+    install: ClassVar[str]
+    world: ClassVar[type[World]]
 
     def __init__(
         self,
@@ -50,8 +85,14 @@ class SimulatedArm(RigidChain, abc.ABC):
         tip: str | None = None,
         mass_scale: PositiveFloat = 1.0,
         payload: NonNegativeFloat = 0.0,
+        v_max: NonNegativeFloat | Sequence[NonNegativeFloat] | None = None,
+        u_max: NonNegativeFloat | Sequence[NonNegativeFloat] | None = None,
     ):
-        self.import_simulator()
+        try:
+            importlib.import_module(self.simulator)
+        except ImportError as error:
+            text = f"{type(self).__name__} needs {self.simulator}: {self.install}"
+            raise ImportError(text) from error
         super().__init__(
             urdf,
             locked_joints=locked_joints,
@@ -66,7 +107,11 @@ class SimulatedArm(RigidChain, abc.ABC):
             text = f"the simulation has no mimic joints: add {mimics} to locked_joints"
             raise ValueError(f"{self.tree.path}: {text}")
         self.check_domain(np.zeros(0), np.zeros(0))
-        self.q_low, self.q_high, self.v_max, self.u_max = self.limits.T.copy()
+        self.limits = self.limits.copy()
+        for column, values in ((2, v_max), (3, u_max)):
+            if values is not None:
+                self.limits[:, column] = values
+        self.q_low, self.q_high, self.v_max, self.u_max = self.limits.T
         for joint, low, high in zip(self.joint_names, self.q_low, self.q_high, strict=True):
             if not low < high:
                 raise ValueError(
@@ -80,19 +125,22 @@ class SimulatedArm(RigidChain, abc.ABC):
         self.text = self.to_urdf()
         self.angles = tuple(k for k, turns in enumerate(self.turning) if turns)
 
-    def import_simulator(self) -> None:
-        """Import the simulator, to refuse an arm where it is not installed."""
-
-    @abc.abstractmethod
     def set_state(self, q: np.ndarray, v: np.ndarray) -> None:
         """Put the arm into a state, ``(N,)`` each, from which :meth:`step` moves it."""
+        self._world.put(q, v)
 
-    @abc.abstractmethod
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return q and v, ``(N,)`` each, after ``step`` s under the motor torque ``(N,)``, Nm.
+        """Return q and v, ``(N,)`` each, after a step of semi-implicit Euler under ``(N,)``, Nm::
 
-        The joints' damping is added.
+        v_k+1 = v_k + step M^-1 (u_k - D v_k - C v_k - G),   q_k+1 = q_k + step v_k+1
         """
+        world = self._world
+        return world.step(torque - self.friction * world.velocity, step)
+
+    @property
+    def _world(self) -> World:
+        # The process is part of the key: a forked process must not use its parent's client.
+        return _open_world(os.getpid(), type(self).world, self.text, self.gravity)
 
     def motor_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return M a + C v + G + D v, ``(*batch, N)``, Nm."""
@@ -109,8 +157,10 @@ class SimulatedArm(RigidChain, abc.ABC):
         """Return everything that the motion depends on, JSON-serializable."""
         return {
             "urdf": hashlib.sha256(self.text.encode()).hexdigest(),
+            "limits": self.limits.tolist(),
             "damping": self.friction.tolist(),
             "gravity": self.gravity,
+            self.simulator: version(self.simulator),
         }
 
     def to_urdf(self) -> str:
@@ -162,3 +212,8 @@ def _principal_inertia(
 
 def _link(body: int) -> str:
     return "base" if body < 0 else f"body{body}"
+
+
+@functools.cache
+def _open_world(pid: int, world: type[World], text: str, gravity: tuple[float, ...]) -> World:
+    return world(text, gravity)

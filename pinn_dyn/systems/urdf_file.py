@@ -246,9 +246,11 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
 
 def _open(urdf: str) -> tuple[Path, bytes]:
     path = Path(urdf).expanduser()
+    folders = [Path(), Path(__file__).parent / "robots"]
     package = importlib.util.find_spec("pybullet_data")
-    shipped = Path(package.origin).parent if package is not None and package.origin else Path()
-    for file in (path, shipped / path):
+    if package is not None and package.origin:
+        folders.append(Path(package.origin).parent)
+    for file in (folder / path for folder in folders):
         if file.is_file():
             return file.resolve(), file.read_bytes()
     raise FileNotFoundError(f"URDF {urdf!r} not found from {Path.cwd()}")

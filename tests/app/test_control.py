@@ -1,6 +1,7 @@
 """control.py: what it writes, and what it refuses."""
 
 import json
+import sys
 
 import numpy as np
 import pandas as pd
@@ -184,11 +185,10 @@ def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, capsys):
         assert problem in refused_text(capsys, *command, *words)
 
 
-@pytest.mark.panda
 @pytest.mark.parametrize(
     "experiment", ["panda/tracking", pytest.param("panda/helix", marks=pytest.mark.slow)]
 )
-def test_the_panda_is_controlled_in_bullet(request, tmp_path, experiment, panda_run):
+def test_the_panda_is_controlled_without_pybullet(request, tmp_path, experiment, panda_run):
     if experiment != "panda/helix":  # which has a picture of its own
         request.getfixturevalue("undrawn")
     folder = tmp_path / "out"
@@ -208,18 +208,23 @@ def test_the_panda_is_controlled_in_bullet(request, tmp_path, experiment, panda_
 
 @pytest.fixture(scope="module")
 def panda_run(tmp_path_factory):
-    pytest.importorskip("pybullet", reason="the Panda is simulated by PyBullet: pinn_dyn[panda]")
+    """A run of a process that cannot import PyBullet, until the last test of this module."""
+    pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
     folder = tmp_path_factory.mktemp("runs") / "panda"
     counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1"]
-    run_script(
-        "train.py",
-        "experiment=panda",
-        *TINY_TRAINING,
-        "dataset.duration=0.2",
-        *counts,
-        STRIDE,
-        NO_FIGURES,
-        "compile=false",
-        f"hydra.run.dir={folder}",
-    )
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("pybullet", "pybullet_data"):
+            patch.setitem(sys.modules, name, None)
+        run_script(
+            "train.py",
+            "experiment=panda",
+            "dataset=panda_mujoco",
+            *TINY_TRAINING,
+            "dataset.duration=0.2",
+            *counts,
+            STRIDE,
+            NO_FIGURES,
+            "compile=false",
+            f"hydra.run.dir={folder}",
+        )
+        yield folder

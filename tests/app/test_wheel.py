@@ -72,11 +72,11 @@ def call(installed, folder, *command):
     return done.stdout
 
 
-def test_the_wheel_holds_every_module_template_and_configuration(wheel):
+def test_the_wheel_holds_every_module_template_robot_and_configuration(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
     modules = {
         str(p.relative_to(ROOT))
-        for kind in ("*.py", "*.html", "py.typed")
+        for kind in ("*.py", "*.html", "*.urdf", "py.typed")
         for p in (ROOT / "pinn_dyn").rglob(kind)
     }
     assert any(name.endswith(".html") for name in modules)

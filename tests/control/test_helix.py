@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
+pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
 
 from pinn_dyn.control.helix import Helix
 from pinn_dyn.control.references import check_limits
-from pinn_dyn.systems import BulletArm
+from pinn_dyn.systems import MujocoArm
 from pinn_dyn.testing import assert_near, slope
-
-pytestmark = pytest.mark.panda
 
 POSTURE = [0.1, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785]
 FAST = {"radius": 0.1, "pitch": 0.06, "period": 4.0, "turns": 1.5}
@@ -22,7 +20,7 @@ FAST = {"radius": 0.1, "pitch": 0.06, "period": 4.0, "turns": 1.5}
 @pytest.fixture(scope="module")
 def arm():
     fingers = ("panda_finger_joint1", "panda_finger_joint2")
-    return BulletArm("franka_panda/panda.urdf", locked_joints=fingers)
+    return MujocoArm("franka_panda/panda.urdf", locked_joints=fingers)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The plants of a closed loop: the contract, SciPy, matrix exponentials, Bullet's roll-out."""
+"""The plants of a closed loop: the contract, SciPy, matrix exponentials, simulators."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,7 @@ from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem, PlantContract, damped_oscillators, exact_solution
 from tests.support.closed_loops import Vanishing
-
-PANDA = "franka_panda/panda.urdf"
-FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, simulated_by
 
 
 def double(values):
@@ -80,12 +78,9 @@ def test_a_copy_that_loses_its_mass_matrix_is_nan_and_the_others_go_on():
     torch.testing.assert_close(states[[0, 2]], others, rtol=0, atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def panda():
-    pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
-    from pinn_dyn.systems import BulletArm
-
-    return BulletArm(PANDA, locked_joints=FINGERS, damping=0.5)
+@pytest.fixture(params=SIMULATORS)
+def panda(request):
+    return simulated_by(request.param)(PANDA, locked_joints=FINGERS, damping=0.5)
 
 
 def panda_states(panda):
@@ -94,8 +89,7 @@ def panda_states(panda):
     return q0, torch.from_numpy(rng.uniform(-1, 1, (2, 7))), rng.uniform(-5, 5, (6, 2, 7))
 
 
-@pytest.mark.panda
-def test_bullet_copies_move_as_in_a_roll_out_of_bullet(panda):
+def test_copies_move_as_in_a_roll_out_of_the_simulator(panda):
     q0, v0, inputs = panda_states(panda)
     states = run(SimulatorPlant(panda, step=0.001), q0, v0, torch.from_numpy(inputs), 0.003)
     for k in range(2):
@@ -104,8 +98,7 @@ def test_bullet_copies_move_as_in_a_roll_out_of_bullet(panda):
         np.testing.assert_allclose(states[k], steps[2::3], rtol=0, atol=1e-9)
 
 
-@pytest.mark.panda
-def test_bullet_refuses_a_time_between_its_steps(panda):
+def test_a_simulator_refuses_a_time_between_its_steps(panda):
     q0, v0, inputs = panda_states(panda)
     plant = SimulatorPlant(panda, step=0.001)
     plant.start(q0, v0)
@@ -119,7 +112,6 @@ class TestSystemPlant(PlantContract):
         return SystemPlant(request.param())
 
 
-@pytest.mark.panda
 class TestSimulatorPlant(PlantContract):
     @pytest.fixture
     def plant(self, panda):

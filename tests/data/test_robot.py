@@ -1,4 +1,4 @@
-"""Recorded data of a PyBullet arm: limits, splits, cache and processes."""
+"""Recorded data of a simulated arm: limits, splits, cache and processes."""
 
 import importlib
 import re
@@ -25,8 +25,8 @@ from pinn_dyn.data.robot_excitation import Plan
 from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from tests.support.processes import fork
-
-pytestmark = pytest.mark.panda
+from tests.support.simulated_arms import SIMULATORS, simulated_by
+from tests.support.urdf_by_hand import SPATIAL
 
 TRACKED = {
     "frequency": [0.05, 0.5],
@@ -42,7 +42,7 @@ FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
 SHORT = {"duration": 0.3, "train": 4, "validation": 2, "test": 2}
 
 
-def build(cache, dataset="panda", **changes):
+def build(cache, dataset="panda_mujoco", **changes):
     """The data set of conf/dataset with its own excitations, short, built as the app does."""
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         composed = hydra.compose(f"dataset/{dataset}").dataset
@@ -52,13 +52,9 @@ def build(cache, dataset="panda", **changes):
     return hydra.utils.instantiate(config, _convert_="all")
 
 
-def needs_pybullet():
-    return pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
-
-
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    needs_pybullet()
+    pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
     return tmp_path_factory.mktemp("cache")
 
 
@@ -181,6 +177,7 @@ def test_a_second_load_reads_the_cache(cache, splits, monkeypatch):
         {"system": {"damping": 0.1}},
         {"system": {"gravity": [0, 0, 0]}},
         {"system": {"payload": 1.0}},
+        {"system": {"u_max": 50.0}},
         {"system": {"locked_joints": [*FINGERS, "panda_joint3"], "damping": 0.5}},
     ],
     ids=str,
@@ -199,14 +196,29 @@ def test_momenta_are_those_of_the_mass_matrix(source, splits):
     torch.testing.assert_close(p, expected, rtol=0, atol=1e-12)
 
 
-def test_any_urdf_by_path(cache):
-    arm = build(
-        cache, "urdf_arm", name="iiwa", system={"urdf": "kuka_iiwa/model.urdf"}, train=2, test=1
-    )
+@pytest.mark.parametrize("name", SIMULATORS)
+def test_any_urdf_by_path(cache, name):
+    system = {
+        "_target_": f"pinn_dyn.systems.{simulated_by(name).__name__}",
+        "urdf": SPATIAL,
+        **{"v_max": 3.0, "u_max": [40.0, 20.0]},
+    }
+    arm = build(cache, "urdf_arm", name="spatial", system=system, train=2, test=1)
     assert list(arm.configurations) == ["middle"]
     q, v, u = recorded(arm, "test")
     a = arm.system.forward_dynamics(q[:, :-1], v[:, :-1], u[:, :-1])
     torch.testing.assert_close(v[:, 1:], v[:, :-1] + 1e-3 * a, rtol=0, atol=1e-8)
+
+
+@pytest.mark.panda
+def test_both_simulators_record_the_same_panda(source):
+    """The draws are the same, and the steps differ by rounding."""
+    simulated_by("BulletArm")
+    bullet = build(source.cache, "panda", duration=0.1)
+    pairs = zip(build(source.cache, duration=0.1).load().train, bullet.load().train, strict=True)
+    for mujoco, other in pairs:
+        torch.testing.assert_close(mujoco.q, other.q, rtol=0, atol=1e-10)
+        torch.testing.assert_close(mujoco.u, other.u, rtol=0, atol=1e-6)
 
 
 # Bad input.
@@ -225,6 +237,8 @@ def test_a_urdf_without_torque_limits_is_refused(cache, tmp_path):
         hydra.errors.InstantiationException, match=r"the joints hinge have no velocity or torque"
     ):
         build(cache, "urdf_arm", system={"urdf": str(path)})
+    limits = build(cache, "urdf_arm", system={"urdf": str(path), "u_max": 20.0}).system.limits
+    assert limits.tolist() == [[-1, 1, 2, 20]]
 
 
 @dataclass(frozen=True)
@@ -251,19 +265,21 @@ def test_a_robot_too_weak_to_hold_itself_is_reported(source):
         weak.draw(source.system, np.arange(101) * 1e-3, [np.random.default_rng(0)])
 
 
-def test_everything_else_imports_without_pybullet(tmp_path):
-    """In a process where importing PyBullet fails, and that has imported nothing of ours."""
+def test_everything_else_imports_without_a_simulator(tmp_path):
+    """In a process where importing simulators fails, and that has imported nothing of ours."""
 
     def work():
         for name in [name for name in sys.modules if name.split(".")[0] == "pinn_dyn"]:
             del sys.modules[name]
-        sys.modules["pybullet"] = sys.modules["pybullet_data"] = None
+        for name in ("pybullet", "pybullet_data", "mujoco", "gymnasium"):
+            sys.modules[name] = None
         for name in ("pinn_dyn.app.train", "pinn_dyn.data", "pinn_dyn.evaluation"):
             importlib.import_module(name)
         systems = importlib.import_module("pinn_dyn.systems")
         systems.SoftArm()
-        with pytest.raises(ImportError, match=re.escape("pip install 'pinn_dyn[panda]'")):
-            systems.BulletArm("franka_panda/panda.urdf")
+        for name, extra in (("BulletArm", "panda"), ("MujocoArm", "mujoco")):
+            with pytest.raises(ImportError, match=re.escape(f"pip install 'pinn_dyn[{extra}]'")):
+                getattr(systems, name)("franka_panda/panda.urdf")
 
     with (tmp_path / "said.txt").open("w") as output:
         process = fork(work, output)

@@ -18,9 +18,10 @@ from pinn_dyn.data import (
     store,
 )
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.systems import SoftArm
+from pinn_dyn.systems import MujocoArm, SoftArm
 from pinn_dyn.testing import DataSourceContract
 from tests.data.logs_files import motion, source, write
+from tests.support.urdf_by_hand import SPATIAL
 
 
 class TestSimulatedSource(DataSourceContract):
@@ -63,19 +64,16 @@ class TestSimulatedSource(DataSourceContract):
         return self.make(cache, keep_every=2)
 
 
-@pytest.mark.panda
 class TestRobotSource(DataSourceContract):
     @pytest.fixture(scope="class")
     def cache(self, tmp_path_factory):
         return tmp_path_factory.mktemp("cache")
 
     def make(self, cache, seed=0):
-        pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
-        from pinn_dyn.systems import BulletArm
-
+        pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
         return RobotSource(
-            name="iiwa",
-            system=BulletArm("kuka_iiwa/model.urdf"),
+            name="spatial",
+            system=MujocoArm(SPATIAL, v_max=3.0, u_max=20.0),
             excitations=[
                 TorqueMultiSine(frequency=[0.1, 1.0], harmonics=2, amplitude=0.2, reach=0.5)
             ],

@@ -1,7 +1,7 @@
 import pytest
 
-from pinn_dyn.systems import BulletArm
-from tests.support.bullet_arms import FINGERS, PANDA, PENDULUM
+from pinn_dyn.systems import MujocoArm
+from tests.support.simulated_arms import FINGERS, PANDA, PENDULUM
 
 
 @pytest.fixture
@@ -22,4 +22,4 @@ def pendulum(tmp_path):
 
 @pytest.fixture(scope="module")
 def panda():
-    return BulletArm(PANDA, locked_joints=FINGERS, damping=0.5)
+    return MujocoArm(PANDA, locked_joints=FINGERS, damping=0.5)

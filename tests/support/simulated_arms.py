@@ -1,7 +1,9 @@
-"""The Panda that ships with PyBullet, and a pendulum as a URDF."""
+"""The Panda, and a pendulum as a URDF, for every simulator."""
 
 import numpy as np
+import pytest
 
+from pinn_dyn import systems
 from tests.support.arm_urdf import changed
 
 PANDA = "franka_panda/panda.urdf"
@@ -16,6 +18,15 @@ PENDULUM = changed(
     ),
     ('<axis xyz="1 0 0"/>', '<axis xyz="0 1 0"/><limit velocity="4" effort="10"/>'),
 )
+
+SIMULATORS = ["MujocoArm", pytest.param("BulletArm", marks=pytest.mark.panda)]
+
+
+def simulated_by(name):
+    """The class of a simulated arm; skip a test without its simulator."""
+    kind = getattr(systems, name)
+    pytest.importorskip(kind.simulator, reason=kind.install)
+    return kind
 
 
 def states(arm, count=4):

@@ -1,36 +1,36 @@
-"""PyBullet arms: terms against closed forms and PyBullet, steps against the equation of motion."""
+"""Simulated arms: terms against closed forms, steps of both simulators against the terms."""
 
 import copy
 import pickle
+import pkgutil
 import re
-from pathlib import Path
+import sys
 
 import numpy as np
 import pytest
 import torch
 
-pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed (the panda extra)")
-import pybullet_data  # noqa: E402
-
-from pinn_dyn.systems import BulletArm  # noqa: E402
-from pinn_dyn.testing.mechanical_system import Configurations, MechanicalSystemContract  # noqa: E402
-from tests.support.bullet_arms import FINGERS, PANDA, states  # noqa: E402
-from tests.support.rigid_chains import TREE  # noqa: E402
-from tests.support.urdf_by_hand import (  # noqa: E402
-    SPATIAL,
-    jacobian_of,
-    urdf_frames,
-    urdf_mass_matrix,
-)
-
-pytestmark = pytest.mark.panda
+from pinn_dyn.systems import BulletArm, MujocoArm, RigidChain
+from pinn_dyn.testing.mechanical_system import Configurations, MechanicalSystemContract
+from tests.support.rigid_chains import TREE
+from tests.support.simulated_arms import FINGERS, PANDA, SIMULATORS, simulated_by, states
+from tests.support.urdf_by_hand import SPATIAL, jacobian_of, urdf_frames, urdf_mass_matrix
 
 ARMS = [
     (PANDA, {"locked_joints": FINGERS, "payload": 1.5, "mass_scale": 1.2}),
-    ("kuka_iiwa/model.urdf", {"gravity": (1.0, -2.0, -9.81)}),
+    pytest.param("kuka_iiwa/model.urdf", {"gravity": (1.0, -2.0, -9.81)}, marks=pytest.mark.panda),
     (SPATIAL, {"damping": [0.3, 0.0]}),
+    (SPATIAL.replace('izz="0.1"', 'izz="0.3"'), {}),  # moments that no body has
     (TREE, {"locked_joints": ["wrist"]}),  # a fork and a sliding joint
 ]
+
+
+mujoco = pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
+
+
+@pytest.fixture(params=SIMULATORS)
+def Arm(request):
+    return simulated_by(request.param)
 
 
 class TestPanda(MechanicalSystemContract):
@@ -62,7 +62,7 @@ def pendulum_terms(q, v, g=9.81):
 
 @pytest.mark.parametrize("gravity", [9.81, 0.0])
 def test_double_pendulum_has_the_terms_of_its_closed_form(pendulum, gravity):
-    arm = BulletArm(pendulum(), gravity=(0, 0, -gravity), damping=(0.3, 0.2))
+    arm = MujocoArm(pendulum(), gravity=(0, 0, -gravity), damping=(0.3, 0.2))
     assert arm.joint_names == ["shoulder", "elbow"]
     q, v, a = states(arm)
     for k in range(len(q)):
@@ -77,13 +77,48 @@ def test_double_pendulum_has_the_terms_of_its_closed_form(pendulum, gravity):
 
 
 def panda_text():
-    return Path(pybullet_data.getDataPath(), PANDA).read_text()
+    return RigidChain(PANDA).tree.path.read_text()
+
+
+@pytest.mark.panda
+def test_the_panda_is_that_of_pybullet():
+    """Also its limits, and the text that a simulator loads, so that recordings stay the same."""
+    data = pytest.importorskip("pybullet_data", reason="the panda extra is not installed")
+    arms = [
+        MujocoArm(urdf, locked_joints=FINGERS) for urdf in (PANDA, f"{data.getDataPath()}/{PANDA}")
+    ]
+    assert arms[0].tree.path != arms[1].tree.path
+    assert arms[0].describe() == arms[1].describe()
+    assert arms[0].tip_position(torch.ones(7)).equal(arms[1].tip_position(torch.ones(7)))
+
+
+@pytest.mark.parametrize("urdf", [PANDA, SPATIAL, TREE])
+def test_the_terms_are_those_of_mujoco(urdf):
+    """MuJoCo reads the file itself, with all joints; those that are locked stay at zero."""
+    locked = [*FINGERS] if urdf == PANDA else ["wrist"] if urdf == TREE else []
+    chain = RigidChain(urdf, locked_joints=locked)
+    spec = mujoco.MjSpec.from_string(panda_text() if urdf == PANDA else urdf)
+    spec.compiler.fusestatic = False  # which drops the moments of links without mass
+    model = spec.compile()
+    model.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    rows = [model.joint(name).dofadr[0] for name in chain.joint_names]
+    for q, v, a in np.random.default_rng(0).uniform(-2, 2, (20, 3, len(rows))):
+        data.qpos[rows], data.qvel[rows], data.qacc[rows] = q, v, a
+        mujoco.mj_inverse(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        state = [torch.from_numpy(x) for x in (q, v, a)]
+        M, bias = chain.mass_and_bias(*state[:2])
+        pairs = [(M, mass[np.ix_(rows, rows)]), (bias, data.qfrc_bias[rows])]
+        pairs.append((chain.inverse_dynamics(*state), data.qfrc_inverse[rows]))
+        for ours, theirs in pairs:
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.abs(theirs).max())
 
 
 @pytest.mark.parametrize("urdf", [PANDA, SPATIAL])
 def test_the_mass_matrix_is_that_of_the_urdf(urdf):
     """Skew axes, turned inertial frames and products of inertia count in full."""
-    arm = BulletArm(urdf, locked_joints=FINGERS if urdf == PANDA else ())
+    arm = MujocoArm(urdf, locked_joints=FINGERS if urdf == PANDA else ())
     text = panda_text() if urdf == PANDA else urdf
     for q in states(arm)[0]:
         M = arm.mass_matrix(torch.from_numpy(q))
@@ -101,8 +136,8 @@ def test_the_mass_matrix_is_that_of_the_urdf(urdf):
 )
 def test_the_tip_is_where_the_urdf_puts_it_and_carries_the_payload(urdf, tip, link):
     settings = {"locked_joints": FINGERS if urdf == PANDA else (), "tip": tip}
-    arm = BulletArm(urdf, gravity=(1, -2, -9.81), **settings)
-    loaded = BulletArm(urdf, gravity=(1, -2, -9.81), payload=2.3, **settings)
+    arm = MujocoArm(urdf, gravity=(1, -2, -9.81), **settings)
+    loaded = MujocoArm(urdf, gravity=(1, -2, -9.81), payload=2.3, **settings)
     g = np.array(arm.gravity)
     for q in states(arm)[0]:
         x = torch.from_numpy(q)
@@ -122,9 +157,9 @@ def test_the_tip_is_where_the_urdf_puts_it_and_carries_the_payload(urdf, tip, li
 
 @pytest.mark.parametrize("damping", [0.0, 0.02])
 @pytest.mark.parametrize(("urdf", "settings"), ARMS)
-def test_a_step_is_that_of_the_equation_of_motion(urdf, settings, damping):
+def test_a_step_is_that_of_the_equation_of_motion(Arm, urdf, settings, damping):
     """Also far beyond the joint and speed limits of the URDF, where nothing may stop the arm."""
-    arm = BulletArm(urdf, **{**settings, "damping": damping})
+    arm = Arm(urdf, **{**settings, "damping": damping})
     rng = np.random.default_rng(1)
     q, v = arm.q_high + 0.5, np.minimum(2 * arm.v_max, 4.0)
     arm.set_state(q, v)
@@ -137,10 +172,11 @@ def test_a_step_is_that_of_the_equation_of_motion(urdf, settings, damping):
         q, v = q_next, v_next
 
 
-def test_arms_stepped_in_turn_move_as_if_alone(panda):
-    """PyBullet keeps nothing of an earlier arm, nor of an arm whose damping alone differs."""
-    arms = [panda, panda, BulletArm(PANDA, locked_joints=FINGERS, damping=2.0)]
-    heavy = BulletArm(PANDA, locked_joints=FINGERS, gravity=(0, 0, -19.62))
+def test_arms_stepped_in_turn_move_as_if_alone(Arm):
+    """Nothing is kept of an earlier arm, nor of an arm whose damping alone differs."""
+    panda = Arm(PANDA, locked_joints=FINGERS)
+    arms = [panda, panda, Arm(PANDA, locked_joints=FINGERS, damping=2.0)]
+    heavy = Arm(PANDA, locked_joints=FINGERS, gravity=(0, 0, -19.62))
     q0, v0, _ = states(panda, 3)
     torques = np.random.default_rng(3).uniform(-10, 10, (3, 40, 7))
     alone = []
@@ -156,9 +192,9 @@ def test_arms_stepped_in_turn_move_as_if_alone(panda):
             np.testing.assert_array_equal((q[i], v[i]), alone[i][k])
 
 
-def test_a_pendulum_keeps_its_energy_between_the_walls_and_frictions_of_its_urdf(pendulum):
+def test_a_pendulum_keeps_its_energy_between_the_walls_and_frictions_of_its_urdf(Arm, pendulum):
     """Released at 1.2 rad between walls at 0.1 rad and with friction in the URDF."""
-    arm = BulletArm(pendulum(), damping=0)
+    arm = Arm(pendulum(), damping=0)
     arm.set_state(np.array([1.2, 0.4]), np.zeros(2))
     moved = [arm.step(np.zeros(2), 1e-4) for _ in range(20000)]
     q, v = (torch.from_numpy(np.array(x[::100])) for x in zip(*moved, strict=True))
@@ -166,6 +202,25 @@ def test_a_pendulum_keeps_its_energy_between_the_walls_and_frictions_of_its_urdf
     energy = arm.total_energy(q, v)
     # Semi-implicit Euler: the error is of first order in the step and does not accumulate.
     assert (energy - energy[0]).abs().max() < 2e-3 * (energy.max() - energy.min() + 10)
+
+
+MJCF = """<mujoco><worldbody>
+  <body><joint name="turn" axis="0 1 0" range="-1 1" limited="true" damping="3" armature="2"/>
+    <geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 0"/>
+    <body pos="0.3 0 0"><joint name="slide" type="slide" axis="1 0 0" range="0 0.1"/>
+      <geom type="box" size="0.05 0.04 0.03"/></body></body></worldbody></mujoco>"""
+
+
+def test_an_mjcf_is_simulated_within_limits_of_the_user(Arm):
+    """The file has no limits of speed and torque; its friction and armature are no part."""
+    arm = Arm(MJCF, damping=[0.1, 0.2], v_max=3.0, u_max=[20.0, 50.0])
+    assert arm.v_max.tolist() == [3, 3]
+    assert arm.u_max.tolist() == [20, 50]
+    assert Arm(MJCF, damping=[0.1, 0.2], v_max=3.0, u_max=20.0).describe() != arm.describe()
+    q, v, u = np.array([0.5, 0.02]), np.array([1.0, -2.0]), np.array([3.0, 5.0])
+    a = arm.forward_dynamics(*map(torch.from_numpy, (q, v, u))).numpy()
+    arm.set_state(q, v)
+    np.testing.assert_allclose(arm.step(u, 1e-3)[1], v + 1e-3 * a, rtol=0, atol=1e-10)
 
 
 # As an object among others.
@@ -188,12 +243,20 @@ def test_copies_and_pickles_give_the_same_numbers(panda):
 )
 def test_a_robot_that_is_no_arm_is_refused_with_what_to_do(pendulum, changes, message):
     with pytest.raises(ValueError, match=message):
-        BulletArm(pendulum(*changes))
+        MujocoArm(pendulum(*changes))
 
 
 def test_mimic_joints_are_refused_with_a_setting_that_works():
     text = TREE.replace('continuous">', 'continuous"><mimic joint="turn"/>')
     with pytest.raises(ValueError, match="mimic joints: add") as error:
-        BulletArm(text, locked_joints=["wrist"])
+        MujocoArm(text, locked_joints=["wrist"])
     (name,) = re.findall(r"add \['(\w+)'\]", str(error.value))
-    assert BulletArm(text, locked_joints=["wrist", name]).joint_names == ["turn", "slide", "fork"]
+    assert MujocoArm(text, locked_joints=["wrist", name]).joint_names == ["turn", "slide", "fork"]
+
+
+def test_an_arm_without_its_simulator_names_one_that_is_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(ImportError, match=r"BulletArm needs pybullet: .*, or use ") as error:
+        BulletArm(TREE, locked_joints=["wrist"])
+    other = pkgutil.resolve_name(str(error.value).rpartition(" ")[2])
+    assert other(TREE, locked_joints=["wrist"]).num_coordinates == 4
