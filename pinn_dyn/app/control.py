@@ -97,7 +97,7 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     if reasons := [reason for reason in record.stopped if reason]:
         raise SimulationError(
             f"{first}: {len(reasons)} of {len(record.stopped)} runs were stopped: {reasons[0]}; "
-            "reduce the gains, raise the rate, or train on data that move all inputs"
+            "reduce the gains, or raise the rate"
         )
     return error
 
@@ -169,7 +169,7 @@ def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | Non
 
 def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
     if not isinstance(law, ModelBasedLaw):
-        raise ConfigError("guard.threshold needs a law without an observer: leave one of them out")
+        raise ConfigError("a guard takes no observer: leave out guard.threshold or the observer")
     train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
     region = DataRegion(q, v, angles=getattr(law.model, "angles", ()))

@@ -100,7 +100,7 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
     if remainder or not between:
         multiple = max(between, 1) * validations
         raise ConfigError(
-            f"trainer.steps is {steps}, expected a multiple of trainer.validations, as {multiple}"
+            f"trainer.steps is {steps}, no multiple of validations: set trainer.steps={multiple}"
         )
     fewest = -(-between // LONGEST_EPOCH)
     parts = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)
@@ -113,7 +113,7 @@ def compiles(compile: bool | Literal["auto"], steps: int, trainer: Mapping[str, 
     on_gpu = torch.cuda.is_available() if accelerator == "auto" else accelerator != "cpu"
     missing = "" if has_cpp_compiler() else "C++ compiler (g++ or clang++) on the path"
     if on_gpu and not missing and not find_spec("triton"):
-        missing = "Triton (pip install triton)"
+        missing = "Triton"
     if compile is True and missing:
         raise ConfigError(f"compile is true, but there is no {missing}: set compile=false")
     return steps >= STEPS_FOR_DERIVATIVE and not missing if compile == "auto" else compile

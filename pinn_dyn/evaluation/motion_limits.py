@@ -98,7 +98,7 @@ class Envelope:
                 "start to a pose that takes less, or limits.torque"
             )
         if float(self.depth(self.start)) > 0:
-            raise ValueError(f"the tip at the start is below {self.lowest_tip} m: set start")
+            raise ValueError(f"the tip starts below {self.lowest_tip} m: set a higher start")
 
     def depth(self, q: Tensor) -> Tensor:
         """Return the depth of the tip below its smallest height, ``(*batch,)``, m."""

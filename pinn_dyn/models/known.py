@@ -122,8 +122,8 @@ class KnownMechanics(LearnedConstants):
         if sizes != (size, len(driven)) or len(set(driven) & set(names)) < len(driven):
             raise ValueError(
                 f"the data have {sizes[0]} coordinates and {sizes[1]} inputs, expected the {size} "
-                f"joints {', '.join(names)} and inputs of {', '.join(driven)}: lock joints "
-                "(structure.locked_joints), or name those with an input (driven_joints)"
+                f"joints {', '.join(names)} and inputs of {', '.join(driven)}: name the "
+                "joints that have an input, as driven_joints=[...]"
             )
         super().__init__(size, statistics.num_inputs)
         self.structure = structure

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import re
+import shlex
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Collection
@@ -232,8 +233,8 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
         path = Path("MJCF text") if is_text(urdf) else path
     if any("xacro" in x.tag or "${" in "".join(x.attrib.values()) for x in root.iter()):
         raise ValueError(
-            f"{path} is a xacro file, expected a URDF: convert it by 'xacro {path} > robot.urdf' "
-            "(pip install xacro)"
+            f"{path} is a xacro file, expected a URDF: convert it by "
+            f"xacro {shlex.quote(str(path))} > robot.urdf"
         )
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]

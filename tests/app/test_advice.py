@@ -5,11 +5,13 @@ import re
 import pandas as pd
 import pytest
 
-from tests.app.entry import NO_FIGURES, ROOT, TINY, fails, run_script
+from tests.app.entry import NO_FIGURES, ROOT, SET_POINTS, TINY, fails, run_script
 from tests.support.delayed_robots import log
 
-OVERRIDE = re.compile(r"~[\w/]+|\b[a-z]\w*(?:[./]\w+)*=(?:\[[^]]*\]|[^\s,;:'\"]+)")
-ADVICE = re.compile(r"(?::|,|;) (?=set|use|give|write|such as|expected|train|add)")
+OVERRIDE = re.compile(r"~[\w/.]+|\b[a-z]\w*(?:[./]\w+)*=(?:\[[^]]*\]|[^\s,;:'\"]+)")
+ADVICE = re.compile(
+    r"(?::|,|;) (?=set|use|give|write|such as|expected|train|add|leave|reduce|raise|change|name)"
+)
 LOG = ["dataset=example_log", "data.pairs=64", "data.batch_size=32", "data.stride=5"]
 LOG += ["validator.horizon=0.1", "validator.window=null", "validator.step=null"]
 LOG += ["trainer.steps=2", "trainer.validations=1"]
@@ -19,7 +21,12 @@ KNOWN += ["dataset.q.columns=[q1,q2]", "dataset.q.unit=rad", "dataset.u.columns=
 for part in ("validation", "test"):
     KNOWN += [f"+dataset.{part}.seconds=2.0", f"dataset.{part}.piece=1.0"]
 KNOWN += ["model=known", "model/structure=urdf", f"model.structure.urdf={PENDULUM}"]
+FIT = ["train.py", *KNOWN, "dataset.u.unit=Nm", "optimizer=least_squares"]
 SHORT = ["steps=2", "duration=3"]
+ROBOT = f"model.structure.urdf={PENDULUM}"
+STEP = ["duration=0.05", "settled_after=0.03", "animate=false", "rate=200"]
+LOOP = ["run={lnn}", *SET_POINTS, "~controllers.truth", "~controllers.pd", "runs=1"]
+CONTINUOUS = [*LOOP, "rate=null", "controllers.learned.terms=truth"]
 COMMANDS = {
     "no momenta": ["train.py", *LOG, "model=hnn"],
     "midpoint, no derivative": ["train.py", *TINY, "model=mlp", "loss=midpoint"],
@@ -46,8 +53,66 @@ COMMANDS = {
     "chain, not transposed": ["train.py", *TINY, "model=lnn", "model.mass.chain=true"],
     "check of a simulation": ["check.py", "dataset=soft_arm_1"],
     "no structure": ["excite.py", *SHORT],
+    "a joint without an input": ["train.py", *KNOWN, "dataset.u.columns=[u1]", "dataset.u.unit=Nm"],
+    "a column too few": [
+        *("train.py", *KNOWN, "dataset.q.columns=[q1]", "dataset.u.columns=[u1]"),
+        "dataset.u.unit=Nm",
+    ],
+    "validations that do not divide the steps": [
+        *("train.py", *TINY, "model=lnn", "trainer.steps=3", "trainer.validations=2"),
+    ],
+    "loss that diverges": ["train.py", *TINY, "model=lnn", "optimizer.lr=1e12", "trainer.steps=9"],
+    "too few windows": [*FIT, "data.pairs=9", "data.batch_size=9"],
+    "too few samples": [*FIT, "optimizer.rollouts=false", "optimizer.samples=9"],
+    "no run": ["control.py", *SET_POINTS, "rate=200"],
+    "no set point": ["control.py", "run={lnn}", *STEP],
+    "control of a black box": ["control.py", "run={mlp}", *SET_POINTS, "rate=200"],
+    "rate of an actuator": ["control.py", *CONTINUOUS, "actuator.rate=1.0"],
+    "delay in continuous time": ["control.py", *CONTINUOUS, "delay=1"],
+    "noise in continuous time": ["control.py", *CONTINUOUS, "sensor.v_noise=0.1"],
+    "guard of an observer": [
+        *("control.py", *LOOP, "guard.threshold=1.0", "rate=200"),
+        "+controllers.learned.observer={_target_: pinn_dyn.control.DisturbanceObserver, "
+        "_partial_: true, bandwidth: 20}",
+    ],
+    "plant without a simulator": ["control.py", *LOOP, "rate=200", "plant=simulator"],
+    "gains that let the loop diverge": [
+        *("control.py", *LOOP, "rate=100"),
+        *("gains.position=2e4", "gains.velocity=300", "controllers.learned.terms=truth"),
+    ],
+    "start outside the limits": ["excite.py", ROBOT, *SHORT, "start=10"],
+    "empty position range": ["excite.py", ROBOT, *SHORT, "limits.low=2", "limits.high=1"],
+    "start too heavy": ["excite.py", ROBOT, *SHORT, "start=0.5", "limits.torque=0.1"],
+    "start too low": ["excite.py", ROBOT, *SHORT, "limits.lowest_tip=-0.1"],
+    "too few periods": ["excite.py", ROBOT, "steps=2", "duration=1"],
 }
-VALUES = {"model.structure.urdf=...": f"model.structure.urdf={PENDULUM}"}
+# Settings that a message names without a value.
+VALUES = {
+    "model.structure.urdf=...": f"model.structure.urdf={PENDULUM}",
+    "driven_joints=[...]": "model.driven_joints=[shoulder]",
+    "more windows (data.pairs)": "data.pairs=16 data.batch_size=16",
+    "longer windows (data.steps)": "data.steps=2",
+    "raise optimizer.samples": "optimizer.samples=500",
+    "run=...": "run={lnn}",
+    "a run of model=lnn or model=hnn": "run={lnn} or run={hnn}",
+    "reference.q=[...]": "reference.q=[0,0,0.2]",
+    "leave it out": "~actuator.rate",
+    "leave out guard.threshold or the observer": (
+        "~guard.threshold or ~controllers.learned.observer"
+    ),
+    "give a rate": "rate=200",
+    "change the rate": "rate=200",
+    "reduce optimizer.lr": "optimizer.lr=0.001",
+    "reduce the gains": "gains.position=5 gains.velocity=0.5",
+    "raise the rate": "rate=2000",
+    "limits.low and limits.high": "limits.low=-1 limits.high=1",
+    "a pose within them": "start=0.0001",
+    "a pose that takes less": "start=0.0001",
+    "a higher start": "start=2",
+    "limits.torque": "limits.torque=10",
+    "raise duration": "duration=3",
+    "frequency": "frequency=2.0",
+}
 
 
 def suggestions(message):
@@ -55,7 +120,7 @@ def suggestions(message):
     *_, advice = ADVICE.split(message)
     for placeholder, value in VALUES.items():
         advice = advice.replace(placeholder, value)
-    matches = [OVERRIDE.findall(part) for part in re.split(r",? or ", advice)]
+    matches = [OVERRIDE.findall(part) for part in re.split(r"[,;]? or ", advice)]
     return [match for match in matches if match]
 
 
@@ -71,14 +136,26 @@ def applied(words, overrides):
     return [*kept, *(x for x in overrides if x[0] != "~" or x[1:] not in present)]
 
 
+def filled(word, folders):
+    """Return a word of a command with the folders that it names, such as {lnn}."""
+    return re.sub(r"\{(\w+)\}", lambda match: str(folders[match[1]]), word)
+
+
+@pytest.fixture
+def runs(lnn_run, mlp_run, hnn_run):
+    return {"lnn": lnn_run, "mlp": mlp_run, "hnn": hnn_run}
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_suggested_override_works(name, tmp_path, monkeypatch):
+def test_the_suggested_override_works(name, tmp_path, monkeypatch, runs):
     if name == "no compiler":
         monkeypatch.setattr("pinn_dyn.app.trainer.has_cpp_compiler", lambda: False)
     arm = log("arm", 0, 0.05)
     table = {"t": arm.t, "q1": arm.q[:, 0], "q2": arm.q[:, 1], "u1": arm.u[:, 0], "u2": arm.u[:, 1]}
     pd.DataFrame(table).to_csv(tmp_path / "arm.csv", index=False)
-    script, *words = [word.replace("{folder}", str(tmp_path)) for word in COMMANDS[name]]
+    runs["folder"] = tmp_path
+    script, *words = [filled(word, runs) for word in COMMANDS[name]]
     if script == "train.py":
         words.append(NO_FIGURES)
     message = str(fails(script, *words, f"hydra.run.dir={tmp_path / 'refused'}").code)
@@ -86,5 +163,6 @@ def test_the_suggested_override_works(name, tmp_path, monkeypatch):
     assert choices, message
     for k, overrides in enumerate(choices):
         folder = tmp_path / str(k)
+        overrides = [filled(word, runs) for word in overrides]
         run_script(script, *applied(words, overrides), f"hydra.run.dir={folder}")
         assert (folder / "config.yaml").is_file()

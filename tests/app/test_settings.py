@@ -56,7 +56,7 @@ def test_an_epoch_is_a_part_of_the_steps_between_validations(steps, validations,
 
 
 def test_steps_that_are_no_multiple_of_the_validations_say_which_are():
-    with pytest.raises(ConfigError, match=r"multiple of trainer.validations, as 99"):
+    with pytest.raises(ConfigError, match=r"multiple of validations: set trainer.steps=99"):
         epochs(100, 3)
 
 

@@ -88,5 +88,5 @@ def test_a_robot_that_steps_by_itself_is_a_plant():
     q, v = plant.advance(torch.tensor([[1.0], [2.0]], dtype=torch.float64), 0.05)
     torch.testing.assert_close(q[:, 0], torch.tensor([0.05, 0.1], dtype=torch.float64))
     assert v.tolist() == [[5.0], [5.0]]
-    with pytest.raises(TypeError, match="Crane is not stepped by a simulator"):
+    with pytest.raises(TypeError, match="Crane has no simulator"):
         SimulatorPlant(Crane())

@@ -219,7 +219,7 @@ def test_ctrl_c_returns_the_best_motion_so_far(monkeypatch):
         (dict(limits={"low": 3.0}), "no position range of turn, lift, bend"),
         (dict(start={"bend": 1.9}), "the start of bend"),
         (dict(limits={"torque": 0.5}, start={"lift": 1.5}), "limits of lift"),
-        (dict(limits={"lowest_tip": 2.0}), "the tip at the start"),
+        (dict(limits={"lowest_tip": 2.0}), "the tip starts below"),
         (dict(duration=1.0), "raise duration or frequency"),
     ],
 )

@@ -1,0 +1,170 @@
+"""Advice of messages about Python calls, packages and files: followed as a user would."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import pinn_dyn
+from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.run_folder import load_run, require_no_links_out
+from pinn_dyn.data.logs import LogError, LogSource
+from pinn_dyn.systems import BulletArm, RigidChain
+from tests.app.entry import NO_FIGURES, ROOT, TINY_DATA, fails, run_script, train
+from tests.support.foreign_runs import foreign
+from tests.support.rigid_chains import joint, link, robot
+
+ARM = robot(link("base"), link("rod"), joint("hinge", "continuous", "base", "rod"))
+MJCF = "<mujoco><worldbody><body><joint/><inertial mass='1' pos='0 0 1' diaginertia='1 1 1'/>"
+MJCF += "</body></worldbody></mujoco>"
+EXTRAS = (ROOT / "pyproject.toml").read_text().partition("[project.optional-dependencies]")[2]
+EXTRAS = dict(re.findall(r"^(\w+) = (\[.*\])", EXTRAS, re.MULTILINE))
+
+
+def load(path):
+    path.touch()
+    part = {"seconds": 1.0, "piece": 1.0}
+    columns = {"q": {"columns": "q", "unit": "rad"}, "u": {"columns": "u", "unit": "Nm"}}
+    return LogSource(
+        name="arm",
+        root=str(path.parent),
+        files=path.name,
+        time={"columns": "t", "unit": "s"},
+        **columns,
+        validation=part,
+        test=part,
+    ).load()
+
+
+# Module that is missing, its name on PyPI, and a call that needs it.
+PACKAGES = [
+    ("rosbags", "rosbags", lambda folder: load(folder / "run.bag")),
+    ("mcap", "mcap", lambda folder: load(folder / "run.mcap")),
+    ("h5py", "h5py", lambda folder: load(folder / "run.h5")),
+    ("pyarrow.parquet", "pyarrow", lambda folder: load(folder / "run.parquet")),
+    ("matio", "mat-io", lambda folder: load(folder / "run.mat")),
+    ("mujoco", "mujoco", lambda _: RigidChain(MJCF)),
+    ("pybullet", "pybullet", lambda _: BulletArm(ARM)),
+]
+
+
+@pytest.mark.parametrize(("module", "package", "call"), PACKAGES, ids=[x[1] for x in PACKAGES])
+def test_the_extra_of_a_message_contains_the_missing_package(
+    module, package, call, tmp_path, monkeypatch
+):
+    for name in [x for x in sys.modules if f"{x}.".startswith(f"{module}.")] or [module]:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises((ImportError, LogError), match="pip install") as error:
+        call(tmp_path)
+    extra = re.search(r"pip install 'pinn_dyn\[(\w+)\]'", str(error.value))[1]
+    assert f'"{package}' in EXTRAS[extra]
+
+
+def test_all_extras_that_the_package_names_exist():
+    texts = [path.read_text() for path in (ROOT / "pinn_dyn").rglob("*.py")]
+    names = {x for text in texts for x in re.findall(r"pinn_dyn\[(\w+)\]", text)}
+    assert names >= {"logs", "mujoco", "panda"}
+    assert names <= set(EXTRAS)
+
+
+def test_the_call_of_torch_that_a_message_names_writes_a_log_that_loads(tmp_path):
+    path = tmp_path / "run.pt"
+    t = torch.arange(600) * 0.01
+    q, u = torch.sin(3 * t), torch.cos(t)
+    torch.save(pd.DataFrame({"t": t, "q": q, "u": u}), path)
+    part = {"seconds": 1.0, "piece": 0.5}
+    log = {"time": {"columns": "t", "unit": "s"}, "validation": part, "test": part}
+    log |= {"q": {"columns": ["q"], "unit": "rad"}, "u": {"columns": ["u"], "unit": "Nm"}}
+    source = LogSource(name="arm", root=str(tmp_path), files=path.name, **log)
+    with pytest.raises(LogError, match="save plain tensors") as error:
+        source.load()
+    call = re.search(r"as in (torch.save\(.*\))", str(error.value))[1]
+    eval(call, {"torch": torch, "t": t, "q": q, "u": u, "path": path})
+    assert LogSource(name="arm", root=str(tmp_path), files=path.name, **log).load().train
+
+
+def test_the_command_for_a_xacro_file_makes_a_robot_that_loads(tmp_path, monkeypatch):
+    """The shell runs the command as printed, with a program that prints the expanded robot."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "my arm.urdf.xacro"
+    path.write_text(
+        ARM.replace("<link", '<xacro:property xmlns:xacro="http://wiki.ros.org/xacro"/><link', 1)
+    )
+    (tmp_path / "plain.urdf").write_text(ARM)
+    program = tmp_path / "xacro"
+    program.write_text('#!/bin/sh\n[ -f "$1" ] && cat plain.urdf\n')
+    program.chmod(0o755)
+    with pytest.raises(ValueError, match="is a xacro file") as error:
+        RigidChain(str(path))
+    command = re.search(r"convert it by (.*)", str(error.value))[1]
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    subprocess.run(command, shell=True, check=True)
+    assert RigidChain("robot.urdf").joint_names == ["hinge"]
+
+
+def test_a_link_out_of_a_run_folder_is_replaced_by_a_copy(tmp_path, lnn_run):
+    run = foreign(lnn_run, tmp_path / "run", lambda config: None)
+    (tmp_path / "log.csv").write_text("a")
+    (run / "log.csv").symlink_to(tmp_path / "log.csv")
+    with pytest.raises(ConfigError, match="replace the link by a copy") as error:
+        require_no_links_out(run)
+    place, target = re.search(r"(\S+) is a link to (\S+):", str(error.value)).groups()
+    text = (tmp_path / "log.csv").read_text()
+    assert target == str(tmp_path / "log.csv")
+    (run / "log.csv").unlink()
+    (run / "log.csv").write_text(text)
+    assert place == str(run / "log.csv")
+    require_no_links_out(run)
+
+
+def test_a_trusted_logger_may_choose_where_it_writes(tmp_path, lnn_run):
+    def change(config):
+        config["logger"]["tensorboard"] = {
+            "_target_": "lightning.pytorch.loggers.CSVLogger",
+            "save_dir": str(tmp_path),
+        }
+
+    run = foreign(lnn_run, tmp_path / "run", change)
+    with pytest.raises(ConfigError, match="unless you add") as error:
+        load_run(run, "best")
+    package = re.search(r"add trust=([\w.]+)", str(error.value))[1]
+    assert load_run(run, "best", (package,)).folder == run
+
+
+def test_runs_of_different_data_are_evaluated_separately_or_on_one_data_set(
+    tmp_path, lnn_run, undrawn
+):
+    other = train(tmp_path / "other", "model=mlp", "dataset.seed=5", NO_FIGURES)
+    words = [f"runs=[{lnn_run},{other}]", "horizon=0.1", "windows=[]"]
+    message = str(fails("evaluate.py", *words, f"hydra.run.dir={tmp_path / '0'}").code)
+    assert "evaluate them separately, or all on one data set, dataset=<name>" in message
+    for k, run in enumerate((lnn_run, other), 1):
+        words[0] = f"runs=[{run}]"
+        run_script("evaluate.py", *words, f"hydra.run.dir={tmp_path / str(k)}")
+    words[0] = f"runs=[{lnn_run},{other}]"
+    run_script(
+        "evaluate.py", *words, "dataset=soft_arm_1", *TINY_DATA, f"hydra.run.dir={tmp_path / '3'}"
+    )
+    assert len(pd.read_csv(tmp_path / "3" / "summary.csv")) >= 2
+
+
+def test_an_ensemble_has_the_interval_that_a_single_network_has_not(tmp_path, lnn_run):
+    start, t = np.array([0.0, 0, 0.2, 0, 0, 0]), np.arange(20) * 0.002
+    u = np.zeros((20, 3))
+    with pytest.raises(TypeError, match="train an ensemble") as error:
+        pinn_dyn.load(lnn_run).predict_interval(start, u, t)
+    option = re.search(r"\((ensemble=\d+)\)", str(error.value))[1]
+    run = pinn_dyn.load(train(tmp_path / "run", "model=lnn", NO_FIGURES, option))
+    low, high = run.predict_interval(start, u, t)
+    assert (low < high)[1:].any()
+    with pytest.raises(TypeError, match="expected predict") as error:
+        run.predict(start, t=t)
+    call = re.search(r"expected (predict\(.*\))", str(error.value))[1]
+    names = {"predict": run.predict, "start": start, "u": u, "t": t}
+    assert eval(call, names).shape == (20, 6)
+    with pytest.raises(ValueError, match="give start, u and t"):
+        run.predict(pd.DataFrame({"t": t}))
