@@ -6,8 +6,9 @@ that ``import pinn_dyn`` takes no time.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from pinn_dyn.lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from pinn_dyn.app.build import dataset as dataset
@@ -51,12 +52,7 @@ _MODULES = {
 }
 
 __all__ = [*_MODULES]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module 'pinn_dyn' has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+__getattr__ = lazy_attributes(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:

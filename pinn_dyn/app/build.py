@@ -10,7 +10,6 @@ from typing import Any
 
 from pinn_dyn.app.config import ConfigError, build_part, composed
 from pinn_dyn.app.run import ModelBuilder
-from pinn_dyn.app.trainer import tensorboard
 from pinn_dyn.control import Controller, Reference
 from pinn_dyn.data import DataSource
 from pinn_dyn.mechanics import MechanicalSystem, Predictor
@@ -45,6 +44,8 @@ def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
     optimizer = config["optimizer"]
     settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
     builders = ("data", "loss", "scheduler", "validator")
+    from pinn_dyn.app.trainer import tensorboard  # imports Lightning, which takes seconds
+
     return {
         "source": build_source(config),
         "model": model_builder(config),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import pkgutil
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import hydra
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
@@ -17,11 +19,13 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.validation import ConfigError, check_arguments, check_value
+from pinn_dyn.app.settings import SETTINGS
+from pinn_dyn.app.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
 
 # An installed package has its conf/ inside, a checkout beside the entry scripts.
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
+CONFIG = "config.yaml"  # in the folder of a run
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
 
 
@@ -65,9 +69,10 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: with a line for each key that is missing or unknown, or has a wrong value.
     """
-    from pinn_dyn.app.settings import SETTINGS  # imports PyTorch, which --help does not need
-
     config = cfg if isinstance(cfg, dict) else plain(cfg)
+    check_keys(SETTINGS[command], config)
+    if isinstance(model := config.get("model"), dict) and "_target_" in model:
+        check_value("model", model)  # imports PyTorch alone, and so answers a typo faster
     check_arguments(SETTINGS[command], config)
     return config
 
@@ -126,6 +131,27 @@ def explained(error: HydraException | OmegaConfBaseException) -> str:
         hint = did_you_mean(option, error.options)
         return f"'{group}/{option}' does not exist{hint or '.'} Options of {group}: {options}"
     return " ".join(str(error).partition("Config search path")[0].split())
+
+
+@contextlib.contextmanager
+def naming(part: str) -> Iterator[None]:
+    """Name the part of the configuration that an error is about."""
+    try:
+        yield
+    except Exception as error:
+        known = isinstance(error, (TypeError, ValueError)) and not isinstance(error, ConfigError)
+        # The class of Lightning is compared by name, since the import takes seconds.
+        if not known and type(error).__name__ != "MisconfigurationException":
+            raise
+        raise ConfigError(f"{part}: {error}") from error
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    """Write the resolved configuration of a run."""
+    from pinn_dyn.data.whole import write_whole  # imports PyTorch, which --help does not need
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
 
 
 def build_part(

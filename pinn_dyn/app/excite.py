@@ -7,8 +7,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pinn_dyn.app.config import ConfigError, build_part, checked
-from pinn_dyn.app.run_folder import write_config
+from pinn_dyn.app.config import ConfigError, build_part, checked, write_config
 from pinn_dyn.evaluation.excitation_design import design_excitation
 
 

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from filelock import FileLock, Timeout
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from pinn_dyn import __version__
-from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.config import ConfigError, write_config
 from pinn_dyn.app.run import ModelBuilder, Run
 from pinn_dyn.app.trust import is_trusted, packages, require_trusted
 from pinn_dyn.data import data_changes
@@ -30,7 +29,7 @@ from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.urdf import urdf_text
 from pinn_dyn.training import COVARIANCE, WholeCheckpoints
 
-CONFIG, METRICS, CHECKPOINTS = "config.yaml", "metrics.json", "checkpoints"
+METRICS, CHECKPOINTS = "metrics.json", "checkpoints"
 RECORD, DATA, FINISHED = "record", "data", "finished"
 """Keys of a checkpoint: metrics of the training, identity of the data, end of the training."""
 
@@ -195,12 +194,6 @@ def merged(config: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         is_section = isinstance(value, Mapping)
         result[key] = merged(result[key], value) if is_section else value
     return result
-
-
-def write_config(folder: Path, config: dict[str, Any]) -> None:
-    """Write the resolved configuration of a run."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
 
 
 def require_no_links_out(folder: Path) -> None:

@@ -4,23 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import lightning as L
-from lightning.pytorch.loggers import Logger
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.app.validation import STAND_INS, Seed
-from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
-from pinn_dyn.data import DataSource, DynamicsData, InitialStates
-from pinn_dyn.evaluation import RolloutValidator
-from pinn_dyn.evaluation.motion_limits import JointValues, MotionLimits
-from pinn_dyn.mechanics import Predictor
-from pinn_dyn.models.known import Structure
-from pinn_dyn.systems import RigidChain
-from pinn_dyn.training import LeastSquares, WindowLoss
+from pinn_dyn.lazy import LazyNames
+
+if TYPE_CHECKING:
+    from lightning import Callback, Trainer
+    from lightning.pytorch.loggers import Logger
+    from torch.optim import Optimizer
+    from torch.optim.lr_scheduler import LRScheduler
+
+    from pinn_dyn.control import Actuator, Controller, Plant, Reference, Sensor
+    from pinn_dyn.data import DataSource, DynamicsData, InitialStates
+    from pinn_dyn.evaluation import RolloutValidator
+    from pinn_dyn.evaluation.motion_limits import JointValues, MotionLimits
+    from pinn_dyn.mechanics import Predictor
+    from pinn_dyn.models.known import Structure
+    from pinn_dyn.systems import RigidChain
+    from pinn_dyn.training import LeastSquares, WindowLoss
+
+TYPES = LazyNames(
+    {
+        **dict.fromkeys(("Callback", "Trainer"), "lightning"),
+        "Logger": "lightning.pytorch.loggers",
+        "Optimizer": "torch.optim",
+        "LRScheduler": "torch.optim.lr_scheduler",
+        **dict.fromkeys(
+            ("Actuator", "Controller", "Plant", "Reference", "Sensor"), "pinn_dyn.control"
+        ),
+        **dict.fromkeys(("DataSource", "DynamicsData", "InitialStates"), "pinn_dyn.data"),
+        "RolloutValidator": "pinn_dyn.evaluation",
+        **dict.fromkeys(("JointValues", "MotionLimits"), "pinn_dyn.evaluation.motion_limits"),
+        "Predictor": "pinn_dyn.mechanics",
+        "Structure": "pinn_dyn.models.known",
+        "RigidChain": "pinn_dyn.systems",
+        **dict.fromkeys(("LeastSquares", "WindowLoss"), "pinn_dyn.training"),
+    }
+)
+"""Names in the annotations below, which are imported when a configuration is checked."""
 
 Names = str | Sequence[str]
 
@@ -46,8 +70,8 @@ class TrainSettings:
     optimizer: Optimizer | LeastSquares | Callable[..., Optimizer]
     scheduler: LRScheduler | Callable[..., LRScheduler]
     validator: RolloutValidator | Callable[..., RolloutValidator]
-    trainer: L.Trainer | Callable[..., L.Trainer]
-    callbacks: Mapping[str, L.Callback | Callable[..., L.Callback] | None]
+    trainer: Trainer | Callable[..., Trainer]
+    callbacks: Mapping[str, Callback | Callable[..., Callback] | None]
     logger: Mapping[str, Logger | Callable[..., Logger]]
 
 
@@ -69,7 +93,7 @@ class TrainerArguments:
     profiler: Literal["simple", "advanced"] | None = None
 
 
-STAND_INS[L.Trainer] = TrainerArguments
+STAND_INS["lightning.pytorch.trainer.trainer.Trainer"] = TrainerArguments
 
 
 @dataclass(kw_only=True)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -15,12 +14,11 @@ import torch
 from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.config import ConfigError, naming
 from pinn_dyn.app.run import BEST_BY, VALIDATION_ERROR
 from pinn_dyn.app.run_folder import CHECKPOINTS, DATA, RECORD, flattened
 from pinn_dyn.data.simulation import has_cpp_compiler
@@ -46,17 +44,6 @@ _COMPARED = ("model_name", "seed", "dataset.name", "data.", "model.", "optimizer
 """Beginnings of the settings that TensorBoard shows beside the validation error."""
 CLIPPING = ("gradient_clip_val", "gradient_clip_algorithm")
 """Arguments of the trainer that the learner takes instead."""
-
-
-@contextlib.contextmanager
-def naming(part: str) -> Iterator[None]:
-    """Name the part of the configuration that an error is about."""
-    try:
-        yield
-    except ConfigError:
-        raise
-    except (TypeError, ValueError, MisconfigurationException) as error:
-        raise ConfigError(f"{part}: {error}") from error
 
 
 def build_learner(

@@ -21,7 +21,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from pinn_dyn.app.command import hush
-from pinn_dyn.app.config import ConfigError
+from pinn_dyn.app.config import ConfigError, naming
 from pinn_dyn.app.constants import write_constants
 from pinn_dyn.app.described import described
 from pinn_dyn.app.known_data import check_known, match_model
@@ -48,7 +48,6 @@ from pinn_dyn.app.trainer import (
     compiles,
     epochs,
     even_validations,
-    naming,
     tensorboard,
 )
 from pinn_dyn.data import DataSource, DynamicsData, LogSource, data_identity, store

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import collections.abc
 import contextlib
+import dataclasses
 import difflib
 import functools
 import inspect
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -30,8 +32,8 @@ _PLAIN = (bool, int, float, str, type(None), Any)  # The optimizers of PyTorch s
 _OPTIMIZER = {"lr": PositiveFloat, "weight_decay": NonNegativeFloat, "eps": PositiveFloat}
 
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
-STAND_INS: dict[Any, type] = {}
-"""Classes of other packages, and dataclasses whose fields are the arguments to accept for them."""
+STAND_INS: dict[str, type] = {}
+"""Names of classes of other packages, and dataclasses with the arguments to accept for them."""
 SET_BY_PROGRAM = {
     *("data.batches_per_epoch", "data.source", "plant.system", "optimizer.maximize"),
     *("optimizer.params", "scheduler.optimizer", "scheduler.total_steps"),
@@ -53,6 +55,18 @@ def check_arguments(target: Callable[..., Any], values: Mapping[str, Any]) -> No
     for path, value in paths.items():
         if value == "???":
             raise ConfigError(_line({"type": "missing", "loc": [path], "input": value}, values, ""))
+
+
+def check_keys(target: Any, values: Mapping[str, Any]) -> None:
+    """Check that keys are fields of a dataclass, without importing the types of its fields."""
+    fields = dict.fromkeys(field.name for field in dataclasses.fields(target))
+    lines = [
+        _line({"type": "unknown_key", "loc": [key], "ctx": fields, "input": None}, values, "")
+        for key in values
+        if key not in fields
+    ]
+    if lines:
+        raise ConfigError("\n".join(lines))
 
 
 def check_value(path: str, value: Any, annotation: Any = object) -> None:
@@ -108,7 +122,8 @@ def places(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 @functools.cache
 def arguments_model(target: Any, required: bool = False) -> type[pydantic.BaseModel]:
     """Make the model of the arguments of a class; all are optional unless ``required``."""
-    target = STAND_INS.get(target, target)
+    name = f"{getattr(target, '__module__', '')}.{getattr(target, '__qualname__', '')}"
+    target = STAND_INS.get(name, target)
     is_plain_class = isinstance(target, type) and not hasattr(target, "__dataclass_fields__")
     hints = _hints(target.__init__ if is_plain_class else target)
     if str(getattr(target, "__module__", "")).startswith("torch.optim"):
@@ -131,7 +146,8 @@ def arguments_model(target: Any, required: bool = False) -> type[pydantic.BaseMo
 
 def _hints(target: Any) -> dict[str, Any]:
     try:
-        return get_type_hints(target, include_extras=True)
+        types = getattr(sys.modules.get(target.__module__), "TYPES", None)
+        return get_type_hints(target, localns=types, include_extras=True)
     except Exception:  # names that other packages import for type checkers only
         return {}
 

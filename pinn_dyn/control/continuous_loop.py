@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
-from scipy.integrate import BDF
 from scipy.sparse import block_diag
 from torch import Tensor
 
@@ -74,7 +74,7 @@ def close_loop_continuous(
             return field(copies, time, x).numpy().reshape(-1, count * size).T.reshape(flat.shape)
 
         share = count**-0.5  # SciPy takes the root mean square over all copies
-        solver = BDF(
+        solver = scipy.integrate.BDF(
             slope,
             0.0,
             states[copies, 0].numpy().ravel(),

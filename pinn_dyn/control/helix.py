@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+import scipy
 import torch
 from pydantic import PositiveFloat
-from scipy.interpolate import make_interp_spline
 
 from pinn_dyn.control.contracts import Motion, Reference
 from pinn_dyn.control.references import smooth_step
@@ -82,7 +82,7 @@ class Helix(Reference):
         q = [home]
         for phi in knots:
             q.append(self._solve(arm, home, q[-1], phi))
-        self._curve = make_interp_spline(knots, q[1:], k=5)
+        self._curve = scipy.interpolate.make_interp_spline(knots, q[1:], k=5)
         self._slopes = self._curve.derivative(1), self._curve.derivative(2)
         between = (knots[:-1, None] + np.diff(knots)[:, None] * [0.25, 0.5, 0.75]).ravel()
         points = np.array([self._point(phi) for phi in between])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
 from pydantic import PositiveFloat
-from scipy.integrate import RK45
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Plant
@@ -57,7 +57,7 @@ class SystemPlant(Plant):
                 return self._system.velocity_derivative(states, u).numpy().ravel()
 
         share = len(x) ** -0.5  # SciPy takes the root mean square over all copies
-        solver = RK45(
+        solver = scipy.integrate.RK45(
             slope,
             0.0,
             x.numpy().ravel(),

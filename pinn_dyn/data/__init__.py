@@ -1,6 +1,7 @@
 """Data: excitation signals, simulated data sets, logs, windows and the LightningDataModule."""
 
-from pinn_dyn.data.datamodule import DynamicsData
+from typing import TYPE_CHECKING
+
 from pinn_dyn.data.excitation import Chirp, Excitation, Mixture, MultiSine, Steps
 from pinn_dyn.data.identity import data_changes, data_identity
 from pinn_dyn.data.logs import Cleaned, LogError, LogSource
@@ -15,6 +16,10 @@ from pinn_dyn.data.simulation import SimulationError, simulate
 from pinn_dyn.data.source import DataSource, Splits
 from pinn_dyn.data.stored import StoredSource, store
 from pinn_dyn.data.windows import Windows, draw_windows
+from pinn_dyn.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from pinn_dyn.data.datamodule import DynamicsData
 
 __all__ = [
     "Chirp",
@@ -43,3 +48,5 @@ __all__ = [
     "simulate",
     "store",
 ]
+
+__getattr__ = lazy_attributes(__name__, {"DynamicsData": "pinn_dyn.data.datamodule"})

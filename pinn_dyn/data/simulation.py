@@ -6,8 +6,8 @@ import logging
 import shutil
 
 import numpy as np
+import scipy
 import torch
-from scipy.integrate import DOP853
 from torch import Tensor
 
 from pinn_dyn.data.excitation import Signal
@@ -106,7 +106,7 @@ def simulate(
     states = np.full((count, len(t), size), np.nan)
     states[:, 0] = x0
     filled = 1
-    solver = DOP853(derivative, t[0], x0.ravel(), t[-1], rtol=rtol, atol=atol)
+    solver = scipy.integrate.DOP853(derivative, t[0], x0.ravel(), t[-1], rtol=rtol, atol=atol)
     with Progress(progress, float(t[-1] - t[0]), "s") as lines:
         while solver.status == "running" and not left.all():
             solver.step()

@@ -1,8 +1,20 @@
 """Ensembles: many members that are trained and evaluated together."""
 
-from pinn_dyn.ensembles.data import EnsembleData
+from typing import TYPE_CHECKING
+
 from pinn_dyn.ensembles.ensemble import Ensemble
-from pinn_dyn.ensembles.learner import EnsembleLearner
 from pinn_dyn.ensembles.posterior import posterior_draws
+from pinn_dyn.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from pinn_dyn.ensembles.data import EnsembleData
+    from pinn_dyn.ensembles.learner import EnsembleLearner
 
 __all__ = ["Ensemble", "EnsembleData", "EnsembleLearner", "posterior_draws"]
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "EnsembleData": "pinn_dyn.ensembles.data",
+        "EnsembleLearner": "pinn_dyn.ensembles.learner",
+    },
+)

@@ -1,5 +1,7 @@
 """Accuracy of models: rollout errors, learned terms beside true terms, tables and figures."""
 
+from typing import TYPE_CHECKING
+
 from pinn_dyn.evaluation.animation import animate
 from pinn_dyn.evaluation.baselines import build_baselines
 from pinn_dyn.evaluation.calibration import Calibration, calibration
@@ -19,7 +21,10 @@ from pinn_dyn.evaluation.metrics import RolloutMetrics, rollout_metrics
 from pinn_dyn.evaluation.plots import save
 from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
 from pinn_dyn.evaluation.torque import TorqueError, torque_error
-from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
+from pinn_dyn.lazy import lazy_attributes
+
+if TYPE_CHECKING:
+    from pinn_dyn.evaluation.validation import RolloutFigures, RolloutValidator
 
 __all__ = [
     "Calibration",
@@ -56,3 +61,8 @@ __all__ = [
     "torque_error",
     "trajectory_figure",
 ]
+
+_VALIDATION = "pinn_dyn.evaluation.validation"
+__getattr__ = lazy_attributes(
+    __name__, {"RolloutFigures": _VALIDATION, "RolloutValidator": _VALIDATION}
+)

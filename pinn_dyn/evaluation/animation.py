@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from torch import Tensor
@@ -49,6 +48,8 @@ def animate(record: ClosedLoopRecord, run: int, robot: Drawable, path: Path) -> 
     draw(0)
     handles, names = ax.get_legend_handles_labels()
     figure.legend(handles, names, loc="lower center", ncols=len(names), fontsize="small")
+    from matplotlib.animation import FuncAnimation, PillowWriter  # takes half a second
+
     FuncAnimation(figure, draw, samples).save(path, PillowWriter(_FRAMES_PER_SECOND))
 
 

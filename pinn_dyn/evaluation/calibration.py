@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
 from matplotlib.figure import Figure
-from scipy.stats import t as student
 from torch import Tensor
 
 from pinn_dyn.evaluation.metrics import diverged_trajectories
@@ -54,7 +54,7 @@ def half_widths(members: int, level: float | np.ndarray = LEVEL) -> np.ndarray:
     The width is the quantile of Student's t with E - 1 degrees of freedom. A further member, and
     so the truth if it is distributed like the members, lies within.
     """
-    return np.asarray(student.ppf(0.5 + 0.5 * np.asarray(level), members - 1))
+    return np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * np.asarray(level), members - 1))
 
 
 def standardized_errors(prediction: Prediction) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import welch
+import scipy
 
 from pinn_dyn.data.logs import DelayCurve, Recording
 from pinn_dyn.data.logs.delay_regression import CUT, averages
@@ -79,7 +79,7 @@ def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
 def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> float:
     """Return the frequency in Hz below which 99 % of the power of v is, above the noise of q."""
     size = min(round(8 / step), min(len(item) for item in training))
-    spectra = [welch(item.q, 1 / step, nperseg=size, axis=0) for item in training]
+    spectra = [scipy.signal.welch(item.q, 1 / step, nperseg=size, axis=0) for item in training]
     f, density = spectra[0][0], np.mean([power for _, power in spectra], axis=0)
     # White noise has 2 s² h per Hz. Power up to four times this level counts as noise.
     level = np.maximum(2 * noise**2 * step, np.median(density[len(f) // 2 :], axis=0))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
+import scipy
 import torch
-from scipy.signal import savgol_filter
 from torch import Tensor
 
 from pinn_dyn.mechanics import MechanicalSystem, Sum, Trajectory, double_copy
@@ -122,5 +122,7 @@ def _acceleration(truth: Trajectory) -> Tensor:
             f"{len(truth.t)} samples: accelerations need at least 5 at a constant step"
         )
     length = min(max(5, 2 * round(_SMOOTHING / step / 2) + 1), 2 * ((len(truth.t) - 1) // 2) + 1)
-    slope = savgol_filter(truth.v.double().numpy(), length, 3, deriv=1, delta=step, axis=-2)
+    slope = scipy.signal.savgol_filter(
+        truth.v.double().numpy(), length, 3, deriv=1, delta=step, axis=-2
+    )
     return torch.from_numpy(slope)

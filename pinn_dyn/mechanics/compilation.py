@@ -12,9 +12,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch._dynamo import config as dynamo_config
-from torch._higher_order_ops.scan import scan
-from torch._inductor import compile as compile_fx_graph
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
@@ -164,6 +161,8 @@ def compile_graph(
 
     The program has no checks. On a CPU it runs in one thread; on a GPU it is a CUDA graph.
     """
+    from torch._inductor import compile as compile_fx_graph  # the import takes a second
+
     _keep_rows()
     graph = make_fx(function, _DECOMPOSITIONS)(*arguments)
     for node in graph.graph.nodes:  # the recorded shapes do not fit; use those of the arguments
@@ -198,6 +197,9 @@ def compile_loop(
     The program is for arguments of fixed shapes and types. Each of the ``inputs`` is ``(T, ...)``,
     and the program returns x_1 to x_T, ``(T, ...)``.
     """
+    from torch._dynamo import config as dynamo_config  # the import takes a second
+    from torch._higher_order_ops.scan import scan
+
     # make_fx does not support bound methods.
     graph = make_fx(lambda *arguments: step(*arguments), _DECOMPOSITIONS)(
         state, constant, *[values[0] for values in inputs]

@@ -1,14 +1,20 @@
 """Training: LightningModules, losses, gradient engines, optimizers and schedules."""
 
-from pinn_dyn.training.checkpoints import WholeCheckpoints
+from typing import TYPE_CHECKING
+
+from pinn_dyn.lazy import lazy_attributes
 from pinn_dyn.training.constants_fit import Fit, StoppedFit
-from pinn_dyn.training.learner import DynamicsLearner, NonFiniteLossError
+from pinn_dyn.training.errors import NonFiniteLossError
 from pinn_dyn.training.least_squares import LeastSquares
-from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
 from pinn_dyn.training.losses import IncrementLoss, MidpointLoss, Penalized, WindowLoss
 from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
 from pinn_dyn.training.schedule import one_cycle
 from pinn_dyn.training.soap import SOAP
+
+if TYPE_CHECKING:
+    from pinn_dyn.training.checkpoints import WholeCheckpoints
+    from pinn_dyn.training.learner import DynamicsLearner
+    from pinn_dyn.training.least_squares_learner import COVARIANCE, LeastSquaresLearner
 
 __all__ = [
     "COVARIANCE",
@@ -28,3 +34,13 @@ __all__ = [
     "WindowLoss",
     "one_cycle",
 ]
+
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "COVARIANCE": "pinn_dyn.training.least_squares_learner",
+        "DynamicsLearner": "pinn_dyn.training.learner",
+        "LeastSquaresLearner": "pinn_dyn.training.least_squares_learner",
+        "WholeCheckpoints": "pinn_dyn.training.checkpoints",
+    },
+)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import scipy
 import torch
-from scipy.signal import butter, sosfiltfilt
 from torch import Tensor
 
 from pinn_dyn.mechanics import Trajectory
@@ -40,8 +40,11 @@ def filtered_motion(trajectories: Sequence[Trajectory], cutoff: float, samples: 
             )
         if item.duration < 3 / cutoff:
             continue
-        low_pass = butter(4, cutoff, fs=rate, output="sos")
-        smooth = [sosfiltfilt(low_pass, getattr(item, name).numpy(), axis=0) for name in "qvu"]
+        low_pass = scipy.signal.butter(4, cutoff, fs=rate, output="sos")
+        smooth = [
+            scipy.signal.sosfiltfilt(low_pass, getattr(item, name).numpy(), axis=0)
+            for name in "qvu"
+        ]
         q, v, u = (torch.from_numpy(x.copy()).double() for x in smooth)
         # Plain differences would lose 2 % of an acceleration at a twentieth of the sample rate.
         near, far = v.roll(-1, 0) - v.roll(1, 0), v.roll(-2, 0) - v.roll(2, 0)

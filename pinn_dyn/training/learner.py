@@ -22,6 +22,7 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
 from pinn_dyn.models.output_limits import free_weights, output_limits, set_output_limits
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.training.errors import NonFiniteLossError
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.losses import Penalized, WindowLoss
 from pinn_dyn.training.parameter_vector import ELEMENTWISE, ParameterVector
@@ -35,10 +36,6 @@ _LATEST = 50  # steps that the loss in lines of progress is averaged over
 
 Validator = Callable[[Predictor, Trajectory], dict[str, float]]
 """Function from a model and true trajectories ``(K, T, N)`` to named metrics."""
-
-
-class NonFiniteLossError(RuntimeError):
-    """Error: the training loss became NaN or infinite."""
 
 
 class DynamicsLearner(L.LightningModule):

@@ -9,10 +9,9 @@ from functools import partial
 from typing import Annotated
 
 import numpy as np
+import scipy
 import torch
 from pydantic import Field, PositiveFloat
-from scipy.cluster.vq import kmeans2
-from scipy.optimize import least_squares
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
@@ -265,7 +264,9 @@ class LeastSquares:
 
         # Windows that overlap have neighboring starts, and so have similar errors of the model.
         starts = x0 / x0.std(0, correction=0).clamp(min=1e-12)
-        _, near = kmeans2(starts.numpy(), min(_BLOCKS, len(x0)), seed=0, minit="++")
+        _, near = scipy.cluster.vq.kmeans2(
+            starts.numpy(), min(_BLOCKS, len(x0)), seed=0, minit="++"
+        )
         speeds = _speeds(windows.v).repeat(1, 2)[:, None, first:]
         size = residuals(False).shape
         labels = [torch.from_numpy(near)[:, None, None], speeds]
@@ -317,7 +318,7 @@ class LeastSquares:
             settings = {"max_nfev": limit, "ftol": tolerance, "xtol": tolerance, "gtol": 1e-8}
             try:
                 with Progress(*task) as progress:
-                    solution = least_squares(value, z.numpy(), slope, **settings)
+                    solution = scipy.optimize.least_squares(value, z.numpy(), slope, **settings)
             except KeyboardInterrupt:
                 vector_to_parameters(torch.from_numpy(best[1]), model.parameters())
                 raise

@@ -74,6 +74,23 @@ def test_the_package_imports_nothing_until_it_is_asked():
         pinn_dyn.Fit  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    ("command", "argument", "absent"),
+    [
+        ("train", "modle=lnn", "torch"),
+        ("train", "model.mas=3", "lightning"),
+        ("check", "longest_delay=none", "lightning"),
+    ],
+)
+def test_a_typo_is_answered_without_slow_imports(command, argument, absent):
+    code = (
+        f"import sys, pinn_dyn.app.command as c; sys.argv[1:] = [{argument!r}]\n"
+        f"try: c.main({command!r})\n"
+        f"except SystemExit as e: sys.exit({absent!r} in sys.modules or 'Error' not in str(e))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 # Predictions.
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import PositiveFloat, PositiveInt
-from scipy.signal import butter, savgol_coeffs, savgol_filter, sosfiltfilt
 
 from pinn_dyn.data.lengths import Length
 from pinn_dyn.data.logs.errors import LogError, listed
@@ -62,11 +62,11 @@ class Butterworth(Step):
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         rate = 1 / recording.sample_time("Butterworth")
-        sections = butter(self.order, self.cutoff, fs=rate, output="sos")
+        sections = scipy.signal.butter(self.order, self.cutoff, fs=rate, output="sos")
         # A period of the cut-off at either end lets the start-up of the filter die out.
         padding = max(3 * (2 * len(sections) + 1), round(rate / self.cutoff))
         smooth = recording.change(
-            self.signals, lambda x: sosfiltfilt(sections, x, axis=0, padlen=padding)
+            self.signals, lambda x: scipy.signal.sosfiltfilt(sections, x, axis=0, padlen=padding)
         )
         return [smooth], f"low-pass of {self.cutoff:g} Hz on {', '.join(self.signals)}"
 
@@ -117,7 +117,7 @@ class _SavitzkyGolaySlope(Step):
         step = recording.sample_time(type(self).__name__)
         # The shortest odd window that determines the polynomial.
         window = window_samples(self.window, recording, self.order + 1 + self.order % 2, odd=True)
-        slope = savgol_filter(values, window, self.order, deriv=1, delta=step, axis=0)
+        slope = scipy.signal.savgol_filter(values, window, self.order, deriv=1, delta=step, axis=0)
         return slope, window, step
 
 
@@ -145,7 +145,9 @@ class SavitzkyGolayVelocity(_SavitzkyGolaySlope):
         text = f"v from q in windows of {window * step:.3g} s"
         if self.causal:
             weights = [
-                savgol_coeffs(window, self.order, deriv=1, delta=step, pos=k, use="dot")
+                scipy.signal.savgol_coeffs(
+                    window, self.order, deriv=1, delta=step, pos=k, use="dot"
+                )
                 for k in range(window)
             ]
             start = [w @ q[:window] for w in weights[:-1]]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
+import scipy
 from scipy.ndimage import gaussian_filter1d
 
 from pinn_dyn.data.logs.checks import BURSTS, burst_share
@@ -183,7 +183,7 @@ def _products(
     """Return sums of Δq ∫v ``(B, N, N)``, Δq² and (∫v)² ``(B, N)`` over tenths of stretches."""
     parts = []
     for item in recordings:
-        integral = cumulative_trapezoid(item.v, dx=step, axis=0, initial=0)
+        integral = scipy.integrate.cumulative_trapezoid(item.v, dx=step, axis=0, initial=0)
         stride = max(1, samples // 10)
         dq, dv = (x[samples:][::stride] - x[:-samples][::stride] for x in (item.q, integral))
         tenths = (np.arange(len(dq)) * _TENTHS // max(len(dq), 1))[:, None] == np.arange(_TENTHS)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.signal import fftconvolve
+import scipy
 
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
@@ -66,7 +66,7 @@ def _is_in(piece: Recording, item: Recording) -> bool:
         if len(track) >= len(q):
             squares = np.cumsum(np.r_[0.0, (track**2).sum(axis=1)])
             energy = squares[len(q) :] - squares[: -len(q)]
-            products = fftconvolve(track, q[::-1], mode="valid", axes=0).sum(axis=1)
+            products = scipy.signal.fftconvolve(track, q[::-1], mode="valid", axes=0).sum(axis=1)
             if (energy - 2 * products + size < _SAME**2 * size).any():
                 return True
     return False

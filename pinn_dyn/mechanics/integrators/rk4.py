@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchdiffeq import odeint
 
 from pinn_dyn.mechanics.integrators.integrator import Dynamics, Integrator
 from pinn_dyn.mechanics.signal import Signal
@@ -37,6 +36,8 @@ class RK4(Integrator):
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
         if signal.t.requires_grad:  # torchdiffeq has no gradient by t, which a learned delay needs
             return super().path(dynamics, start, grid, signal)
+        from torchdiffeq import odeint  # imports scipy.integrate, which takes a second
+
         f = dynamics.state_derivative
 
         def rate(time: Tensor, increment: Tensor) -> Tensor:

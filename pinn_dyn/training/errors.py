@@ -1,0 +1,5 @@
+"""Errors of a training."""
+
+
+class NonFiniteLossError(RuntimeError):
+    """Error: the training loss became NaN or infinite."""
