@@ -21,20 +21,30 @@ def export(model: Predictor, path: str | Path) -> Path:
     """Write the identified robot to a URDF (``.urdf``) or an MJCF (``.xml``).
 
     Raises:
-        ValueError: on another ending.
+        ValueError: on another ending, or an MJCF of elastic joints or feed-forward forces.
         TypeError: if the model has no bodies.
     """
     path = Path(path).expanduser()
     if path.suffix not in _WRITERS:
         raise ValueError(f"{path} ends in {path.suffix!r}, expected {' or '.join(_WRITERS)}")
     structure = getattr(model, "structure", None)
-    if not isinstance(model, KnownMechanics) or not isinstance(structure, RigidChain):
+    chain = getattr(structure, "chain", structure)  # the links of elastic joints
+    if not isinstance(model, KnownMechanics) or not isinstance(chain, RigidChain):
         kind = type(model).__name__
         reason = "its network would be lost" if isinstance(model, KnownAndNetwork) else "no bodies"
         raise TypeError(f"a {kind} has no robot file ({reason}): export a run of model=known")
+    if path.suffix == ".xml" and (model.elastic or model.num_inputs > len(model.driven)):
+        kind = "elastic joints" if model.elastic else "feed-forward forces"
+        raise ValueError(f"{path}: {kind} have no actuator of an MJCF, use the ending .urdf")
     model = double_copy(model)
-    structure = structure.double()
+    chain = chain.double()
     with torch.no_grad():
+        offset, gain = model.constant_force(), model.input_gain() @ model.motors
+        bias, limit = [offset, 0 * offset, 0 * offset], torch.full_like(offset, torch.inf)
+        if servo := model.servo:
+            gain = servo.springs()
+            bias = [offset, -gain, -servo.damping_rates()]
+            limit[model.driven] = torch.inf if servo.affine else servo.largest_force()
         drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)
         constants = RobotConstants(
@@ -42,8 +52,9 @@ def export(model: Predictor, path: str | Path) -> Path:
             armature=model.rotor_inertia(),
             damping=model.viscous(),
             friction=(model.friction(fast) - model.friction(-fast)) / 2,
-            gain=model.input_gain() @ model.motors,
-            offset=model.constant_force(),
+            gain=gain,
+            bias=torch.stack(bias, dim=-1),
+            limit=limit,
             notes=[
                 f"Inertias, damping and friction identified by pinn_dyn {__version__}. Drives:",
                 *(
@@ -54,5 +65,5 @@ def export(model: Predictor, path: str | Path) -> Path:
             ],
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, _WRITERS[path.suffix](structure, constants, path.parent))
+    write_whole(path, _WRITERS[path.suffix](chain, constants, path.parent))
     return path

@@ -84,7 +84,7 @@ class _Loaded(nn.Module):
         super().__init__()
         self.known, self.num_inputs = mechanics, mechanics.num_inputs
         self.drive_gain, self.force_ratio = mechanics.drive_gain, mechanics.force_ratio
-        structure: Any = mechanics.structure
+        structure: Any = getattr(mechanics.structure, "chain", mechanics.structure)
         body, pose = structure._tip_body, torch.eye(4, dtype=torch.float64)
         self.frame = structure.body_names[body]
         if structure.tip is not None:

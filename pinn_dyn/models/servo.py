@@ -110,7 +110,7 @@ class Servo(InputMatrix):
 
     def strength(self) -> Tensor:
         """Return 1 / (1/k + e/L), ``(n,)``, the force by target error, with a typical error e."""
-        return self.gain() / (1 + self.gain() * self.error / self._largest())
+        return self.gain() / (1 + self.gain() * self.error / self.largest_force())
 
     def springs(self) -> Tensor:
         """Return k of all coordinates, ``(N,)``; 0 for a coordinate without a servo."""
@@ -154,11 +154,11 @@ class Servo(InputMatrix):
         torque = sum(feedforward, self.gain() * (target - q @ side))
         return torque if self.damping is None else torque - self.damping() * (v @ side)
 
-    def _largest(self) -> Tensor:
+    def largest_force(self) -> Tensor:
         """Return L, ``(n,)``."""
         return self.fixed_limit if self.limit is None else self.limit()
 
     def _limited(self, linear: Tensor) -> Tensor:
-        limit = self._largest()
+        limit = self.largest_force()
         ratio = (linear / limit).clamp(-_BEYOND, _BEYOND)
         return limit * ratio / (1 + ratio**_SHARPNESS) ** (1 / _SHARPNESS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import warnings
 import xml.etree.ElementTree as ET
@@ -10,6 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -31,7 +33,9 @@ class RobotConstants(NamedTuple):
     Attributes:
         inertia: pseudo-inertias of the bodies in the frames of their joints, ``(B, 4, 4)``.
         armature, damping, friction: inertias of the rotors, viscous and dry friction, ``(N,)``.
-        gain, offset: force per input, zero for a passive joint, and constant force, ``(N,)``.
+        gain: force per input, zero for a passive joint, ``(N,)``.
+        bias: constant force, and force of the drive per q and per v, ``(N, 3)``.
+        limit: largest force of the drive without its constant, ``(N,)``.
         notes: lines for a comment at the head of the file.
     """
 
@@ -40,7 +44,8 @@ class RobotConstants(NamedTuple):
     damping: Tensor
     friction: Tensor
     gain: Tensor
-    offset: Tensor
+    bias: Tensor
+    limit: Tensor
     notes: list[str]
 
 
@@ -105,8 +110,8 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
 def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     """Return an MJCF of the bodies, joints and drives of a robot, without shapes.
 
-    An actuator computes gain * ctrl + offset, so that ctrl is the input of the model. Joints that
-    follow others are coupled by equalities.
+    An actuator computes gain * ctrl and the bias, so that ctrl is the input of the model. The force
+    of a servo has a sharp limit. Joints that follow others are coupled by equalities.
     """
     file, tree = UrdfFile(robot.urdf), robot.tree
     names = {file.ends[name][1]: name for name in file.joints}
@@ -141,7 +146,10 @@ def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
             if low < high and not (turns and high - low > 6.28):
                 settings |= {"range": exact_text([low, high]), "limited": "true"}
             if gain := float(constants.gain[number]):
-                law = {"gainprm": repr(gain), "biasprm": exact_text(constants.offset[[number]])}
+                law = {"gainprm": repr(gain), "biasprm": exact_text(constants.bias[number])}
+                if (limit := float(constants.limit[number])) < math.inf:
+                    ends = constants.bias[number, 0] + limit * torch.tensor([-1.0, 1.0])
+                    law |= {"forcerange": exact_text(ends), "forcelimited": "true"}
                 ET.SubElement(actuators, "general", law, name=joint, joint=joint, biastype="affine")
         ET.SubElement(element, "joint", settings, name=joint)
     return _written(root, constants.notes)

@@ -1,6 +1,7 @@
 """Identified robots written to URDF and MJCF, against Pinocchio, MuJoCo and Bullet."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,10 @@ import torch
 
 from pinn_dyn.app.export import export
 from pinn_dyn.app.run_folder import with_structures
-from pinn_dyn.models import KnownMechanics, LagrangianNetwork, NoFriction, Stribeck
+from pinn_dyn.models import KnownMechanics, LagrangianNetwork, NoFriction, Servo, Stribeck
 from pinn_dyn.systems import RigidChain
 from tests.support.arm_urdf import ARM
-from tests.support.known import statistics
+from tests.support.known import elastic_model, statistics
 from tests.support.rigid_chains import TREE
 
 mujoco = pytest.importorskip("mujoco", reason="the mujoco extra is not installed")
@@ -97,6 +98,43 @@ def test_an_exported_robot_has_the_learned_dynamics_elsewhere(name, tmp_path):
     )
     again = RigidChain(str(urdf)).mass_matrix(torch.from_numpy(q))
     torch.testing.assert_close(again, structure.mass_matrix(torch.from_numpy(q), model.bodies()))
+
+
+@pytest.mark.parametrize("limit", [None, 3.0, "learned"])
+def test_a_servo_becomes_an_actuator_with_the_same_forces(tmp_path, limit):
+    """At a fifth of the limit, and far beyond: in between, the limit of the model is smooth."""
+    model = learned(TREE, ["wrist"], NoFriction, input=partial(Servo, limit=limit, stiffness=8.0))
+    q, v, _ = states(len(model.driven))
+    largest = torch.inf if limit is None else model.servo.largest_force()
+    mjcf = mujoco.MjModel.from_xml_path(str(export(model, tmp_path / "arm.xml")))
+    data = mujoco.MjData(mjcf)
+    order = [mjcf.joint(name).id for name in model.structure.joint_names]
+    drives = [mjcf.actuator(name).id for name in model.structure.joint_names]
+    for size in (0.1, 1e3):
+        s = size * (torch.ones_like(q) if limit is None else largest) * q.sign()
+        u = q + (s + model.servo.damping_rates() * v) / model.servo.gain()
+        expected = s.clamp(-largest, largest) if limit else s
+        expected = expected + model.constant_force()
+        for k in range(STATES):
+            data.qpos[order], data.qvel[order], data.ctrl[drives] = q[k], v[k], u[k]
+            mujoco.mj_forward(mjcf, data)
+            np.testing.assert_allclose(data.qfrc_actuator[order], expected[k], rtol=1e-6)
+        torch.testing.assert_close(
+            model.motor_force(q, v, u) + model.constant_force(), expected, rtol=1e-6, atol=1e-6
+        )
+
+
+def test_the_links_of_elastic_joints_are_written_to_a_urdf(tmp_path):
+    model = elastic_model()
+    chain = model.structure.chain
+    q, v, a = states(chain.num_coordinates)
+    path = export(model, tmp_path / "arm.urdf")
+    forces = pinocchio_forces(path, chain.joint_names, *(x.numpy() for x in (q, v, a)))
+    np.testing.assert_allclose(
+        forces, chain.rigid_force(q, v, a, model.bodies().detach()), atol=1e-9
+    )
+    with pytest.raises(ValueError, match=r"use the ending \.urdf"):
+        export(model, tmp_path / "arm.xml")
 
 
 BEND = '<joint name="bend" type="continuous">'
