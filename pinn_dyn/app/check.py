@@ -14,6 +14,7 @@ from pinn_dyn.app.known_data import match_structure
 from pinn_dyn.app.sweep import command_line
 from pinn_dyn.data import LogSource
 from pinn_dyn.evaluation.log_check import check as check_log
+from pinn_dyn.systems import RigidChain
 
 
 def check(cfg: DictConfig) -> None:
@@ -26,7 +27,9 @@ def check(cfg: DictConfig) -> None:
         )
     structure = None
     if (part := config["model"]["structure"]) is not None:
-        structure = match_structure(build_part("model.structure", part), source)
+        structure = build_part("model.structure", part)
+        if isinstance(structure, RigidChain):
+            structure = match_structure(structure, source)
     with naming(source.name):
         report = check_log(source, longest_delay=config["longest_delay"], structure=structure)
     folder = Path(HydraConfig.get().runtime.output_dir)

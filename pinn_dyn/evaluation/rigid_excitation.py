@@ -18,7 +18,7 @@ from pinn_dyn.training.least_squares import REST
 
 MOST = 100.0
 """Condition number up to which a motion is well conditioned, as Gautier and Khalil take it."""
-_DEPENDENT = 1e-6  # remainder of a dependent column, as a share of its length
+_DEPENDENT = 3e-3  # remainder of a dependent column, as a share of its length: URDFs round pi / 2
 _DRIVE = ("armature", "viscous friction", "dry friction", "offset")
 
 
@@ -50,8 +50,7 @@ def base_parameters(regressor: np.ndarray) -> np.ndarray:
     Source: Gautier 1991, "Numerical calculation of the base inertial parameters of robots".
     """
     norms = np.linalg.norm(regressor, axis=0)
-    # The rounded angles of a URDF leave next to nothing of a column that would be zero.
-    scaled = regressor / np.where(norms > _DEPENDENT * norms.max(), norms, 1.0)
+    scaled = regressor / np.where(norms > _DEPENDENT * norms.max(), norms, np.inf)
     return np.flatnonzero(np.abs(np.diag(np.linalg.qr(scaled, mode="r"))) > _DEPENDENT)
 
 

@@ -5,12 +5,13 @@ import shlex
 
 import numpy as np
 import pandas as pd
+import pytest
 from scipy.signal import lfilter
 
 from pinn_dyn import load
 from pinn_dyn.app.check import _training
-from pinn_dyn.models import CoulombFriction, KnownMechanics, Servo
-from tests.app.entry import ROOT, fails, run_script
+from pinn_dyn.models import CoulombFriction, ElasticJoints, KnownMechanics, Servo
+from tests.app.entry import NO_FIGURES, ROOT, fails, run_script
 from tests.support.delayed_robots import log, resting
 
 COLUMNS = [
@@ -139,3 +140,27 @@ def test_known_kinematics_add_what_the_motion_tells_of_the_bodies(tmp_path, caps
 
 def test_a_simulated_data_set_is_refused():
     assert "is simulated, expected a log" in str(fails("check.py", "dataset=soft_arm_1").code)
+
+
+@pytest.mark.slow
+def test_the_constants_of_elastic_joints_are_trained_as_printed(tmp_path, capsys):
+    item = log("arm", 0, 0.0)
+    q, motors = item.q.T, (item.q + item.u / 300).T
+    table = {"t": item.t, "q1": q[0], "q2": q[1], "m1": motors[0], "m2": motors[1]}
+    table |= {"u1": item.u[:, 0], "u2": item.u[:, 1]}
+    words = ["model/structure=elastic", "dataset.q.columns=[q1,q2,m1,m2]"]
+    words += [structure("double_pendulum")[1].replace("urdf=", "chain.urdf=", 1)]
+    model = printed_training(tmp_path, capsys, pd.DataFrame(table), "its constants", *words)
+    assert isinstance(model.structure, ElasticJoints)
+
+
+def test_both_remedies_for_a_delay_are_followed(tmp_path, capsys):
+    words = [*arguments(tmp_path), "data.pairs=64", "data.batch_size=64", "trainer.steps=1"]
+    run_script("check.py", *words[:-3])
+    text = capsys.readouterr().out
+    step = re.search(r"delay: (\{.*\}) # s", text)[1]
+    option = re.search(r"learn the delay with the model \((.*?)\)", text)[1]
+    words += ["model=lnn", "trainer.validations=1", "validator.horizon=0.1", NO_FIGURES]
+    for k, override in enumerate((f"+dataset.steps.delay={step}", option)):
+        run_script("train.py", *words, override, f"hydra.run.dir={tmp_path / str(k)}")
+    assert load(tmp_path / "1").model.delay.longest > 0.05

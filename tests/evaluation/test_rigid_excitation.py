@@ -7,7 +7,7 @@ import torch
 
 from pinn_dyn.data.logs import LogSource
 from pinn_dyn.evaluation.log_check import check
-from pinn_dyn.evaluation.rigid_excitation import base_parameters, rigid_excitation
+from pinn_dyn.evaluation.rigid_excitation import base_columns, base_parameters, rigid_excitation
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import RigidChain
 from tests.support.delayed_robots import log, sines
@@ -50,6 +50,17 @@ def test_a_link_carries_the_mass_of_the_next_one_as_a_point_at_its_joint():
     expected[1, 10] = -0.5
     expected[2, 10] = 0.25
     np.testing.assert_allclose(regressor, regressor[:, columns] @ expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", ["1.5707963267948966", "1.5708", "1.571", "1.57"])
+def test_rounded_angles_of_a_urdf_add_no_base_parameter(angle):
+    """Armatures 1 and 2 are grouped with links where axes are orthogonal (Gautier, Khalil 1990)."""
+    parts = [link("base"), *(link(f"body{k}") for k in range(3))]
+    ends = zip(("base", "body0", "body1"), ("body0", "body1", "body2"), strict=True)
+    for k, (before, behind) in enumerate(ends):
+        rpy = "0 0 0" if k == 0 else f"{'-' if k % 2 else ''}{angle} 0 0"
+        parts.append(joint(f"joint{k}", "continuous", before, behind, "0 0 0", rpy, axis="0 0 1"))
+    assert len(base_columns(RigidChain(robot(*parts)))) == (1 + 7 + 7) + 3 * 3 + 1
 
 
 def test_the_panda_has_43_base_parameters():
