@@ -235,6 +235,23 @@ def test_a_joint_that_turns_many_times_is_not_in_degrees(tmp_path):
     assert "'q1': an angle" in warned(tmp_path, motion().assign(q1=50 * motion()["q1"]))
 
 
+def test_a_free_motor_that_goes_to_and_fro_is_not_in_degrees(tmp_path):
+    """A motor of 1e-4 kg m^2 with dry friction and position control, simulated at 10 kHz."""
+    rows, q, v = [], 0.0, 0.0
+    rng = np.random.default_rng(2)
+    goals = np.repeat(rng.uniform(-100, 100, 30), 5000)
+    for goal in goals[:100_100]:
+        u = np.clip(2e-3 * (goal - q) - 4e-4 * v, -0.05, 0.05)
+        rows.append((q, v, u))
+        v += 1e-4 * (u - 0.002 * np.tanh(v) - 1e-5 * v) / 1e-4
+        q += 1e-4 * v
+    q, v, u = np.transpose(rows[:100_001:100])
+    assert 50 < np.abs(q).max() < 180
+    table = motion().assign(q1=q + 1e-3 * rng.normal(size=1001), v1=v, u1=u)
+    assert "in degrees" not in warned(tmp_path, table)
+    assert "'q1': an angle" in warned(tmp_path, table.assign(u1=np.roll(u, 300)))
+
+
 @pytest.mark.parametrize(("factor", "ratio"), [(180 / np.pi, 0.01745), (-1.0, -1.0), (0.5, 2.0)])
 def test_velocity_that_disagrees_by_a_factor(tmp_path, factor, ratio):
     text = warned(tmp_path, motion().assign(v2=factor * motion()["v2"]))

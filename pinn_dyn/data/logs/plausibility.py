@@ -20,6 +20,7 @@ _AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and
 _STILL = 1e-12  # range of a coordinate that does not move, m or rad
 _TENTHS, _MOST_ODD = 10, 0.6  # parts of a stretch; largest share of parts that disagree
 _SMOOTH, _PERIODIC = 0.03, 0.6  # s; of the acceleration: largest share that periodic terms leave
+_FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
 _MOVING, _LEFT = 0.05, 0.7  # of a tenth: share of the mean square, share of Δq² that k v leaves
 
 
@@ -64,24 +65,29 @@ def check_angles(recordings: list[Recording], q: Columns, step: float) -> list[M
 
 
 def _turns(recordings: list[Recording], k: int, step: float) -> bool:
-    """Tell whether angle k grows up to the end, or its acceleration has the period of a turn."""
+    """Tell whether angle k grows up to the end, or its acceleration has the period of a turn.
+
+    A free motor, whose acceleration follows from its input and its friction, may turn, too.
+    """
     steps = [np.diff(item.q[:: max(1, len(item) // 50), k]) for item in recordings]
     path, last = sum(np.abs(x).sum() for x in steps), sum(abs(x[-1]) * len(x) for x in steps)
     if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
         return True
     samples = max(_SMOOTH / step, 1.5)
+    n, m = recordings[0].q.shape[1], recordings[0].u.shape[1]
     parts = []
     for item in recordings:
         v = np.gradient(item.q, step, axis=0)
         smooth = [gaussian_filter1d(v, samples, 0, order) for order in (1, 0)]
-        parts.append(np.hstack([smooth[0][:, [k]], smooth[1], np.sin(item.q), np.cos(item.q)]))
-    a, v, trig = np.split(np.vstack(parts), [1, 1 + recordings[0].q.shape[1]], axis=1)
-    plain = np.hstack([v, np.ones_like(a)])
+        drives = np.hstack([gaussian_filter1d(item.u, samples, 0), np.sign(smooth[1])])
+        trig = np.hstack([np.sin(item.q), np.cos(item.q)])
+        parts.append(np.hstack([smooth[0][:, [k]], np.ones((len(v), 1)), smooth[1], drives, trig]))
+    a, plain, drives, trig = np.split(np.vstack(parts), np.cumsum([1, 1 + n, n + m]), axis=1)
     left = [
         ((a - x @ np.linalg.lstsq(x, a, rcond=None)[0]) ** 2).sum()
-        for x in (plain, np.hstack([plain, trig]))
+        for x in (plain, np.hstack([plain, trig]), np.hstack([plain, drives]))
     ]
-    return bool(left[1] < _PERIODIC * left[0])
+    return bool(left[1] < _PERIODIC * left[0] or left[2] < _FREE * (a**2).sum())
 
 
 def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measurement]:
