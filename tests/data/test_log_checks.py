@@ -16,6 +16,7 @@ from pinn_dyn.data.logs import (
     Resample,
     SplitGaps,
 )
+from pinn_dyn.data.logs.checks import _are_ticks
 from tests.data.logs_files import motion, source, write
 
 RESAMPLE = {"resample": Resample(rate=100.0, max_gap=0.2)}
@@ -302,6 +303,19 @@ def ticks(rate=500.0, resolution=2 * np.pi / 4096):
 
 def test_the_resolution_of_an_encoder_stands_for_no_missing_value(tmp_path):
     assert "no value" not in warned(tmp_path, ticks())
+
+
+@pytest.mark.parametrize(
+    ("sizes", "expected"),
+    [
+        ([1.0] * 9 + [1.5, 2.0, 3.0], True),
+        ([1.0] * 9, False),  # too few
+        ([1.0] * 9 + [1.2, 1.3, 2.8], False),  # no multiples
+        ([1.0] * 11 + [400.0], False),  # a lost value among the steps
+    ],
+)
+def test_steps_of_a_resolution_are_many_equal_and_small(sizes, expected):
+    assert _are_ticks(0.37 * np.array(sizes)) == expected
 
 
 @pytest.mark.parametrize("value", [-1.0, 999.0, 65535.0])

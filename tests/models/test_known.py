@@ -132,3 +132,18 @@ def test_drives_start_at_the_scales_of_the_data():
     for name in slides:
         units = [(turns if turning else slides)[name] for turning in model.structure.turning]
         assert getattr(model, name).units == units
+
+
+def test_the_ratio_of_forces_counts_per_input():
+    """Bodies of half the mass with half the drive gain fit the same inputs."""
+    model = known_model(drive_gain=[1.0, 2.0, 3.0, 4.0], gain_spread=0.7)
+    q, v, a = torch.randn(3, 20, 4, generator=torch.Generator().manual_seed(0)).double()
+    with torch.no_grad():
+        model.armature.z.fill_(-20.0)
+        ratio, _ = model.force_ratio(q, v, a)
+        torch.testing.assert_close(ratio, torch.ones(4).double(), rtol=1e-5, atol=0)
+        model.gain.z.fill_(math.log(0.5) / 0.7)
+        torch.testing.assert_close(model.force_ratio(q, v, a)[0], 2 * ratio)
+        mass = math.log(0.5) / 2 / model.bodies.spread
+        model.bodies.z[:, 0] = mass
+        torch.testing.assert_close(model.force_ratio(q, v, a)[0], ratio, rtol=1e-5, atol=0)

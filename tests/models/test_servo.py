@@ -213,3 +213,19 @@ def test_least_squares_identifies_gain_damping_and_limit_of_a_saturating_servo()
     assert table["unit"]["servo stiffness of horn"] == "Nm/rad"
     plain, _ = fitted_servo(start="prior", spread=0.05, input=Servo)
     assert fit.residual < 0.1 * plain.residual
+
+
+def test_targets_come_first_and_then_feed_forward_forces_in_the_order_of_the_joints():
+    """Joints 2 and 0 of three, with targets (0.5, -0.2) and forces (3, 7)."""
+    model = make_structured(
+        "lnn", 3, 4, input=partial(Servo, joints=[2, 0], stiffness=[10.0, 20.0])
+    )
+    q = torch.tensor([0.1, 0.4, 0.3]).double()
+    u = torch.tensor([0.5, -0.2, 3.0, 7.0]).double()
+    k = model.servo.gain().detach().double()
+    expected = torch.stack([k[1] * (-0.2 - 0.1) + 7, 0 * k[0], k[0] * (0.5 - 0.3) + 3])
+    at_rest = model.forward_dynamics(q, 0 * q, u) - model.forward_dynamics(q, 0 * q, 0 * u)
+    force = model.mass_matrix(q) @ at_rest
+    spring = torch.stack([-k[1] * 0.1, 0 * k[0], -k[0] * 0.3])
+    assert_near(force + spring, expected, 1e-6)
+    assert_near(model.servo.torque(q, 0 * q, u), expected[[2, 0]], 1e-6)
