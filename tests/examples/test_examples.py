@@ -113,6 +113,12 @@ def test_identified_robot():
     assert len(set(torques)) == 1
 
 
+def test_reinforcement_learning(own_log):
+    pytest.importorskip("gymnasium", reason="the envs extra is not installed")
+    text = run("reinforcement_learning.py", RUN, "--trials=1", "--duration=0.1")
+    assert len(re.findall(r"mean return .*: -\d+\.\d+ before, -\d+\.\d+ after", text)) == 2
+
+
 @pytest.mark.slow
 def test_ensemble_with_spread():
     lines = run("ensemble_with_spread.py", "--members", "2", "--steps", "2").splitlines()

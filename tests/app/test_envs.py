@@ -1,0 +1,179 @@
+"""Robots as Gymnasium environments, against predictions of the model and exact solutions."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import pinn_dyn
+from pinn_dyn.data import DataSource, Splits
+from pinn_dyn.mechanics import Signal, Trajectory
+from pinn_dyn.models.delay import LearnedDelay
+from pinn_dyn.testing import damped_oscillators, exact_solution
+from tests.support.closed_loops import Vanishing
+
+gymnasium = pytest.importorskip("gymnasium", reason="the envs extra is not installed")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from pinn_dyn.envs import RobotEnv  # noqa: E402
+
+
+class Recorded(DataSource):
+    """Three random trajectories of N coordinates and M inputs, 0.1 s between samples."""
+
+    name = "recorded"
+
+    def __init__(self, size, inputs):
+        rng = torch.Generator().manual_seed(0)
+        self.labels, self.input_labels = [f"q{k}" for k in range(size)], ["u"] * inputs
+        t = 0.1 * torch.arange(20, dtype=torch.float64)
+        q, v = 0.5 * torch.rand(2, 3, 20, size, generator=rng, dtype=torch.float64)
+        u = torch.rand(3, 20, inputs, generator=rng, dtype=torch.float64) - 0.5
+        self.items = [Trajectory(q[k], v[k], Signal(t, u[k])) for k in range(3)]
+
+    def load(self):
+        return Splits(self.items, self.items, self.items)
+
+
+def oscillators(**settings):
+    return RobotEnv(damped_oscillators(), data=Recorded(2, 1), duration=1.0, **settings)
+
+
+@pytest.fixture(params=["lnn_run", "hnn_run"])
+def run(request):
+    return pinn_dyn.load(request.getfixturevalue(request.param))
+
+
+def rolled_out(env, actions, seed=0):
+    """The start and the states (q, v) after each action."""
+    size = env.plant.num_coordinates
+    observations = [env.reset(seed=seed)[0], *(env.step(u)[0] for u in actions)]
+    return np.stack(observations)[:, : 2 * size]
+
+
+def actions_of(env, count):
+    env.action_space.seed(0)
+    return np.stack([env.action_space.sample() for _ in range(count)])
+
+
+def test_the_environments_keep_the_interface_of_gymnasium(lnn_run):
+    """A learned robot by its registered name and folder, and a true one with its data."""
+    learned = gymnasium.make("pinn_dyn.envs:pinn_dyn/Robot-v0", robot=str(lnn_run), duration=0.1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(symmetric and normalized|minimum|maximum).*")
+        for env in (learned.unwrapped, oscillators(), oscillators(reward=lambda q, v, u: 1.0)):
+            check_env(env, skip_render_check=True)
+
+
+def test_a_learned_robot_moves_as_its_model_predicts(run):
+    env = RobotEnv(run, duration=1.0)
+    assert env.dt == run.statistics.step
+    actions = actions_of(env, 4)
+    states = torch.from_numpy(rolled_out(env, actions))
+    t = env.dt * torch.arange(5, dtype=torch.float64)
+    held = torch.from_numpy(np.append(actions, actions[-1:], 0).astype(float))
+    q, v = states[0].chunk(2)
+    start = states[0] if run.model.state == "qv" else torch.cat([q, run.model.momentum(q, v)])
+    expected = run.model.predict(start, t, Signal(t, held, "hold"))
+    if run.model.state == "qp":
+        q, p = expected.chunk(2, -1)
+        expected = torch.cat([q, run.model.velocity(q, p)], -1)
+    torch.testing.assert_close(states, expected, rtol=0, atol=1e-10)
+
+
+def test_longer_steps_are_integrated_in_those_of_the_training(lnn_run):
+    run = pinn_dyn.load(lnn_run)
+    fine = RobotEnv(run)
+    (action,) = actions_of(fine, 1)
+    coarse = rolled_out(RobotEnv(run, step=3 * fine.dt), [action])
+    expected = rolled_out(fine, [action] * 3)[[0, -1]]
+    np.testing.assert_allclose(coarse, expected, rtol=0, atol=1e-10)
+
+
+def test_a_learned_delay_shifts_the_inputs(lnn_run):
+    """A delay of two steps: the robot moves as without the delay and with two zeros before."""
+    run = pinn_dyn.load(lnn_run)
+    env = RobotEnv(run)
+    actions = actions_of(env, 5)
+    env.action_space = gymnasium.spaces.Box(-9, 9, actions[0].shape)
+    expected = rolled_out(env, [*np.zeros((2, actions.shape[1])), *actions])
+    run.model.delay = LearnedDelay(longest=4 * env.dt, initial=2 * env.dt).double()
+    delayed = RobotEnv(run)
+    states = rolled_out(delayed, [*actions, *actions[:2]])
+    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-10)
+
+
+def test_a_true_robot_moves_as_the_exact_solution():
+    env = oscillators(step=0.3)
+    actions = actions_of(env, 3)
+    states = rolled_out(env, actions)
+    t, u = 0.3 * torch.arange(4), torch.from_numpy(np.append(actions, actions[-1:], 0))
+    start = torch.from_numpy(states[0])
+    expected = exact_solution(damped_oscillators(), start, t, u, "hold")
+    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-5)
+
+
+def test_episodes_start_in_the_data_and_repeat_with_their_seed():
+    env = oscillators()
+    q, v = (torch.cat([getattr(x, k) for x in env_data()]) for k in "qv")
+    starts = np.stack([env.reset(seed=seed)[0] for seed in (1, 2, 1)])
+    assert (starts[0] == starts[2]).all()
+    assert (starts[0] != starts[1]).any()
+    for start in starts:
+        state, goal = start[:4], start[4:]
+        assert (np.abs(torch.cat([q, v], 1).numpy() - state).max(1) == 0).any()
+        assert (np.abs(q.numpy() - goal).max(1) == 0).any()
+    assert env.action_space.low == np.float32(min(x.u.min() for x in env_data()))
+
+
+def env_data():
+    return Recorded(2, 1).load().train
+
+
+def test_reward_limits_and_end_of_an_episode():
+    env, other = oscillators(), oscillators(reward=lambda q, v, u: q[0] + 10 * v[1] + 100 * u[0])
+    env.reset(seed=0)
+    observation, reward, terminated, truncated, info = env.step(np.array([1e3]))
+    assert reward == pytest.approx(-np.square(observation[:2] - observation[4:]).sum())
+    assert info["distance"] >= 0
+    assert not terminated
+    assert not truncated
+    other.reset(seed=0)
+    q1, _, _, v2 = (seen := other.step(env.action_space.high))[0]
+    np.testing.assert_array_equal(seen[0], observation[:4])  # the action was clipped
+    assert seen[1] == pytest.approx(q1 + 10 * v2 + 100 * env.action_space.high[0])
+    ends = [other.step(np.zeros(1))[3] for _ in range(9)]
+    assert ends == [False] * 8 + [True]
+
+
+def test_a_robot_that_diverges_gains_nothing():
+    """Its mass vanishes at q = 1, which it reaches within a second; the goal is elsewhere."""
+    env = RobotEnv(Vanishing(), data=Recorded(1, 1), duration=5.0, u_low=[0.0], u_high=[50.0])
+    env.reset(seed=0)
+    rewards, terminated = [], False
+    while not terminated:
+        observation, reward, terminated, truncated, _ = env.step(np.array([50.0]))
+        rewards.append(reward)
+        assert not truncated
+    assert np.isfinite(observation).all()
+    left = 50 - len(rewards) + 1
+    assert rewards[-1] == pytest.approx(left * rewards[-2])
+
+
+def test_several_environments_step_together():
+    envs = gymnasium.make_vec(
+        "pinn_dyn.envs:pinn_dyn/Robot-v0",
+        num_envs=2,
+        vectorization_mode="sync",
+        robot=damped_oscillators(),
+        data=Recorded(2, 1),
+    )
+    first, _ = envs.reset(seed=[0, 1])
+    assert (first[0] == oscillators().reset(seed=0)[0]).all()
+    assert envs.step(envs.action_space.sample())[0].shape == (2, 6)
+
+
+def test_a_robot_without_data_is_told_so():
+    with pytest.raises(TypeError, match="set data"):
+        RobotEnv(damped_oscillators())
