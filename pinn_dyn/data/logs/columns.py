@@ -143,17 +143,12 @@ class Columns:
     def contradictions(self, signal: str, units: Mapping[str, str]) -> list[str]:
         """Return a sentence for each column whose unit in the file, as in ``units``, differs."""
         texts = []
-        for k, (column, unit) in enumerate(zip(self.columns, self.unit, strict=True)):
-            name = known_unit(units.get(column, ""))
-            if name in (None, "1") or self.units[k] in ("1", "1/s"):
-                continue
-            si, factor = UNITS[name]
-            # A letter in parentheses may be an index, and a factor may be a part of the scale.
-            if (len(name) == 1 and si != self.units[k]) or math.isclose(
-                abs(self.factors[k]), factor
-            ):
-                continue
-            if UNITS[name] != to_si(unit):
+        for column, unit, factor in zip(self.columns, self.unit, self.factors, strict=True):
+            name = known_unit(units.get(column, "")) or unit
+            si, usual = to_si(name)
+            # A factor may be a part of the scale.
+            differs = si == to_si(unit)[0] and usual != to_si(unit)[1]
+            if differs and not math.isclose(abs(factor), usual):
                 texts.append(
                     f"column {column!r} ({signal}) is in {name} by the header of the file, but "
                     f"the data set says {unit}: write unit: {name}"

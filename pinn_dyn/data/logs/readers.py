@@ -22,7 +22,7 @@ from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.parquet import read_parquet
 from pinn_dyn.data.logs.table import Request, Table
-from pinn_dyn.data.logs.text import read_excel, read_text
+from pinn_dyn.data.logs.text import read_text
 
 Reader = Callable[[Path, Request], "pd.DataFrame | Table | Mapping[str, pd.DataFrame | Table]"]
 """Function that reads a file, or the runs of a file by name.
@@ -35,7 +35,6 @@ READERS: dict[str, Reader] = {
     **dict.fromkeys((".asc", ".lvm", ".mot", ".prn", ".sto", ".tab"), read_text),
     ".mat": read_mat,
     **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
-    **dict.fromkeys((".xlsx", ".xls", ".ods"), read_excel),
     ".npz": read_npz,
     ".npy": read_npy,
     **dict.fromkeys((".pt", ".pth"), read_torch),
@@ -43,15 +42,6 @@ READERS: dict[str, Reader] = {
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
 """Reader of each suffix; the folder of a ROS 2 bag is read as ``.db3``."""
-
-
-# Commands that convert a file of another format, and its name without the suffix.
-_CONVERSIONS = {
-    ".jsonl": " (pandas: read_json('{}', lines=True).to_csv('{}.csv', index=False))",
-    ".mf4": " (asammdf: MDF('{}').to_dataframe().to_parquet('{}.parquet'))",
-    ".tdms": " (npTDMS: TdmsFile('{}').as_dataframe().to_parquet('{}.parquet'))",
-    ".ulg": " (pyulog: ulog2csv {})",
-}
 
 
 def _is_bag(path: Path) -> bool:
@@ -66,9 +56,8 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
     """
     suffix = ".db3" if _is_bag(path) else path.suffix.lower()
     if suffix not in READERS:
-        convert = _CONVERSIONS.get(suffix, "").format(path.name, path.stem)
         raise LogError(
-            f"{path}: no reader for {suffix!r}{convert}, expected one of {', '.join(READERS)}"
+            f"{path}: no reader for {suffix!r}: save the log as one of {', '.join(READERS)}"
         )
     try:
         content = READERS[suffix](path, request)

@@ -24,6 +24,7 @@ from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.table import Request, Table, vector_columns
 
 _SAMPLE = 300  # lines from which the dialect and the header are detected
+_FOOTER = 20  # lines at the end that may be no rows
 _COMMENTS = ("#", "%", "//")
 _NO_VALUES = ["-", "--", "nan(ind)", "-nan(ind)"]  # beside those of pandas
 _MISSING = {"", "nan", "na", "n/a", "null", "none", *_NO_VALUES}
@@ -34,13 +35,8 @@ _NUMBERS = {
 _NUMBER = {mark: re.compile(text, re.ASCII | re.IGNORECASE) for mark, text in _NUMBERS.items()}
 _ITEM = rf"(?:{_NUMBERS['.']}|nan)"
 _BRACKETS = rf"[\[({{]\s*{_ITEM}(?:[\s,;]+{_ITEM})*[\s,;]*[\])}}]"
-_SERIAL = re.compile(r"^(?:\[(\d[^]\n]*)\]|(\d+:[\d:.]+) ->) ([^,;\s]*)([,;\t ])", re.MULTILINE)
-_LABEL = re.compile(r"(?<![^\s,;])([^\W\d]\w*):[ \t]*(?=[+-]?[.\d])")
-_LABELED = re.compile(rf'("[^"]*"[\t,; ])?(?:{_LABEL.pattern}[^\s,;]+[ \t,;]*)+')
 _BARE_BRACKETS = re.compile(rf"(?<![^\s,;]){_BRACKETS}", re.IGNORECASE)
-_VECTOR = re.compile(
-    rf"(?:array\()?{_BRACKETS}\)?|{_ITEM}(?:[\s;]+{_ITEM})+", re.ASCII | re.IGNORECASE
-)
+_VECTOR = re.compile(rf"(?:array\()?{_BRACKETS}\)?", re.ASCII | re.IGNORECASE)
 
 
 class _Dialect(NamedTuple):
@@ -56,16 +52,14 @@ class _Dialect(NamedTuple):
         row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
         return [cell.strip() for cell in row]
 
-    def weights(self, line: str) -> list[float | None]:
-        """Return 1 for a number, 1/2 for a bare vector, 0 for text, None for an empty cell."""
-        return [self._weight(cell) for cell in self.cells(line)]
-
-    def _weight(self, cell: str) -> float | None:
-        if cell.lower() in _MISSING:
-            return None
-        if _NUMBER[self.decimal].fullmatch(cell):
-            return 1.0
-        return (0.5 if cell[0] in "+-.0123456789" else 1.0) if _VECTOR.fullmatch(cell) else 0.0
+    def numeric(self, line: str) -> list[bool | None]:
+        """Tell for each cell of a line whether it is a number or a vector; None if it is empty."""
+        return [
+            None
+            if cell.lower() in _MISSING
+            else any(x.fullmatch(cell) for x in (_NUMBER[self.decimal], _VECTOR))
+            for cell in self.cells(line)
+        ]
 
 
 def read_text(path: Path, request: Request) -> Table:
@@ -79,39 +73,10 @@ def read_text(path: Path, request: Request) -> Table:
         LogError: if no line holds numbers, or rows are longer than the header.
     """
     content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    return parse_text(_decoded(content), path, request)
-
-
-def read_excel(path: Path, request: Request) -> Table:
-    """Read the first sheet of a spreadsheet as a text file."""
-    try:
-        sheet = pd.read_excel(path, header=None)
-    except ImportError as error:
-        raise LogError(f"{path}: save the sheet as CSV. {error}") from error
-    return parse_text(sheet.to_csv(header=False, index=False), path, request)
-
-
-def _decoded(content: bytes) -> str:
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff") or content[1:2] == b"\0":
-        return content.decode("utf-16")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("cp1252")
-
-
-def parse_text(text: str, path: Path, request: Request) -> Table:
-    """Return the table of a text, see :func:`read_text`."""
-    text = text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+    text = _decoded(content).replace("\r\n", "\n").replace("\r", "\n")
     if _BARE_BRACKETS.search(text, 0, 10_000):
         text = _BARE_BRACKETS.sub(r'"\g<0>"', text)
-    if _SERIAL.search(text, 0, 10_000):  # stamps of a terminal
-        text = _SERIAL.sub(r'"\1\2"\4\3\4', text)
     lines = text.split("\n", _SAMPLE)[:_SAMPLE]
-    if labels := _LABELED.fullmatch(lines[len(lines) // 2]):  # serial plotter of Arduino
-        names = ([""] if labels[1] else []) + _LABEL.findall(labels[0])
-        text = ",".join(names) + "\n" + _LABEL.sub("", text)
-        lines = text.split("\n", _SAMPLE)[:_SAMPLE]
     dialect = _dialect(lines, request.sep)
     if dialect is None:
         line = next(filter(None, map(str.strip, reversed(lines))), "")[:80]
@@ -125,7 +90,7 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
         )
     # The lines above are empty, as quotes in them may be unbalanced.
     body = "\n" * start + text[sum(len(line) + 1 for line in lines[:start]) :]
-    body, notes = _repaired(body, lines[:start], dialect)
+    body, notes = _repaired(body, lines[header] if header >= 0 else None, dialect)
     with warnings.catch_warnings():
         # pandas would cut rows that are longer than the header, and only warn.
         warnings.simplefilter("error", pd.errors.ParserWarning)
@@ -142,17 +107,20 @@ def parse_text(text: str, path: Path, request: Request) -> Table:
             low_memory=False,
             index_col=False,
         )
-    frame.index = pd.RangeIndex(len(frame)) + (start if labels else start + 1)
-    bare = [re.sub(r"\s*[\[(][^\])]*[\])]$", "", name) for name in names]
-    short = [
-        x if x in {*request.columns} - {*names} and bare.count(x) == 1 else name
-        for x, name in zip(bare, names, strict=True)
-    ]
-    frame = _with_vectors(frame.dropna(how="all"), short)
+    frame.index = pd.RangeIndex(start + 1, len(frame) + start + 1)
+    frame = _with_vectors(frame.dropna(how="all"), names)
     units = _units(lines[header + 1 : start], dialect, names)
-    units |= {x: units[name] for x, name in zip(short, names, strict=True) if name in units}
     hint = "" if header >= 0 else ": it has no header, so its columns are numbered from 0."
     return Table(frame, str(path), "line", notes, units, hint)
+
+
+def _decoded(content: bytes) -> str:
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff") or content[1:2] == b"\0":
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252")
 
 
 def _dialect(lines: Sequence[str], separator: str | None) -> _Dialect | None:
@@ -162,11 +130,10 @@ def _dialect(lines: Sequence[str], separator: str | None) -> _Dialect | None:
         for mark in [separator] if separator else ",;\t| ":
             dialect = _Dialect(mark, decimal, 0)
             for line in lines[-100:] if mark != decimal else ():
-                weights = dialect.weights(line)
-                filled = [weight for weight in weights if weight is not None]
+                filled = [cell for cell in dialect.numeric(line) if cell is not None]
                 if any(filled):
-                    score = sum(filled) ** 2 / len(filled)
-                    scores[dialect._replace(width=len(weights))] += score  # type: ignore[assignment]
+                    width = len(dialect.cells(line))
+                    scores[dialect._replace(width=width)] += sum(filled) ** 2 / len(filled)  # type: ignore[assignment]
     if not scores:
         return None
     best = max(scores, key=lambda dialect: scores[dialect])
@@ -179,32 +146,23 @@ def _header(
     lines: Sequence[str], dialect: _Dialect, requested: Collection[str]
 ) -> tuple[list[str], int, int]:
     """Return the names of the columns, the line of the header or -1, and the first row."""
-    rows = [dialect.weights(line)[: dialect.width] for line in lines]
-    columns = list(zip(*(row for row in rows if len(row) == dialect.width), strict=True))
-    numeric = [k for k, cells in enumerate(columns) if _texts(cells) < len(cells) / 2]
+    rows = [dialect.numeric(line)[: dialect.width] for line in lines]
+    full = [row for row in rows if len(row) == dialect.width]
+    columns = [k for k, x in enumerate(zip(*full, strict=True)) if 2 * x.count(False) < len(x)]
 
     def is_row(k: int) -> bool:
-        cells = [rows[k][n] for n in numeric if n < len(rows[k])]
-        if len(cells) < len(numeric) or not any(cells) or _texts(cells):
+        cells = [rows[k][n] for n in columns if n < len(rows[k])]
+        if len(cells) < len(columns) or not any(cells) or False in cells:
             return False
         matches = {*dialect.cells(lines[k])} & {*requested}  # names of columns may be numbers
         return len(matches) < 2 or all(name.isdigit() for name in matches)
 
-    def is_text(k: int) -> bool:
-        units = [known_unit(cell) for cell in dialect.cells(lines[k]) if cell]
-        numbers = [weight for weight in rows[k] if weight]
-        texts = _texts([rows[k][n] for n in numeric if n < len(rows[k])])
-        is_units = None not in units and len(numbers) < len(units)
-        return not numbers or is_units or texts >= max(2, len(numeric) / 2) or _comment(lines[k])
-
     first = next((k for k in range(len(rows)) if is_row(k)), len(rows))
-    best = (len({str(k) for k in range(dialect.width)} & {*requested}), False, False, False, -1)
     names = [str(k) for k in range(dialect.width)]
+    best = (len({*names} & {*requested}), False, False, False, -1)
     for k, line in enumerate(lines[:first]):
         bare = [line.lstrip(" \t#%/")] if _comment(line) else []
         for candidate in [names for text in (line, *bare) for names in _names(text, dialect)]:
-            if len(set(candidate)) < len(candidate) and k:
-                candidate = _grouped(dialect.cells(lines[k - 1]), candidate)
             matches = len({*candidate} & {*requested})
             exact = len(candidate) == dialect.width
             is_units = not any(known_unit(cell) is None for cell in candidate if cell)
@@ -212,19 +170,10 @@ def _header(
             if (exact or matches) and score > best:
                 best, names = score, candidate
     header = best[-1]
-    for line in lines[:first]:  # names of the index, which pandas writes in a line of their own
-        for k, cell in enumerate(dialect.cells(line)[: len(names)]):
-            if not names[k] and cell in {*requested} - {*names}:
-                names[k] = cell
     names[0] = names[0] or "index"
     if header < 0 and dialect.cells("".join(lines[first : first + 1])) == names:
-        header = first  # pandas numbers columns without names
-    start = next((k for k in range(header + 1, len(rows)) if not is_text(k)), len(rows))
-    return names, header, first if header < 0 else start
-
-
-def _texts(weights: Collection[float | None]) -> int:
-    return sum(weight == 0 for weight in weights)
+        header, first = first, first + 1  # pandas numbers columns without names
+    return names, header, first
 
 
 def _comment(line: str) -> bool:
@@ -239,18 +188,7 @@ def _names(line: str, dialect: _Dialect) -> list[list[str]]:
     for names in splits:
         while names and not names[-1]:
             names.pop()
-    if dialect.separator == " " and len(splits[-1]) == dialect.width - 1:
-        splits[-1].insert(0, "")  # R leaves the names of the rows without a header
     return splits
-
-
-def _grouped(groups: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return repeated names behind the names of their groups in the line above."""
-    result, group = [], ""
-    for k, name in enumerate(names):
-        group = groups[k] if k < len(groups) and groups[k] else group
-        result.append(f"{group} {name}".strip() if list(names).count(name) > 1 else name)
-    return result
 
 
 def _units(lines: Sequence[str], dialect: _Dialect, names: Sequence[str]) -> dict[str, str]:
@@ -261,28 +199,21 @@ def _units(lines: Sequence[str], dialect: _Dialect, names: Sequence[str]) -> dic
     return units
 
 
-def _repaired(body: str, above: Sequence[str], dialect: _Dialect) -> tuple[str, list[str]]:
+def _repaired(body: str, header: str | None, dialect: _Dialect) -> tuple[str, list[str]]:
     """Return the rows without comments, repeated headers and a last line cut short, with notes."""
     notes = []
     if any(mark in body for mark in _COMMENTS):
         body = re.sub(rf"(?m)^[ \t]*(?:{'|'.join(_COMMENTS)}).*$", "", body)
-    repeats = 0
-    for line in filter(str.strip, dict.fromkeys(above)):
-        if repeat := body.count(f"\n{line}\n"):
-            repeats += repeat
-            body = body.replace(f"\n{line}\n", "\n\n")
-    if repeats:
+    if header and (repeats := body.count(f"\n{header}\n")):
         notes.append(f"{repeats} lines that repeat the header are dropped: a restarted recorder?")
+        body = body.replace(f"\n{header}\n", "\n\n")
     body = body.rstrip("\n\0 ")
-    end = body[-100_000:].split("\n")
-    cut = len(end)
-    while cut > 1 and len(weights := dialect.weights(end[cut - 1])) < dialect.width:
-        if cut < len(end) and any(weights):
-            break
-        cut -= 1
-    if end[cut:]:
-        body = body[: len(body) - len("\n".join(end[cut:]))]
-        notes.append(f"line {body.count(chr(10)) + 1} is dropped, it is cut short: {end[cut][:80]}")
+    end = body.rsplit("\n", _FOOTER)
+    widths = [len(dialect.cells(line)) for line in end[:0:-1]]
+    if short := next((k for k, width in enumerate(widths) if width >= dialect.width), 0):
+        body = "\n".join(end[:-short])
+        text = f"{short} lines from line {body.count(chr(10)) + 2} on are dropped, they are"
+        notes.append(f"{text} shorter than the rows, as is {end[-1][:80]!r}")
     return body, notes
 
 
