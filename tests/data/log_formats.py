@@ -55,7 +55,7 @@ def commands(row, store):
     return store.types["std_msgs/msg/Float64MultiArray"](layout=layout, data=data)
 
 
-def write_bag(path, table, *, version=2, mcap=True, late=0.0, empty_every=None):
+def write_bag(path, table, *, version=2, mcap=True, late=0.0, empty_every=None, twice=False):
     """Joint states, and commands ``late`` s after each of them as received."""
     store = STORE if version == 2 else STORE1
     if version == 2:
@@ -79,6 +79,8 @@ def write_bag(path, table, *, version=2, mcap=True, late=0.0, empty_every=None):
             messages.append((stamp, states, message))
             if empty_every and k % empty_every == 0:
                 messages.append((stamp, states, joint_state(row, k, store, empty=True)))
+            if twice:
+                messages.append((stamp, inputs, commands({**row, "u1": 99.0}, store)))
             messages.append((stamp + round(1e9 * late), inputs, commands(row, store)))
         for stamp, connection, message in sorted(messages, key=lambda m: m[0]):
             writer.write(connection, stamp, serialize(message, connection.msgtype))

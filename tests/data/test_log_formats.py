@@ -62,7 +62,7 @@ def test_bags_map_joints_by_name_whatever_their_order(tmp_path, expected, files,
     formats.write_bag(tmp_path / ("run.bag" if "version" in options else "run"), TABLE, **options)
     log = source(tmp_path, files=files, **formats.BAG)
     assert_same(trajectories(log), expected)
-    assert ("lack an entry" in log.report) == ("empty_every" in options)
+    assert ("of gripper are dropped" in log.report) == ("empty_every" in options)
     assert log.names()["train"]
 
 
@@ -79,7 +79,7 @@ def test_a_bag_is_decoded_once_until_it_changes(tmp_path, monkeypatch):
     pd.testing.assert_frame_equal(again.frame, table.frame)
     shutil.rmtree(tmp_path / "run")
     formats.write_bag(tmp_path / "run", TABLE[:300])
-    assert len(read_bag(tmp_path / "run", QUERY)) == 300
+    assert len(read_bag(tmp_path / "run", QUERY)) == 2 * 300
 
 
 def test_an_entry_of_nested_messages(tmp_path):
@@ -112,9 +112,26 @@ def test_inputs_on_another_clock_are_the_last_that_are_not_too_old(tmp_path):
     # The command of a row is received 4 ms after it: the next row is the first that has it.
     np.testing.assert_allclose(first.u[:50], TABLE[["u1", "u2"]].to_numpy()[:50], atol=1e-9)
     np.testing.assert_allclose(first.q[:50], TABLE[["q1", "q2"]].to_numpy()[1:51], atol=1e-9)
-    assert "1 of 601 messages of /joint_states are dropped" in log.report
-    with pytest.raises(LogError, match="no row is left"):
-        source(tmp_path, files="run", max_age=0.005, **formats.BAG).load()
+    assert "1 of 601 rows lack a value and are dropped" in log.report
+
+
+@pytest.mark.parametrize("clock", ["t", "header/stamp"])
+def test_the_last_of_several_commands_at_a_time_counts(tmp_path, expected, clock):
+    formats.write_bag(tmp_path / "run", TABLE, twice=True)
+    time = dict(columns=f"/joint_states/{clock}", unit="s")
+    log = source(tmp_path, files="run", **formats.BAG | {"time": time})
+    assert_same(trajectories(log), expected)
+    assert not log.warnings
+
+
+def test_velocities_of_another_topic_are_interpolated(tmp_path):
+    formats.write_bag(tmp_path / "run", TABLE, late=0.004)
+    u = dict(columns=formats.BAG["q"]["columns"], unit="Nm")
+    q = dict(columns=formats.BAG["u"]["columns"], unit="rad")
+    description = formats.BAG | {"time": dict(columns="/commands/t", unit="s"), "q": q, "u": u}
+    run = source(tmp_path, files="run", **description).cleaned[0].raw
+    np.testing.assert_allclose(run.q, TABLE[["u1", "u2"]].to_numpy()[: len(run)], atol=1e-9)
+    np.testing.assert_allclose(run.v[:, 0], np.interp(run.t, TABLE["t"], TABLE["v1"]), atol=1e-9)
 
 
 def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path, expected):

@@ -1,18 +1,16 @@
 """Bags of ROS 1 and ROS 2 and MCAP files as tables, without ROS.
 
 A column is ``<topic>/<field>``, as ``/joint_states/position/panda_joint1`` or ``/commands/data/2``.
-``<topic>/t`` is the time of a message, s: that of its header, or when the bag received it. The
-topic of the time column has the rows. Of other topics a row takes the last message before it that
-is not older than ``max_age``; rows without such a message are dropped.
+``<topic>/t`` is the time of a message, s: that of its header, or when the bag received it. A row is
+a message of one topic, with empty cells for the columns of other topics.
 """
 
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,39 +23,36 @@ from pinn_dyn.data.logs.table import Request, Table
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")
 _LATEST = 1.0  # s; a message that is later than this begins a new run
-
-
-class _Topic(NamedTuple):
-    """Values by the times of the messages, masks of missing entries, and who published them."""
-
-    frame: pd.DataFrame
-    missing: np.ndarray
-    publishers: pd.Series
+_RECEIVED = ""  # column of the times of receipt
 
 
 def read_bag(path: Path, request: Request) -> Table:
-    """Read columns of a bag, one row per message of the topic of the time."""
+    """Read columns of a bag, one row per message."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
-    description = [4, str(path.absolute()), stats, fields, request.max_age]
+    description = [5, str(path.absolute()), stats, fields, request.max_age]
 
     def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
-        topics = _decode(path, fields, request.max_age, notes)
-        frame = _merge(path, topics, fields[0], request.max_age, notes)[fields]
-        return {"rows": frame.index, "values": frame, "notes": np.array(notes, dtype=str)}
+        frame = _merged(_decode(path, fields, request.max_age, notes))
+        clock = frame[fields[0]]
+        exact = clock.isna() | (clock == frame.index)
+        # A message of another topic has the time of the next row of the clock.
+        frame[fields[0]] = frame.index if exact.all() else clock.bfill()
+        frame = frame.dropna(subset=fields[:1])[fields]
+        return {"values": frame.to_numpy(), "notes": np.array(notes, dtype=str)}
 
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser()
     arrays = load_or_make(folder, "bag", description, decode)
-    frame = pd.DataFrame(arrays["values"], arrays["rows"], fields)
-    return Table(frame, str(path), "message", arrays["notes"].tolist())
+    frame = pd.DataFrame(arrays["values"], columns=fields)
+    return Table(frame.set_axis(frame.index + 1), str(path), "message", arrays["notes"].tolist())
 
 
 def _decode(
     path: Path, columns: Sequence[str], max_age: float, notes: list[str]
-) -> dict[str, _Topic]:
-    """Return the values by topic; at times of receipt if these alone are of the same clock."""
+) -> list[pd.DataFrame]:
+    """Return the values of each topic, at times of receipt if the stamps are of several clocks."""
     with open_bag(path) as bag:
         kinds = listed(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
         fields = _fields_of_topics(path, sorted(bag.topics, key=len, reverse=True), columns, kinds)
@@ -67,68 +62,79 @@ def _decode(
             values = [_number(message, field, location) for field in fields[topic].values()]
             names = getattr(message, "name", ())
             joints = tuple(map(str, names)) if hasattr(names, "__len__") else ()
-            rows[topic].append((_stamp(message), 1e-9 * received, (publisher, joints), *values))
+            rows[topic].append((_stamp(message), 1e-9 * received, publisher, joints, *values))
         notes += bag.notes
-    content = {topic: np.array(x, dtype=object) for topic, x in rows.items()}
-    if empty := [topic for topic, x in content.items() if not len(x)]:
+    if empty := [topic for topic, x in rows.items() if not x]:
         raise LogError(f"{path}: {listed(empty)} has no message, choose another of {kinds}")
     delays = {}
-    for topic, (stamps, times) in {x: y[:, :2].astype(float).T for x, y in content.items()}.items():
-        if (stamps > 0).any():
-            delays[topic] = float(np.median((times - stamps)[stamps > 0]))
-    far = [topic for topic, delay in delays.items() if abs(delay) > max_age]
-    if far and len(delays) < len(content):
-        notes.append(f"stamps of {listed(far)} are off by {delays[far[0]]:.4g} s: times of receipt")
-        for topic in delays:
-            content[topic][:, 0] = None
-    return {
-        topic: _topic(path, topic, list(names), content[topic], kinds, notes)
-        for topic, names in fields.items()
-    }
+    for topic, content in rows.items():
+        stamps, times = np.array([row[:2] for row in content], dtype=float).T
+        delays[topic] = float(np.median((times - stamps)[stamps > 0])) if (stamps > 0).any() else 0
+    far = max(delays, key=lambda topic: abs(delays[topic]))
+    if receipt := max(delays.values()) - min(delays.values()) > max_age:
+        notes.append(f"stamps of {far} are off by {delays[far]:.4g} s: times of receipt")
+    tables = {topic: np.array(x, dtype=object) for topic, x in rows.items()}
+    for table in tables.values() if receipt else ():
+        table[:, 0] = None
+    return [_topic(path, x, list(fields[x]), table, kinds, notes) for x, table in tables.items()]
 
 
 def _topic(
     path: Path, topic: str, columns: list[str], rows: np.ndarray, kinds: str, notes: list[str]
-) -> _Topic:
-    """Return the values of a topic in the order of the times of its messages."""
-    stamps, times = rows[:, :2].astype(float).T
-    if (stamps > 0).any():
-        # In a simulation 0 is the first time.
-        zero = (stamps == 0) & (stamps[stamps > 0].min() > _LATEST)
-        if zero.any():
-            text = f"{zero.sum()} of {len(rows)} messages of {topic} with stamp 0 are dropped"
-            notes.append(text)
-        rows, times = rows[~zero], np.where(np.isnan(stamps), times, stamps)[~zero]
-    elif (stamps == 0).any():
+) -> pd.DataFrame:
+    """Return the values of a topic by the times of its messages, with their times of receipt."""
+    stamps, received = rows[:, :2].astype(float).T
+    # In a simulation 0 is the first time.
+    zero = (stamps == 0) & (stamps[stamps > 0].min(initial=np.inf) > _LATEST)
+    if zero.all():
         notes.append(f"the stamps of {topic} are 0: its times are those of receipt")
-    delay = np.maximum.accumulate(times) - times
-    if 0 < delay.max() < _LATEST:
-        notes.append(f"{(delay > 0).sum()} messages of {topic} came late: sorted by their times")
-        order = times.argsort(kind="stable")
-        rows, times = rows[order], times[order]
-    content = rows[:, 3:]
-    if f"{topic}/t" in columns and content[0, columns.index(f"{topic}/t")] is None:
+        stamps, zero = np.full(len(rows), np.nan), ~zero
+    times = np.where(np.isnan(stamps), received, stamps)
+    publishers, joints, content = rows[:, 2].astype(int), rows[:, 3], rows[:, 4:]
+    signals = [k for k, column in enumerate(columns) if column != f"{topic}/t"]
+    if len(signals) < len(columns) and content[0, columns.index(f"{topic}/t")] is None:
         content[:, columns.index(f"{topic}/t")] = times
     missing = np.array(content == None)  # noqa: E711
-    complete = rows[~missing.any(axis=1), 2]
+    foreign = missing[:, signals].all(axis=1) & (len(signals) > 0)
     values = content.astype(float)
-    for column, absent, numbers in zip(columns, missing.T, values.T, strict=True):
-        if absent.all():
-            joints = sorted({name for _, names in rows[:, 2] for name in names})
-            short = column.rpartition("/")[2] in joints or not joints
-            reason = "its array is shorter" if short else f"the messages name {listed(joints)}"
+    for k, column in enumerate(columns):
+        field = column.rpartition("/")[2]
+        names = (
+            [{*x} for x in joints]
+            if not field.isdigit()
+            else [{*x[int(field) : int(field) + 1]} for x in joints[~foreign]]
+        )
+        joined = sorted(set().union(*names))
+        if missing[:, k].all():
+            short = field in joined or not joined
+            reason = "its array is shorter" if short else f"the messages name {listed(joined)}"
             raise LogError(f"{path}: no message has a value of {column!r}: {reason}")
-        if np.isnan(numbers).all():
+        if np.isnan(values[:, k]).all():
             raise LogError(
                 f"{path}: {column!r} is NaN in all {len(rows)} messages: the driver does not "
                 f"measure it. Choose another signal, such as commands; the bag has {kinds}"
             )
-        k = column.rpartition("/")[2]
-        if k.isdigit() and len(mixed := {x[int(k)] for _, x in complete if int(k) < len(x)}) > 1:
-            turns = f"is of {listed(sorted(mixed))} by turns"
-            raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(k)]}{min(mixed)}")
-    frame = pd.DataFrame(values, columns=columns, index=times)
-    return _Topic(frame, np.any(missing, axis=1), pd.Series(rows[:, 2]))
+        if field.isdigit() and len(joined) > 1:
+            turns = f"is of {listed(joined)} by turns"
+            raise LogError(f"{path}: {column!r} {turns}: write {column[: -len(field)]}{joined[0]}")
+    usual = pd.Series(publishers[~foreign]).mode()[0]
+    for reason, mask in (
+        ("with stamp 0", zero),
+        (f"of {listed(sorted(set().union(*joints[foreign])))}", foreign),
+        ("of another publisher", ~foreign & (publishers != usual)),
+    ):
+        if mask.any():
+            notes.append(f"{mask.sum()} of {len(rows)} messages of {topic} {reason} are dropped")
+    stays = ~zero & ~foreign & (publishers == usual)
+    frame = pd.DataFrame(values, times, columns).assign(**{_RECEIVED: received})
+    return frame[stays]
+
+
+def _merged(topics: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of all topics, in each run in the order of their times."""
+    frame = pd.concat(topics).sort_values(_RECEIVED, kind="stable")
+    run = np.cumsum(np.diff(frame.index, prepend=frame.index[0]) < -_LATEST)
+    return frame.iloc[np.lexsort((frame.index, run))]
 
 
 def _fields_of_topics(
@@ -207,36 +213,3 @@ def _paths(node: Any, parents: Sequence[Any] = ()) -> list[str]:
     else:
         parts = {x: getattr(node, x) for x in dir(node) if x[0] != "_" and x != "DESCRIPTOR"}
     return [f"/{x}{y}" for x, part in parts.items() for y in _paths(part, [node, *parents])]
-
-
-def _merge(
-    path: Path, topics: dict[str, _Topic], first: str, max_age: float, notes: list[str]
-) -> pd.DataFrame:
-    """Return the rows of the topic of the first column, with the last values of other topics."""
-    clock = next(name for name, topic in topics.items() if first in topic.frame)
-    frame, missing, publishers = topics.pop(clock)
-    times, nodes = frame.index, publishers.str[0]
-    joints = {name for _, names in publishers[missing] for name in names}
-    joints -= {name for _, names in publishers[~missing] for name in names}
-    lack = f"lack an entry, being of {listed(sorted(joints))}," if joints else "lack an entry"
-    frame.index = pd.RangeIndex(1, len(frame) + 1)
-    faults = {
-        lack: missing,
-        "are of another publisher": ~nodes.isin(nodes[~missing].mode()[:1]),
-        "are NaN": frame.isna().any(axis=1),
-    }
-    for topic in topics.values():
-        messages = topic.frame.dropna().sort_index(kind="stable")
-        messages = messages[~messages.index.duplicated(keep="last")]
-        latest = messages.reindex(times, method="ffill", tolerance=max_age)
-        frame[messages.columns] = latest.to_numpy()
-    age = f"have no message of {listed(topics)} in the {max_age:g} s before them"
-    faults[age] = frame.isna().any(axis=1)
-    reasons = np.select([*faults.values()], [*faults], "")
-    if dropped := Counter(reasons[reasons != ""].tolist()):
-        text = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
-        text = f"{dropped.total()} of {len(frame)} messages of {clock} are dropped: {text}"
-        if dropped.total() == len(frame):
-            raise LogError(f"{path}: no row is left: {text}")
-        notes.append(text)
-    return frame[reasons == ""]

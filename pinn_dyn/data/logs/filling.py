@@ -50,7 +50,7 @@ def fill(
     clock = ~np.isnan(recording.q[:, 0])
     if len(times := t[clock]) > 1:  # rows between samples of q are of other signals
         age, _ = _filled(t, times, times, np.ones(len(t), dtype=bool), hold=False)
-        clock |= age > _LOST * np.median(np.diff(times))
+        clock |= np.isfinite(age) & (age > _LOST * np.median(np.diff(times)))
     stays = clock.copy()
     for signal, columns in signals.items():
         filled: dict[str, np.ndarray] = {}
