@@ -6,6 +6,8 @@ import h5py
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.io
+import torch
 
 from pinn_dyn.data.logs import LogError
 from tests.data import log_formats as formats
@@ -79,6 +81,52 @@ def test_hdf5_of_compound_data_and_images(tmp_path):
         file["log"] = rows
         file.create_dataset("images", (len(TABLE), 9999, 9999, 3), "u1")  # 180 GB: not loaded
     assert_motion(source(tmp_path, **HDF5))
+
+
+def stacked(runs):
+    return {name: np.stack([run[name] for run in runs]) for name in runs[0]}
+
+
+def numbered(runs):
+    return {f"{name}_{k}": x for k, run in enumerate(runs) for name, x in run.items()}
+
+
+def shared_clock(runs):
+    return stacked(runs) | {"t": runs[0]["t"]}
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5", "mat", "pt"])
+@pytest.mark.parametrize("form", [stacked, shared_clock, numbered])
+def test_arrays_of_several_runs(tmp_path, kind, form):
+    tables = [motion(6.0, phase=k) for k in range(3)]
+    runs = [
+        {"t": x["t"].to_numpy()}
+        | {name: x[[f"{name}1", f"{name}2"]].to_numpy()[: 601 - (name == "u")] for name in "qvu"}
+        for x in tables
+    ]
+    arrays = form(runs) | {"M": np.eye(3)}
+    path = tmp_path / f"run.{kind}"
+    if kind == "npz":
+        np.savez(path, **arrays)
+    elif kind == "mat":
+        scipy.io.savemat(path, arrays)
+    elif kind == "pt":
+        torch.save({name: torch.tensor(x) for name, x in arrays.items()}, path)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, x in arrays.items():
+                file[name] = x
+    columns = {
+        name: dict(columns=[f"{name}_1", f"{name}_2"], unit=unit)
+        for name, unit in (("q", "rad"), ("v", "rad/s"), ("u", "Nm"))
+    }
+    log = source(tmp_path, files=path.name, **columns)
+    recordings = {part.raw.run: part.raw for part in log.cleaned if part.split == "train"}
+    for k, table in enumerate(tables):
+        run = recordings[f"{k}"]
+        for name in "qvu":
+            expected = table[[f"{name}1", f"{name}2"]].to_numpy()[: len(run)]
+            np.testing.assert_allclose(getattr(run, name), expected)
 
 
 def test_the_rate_in_an_hdf5_file_without_clock_is_named(tmp_path):

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import yaml
 from hydra.utils import instantiate
+from scipy.ndimage import gaussian_filter1d
 
 from pinn_dyn.data import logs
 from pinn_dyn.data.logs import LogError, LogSource
@@ -99,13 +100,9 @@ def append(step):
 
 
 def runs(text):
-    """Put a copy and its original, ``c, in test, is a copy of b``, into one split."""
-    both = re.findall(r"(\w), in", text)
+    """Put a copy and its original, ``c repeat one of b``, into one split."""
+    both = text.split(" repeat one of ")
     return {part: {"runs": x, "piece": 0.5} for part, x in (("test", both), ("validation", ["d"]))}
-
-
-def apart(files):
-    return {name: table().iloc[100 * k :] for k, name in enumerate(files)}
 
 
 def parts(names):
@@ -115,7 +112,9 @@ def parts(names):
 ALTERNATING = table()
 ALTERNATING.loc[1::2, "q"] -= 2 * ALTERNATING.loc[1::2, "q"]
 SLOW = {"a": table(), "b": table(), "c": table()[::2].reset_index(drop=True)}
-COPIED = apart("abcd") | {"c": apart("abcd")["b"]}
+NOISE = gaussian_filter1d(np.random.default_rng(0).normal(size=(4, 1200)), 8)
+RANDOM = {name: table().assign(q=q) for name, q in zip("abcd", NOISE, strict=True)}
+COPIED = RANDOM | {"c": RANDOM["b"]}
 SPLIT = {part: {"runs": [run], "piece": 0.5} for part, run in (("test", "c"), ("validation", "b"))}
 LONG = table().rename(columns={"q": "x", "u": "y"}).assign(joint="arm")
 LONG = pd.concat([LONG, LONG.iloc[[50]]], ignore_index=True)
@@ -137,7 +136,7 @@ ADVICE = {
         SLOW, {}, r"add a (\w+) step", lambda name: (SLOW, {"steps": {name: STEPS[name]}}),
     ),
     "copied run": (
-        COPIED, SPLIT, r"(\w, in test, .* in validation), .* put both into one split",
+        COPIED, SPLIT, r"motions of (\w repeat one of \w), .* keep such runs in one split",
         lambda text: (COPIED, runs(text)),
     ),
     "pieces too long": (

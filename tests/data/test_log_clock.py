@@ -36,7 +36,6 @@ CLOCKS = {
     "time of day": ({"t": texts("%H:%M:%S.%f")}, {}),
     "time of day with a colon": ({"t": texts("%H:%M:%S:%f")}, {}),
     "midnight": ({"t": (STAMPS + pd.Timedelta("10:46:31")).dt.strftime("%H:%M:%S.%f")}, {}),
-    "minutes": ({"t": texts("%M:%S.%f")}, {}),
     "AM and PM": ({"t": STAMPS.dt.strftime("%m/%d/%Y %I:%M:%S.%f %p")}, {}),
     "date and time": (
         {"day": STAMPS.dt.strftime("%Y-%m-%d"), "time": texts("%H:%M:%S.%f")},

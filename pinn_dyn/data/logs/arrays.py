@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,8 @@ def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
             if not any("MATLAB_class" in item.attrs for item in file.values()):
                 return read_hdf5(path, request)
     runs = elements(matlab_variables(path), request.time, request.columns)
+    if len(runs) == 1:
+        return _tables(path, request, runs.popitem()[1])
     return {run: table_of_arrays(path, request, variables) for run, variables in runs.items()}
 
 
@@ -45,38 +47,28 @@ def read_hdf5(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """
     h5py = optional("h5py", path)
     with h5py.File(path, "r") as file:
-        names = _data_sets(path, h5py, file, request.columns)
-        variables = {name: file[name] for name in names}
-        groups = {name.rpartition("/")[0] for name in names}
-        for name in sorted({"/", *groups, *names}):
+        variables = _data_sets(path, h5py, file, request.columns)
+        groups = {name.rpartition("/")[0] for name in variables}
+        for name in sorted({"/", *groups, *variables}):
             values = file[name or "/"].attrs.items()
             variables |= {f"{name.strip('/')}@{key}": np.asarray(x) for key, x in values}
-        runs = _runs(variables, request.columns)
-        return {run: table_of_arrays(path, request, values) for run, values in runs.items()}
+        return _tables(path, request, variables)
 
 
-def _runs(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the variables of each run, the text that stands for the ``*`` of the columns."""
-    before = next((x.split("*")[0] for x in columns if "*" in x), None)
-    if before is None:
-        return {"": dict(variables)}
-    runs: dict[str, dict[str, Any]] = {}
-    for name, value in variables.items():
-        run, _, field = name.removeprefix(before).partition("/")
-        if name.startswith(before) and field:
-            runs.setdefault(run, {})[f"{before}*/{field}"] = value
-    return dict(sorted(runs.items(), key=lambda x: [len(x[0]), x[0]]))
+def _data_sets(path: Path, h5py: Any, file: Any, columns: Collection[str]) -> dict[str, Any]:
+    """Return the plain data sets; refuse columns whose values lie in other files."""
+    plain: dict[str, Any] = {}
+    outside: list[str] = []
 
+    def visit(name: str, link: Any) -> None:
+        item: Any = file[name] if isinstance(link, h5py.HardLink) else link
+        is_set = isinstance(item, h5py.Dataset)
+        if isinstance(item, h5py.ExternalLink) or (is_set and (item.external or item.is_virtual)):
+            outside.append(name)
+        elif is_set:
+            plain[name] = item
 
-def _data_sets(path: Path, h5py: Any, file: Any, columns: Collection[str]) -> list[str]:
-    """Return the names of plain data sets; refuse columns whose values lie in other files."""
-    links: dict[str, Any] = {}
-    file.visititems_links(links.__setitem__)
-    items = {x: file[x] for x, link in links.items() if isinstance(link, h5py.HardLink)}
-    sets = {x: item for x, item in items.items() if isinstance(item, h5py.Dataset)}
-    plain = [x for x, item in sets.items() if not item.external and not item.is_virtual]
-    outside = {x for x, link in links.items() if isinstance(link, h5py.ExternalLink)}
-    outside |= sets.keys() - {*plain}
+    file.visititems_links(visit)
     if refused := [x for x in outside if any(y.startswith(x) for y in columns)]:
         raise LogError(
             f"{path}: {listed(refused)}: values of other files or virtual data sets are not read, "
@@ -85,15 +77,15 @@ def _data_sets(path: Path, h5py: Any, file: Any, columns: Collection[str]) -> li
     return plain
 
 
-def read_npz(path: Path, request: Request) -> pd.DataFrame:
+def read_npz(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """Read an NPZ file. One with Python objects is refused, never unpickled."""
     with np.load(path, allow_pickle=False) as file:
-        return table_of_arrays(path, request, file)
+        return _tables(path, request, dict(file))
 
 
-def read_npy(path: Path, request: Request) -> pd.DataFrame:
+def read_npy(path: Path, request: Request) -> dict[str, pd.DataFrame]:
     """Read a matrix with the columns ``0``, ``1`` and so on, or a structured array by its names."""
-    return _table(path, request, np.load(path, allow_pickle=False))
+    return _of_python(path, request, np.load(path, allow_pickle=False))
 
 
 def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
@@ -108,16 +100,18 @@ def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
             f"{path}: holds Python objects, which are not loaded: save plain tensors, as in "
             "torch.save({'t': t, 'q': q, 'u': u}, path)"
         ) from error
-    runs = dict(enumerate(content)) if isinstance(content, list) else {"": content}
-    return {str(run): _table(path, request, values) for run, values in runs.items()}
+    if not isinstance(content, list):
+        return _of_python(path, request, content)
+    tables = [_of_python(path, request, values) for values in content]
+    return {f"{k}{run}": x for k, runs in enumerate(tables) for run, x in runs.items()}
 
 
-def _table(path: Path, request: Request, content: Any) -> pd.DataFrame:
+def _of_python(path: Path, request: Request, content: Any) -> dict[str, pd.DataFrame]:
     variables = dict(_nested("", content))
     if "" in variables and not variables[""].dtype.names:
         columns = np.atleast_2d(variables[""]).T
         variables = {str(k): column for k, column in enumerate(columns)}
-    return table_of_arrays(path, request, variables)
+    return _tables(path, request, variables)
 
 
 def _nested(name: str, content: Any) -> Iterator[tuple[str, Any]]:
@@ -128,6 +122,43 @@ def _nested(name: str, content: Any) -> Iterator[tuple[str, Any]]:
     else:
         is_tensor = isinstance(content, torch.Tensor)
         yield name, content.numpy(force=True) if is_tensor else np.asarray(content)
+
+
+def _tables(path: Path, request: Request, variables: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
+    runs = _runs(variables, request)
+    return {run: table_of_arrays(path, request, values) for run, values in runs.items()}
+
+
+def _runs(variables: Mapping[str, Any], request: Request) -> dict[str, dict[str, Any]]:
+    """Return the variables of each run.
+
+    A run is a text that stands for the ``*`` of the columns, a number k of arrays ``t_k``, ``q_k``,
+    or an entry of the first axis of arrays ``(runs, T, N)``.
+    """
+    runs: dict[str, dict[str, Any]] = {}
+    if before := [x.split("*")[0] for x in request.columns if "*" in x]:
+        for name, value in variables.items():
+            run, _, field = name.removeprefix(before[0]).partition("/")
+            if name.startswith(before[0]) and field:
+                runs.setdefault(run, {})[f"{before[0]}*/{field}"] = value
+        return dict(sorted(runs.items(), key=lambda x: [len(x[0]), x[0]]))
+    first = re.compile(rf"{re.escape(request.time)}_(\d+)")
+    numbers = [match[1] for match in map(first.fullmatch, variables) if match]
+    if request.time not in variables and numbers:
+        ends = {run: f"_{run}" for run in numbers}
+        return {
+            run: {x.removesuffix(end): y for x, y in variables.items() if x.endswith(end)}
+            for run, end in ends.items()
+        }
+    bases = {y for x in request.columns for y in (x, x.rpartition("_")[0]) if y in variables}
+    shapes = [variables[base].shape for base in bases]
+    stacks = {shape[:2] for shape in shapes if len(shape) == 3 and min(shape) > 1}
+    if not stacks:
+        return {"": dict(variables)}
+    return {
+        str(k): {x: y[k] if y.shape[:2] in stacks else y for x, y in variables.items()}
+        for k in range(next(iter(stacks))[0])
+    }
 
 
 def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) -> pd.DataFrame:

@@ -10,14 +10,13 @@ from scipy.ndimage import median_filter
 
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
-from pinn_dyn.data.logs.measurement import Measurement
+from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import clock_steps
 from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
 from pinn_dyn.data.logs.table import Table
 
 _GAP_FACTOR = 3.0  # sample times from which a distance between rows is a gap
-BURSTS = 0.4
-"""Share of rows right after the row before from which stamps come in bursts."""
+_BURSTS = 0.4  # share of rows right after the row before from which stamps come in bursts
 # A row is a jump if its distance from its neighbors exceeds this multiple of the usual distance.
 _JUMP_FACTOR = {"q": 10.0, "v": 10.0, "u": 20.0}
 _NEIGHBORS = 7
@@ -27,7 +26,7 @@ _NO_VALUE = {-1, *(sign * x for sign in (1, -1) for x in (99, 999, 9999, 99999, 
 _LARGEST = 1e12  # SI units
 
 
-def burst_share(t: np.ndarray) -> float:
+def _burst_share(t: np.ndarray) -> float:
     """Return the share of rows within a fifth of the mean sample time of the row before.
 
     It is (n - 1)/n for bursts of n rows, and 0 for rows that are stamped when they are sampled.
@@ -40,15 +39,17 @@ def burst_share(t: np.ndarray) -> float:
     return float((spacing < usual.mean() / 5).mean())
 
 
-def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[str]) -> None:
-    """Check the times of one run in s.
+def check_clock(
+    t: np.ndarray, table: Table, clock: Clock, repairs: Collection[str]
+) -> list[Measurement]:
+    """Check the times of one run in s; warn of bursts that no step repairs.
 
     Raises:
         LogError: on an implausible sample time, and on times that go back, repeat or jump unless a
             step repairs this; names the row and the step.
     """
     if clock.rate is not None:
-        return
+        return []
     spacing = np.diff(t)
     rate = "state the rate in Hz instead, as in time: {{rate: {:.4g}}}"
     if not (spacing > 0).any():
@@ -60,21 +61,19 @@ def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[s
     low, high = SAMPLE_TIMES
     if not low <= typical <= high and (spacing >= 0).all():
         shared = int(np.median(np.unique(t, return_counts=True)[1]))  # stamps in whole seconds
-        unit = clock.plausible_unit(table, typical) if shared == 1 else ""
+        unit = clock.plausible_unit(typical) if shared == len(clock.columns) == 1 else ""
         cure = f"write the unit {unit}, or " if unit else ""
         raise LogError(
             f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s, "
             f"expected {low:g} to {high:g} s: {cure}{rate.format(shared / typical)}"
         )
-    row_clock = ""
     same = spacing == 0
     if same.any():  # a logger that is faster than its source repeats whole rows
         same[same] = table.frame.duplicated().to_numpy()[1:][same]
-    if burst_share(t[np.r_[True, ~same]]) > BURSTS:
-        options = f"rate: <of the rows, Hz>, longest: {2 * spacing.max():.2g}"
-        row_clock = (
-            f"its stamps come in bursts: use examples.cleaning_steps.RowClock ({options}), or "
-        )
+    bursts = _burst_share(t[np.r_[True, ~same]])
+    options = f"rate: <of the rows, Hz>, longest: {2 * spacing.max():.2g}"
+    text = f"its stamps come in bursts: use examples.cleaning_steps.RowClock ({options})"
+    row_clock = f"{text}, or " if bursts > _BURSTS else ""
     steps = f"as in{clock_steps(t)}"
     split = "name the column that tells runs apart in 'trajectory' (run=... of pinn_dyn.fit)"
     once = f"{row_clock}add a Deduplicate step, which keeps the first row, {steps}"
@@ -91,6 +90,10 @@ def check_clock(t: np.ndarray, table: Table, clock: Clock, repairs: Collection[s
                 f"{t[k + 1]:.9g} s ({int(rows.sum())} such rows, {typical:.6g} s is usual): "
                 f"{cure}"
             )
+    bad = bool(row_clock) and "bursts" not in repairs
+    expected = f"below {_BURSTS}"
+    text = f"{table.name}: {text}"
+    return [judged("share of rows in bursts", table.name, bursts, expected, bad, text)]
 
 
 def check_rows(

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
 from scipy.ndimage import gaussian_filter1d
 
-from pinn_dyn.data.logs.checks import BURSTS, burst_share
 from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
@@ -22,22 +21,6 @@ _TENTHS, _MOST_ODD = 10, 0.6  # parts of a stretch; largest share of parts that 
 _SMOOTH, _PERIODIC = 0.03, 0.6  # s; of the acceleration: largest share that periodic terms leave
 _FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
 _MOVING, _LEFT = 0.05, 0.7  # of a tenth: share of the mean square, share of Δq² that k v leaves
-
-
-def check_stamps(recordings: list[Recording], repairs: Collection[str]) -> list[Measurement]:
-    """Measure whether stamps come in bursts, as of a logger that empties a buffer."""
-    shares = []
-    for item in recordings:
-        # A logger that is faster than its source repeats whole rows.
-        fresh = (np.diff(item.t) != 0) | (np.diff(item.values(), axis=0) != 0).any(axis=1)
-        shares.append((burst_share(item.t[np.r_[True, fresh]]), item.run))
-    share, run = max(shares)
-    text = (
-        f"{run}: stamps come in bursts, most rows follow the row before within a fifth of the mean "
-        "sample time: if no row is missing, use the step examples.cleaning_steps.RowClock"
-    )
-    bad = share > BURSTS and "bursts" not in repairs
-    return [judged("share of rows in bursts", run, share, f"below {BURSTS}", bad, text)]
 
 
 def check_inputs(training: list[Recording], u: Columns) -> list[Measurement]:

@@ -129,7 +129,7 @@ class Layout:
             splits = "gaps" in self.repairs
             stays = fill(item, self.signals, part, self.request.max_age, report, splits=splits)
             rows, item, part = rows[stays], item.rows(stays), part.select(stays)
-        check_clock(item.t, part, self.time, self.repairs)
+        report.measurements += check_clock(item.t, part, self.time, self.repairs)
         for signal, columns in self.signals.items():
             x = getattr(item, signal)
             report.measurements += check_rows(part, item.t, signal, columns, x, self.repairs)

@@ -1,50 +1,34 @@
-"""Motions that occur twice: copies of runs, and test motions that repeat a training motion."""
+"""Motions of the validation and the test that occur in another split too."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 
 import numpy as np
 import scipy
 
-from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import Recording
 
 _SAME = 0.05  # distance of a repeated motion, as a share of its spread
 
 
-def refuse_copies(parts: Mapping[str, list[Recording]]) -> None:
-    """Raise a LogError on the same numbers in two splits: the test would measure the training."""
-    first: dict[int, tuple[str, str]] = {}
-    for split, recordings in parts.items():
-        for item in recordings:
-            content = hash((item.q.tobytes(), item.u.tobytes()))
-            split_of_first, run = first.setdefault(content, (split, item.run))
-            if split_of_first != split:
-                raise LogError(
-                    f"{item.run}, in {split}, is a copy of {run}, in {split_of_first}, number by "
-                    "number: leave one of them out, or put both into one split"
-                )
-
-
 def check_repeats(
-    training: list[Recording], pieces: list[Recording], name: str
+    earlier: list[Recording], pieces: list[Recording], name: str
 ) -> list[Measurement]:
-    """Count the roll-outs of the split ``name`` that repeat a motion of the training.
+    """Count the roll-outs of the split ``name`` that repeat a motion of the splits before it.
 
-    At a shift s, the mean of ‖q_test(t) - q_train(t + s)‖² is below 0.05² times the variance of q.
+    At a shift s, the mean of ‖q(t) - q_earlier(t + s)‖² is below 0.05² times the variance of q.
     """
     pairs = Counter(
-        (piece.run, item.run) for piece in pieces for item in training if _is_in(piece, item)
+        (piece.run, item.run) for piece in pieces for item in earlier if _is_in(piece, item)
     )
-    title = f"motions of the {name} that repeat one of the training"
+    title = f"motions of the {name} that repeat one of another split"
     results = []
     for (run, original), count in pairs.items():
         text = (
-            f"{name}: {count} of the motions of {run} repeat one of {original}, which is in the "
-            "training: keep such runs in one split"
+            f"{name}: {count} of the motions of {run} repeat one of {original}, of another "
+            "split: keep such runs in one split"
         )
         results.append(
             judged(title, run, count, "0", True, text, section="docs/csv_logs.md#splits")

@@ -20,7 +20,7 @@ from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned, one_sample_time, pieces_of, summary, trajectory
 from pinn_dyn.data.logs.reading import Layout
 from pinn_dyn.data.logs.recording import Recording, Report
-from pinn_dyn.data.logs.repeats import check_repeats, refuse_copies
+from pinn_dyn.data.logs.repeats import check_repeats
 from pinn_dyn.data.logs.runs import check_runs
 from pinn_dyn.data.logs.splits import Part, default_split, split
 from pinn_dyn.data.logs.stamps import Clock
@@ -201,12 +201,10 @@ class LogSource(DataSource):
         report = Report(self.name)
         recordings = self._layout.read(self.files, self.root, report)
         measurements = report.measurements
-        measurements += plausibility.check_stamps(recordings, self._repairs)
         if self.test is None:
             times = {item.run: item.t for item in recordings}
             self.validation, self.test, self.guard = default_split(times, self.seed)
         parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
-        refuse_copies(parts)
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
         pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
         limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
@@ -226,11 +224,12 @@ class LogSource(DataSource):
         measurements += plausibility.check_inputs(training, self.u)
         measurements += plausibility.check_rest(stretches, self.q)
         report.add("Splits", "train", summary(training, step))
-        rollouts = {"train": training}
+        rollouts, earlier = {"train": training}, training
         for name, part in (("validation", self.validation), ("test", self.test)):
             rollouts[name], note = pieces_of(name, part, stretches[name], step)
             report.add("Splits", name, note)
-            measurements += check_repeats(training, rollouts[name], name)
+            measurements += check_repeats(earlier, rollouts[name], name)
+            earlier = [*earlier, *stretches[name]]
         for text in report.warnings:
             log.warning("%s: %s", self.name, text)
         names = {name: [item.place for item in items] for name, items in rollouts.items()}

@@ -83,17 +83,13 @@ class Clock(Columns):
             return t[0] * np.arange(len(t)), [f"{self.name} is a sample time of {t[0]:.6g} s"]
         return t, notes
 
-    def plausible_unit(self, table: Table, sample_time: float) -> str:
+    def plausible_unit(self, sample_time: float) -> str:
         """Return the unit that turns an implausible sample time, s, into a usual one, or ""."""
+        counts = sample_time / self.factors[0]
+        usual = {x: factor * counts for x, (si, factor) in UNITS.items() if si == "s"}
         low, high = SAMPLE_TIMES
-        if len(self.columns) > 1 or self._counts(table, self.columns[0])[1]:
-            return ""
-        usual = {
-            unit: abs(np.log(100 * sample_time * factor / UNITS[self.unit[0]][1]))
-            for unit, (si, factor) in UNITS.items()
-            if si == "s" and low <= sample_time * factor / UNITS[self.unit[0]][1] <= high
-        }
-        return min(usual, key=lambda unit: usual[unit], default="")
+        units = [unit for unit, size in usual.items() if low <= size <= high]
+        return min(units, key=lambda unit: abs(np.log(100 * usual[unit])), default="")
 
     def _counts(self, table: Table, name: str) -> tuple[np.ndarray, float | None]:
         """Return a column as numbers ``(T,)``, and the seconds per count of dates and times."""
@@ -127,8 +123,6 @@ class Clock(Columns):
 def _dates(text: pd.Series) -> pd.Series:
     """Return texts as dates or as times of day; NaT for texts that are neither."""
     text = text.str.strip().str.replace(r"(:\d\d)(?:,|:(?=\d{3}))(\d+)", r"\1.\2", regex=True)
-    # A spreadsheet shows minutes, seconds and tenths.
-    text = text.str.replace(r"^(\d+:\d+\.\d+)$", r"0:\1", regex=True)
     trials = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # formats that pandas reads cell by cell
