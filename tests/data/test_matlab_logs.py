@@ -91,10 +91,6 @@ FORMS = {
         {"trial": structs([{name: 2 * x for name, x in SIGNALS.items()}, SIGNALS])},
         fields("trial(2)."),
     ),
-    "samples": (  # messages of a bag in MATLAB
-        {"msgs": cells([{name: x[k] for name, x in SIGNALS.items()} for k in range(len(T))])},
-        fields("msgs."),
-    ),
     "timetable": (
         {
             "TT": TABLE.drop(columns="t").set_index(
@@ -133,7 +129,7 @@ def expected(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("form", "version"),
-    [(form, version) for form in FORMS for version in ("v7", "v7.3")[: 2 - (form == "samples")]],
+    [(form, version) for form in FORMS for version in ("v7", "v7.3")],
 )
 def test_forms_of_matlab_give_the_same_motion(tmp_path, expected, form, version):
     content, description = FORMS[form]

@@ -34,7 +34,7 @@ def read_mat(path: Path, request: Request) -> dict[str, pd.DataFrame]:
             _data_sets(path, h5py, file, [x.replace(".", "/") for x in request.columns])
             if not any("MATLAB_class" in item.attrs for item in file.values()):
                 return read_hdf5(path, request)
-    runs = elements(matlab_variables(path), request.time, request.columns)
+    runs = elements(matlab_variables(path), request.columns)
     if len(runs) == 1:
         return _tables(path, request, runs.popitem()[1])
     return {run: table_of_arrays(path, request, variables) for run, variables in runs.items()}

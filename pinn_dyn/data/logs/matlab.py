@@ -32,13 +32,10 @@ def matlab_variables(path: Path) -> dict[str, Any]:
     return {name: x for key, value in content.items() for name, x in _leaves(key, value)}
 
 
-def elements(
-    variables: Mapping[str, Any], time: str, columns: Sequence[str]
-) -> dict[str, dict[str, Any]]:
+def elements(variables: Mapping[str, Any], columns: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return the variables of each element of the struct or cell arrays that hold the columns.
 
-    An element is a run, and its variables have names without an index, ``trial.q``. If its time is
-    a scalar and the elements outnumber its values, then an element is a sample of one run.
+    An element is a run, and its variables have names without an index, ``trial.q``.
     """
     runs: dict[str, dict[str, Any]] = {}
     for name, value in variables.items():
@@ -53,13 +50,6 @@ def elements(
     }
     if not runs or all({x, x.rpartition("_")[0]} & variables.keys() for x in columns):
         return {"": dict(variables)}
-    used = [np.size(x) for values in runs.values() for name, x in values.items() if name in names]
-    if max(used) < len(runs) and all(
-        np.size(values.get(time, ())) == 1 for values in runs.values()
-    ):
-        shared = set.intersection(*({*values} for values in runs.values())) & names
-        rows = {name: [np.ravel(x[name]) for x in runs.values()] for name in shared}
-        return {"": {name: np.stack(x) for name, x in rows.items() if len({*map(len, x)}) == 1}}
     return {run: {**common, **values} for run, values in runs.items()}
 
 

@@ -56,15 +56,11 @@ def _mcap(path: Path) -> Iterator[Bag]:
     library = optional("mcap.reader", path)
     notes: list[str] = []
     with path.open("rb") as file:
-        try:
-            summary = library.make_reader(file).get_summary()
-        except Exception:  # the file has no end
-            summary = None
 
         def stream(topics: Sequence[str] | None) -> Iterator[tuple[Any, Any, Any]]:
             file.seek(0)
-            make = library.make_reader if summary else library.NonSeekingReader
-            messages = make(file).iter_messages(topics, log_time_order=False)
+            reader = library.NonSeekingReader(file)
+            messages = reader.iter_messages(topics, log_time_order=False)
             try:
                 yield next(messages)
             except StopIteration:
@@ -72,14 +68,9 @@ def _mcap(path: Path) -> Iterator[Bag]:
             try:
                 yield from messages
             except Exception:
-                if summary:
-                    raise
                 notes[:] = ["the file has no end, as after a crash, and is read up to there"]
 
-        if summary:
-            schemas = {x.topic: summary.schemas.get(x.schema_id) for x in summary.channels.values()}
-        else:
-            schemas = {channel.topic: schema for schema, channel, _ in stream(None)}
+        schemas = {channel.topic: schema for schema, channel, _ in stream(None)}
 
         def messages(topics: Sequence[str]) -> Iterator[Message]:
             decoders: dict[int, Callable[[bytes], Any]] = {}
