@@ -49,7 +49,7 @@ def fill(
     t, run = recording.t, recording.run
     clock = ~np.isnan(recording.q[:, 0])
     if len(times := t[clock]) > 1:  # rows between samples of q are of other signals
-        age, _ = _filled(t, times, times, np.ones(len(t), dtype=bool), hold=False)
+        age, _ = _filled(times, times, t, hold=False)
         clock |= np.isfinite(age) & (age > _LOST * np.median(np.diff(times)))
     stays = clock.copy()
     for signal, columns in signals.items():
@@ -59,32 +59,28 @@ def fill(
             present = ~np.isnan(x)
             if not present.any():
                 raise LogError(f"{table.name}: the column {name!r} ({signal}) has no values")
-            empty = clock & ~present
-            if not empty.any():
-                continue
-            age, x[empty] = _filled(t, t[present], x[present], empty, hold=signal == "u")
-            usual = np.diff(t[present])
-            longest = max(max_age, _MISSED * float(np.median(usual))) if len(usual) else 0.0
+            empty = np.flatnonzero(clock & ~present)
+            age, x[empty] = _filled(t[present], x[present], t[empty], hold=signal == "u")
+            usual = np.median(np.diff(t[present])) if present.sum() > 1 else 0.0
+            longest = max(max_age, _MISSED * float(usual))
             good = age <= longest
-            stays[np.flatnonzero(empty)[~good]] = False
+            stays[empty[~good]] = False
             if good.any():
                 filled[name] = age[good]
             inside = np.isfinite(age) & ~good
             if inside.any():
-                row = int(np.flatnonzero(empty)[inside.argmax()])
                 text = (
-                    f"{table.place(row, name, signal)}: no value for {age[inside].max():.3g} s, "
-                    f"more than {longest:.3g} s (max_age)"
+                    f"{table.place(int(empty[inside][0]), name, signal)}: no value for "
+                    f"{age[inside].max():.3g} s, more than {longest:.3g} s (max_age)"
                 )
                 if not splits:
                     raise LogError(f"{text}: split the run there, as in{clock_steps(t[clock])}")
                 report.warn("empty cells", f"{text}: {inside.sum()} rows are dropped")
         if filled:
             count, distance = max(map(len, filled.values())), max(map(np.max, filled.values()))
-            way = "held" if signal == "u" else "interpolated"
             text = (
-                f"{count} of {clock.sum()} values of {signal} ({', '.join(filled)}) are "
-                f"missing and {way}, over at most {distance:.3g} s"
+                f"{count} of {clock.sum()} values of {signal} ({', '.join(filled)}) are missing "
+                f"and {'held' if signal == 'u' else 'interpolated'}, over at most {distance:.3g} s"
             )
             if count > _SLOWER * clock.sum():
                 report.add("Read", run, text)
@@ -98,16 +94,13 @@ def fill(
 
 
 def _filled(
-    t: np.ndarray, times: np.ndarray, x: np.ndarray, empty: np.ndarray, *, hold: bool
+    times: np.ndarray, x: np.ndarray, at: np.ndarray, *, hold: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of the values around the empty cells, s, and the cells' new values."""
-    at = t[empty]
+    """Return the distances of the values before and after some times, s, and the values there."""
     last = np.searchsorted(times, at, side="right") - 1
     following = np.searchsorted(times, at)
-    bounded = np.r_[times, np.inf]
-    age = np.where(last < 0, np.inf, bounded[following] - times[last])
+    age = np.where(last < 0, np.inf, np.r_[times, np.inf][following] - times[last])
     if not hold:
         return age, np.interp(at, times, x)
     # A value is held beyond the end of its signal, too.
-    age = np.where(following < len(times), age, at - times[last])
-    return age, x[last]
+    return np.where(following < len(times), age, at - times[last]), x[last]

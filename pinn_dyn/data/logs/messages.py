@@ -68,7 +68,9 @@ def _mcap(path: Path) -> Iterator[Bag]:
             try:
                 yield from messages
             except Exception:
-                notes[:] = ["the file has no end, as after a crash, and is read up to there"]
+                notes[:] = [
+                    "the file is damaged or has no end, as after a crash: it is read up to there"
+                ]
 
         schemas = {channel.topic: schema for schema, channel, _ in stream(None)}
 
