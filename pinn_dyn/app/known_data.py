@@ -80,13 +80,6 @@ def match_structure(structure: RigidChain, source: DataSource) -> RigidChain:
     if structure.tree.unread:
         log.warning("the model leaves out of the MJCF: %s", "; ".join(structure.tree.unread))
     names = structure.joint_names
-    for key, speeds in signals[1:-1]:
-        if (order := _joints_of(list(speeds), names)) not in (None, names):
-            columns = [list(speeds)[order.index(name)] for name in names]
-            raise ConfigError(
-                f"{key} has the order {', '.join(speeds)}, and q that of the joints "
-                f"{', '.join(names)}: expected {key}=[{','.join(columns)}]"
-            )
     for (column, unit), joint, turns in zip(units.items(), names, structure.turning, strict=True):
         expected = "rad" if turns else "m"
         if unit not in ("", expected):

@@ -145,12 +145,14 @@ def test_stamps_since_1970_are_shown_in_seconds_of_the_run(tmp_path, expected):
         source(tmp_path, files="run", steps=steps, **formats.BAG).load()
 
 
-@pytest.mark.parametrize("name", ["run/run.mcap", "run.bag"])
+@pytest.mark.parametrize("name", ["run/run.mcap", "run.bag", "run.bag.active"])
 def test_a_bag_cut_short_is_named(tmp_path, name):
-    formats.write_bag(tmp_path / name.split("/")[0], TABLE, version=1 if "bag" in name else 2)
+    version = 2 if "mcap" in name else 1
     path = tmp_path / name
+    formats.write_bag(tmp_path / name.split("/")[0], TABLE, version=version)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(LogError, match=f"{path.name}: cannot be read as .* cut short"):
+    cure = f" Repair it by rosbag reindex {path.name}" if version == 1 else ""
+    with pytest.raises(LogError, match=rf"{path.name}: cannot be read as .* cut short\?{cure}"):
         source(tmp_path, files=name, **formats.BAG).load()
 
 

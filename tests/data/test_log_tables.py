@@ -59,6 +59,47 @@ def test_names_of_files_tell_the_runs_apart(tmp_path, form):
             np.testing.assert_allclose(part.raw.u[:9], runs[match[0]][U][:9], atol=1e-10)
 
 
+def test_files_of_single_joints_have_columns_by_their_names(tmp_path):
+    for run, phase in enumerate((0.0, 1.0, 2.0)):
+        table = motion(phase=phase)
+        for k, joint in ((1, "arm1"), (2, "arm10")):
+            columns = {f"{name}{k}": name for name in "qvu"}
+            (tmp_path / f"run{run}").mkdir(exist_ok=True)
+            part = table[[*T, *columns]].rename(columns=columns)
+            write(tmp_path / f"run{run}", part, f"{joint}.csv")
+    columns = {
+        key: dict(columns=[f"arm1/{key}", f"arm10/{key}"], unit=unit)
+        for key, unit in (("q", "rad"), ("v", "rad/s"), ("u", "Nm"))
+    }
+    log = source(tmp_path, files="*/*.csv", **columns)
+    assert len({part.raw.run for part in log.cleaned}) == 3
+    for run, phase in enumerate((0.0, 1.0, 2.0)):
+        (part, *_) = [x.raw for x in log.cleaned if f"{run}" in x.raw.run and x.split == "train"]
+        for key in "qvu":
+            expected = motion(phase=phase)[[f"{key}1", f"{key}2"]].to_numpy()[: len(part)]
+            np.testing.assert_allclose(getattr(part, key), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("q", "v"),
+    [(["q1", "q2"], ["v2", "v1"]), (["arm.q", "tool.q"], ["d(tool)", "d(arm)"])],
+)
+def test_velocities_are_in_the_order_of_q(tmp_path, q, v):
+    names = dict(zip([*Q, *V], [*q, *v[::-1]], strict=True))
+    write(tmp_path, TABLE.assign(v2=TABLE["v2"] * 180 / np.pi).rename(columns=names))
+    units = ["deg/s", "rad/s"]
+    log = source(tmp_path, q=dict(columns=q, unit="rad"), v=dict(columns=v, unit=units))
+    assert_equal(log)
+    assert not log.warnings
+
+
+def test_numbers_of_columns_are_in_no_order(tmp_path):
+    table = TABLE.rename(columns=dict(zip([*Q, *V], ["11", "12", "22", "21"], strict=True)))
+    write(tmp_path, table)
+    v = dict(columns=["22", "21"], unit="rad/s")
+    assert_equal(source(tmp_path, q=dict(columns=["11", "12"], unit="rad"), v=v))
+
+
 def test_names_that_tell_nothing_are_refused(tmp_path):
     for name, table in zip(("a", "b", "c", "d"), [TABLE[T + Q], TABLE[T + V + U]] * 2, strict=True):
         write(tmp_path, table, f"{name}.csv")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -81,6 +82,13 @@ def described(kind: type[_Described], name: str, value: _Described | Mapping[str
         raise LogError("; ".join(mistakes).replace("Value error, ", "")) from error
 
 
+def _differences(names: Sequence[str]) -> list[str]:
+    """Return names without their common beginning and end."""
+    first = len(os.path.commonprefix(names))  # noqa: RUF071
+    end = len(os.path.commonprefix([x[first:][::-1] for x in names]))  # noqa: RUF071
+    return [x[first : len(x) - end] for x in names]
+
+
 PerColumn = BeforeValidator(lambda x: [x] if isinstance(x, (str, int, float)) else x)
 
 
@@ -139,6 +147,18 @@ class Columns:
         for column, unit in zip(self.columns, self.units, strict=True):
             if unit not in expected:
                 raise LogError(f"{signal} has the column {column!r} in {unit}, expected {expected}")
+
+    def in_order_of(self, columns: Sequence[str]) -> Columns:
+        """Return the columns in the order of others, whose names differ alike: ``dq2`` and ``q2``.
+
+        Numbers of columns have no order.
+        """
+        names, order = _differences(self.columns), _differences(columns)
+        if sorted(names) != sorted(order) or all(x.isdigit() for x in columns):
+            return self
+        places = [names.index(x) for x in order]
+        keys = ("columns", "unit", "sign", "scale", "offset")
+        return replace(self, **{key: [getattr(self, key)[k] for k in places] for key in keys})
 
     def contradictions(self, signal: str, units: Mapping[str, str]) -> list[str]:
         """Return a sentence for each column whose unit in the file, as in ``units``, differs."""

@@ -49,11 +49,13 @@ def joined(
 
     Tables with the same columns are of different runs. Words that only their names share tell
     nothing; the other words of the names tell which tables belong together: ``run1_pos`` and
-    ``run1_vel``, or ``run1/pos`` and ``run1/vel``.
+    ``run1_vel``, or ``run1/pos`` and ``run1/vel``. A column ``elbow/q`` is the column ``q`` of a
+    table with ``elbow`` in its name.
 
     Raises:
         LogError: if no table has a column, or the names do not tell the runs apart.
     """
+    tables = {stem: _prefixed(table, stem, columns) for stem, table in tables.items()}
     parts = {name: tuple(x for x in columns if x in table) for name, table in tables.items()}
     if len(tables) == 1 or any(len(part) == len(columns) for part in parts.values()):
         return dict(tables)
@@ -80,6 +82,18 @@ def joined(
         f"the files {listed(tables)} hold parts of the columns, and their names do not tell which "
         "belong to the same run: name them as run1_q, run1_u, run2_q, run2_u"
     )
+
+
+def _prefixed(table: Table, stem: str, columns: Sequence[str]) -> Table:
+    """Return a table with its columns ``q`` as columns ``<word>/q``, by a word of its name."""
+    pairs = {x: x.rpartition("/") for x in columns if x not in table}
+    names = {
+        x: name
+        for x, (word, _, name) in pairs.items()
+        if name in table and re.search(rf"(^|[\W_]){re.escape(word)}([\W_]|$)", stem) and word
+    }
+    frame = table.frame.assign(**{x: table.frame[name] for x, name in names.items()})
+    return replace(table, frame=frame) if names else table
 
 
 def _join(tables: Sequence[Table], clock: Clock, trajectory: str | None) -> Table:

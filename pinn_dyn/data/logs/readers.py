@@ -54,7 +54,7 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
     Raises:
         LogError: if no reader knows its format, or it is damaged or empty.
     """
-    suffix = ".db3" if _is_bag(path) else path.suffix.lower()
+    suffix = ".db3" if _is_bag(path) else path.suffix.lower().replace(".active", ".bag")
     if suffix not in READERS:
         raise LogError(
             f"{path}: no reader for {suffix!r}: save the log as one of {', '.join(READERS)}"
@@ -66,6 +66,7 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
         cause = "save plain arrays:" if "allow_pickle" in text else "is it cut short?"
+        cause += f" Repair it by rosbag reindex {path.name}:" if suffix == ".bag" else ""
         raise LogError(f"{path}: cannot be read as {suffix}, {cause} {text}") from error
     tables = content if isinstance(content, Mapping) else {"": content}
     if not any(map(len, tables.values())):

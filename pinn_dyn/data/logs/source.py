@@ -54,7 +54,7 @@ class LogSource(DataSource):
         time: columns of the time, or ``{rate: 100}`` for a log without time, see :class:`Clock`.
         q: columns of the configuration, N.
         u: columns of the input, M; None or [] for a robot that nothing drives.
-        v: columns of the velocity, N, or None.
+        v: columns of the velocity, N, or None; in the order of q if their names tell it.
         max_age: oldest message of another topic, or value of a slower column, of a row, s.
         sep: separator of the cells of a text file; None detects it.
         trajectory: column that tells the runs of a file apart, or None where a file is one run.
@@ -106,7 +106,9 @@ class LogSource(DataSource):
         self.time: Clock = described(Clock, "time", time)
         self.q: Columns = described(Columns, "q", q)
         self.u: Columns = described(Columns, "u", u or {"columns": [], "unit": []})
-        self.v: Columns | None = None if v is None else described(Columns, "v", v)
+        self.v: Columns | None = None
+        if v is not None:
+            self.v = described(Columns, "v", v).in_order_of(self.q.columns)
         signals = {"q": self.q, "v": self.v, "u": self.u}
         self._signals = {key: columns for key, columns in signals.items() if columns is not None}
         self._check_units()
