@@ -1,5 +1,7 @@
 """A motion in the forms of MATLAB and Simulink gives the trajectories of the same CSV."""
 
+import re
+
 import h5py
 import matio
 import numpy as np
@@ -45,11 +47,11 @@ def opaque(classname, **properties):
     return MatlabOpaque(properties=properties, classname=classname)
 
 
-def timeseries(data, *, uniform=False):
+def timeseries(data, *, uniform=False, start=T[0, 0]):
     """Return a time series as MATLAB saves it; a uniform clock has a start, a step and a length."""
     none = np.empty((0, 0))
     step = np.array([[T[1, 0] - T[0, 0]]])
-    info = dict(Start_=T[:1], Increment_=step, Length=np.array([[float(len(T))]]))
+    info = dict(Start_=np.array([[start]]), Increment_=step, Length=np.array([[float(len(T))]]))
     return opaque(
         "timeseries",
         Name="",
@@ -139,6 +141,27 @@ def test_forms_of_matlab_give_the_same_motion(tmp_path, expected, form, version)
     ):
         for name in ("t", "q", "v", "u"):
             np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6)
+
+
+def test_a_uniform_clock_of_a_time_series_has_a_start(tmp_path):
+    content = {x: timeseries(SIGNALS[x], uniform=True, start=2.5) for x in "qvu"}
+    matio.save_to_mat(str(tmp_path / "run.mat"), content, version="v7")
+    log = source(tmp_path, files="run.mat", **FORMS["timeseries"][1])
+    times = np.sort(np.concatenate([part.raw.t for part in log.cleaned]))
+    np.testing.assert_allclose(times[[0, -1]], 2.5 + T[[0, -1], 0])
+
+
+def test_a_scalar_rate_is_no_sample_time_and_the_advice_works(tmp_path, expected):
+    matio.save_to_mat(str(tmp_path / "run.mat"), {**SIGNALS, "t": 0, "fs": 100.0}, version="v7")
+    description = {**fields(""), "time": dict(columns="fs", unit="s")}
+    with pytest.raises(LogError, match="fs is a rate") as error:
+        source(tmp_path, files="run.mat", **description).load()
+    rate = float(re.search(r"write time: \{rate: (.*?)\}", str(error.value))[1])
+    (train,) = (
+        source(tmp_path, files="run.mat", **description | {"time": {"rate": rate}}).load().train
+    )
+    np.testing.assert_allclose(train.t, expected[0].t)
+    np.testing.assert_allclose(train.u, expected[0].u)
 
 
 @pytest.mark.parametrize("version", ["v7", "v7.3"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import field
 from typing import Annotated
 
@@ -139,16 +138,14 @@ def _dates(text: pd.Series) -> pd.Series:
 
 def _unwrapped(raw: np.ndarray, factor: float) -> tuple[np.ndarray, list[str]]:
     """Continue a counter where it jumps back by its range, and return a note."""
-    steps = np.diff(raw)
-    if not (steps < 0).any() or not (steps > 0).any():
+    back = np.diff(raw) < 0
+    if not back.any() or back.all():
         return raw, []
-    longest = _WRAP_SAMPLES * float(np.median(steps[steps > 0]))
-    periods: Sequence[float] = [*_COUNTERS, *(x / factor for x in _CYCLES)]
-    for period in periods:
-        wraps = (steps < 0) & (steps + period >= 0) & (steps + period <= longest)
+    longest = _WRAP_SAMPLES * np.median(np.diff(raw)[~back])
+    for period in (*_COUNTERS, *(x / factor for x in _CYCLES)):
+        turned = np.unwrap(raw, period=period)
+        steps = np.diff(turned)[back]
+        wraps = (steps >= 0) & (steps <= longest)
         if wraps.any() and longest < period / 4:
-            turns = np.r_[0, np.cumsum(wraps)] * (
-                round(period) if raw.dtype.kind == "i" else period
-            )
-            return raw + turns, [f"the time wraps {wraps.sum()} times and is continued"]
+            return turned, [f"the time wraps {wraps.sum()} times and is continued"]
     return raw, []
