@@ -61,7 +61,7 @@ def check_clock(
     low, high = SAMPLE_TIMES
     if not low <= typical <= high and (spacing >= 0).all():
         shared = int(np.median(np.unique(t, return_counts=True)[1]))  # stamps in whole seconds
-        unit = clock.plausible_unit(typical) if shared == len(clock.columns) == 1 else ""
+        unit = clock.plausible_unit(table, typical) if shared == 1 else ""
         cure = f"write the unit {unit}, or " if unit else ""
         raise LogError(
             f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s, "

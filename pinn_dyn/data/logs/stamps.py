@@ -82,8 +82,10 @@ class Clock(Columns):
             return t[0] * np.arange(len(t)), [f"{self.name} is a sample time of {t[0]:.6g} s"]
         return t, notes
 
-    def plausible_unit(self, sample_time: float) -> str:
+    def plausible_unit(self, table: Table, sample_time: float) -> str:
         """Return the unit that turns an implausible sample time, s, into a usual one, or ""."""
+        if len(self.columns) > 1 or self._counts(table, self.columns[0])[1]:
+            return ""
         counts = sample_time / self.factors[0]
         usual = {x: factor * counts for x, (si, factor) in UNITS.items() if si == "s"}
         low, high = SAMPLE_TIMES
