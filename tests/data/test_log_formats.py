@@ -124,6 +124,14 @@ def test_the_last_of_several_commands_at_a_time_counts(tmp_path, expected, clock
     assert not log.warnings
 
 
+def test_a_bag_at_a_rate_has_the_rows_of_q(tmp_path):
+    formats.write_bag(tmp_path / "run", TABLE, twice=True)
+    log = source(tmp_path, files="run", **formats.BAG | {"time": {"rate": 100}})
+    run = log.cleaned[0].raw
+    np.testing.assert_allclose(run.q, TABLE[["q1", "q2"]][: len(run)])
+    np.testing.assert_allclose(run.u, TABLE[["u1", "u2"]][: len(run)], atol=1e-9)
+
+
 def test_velocities_of_another_topic_are_interpolated(tmp_path):
     formats.write_bag(tmp_path / "run", TABLE, late=0.004)
     u = dict(columns=formats.BAG["q"]["columns"], unit="Nm")

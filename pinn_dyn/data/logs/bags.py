@@ -35,11 +35,14 @@ def read_bag(path: Path, request: Request) -> Table:
 
     def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
-        frame = _merged(_decode(path, fields, request.max_age, notes))
+        frame = _merged(_decode(path, fields, request.max_age, notes), fields[0])
         clock = frame[fields[0]]
-        exact = clock.isna() | (clock == frame.index)
-        # A message of another topic has the time of the next row of the clock.
-        frame[fields[0]] = frame.index if exact.all() else clock.bfill()
+        if not request.time:  # the rows of the first topic, with the last values of others
+            frame = frame.ffill().where(clock.notna())
+        elif (clock.isna() | (clock == frame.index)).all():
+            frame[fields[0]] = frame.index
+        else:  # a message of another topic has the time of the next row of the clock
+            frame[fields[0]] = clock.bfill()
         frame = frame.dropna(subset=fields[:1])[fields]
         return {"values": frame.to_numpy(), "notes": np.array(notes, dtype=str)}
 
@@ -130,11 +133,11 @@ def _topic(
     return frame[stays]
 
 
-def _merged(topics: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Return the rows of all topics, in each run in the order of their times."""
+def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:
+    """Return all rows by their times in each run; at equal times those of ``last`` are last."""
     frame = pd.concat(topics).sort_values(_RECEIVED, kind="stable")
     run = np.cumsum(np.diff(frame.index, prepend=frame.index[0]) < -_LATEST)
-    return frame.iloc[np.lexsort((frame.index, run))]
+    return frame.iloc[np.lexsort((frame[last].notna(), frame.index, run))]
 
 
 def _fields_of_topics(
