@@ -15,6 +15,7 @@ from torch import Tensor
 from pinn_dyn.app.build import build_law, build_reference
 from pinn_dyn.app.config import ConfigError, build_part, checked, write_config
 from pinn_dyn.app.control_results import write_results
+from pinn_dyn.app.export import ranges_of
 from pinn_dyn.app.provenance import write_provenance
 from pinn_dyn.app.run import Run
 from pinn_dyn.app.run_folder import load_run
@@ -59,7 +60,7 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     learned = _learned_system(run, config)
     _require_learned_law(config, source)
     if source.system is None:
-        return _without_robot(learned, source, config, folder)
+        return _without_robot(learned, run, config, folder)
     runs, configurations = {run.config["name"]: run}, {"run": run.config}
     origin = write_provenance(runs, source, config, configurations, folder)
     robot = build_part("robot", {**run.config["dataset"]["system"], **config["robot"]})
@@ -69,10 +70,10 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     if config["trajectory"] >= count:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
-    if config["export"]:
-        _export(laws["learned"], config)
     if config["guard"].get("threshold") is not None:
         laws["learned"] = _guarded(laws["learned"], config, source)
+    if config["export"]:
+        _export(laws[config["exported_law"]], run, config)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     noisy = np.any(sensor.q_noise) or np.any(sensor.v_noise)
     result = close_loops(
@@ -104,22 +105,34 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
 
 def _require_learned_law(config: dict[str, Any], source: DataSource) -> None:
     """Refuse keys that would be ignored without the learned law, or without a robot."""
-    of_loop = {"stability": config["stability"], "guard": config["guard"].get("threshold")}
-    of_loop = {key: value for key, value in of_loop.items() if value is not None}
+    used = {"stability": config["stability"], "guard": config["guard"].get("threshold")}
+    keys = [key for key, value in used.items() if value is not None]
+    of_loop = [key for key in keys if key != "guard" or not config["export"]]
     if source.system is None and of_loop:
-        keys = " and ".join(of_loop)
-        raise ConfigError(f"{keys}: {source.name} has no simulated robot: leave the key out")
-    if "learned" not in config["controllers"] and (of_loop or config["export"]):
-        keys = " and ".join([*of_loop, *(["export"] if config["export"] else [])])
-        raise ConfigError(f"{keys}: needs the controller 'learned': do not remove it")
+        names = " and ".join(of_loop)
+        raise ConfigError(f"{names}: {source.name} has no simulated robot: leave the key out")
+    if "learned" not in config["controllers"] and keys:
+        raise ConfigError(f"{' and '.join(keys)}: needs the controller 'learned': do not remove it")
+    law = config["exported_law"]
+    if config["export"] and config["controllers"].get(law, {}).get("terms") != "learned":
+        parts = config["controllers"].items()
+        learned_names = [name for name, part in parts if part["terms"] == "learned"]
+        raise ConfigError(
+            f"export: exported_law is {law!r}, expected a controller with learned terms: "
+            f"{', '.join(learned_names) or 'do not remove them all'}"
+        )
 
 
 def _without_robot(
-    learned: MechanicalSystem, source: DataSource, config: dict[str, Any], folder: Path
+    learned: MechanicalSystem, run: Run, config: dict[str, Any], folder: Path
 ) -> float:
     """Export the law on a model of measured data, and write how well it is conditioned."""
+    source = run.source
     if config["export"]:
-        _export(build_law(config, "learned", learned, learned), config)
+        law = build_law(config, config["exported_law"], learned, learned)
+        if config["guard"].get("threshold") is not None and config["exported_law"] == "learned":
+            law = _guarded(law, config, source)
+        _export(law, run, config)
     q = torch.cat([_thinned(item.q) for item in source.load().train])
     table = term_conditions(learned, q)
     table.to_csv(folder / "conditions.csv", index=False)
@@ -133,9 +146,17 @@ def _without_robot(
     return float("nan")
 
 
-def _export(law: Controller, config: dict[str, Any]) -> None:
-    path = export_law(law, Path(config["export"]))
-    log.info("the learned law is in %s; docs/realtime.md says how to load it", path)
+def _export(law: Controller, run: Run, config: dict[str, Any]) -> None:
+    path = export_law(
+        law,
+        config["export"],
+        actuator=build_part("actuator", config["actuator"]),
+        period=config["rate"] and 1 / config["rate"],
+        real=config["export_real"],
+        about={"q": run.labels, "u": run.input_labels},
+        ranges=ranges_of(run.statistics),
+    )
+    log.info("%s holds the law; docs/realtime.md says how to call it", path)
 
 
 def _thinned(values: Tensor) -> Tensor:
@@ -173,4 +194,4 @@ def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Con
     train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
     region = DataRegion(q, v, angles=getattr(law.model, "angles", ()))
-    return Guarded(law, region, threshold=config["guard"]["threshold"])
+    return Guarded(law, region, **config["guard"])

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from pinn_dyn import __version__
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.exports.exported import ENDINGS, Real, write
+from pinn_dyn.exports.model_functions import Ranges, model_functions
 from pinn_dyn.mechanics import Predictor, double_copy
-from pinn_dyn.models import KnownAndNetwork, KnownMechanics
+from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.systems import RigidChain
 from pinn_dyn.systems.robot_files import RobotConstants, new_mjcf, updated_urdf
 
@@ -17,16 +21,74 @@ _WRITERS = {".urdf": updated_urdf, ".xml": new_mjcf}
 _BODY_COLUMNS = 10  # of physical_constants
 
 
-def export(model: Predictor, path: str | Path) -> Path:
-    """Write the identified robot to a URDF (``.urdf``) or an MJCF (``.xml``).
+def export(
+    model: Predictor,
+    path: str | Path,
+    what: str | None = None,
+    *,
+    real: Real = "double",
+    statistics: Statistics | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write a model to a file for other programs, in the format of the ending of the path.
+
+    - ``.c`` (with ``.h``): its functions, see :func:`~.exports.model_functions.model_functions`;
+    - ``.onnx``, ``.casadi``: one of these functions;
+    - ``.urdf``, ``.xml`` (MJCF): the identified robot of a run of model=known.
+
+    Args:
+        model: a model or a known system.
+        path: the file.
+        what: name of the function, ``forward_dynamics`` by default (``next_state`` for models
+            that have no other); of a ``.c`` file the default is all.
+        real: type of the numbers, for ``.c`` and ``.onnx``.
+        statistics: ranges of the training data, in which the file is compared with the model;
+            without them within [-1, 1].
+        about: fields for the information in the file, such as names of coordinates.
 
     Raises:
-        ValueError: on another ending, or an MJCF of elastic joints or feed-forward forces.
-        TypeError: if the model has no bodies.
+        ValueError: on another ending or function, or an MJCF of elastic joints or feed-forward
+            forces.
+        TypeError: if the format cannot hold the model.
+        RuntimeError: if the file differs from the model, see :func:`~.exports.exported.write`.
     """
     path = Path(path).expanduser()
-    if path.suffix not in _WRITERS:
-        raise ValueError(f"{path} ends in {path.suffix!r}, expected {' or '.join(_WRITERS)}")
+    if path.suffix in _WRITERS:
+        return _export_robot(model, path)
+    if path.suffix not in ENDINGS:
+        endings = ", ".join([*ENDINGS, *_WRITERS])
+        raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
+    model = double_copy(model).requires_grad_(False)
+    functions = model_functions(model, None if statistics is None else ranges_of(statistics))
+    names = [function.name for function in functions]
+    if what is None and path.suffix != ".c":
+        what = names[0]
+    if what not in (None, *names):
+        raise ValueError(f"what is {what!r}, expected one of {', '.join(names)}")
+    info = {
+        "model": type(model).__name__,
+        "num_coordinates": model.num_coordinates,
+        "num_inputs": model.num_inputs,
+        **model.learned_figures(),
+        **(about or {}),
+    }
+    return write([f for f in functions if what in (None, f.name)], path, info, real)
+
+
+def ranges_of(statistics: Statistics) -> Ranges:
+    """Return the ranges of the training data, of v, a and u twice their standard deviations."""
+    v, a, u = 2 * statistics.v_std, 2 * statistics.acceleration, statistics.u_mean
+    h = torch.tensor(statistics.step)
+    return {
+        "q": (statistics.q_low, statistics.q_high),
+        "v": (-v, v),
+        "a": (-a, a),
+        "u": (u - 2 * statistics.u_std, u + 2 * statistics.u_std),
+        "h": (0.5 * h, h),
+    }
+
+
+def _export_robot(model: Predictor, path: Path) -> Path:
     structure = getattr(model, "structure", None)
     chain = getattr(structure, "chain", structure)  # the links of elastic joints
     if not isinstance(model, KnownMechanics) or not isinstance(chain, RigidChain):

@@ -23,6 +23,7 @@ from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.payload import identify_payload
+from pinn_dyn.exports.exported import Real
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
@@ -147,9 +148,17 @@ class Run:
         if self._made_in_python is not None and not (target / TRAJECTORIES).exists():
             store(self._made_in_python, target / TRAJECTORIES)
 
-    def export(self, path: str | Path) -> Path:
-        """Write the identified robot to a URDF or an MJCF, see :func:`~.app.export.export`."""
-        return export(self.model, path)
+    def export(self, path: str | Path, what: str | None = None, *, real: Real = "double") -> Path:
+        """Write the model to a C, ONNX, CasADi, URDF or MJCF file, see :func:`~.app.export.export`.
+
+        Args:
+            path: the file, whose ending chooses the format.
+            what: name of the function, for a file of a single function.
+            real: type of the numbers in a ``.c`` or ``.onnx`` file, ``double`` or ``float``.
+        """
+        about = {"q": self.labels, "u": self.input_labels}
+        statistics = self.statistics
+        return export(self.model, path, what, real=real, statistics=statistics, about=about)
 
     def identify_payload(
         self, loaded: DataSource | pd.DataFrame | str | Sequence[str]

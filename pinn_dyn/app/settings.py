@@ -135,6 +135,7 @@ class Guard:
     """Reaction to states far from the training data."""
 
     threshold: PositiveFloat | None = None
+    fallback: Literal["hold", "regulation"] | None = None
 
 
 @dataclass(kw_only=True)
@@ -168,6 +169,8 @@ class ControlSettings:
     guard: Guard | Mapping[str, Any]
     stability: Stability | Mapping[str, Any] | None
     export: str | None
+    exported_law: str
+    export_real: Literal["double", "float"]
     settle_fraction: Annotated[float, Field(gt=0, lt=1)]
     settled_after: NonNegativeFloat
     trajectory: NonNegativeInt

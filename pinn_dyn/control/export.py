@@ -1,11 +1,12 @@
-"""Compile a control law ahead of time into one file that PyTorch runs without this package."""
+"""Files of control laws for other programs, and the loader of those that PyTorch runs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from pinn_dyn.control.contracts import Controller
+from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.laws import ModelBasedLaw
+from pinn_dyn.control.region import Guarded
+from pinn_dyn.control.safe_law import SafeLaw
 from pinn_dyn.data.whole import write_whole
+from pinn_dyn.exports.exported import ENDINGS, STATES, ExportedFunction, Real, write
+from pinn_dyn.exports.model_functions import Ranges
+
+log = logging.getLogger(__name__)
 
 INPUTS = ("q", "v", "q_ref", "v_ref", "a_ref")
 TOLERANCE = 1e-5
@@ -51,25 +59,88 @@ class CompiledLaw:
         return self._run(values)[0]
 
 
-def export_law(controller: Controller, path: str | Path) -> Path:
+def export_law(
+    controller: Controller,
+    path: str | Path,
+    *,
+    actuator: Actuator | None = None,
+    period: float | None = None,
+    real: Real = "double",
+    about: Mapping[str, Any] | None = None,
+    ranges: Ranges | None = None,
+) -> Path:
+    """Write a law to a file for other programs, see docs/realtime.md.
+
+    - ``.c`` (with ``.h``), ``.onnx`` and ``.casadi``: the :class:`~.safe_law.SafeLaw`, that is the
+      law, its observer, its guard and the limits of the input, with explicit memory.
+    - ``.pt2``: the law alone, by AOTInductor, for PyTorch without this package.
+
+    Args:
+        controller: a law of a model in float64 on the CPU, also with an observer or a guard.
+        path: the file.
+        actuator: limits of the input.
+        period: time between two calls, s; limits of the rate and observers need it.
+        real: type of the numbers of a ``.c`` or ``.onnx`` file.
+        about: fields for the information in the file, such as names of coordinates.
+        ranges: smallest and largest q, v and a of the states of the comparison, by name.
+
+    Raises:
+        ValueError: on another ending, or a missing period.
+        TypeError: on a controller that is no law of a model, or an operation that a format lacks.
+        RuntimeError: if the file cannot be compiled or loaded, or does not repeat the law to 1e-9
+            (``.pt2``: 1e-5, float: 1e-4).
+    """
+    path = Path(path).expanduser()
+    if path.suffix == ".pt2":
+        return _export_package(controller, path, limited=actuator not in (None, Actuator()))
+    if path.suffix not in ENDINGS:
+        endings = ", ".join([*ENDINGS, ".pt2"])
+        raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
+    safe = SafeLaw(controller, actuator, period)
+    n, m = safe.law.num_coordinates, safe.law.num_inputs
+    generator = torch.Generator().manual_seed(0)
+    unit = torch.ones((), dtype=torch.float64)
+
+    def states(name: str, size: int) -> Tensor:
+        low, high = (ranges or {}).get(name, (-unit, unit))
+        values = torch.rand(STATES, size, generator=generator, dtype=torch.float64)
+        return low + (high - low) * values
+
+    inputs = {name: states(name.removesuffix("_ref"), n) for name in INPUTS}
+    inputs["memory_in"] = states("memory", safe.memory_size)
+    inputs["memory_in"][:, m : m + 1].round_()  # of an observer: called before or not
+    info = {
+        "law": type(safe.law).__name__,
+        "observer": safe.observer and {"bandwidth": safe.observer.bandwidth},
+        "guard": safe.guard
+        and {key: getattr(safe.guard, key) for key in ("threshold", "fallback")},
+        "limits": {key: getattr(safe.actuator, key) for key in ("low", "high", "rate")},
+        "period": period,
+        "num_coordinates": n,
+        "num_inputs": m,
+        "memory_size": safe.memory_size,
+        **{key: getattr(safe.law, key).tolist() for key in ("position_gain", "velocity_gain")},
+        **(about or {}),
+    }
+    text = (
+        "Input u of the law. Returns the sum of 1 (limited), 2 (outside the training data) and 4 "
+        "(not finite: the last input). Zero memory_in before the first call, then memory_out."
+    )
+    law = ExportedFunction("control", safe, inputs, ("u", "status", "memory_out"), text)
+    return write([law], path, info, real)
+
+
+def _export_package(controller: Controller, path: Path, limited: bool) -> Path:
     """Compile u = law(q, v, q_ref, v_ref, a_ref) for one state and write it to a ``.pt2`` file.
 
     The file holds machine code of torch.export and AOTInductor for the processor and PyTorch
-    version of the export, and runs on one thread with PyTorch alone, see docs/realtime.md. The
-    file ``<path>.sha256`` holds the checksum for :func:`load_law`.
-
-    Args:
-        controller: a law without memory, its model in float64 on the CPU.
-        path: the ``.pt2`` file to write.
-
-    Raises:
-        TypeError: on a controller with a memory.
-        RuntimeError: if the law cannot be compiled (a C++ compiler is needed), or the file does
-            not repeat the law to 1e-5.
+    version of the export, and runs on one thread. ``<path>.sha256`` holds its checksum.
     """
+    if limited or isinstance(controller, Guarded):
+        log.warning("%s holds no limits and no guard of the input: use .c or .onnx", path.name)
+    controller = controller.law if isinstance(controller, Guarded) else controller
     if not isinstance(controller, ModelBasedLaw):
-        raise TypeError(f"{type(controller).__name__} is no law of a model without memory")
-    path = Path(path)
+        raise TypeError(f"{type(controller).__name__} has a memory: export it to .c or .onnx")
     generator = torch.Generator().manual_seed(0)
     shape = (_CHECKS, len(INPUTS), controller.num_coordinates)
     states = 2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1

@@ -57,6 +57,7 @@ class DisturbanceObserver(Controller):
 
     Attributes:
         residual: r of the latest call, ``(*batch, N)``, N or Nm; None before the first call.
+        bandwidth, max_rate: as above; the rate is infinite without a limit.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class DisturbanceObserver(Controller):
         super().__init__(law.num_coordinates, law.num_inputs)
         self.law = law
         self.bandwidth = float(bandwidth)
-        self._max_rate = math.inf if max_rate is None else float(max_rate)
+        self.max_rate = math.inf if max_rate is None else float(max_rate)
         self._actuator = actuator
         self.residual: Tensor | None = None
         self._size: Tensor | None = None
@@ -111,7 +112,7 @@ class DisturbanceObserver(Controller):
                 disturbance = (momentum - last.momentum) / period - modeled
                 gain = -math.expm1(-self.bandwidth * period)
                 change = gain * (disturbance - self.residual)
-                limit = self._max_rate * period
+                limit = self.max_rate * period
                 self.residual = self.residual + change.clamp(-limit, limit)
             compensation = pseudo_inverse_times(A, self.residual)
             u = u - compensation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,9 +13,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.control.laws import ComputedTorque, ModelBasedLaw, Regulation
 from pinn_dyn.mechanics.arrays import require_last_dim
 
 log = logging.getLogger(__name__)
+
+_COLUMN = 32  # states whose distances are compared side by side, see DataRegion.nearest
+FallBack = Literal["hold", "regulation"]
+"""Input outside the training data: the last input, or PD with gravity compensation."""
 
 
 class DataRegion:
@@ -81,6 +87,16 @@ class DataRegion:
         nearest, _ = self._tree.query(np.where(finite[..., None], states, 0.0))
         return torch.as_tensor(np.where(finite, nearest / self.radius, np.nan)).to(q)
 
+    def nearest(self, q: Tensor, v: Tensor) -> Tensor:
+        """Return the distance ``()`` of a state ``(N,)``, by tensor operations to be exported."""
+        x = torch.cat([q, v])
+        linear = [k for k in range(len(x)) if k not in self.angles]
+        features = torch.cat([x[linear], x[self.angles].sin(), x[self.angles].cos()])
+        states = np.resize(self._tree.data, (-(-self._tree.n // _COLUMN) * _COLUMN, len(features)))
+        offset = (features / torch.from_numpy(self._scale)).unsqueeze(-1) - torch.tensor(states.T)
+        squares = (offset * offset).sum(0).reshape(-1, _COLUMN)
+        return squares.amin(0).amin(0).sqrt() / self.radius
+
     def _features(self, q: Tensor, v: Tensor) -> np.ndarray:
         x = torch.cat([q, v], dim=-1).detach().cpu().double().numpy()
         angles = x[..., self.angles]
@@ -95,16 +111,36 @@ class Guarded(Controller):
         law: the law to guard.
         region: the training data of the law's model.
         threshold: distance from which a state is outside; 1 is the edge of the data.
+        fallback: input outside: ``hold`` for the last input, ``regulation`` for
+            :class:`Regulation` by the gains of the law, None for the input of the law.
+
+    Raises:
+        ValueError: on ``regulation`` for a law whose gains are no stiffness and damping.
     """
 
-    def __init__(self, law: Controller, region: DataRegion, *, threshold: PositiveFloat = 2.0):
+    def __init__(
+        self,
+        law: Controller,
+        region: DataRegion,
+        *,
+        threshold: PositiveFloat = 2.0,
+        fallback: FallBack | None = None,
+    ):
         super().__init__(law.num_coordinates, law.num_inputs)
-        self.law, self.region, self.threshold = law, region, threshold
+        self.law, self.region, self.threshold, self.fallback = law, region, threshold, fallback
+        if fallback == "regulation":
+            if not isinstance(law, ModelBasedLaw) or isinstance(law, ComputedTorque):
+                raise ValueError(
+                    f"fallback regulation needs gains in Nm/rad, which {type(law).__name__} has "
+                    "not: use the fallback hold"
+                )
+            self._regulation = Regulation(law.model, law.position_gain, law.velocity_gain)
         self.reset()
 
     def reset(self) -> None:
         self.law.reset()
         self._distance: Tensor | None = None
+        self._last: Tensor | None = None
         self._warned = False
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
@@ -118,7 +154,18 @@ class Guarded(Controller):
                 f"training data, at distances up to {float(self._distance.nan_to_num().max()):.3g} "
                 f"(1: edge of the data, {self.threshold:g}: threshold of the guard)"
             )
+        if self.fallback:
+            last = torch.zeros_like(u) if self._last is None else self._last
+            u = torch.where(outside.unsqueeze(-1), self.fall_back(q, v, reference, u, last), u)
+        self._last = u
         return u
+
+    def fall_back(self, q: Tensor, v: Tensor, reference: Motion, u: Tensor, last: Tensor) -> Tensor:
+        """Return the input outside the data, ``(*batch, M)``; u is that of the law."""
+        if self.fallback == "hold":
+            return last
+        with torch.no_grad():
+            return self._regulation.law(q, v, *reference) if self.fallback else u
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return those of the law, ``distance``, and ``outside`` as 0 or 1."""

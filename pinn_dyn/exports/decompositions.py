@@ -74,6 +74,12 @@ def _solve_ex(A: Tensor, B: Tensor, *, left: bool = True, check_errors: bool = F
     return (result.squeeze(-1) if vector else result), A, failed, failed
 
 
+def _inverse_ex(A: Tensor, *, check_errors: bool = False) -> Any:
+    identity = torch.eye(A.shape[-1], dtype=A.dtype).expand(A.shape)
+    inverse, _, _, failed = _solve_ex(A, identity)
+    return inverse, failed
+
+
 def _solve_triangular(
     A: Tensor, B: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
 ) -> Tensor:
@@ -87,6 +93,9 @@ DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.linalg_cholesky_ex.default: _cholesky_ex,
     _aten.cholesky_solve.default: _cholesky_solve,
     _aten._linalg_solve_ex.default: _solve_ex,
+    _aten.addmm.default: lambda bias, a, b, beta=1, alpha=1: beta * bias + alpha * (a @ b),
+    _aten.bmm.default: lambda a, b: (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(-2),
+    _aten.linalg_inv_ex.default: _inverse_ex,
     _aten.linalg_qr.default: lambda A, mode="reduced": qr(A),
     _aten.linalg_solve_triangular.default: _solve_triangular,
 }

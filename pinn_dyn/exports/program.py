@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, fx
-from torch._decomp import core_aten_decompositions
+from torch._decomp import core_aten_decompositions, get_decompositions
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
@@ -54,6 +54,23 @@ class Program:
         return list(output.args[0])
 
 
+def operation(node: fx.Node) -> str:
+    """Return the name of an operation in :data:`torch.ops.aten`, without its overload."""
+    target = node.target
+    if isinstance(target, torch._ops.OpOverload):
+        return str(target.overloadpacket.__name__)
+    return getattr(target, "__name__", str(target))
+
+
+def unsupported(node: fx.Node, form: str) -> TypeError:
+    """Return the error for an operation that a form of export lacks, with its place."""
+    trace = (node.meta.get("stack_trace") or "").strip().split("\n")[0]
+    place = f", {trace[0].lower() + trace[1:]}" if trace else ""
+    return TypeError(
+        f"{node.target}{place}: {form} has no such operation, write the head with others"
+    )
+
+
 def trace(
     function: Callable[..., Tensor | tuple[Tensor, ...]],
     inputs: Mapping[str, Tensor],
@@ -72,9 +89,10 @@ def trace(
             result = function(*arguments)
         return (result,) if isinstance(result, Tensor) else tuple(result)
 
-    table = {**core_aten_decompositions(), **DECOMPOSITIONS}
+    softmax = get_decompositions([torch.ops.aten._softmax])
+    table = {**core_aten_decompositions(), **softmax, **DECOMPOSITIONS}
     values = tuple(value.clone() for value in inputs.values())  # make_fx merges equal tensors
-    module = make_fx(torch.func.functionalize(run), table)(*values)
+    module = make_fx(torch.func.functionalize(run), table, record_stack_traces=True)(*values)
     _fold_constants(module, values)
     results = module(*values)
     shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}
@@ -102,6 +120,8 @@ def _fold_constants(module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> No
     for node in graph.nodes:
         if node.target is torch.ops.aten.squeeze_.dim:
             node.target = torch.ops.aten.squeeze.dim
+        elif node.target is torch.ops.aten._linalg_check_errors.default:
+            graph.erase_node(node)
     graph.eliminate_dead_code()
     _Values(module).run(*arguments)
     for node in list(graph.nodes):

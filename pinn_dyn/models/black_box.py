@@ -57,9 +57,13 @@ class NextStateMLP(Predictor):
         path = [x]
         # A held input has the same value at both ends of a step.
         for before, after in input.stages(t, (0.0, 1.0)).to(x0):
-            x = x + self.scale * self.network(torch.cat([x0 + x, before, after], dim=-1))
+            x = x + self.increment(x0 + x, before, after)
             path.append(x)
         return torch.stack(path, dim=-2)
+
+    def increment(self, x: Tensor, u: Tensor, u_next: Tensor) -> Tensor:
+        """Return the increment of x over a step with u at its start and u_next at its end."""
+        return self.scale * self.network(torch.cat([x, u, u_next], dim=-1))
 
 
 class AccelerationMLP(DelayedPredictor):

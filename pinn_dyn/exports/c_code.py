@@ -1,0 +1,408 @@
+"""C functions of programs: loops over arrays of fixed size on the stack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, fx
+
+from pinn_dyn.exports.program import Program, operation, unsupported
+
+PRELUDE = """\
+#include <tgmath.h>
+
+static inline real square(real x) { return x * x; }
+static inline real larger(real a, real b) { return a > b || a != a ? a : b; }
+static inline real smaller(real a, real b) { return a < b || a != a ? a : b; }
+static inline real sign(real x) { return (real)((x > 0) - (x < 0)); }
+static inline real sigmoid(real x) { return 1 / (1 + exp(-x)); }
+"""
+"""Functions of the code, after a ``typedef`` of real. NaN passes, as in PyTorch."""
+
+_FUNCTIONS = "sqrt exp expm1 log log1p sin cos tan asin acos atan sinh cosh tanh erf floor sigmoid"
+_OPERATORS = {"mul": "*", "div": "/", "add": "+", "sub": "-", "gt": ">", "ge": ">=", "lt": "<"}
+_OPERATORS |= {"le": "<=", "eq": "==", "ne": "!="}
+_OPERATORS |= {
+    f"{kind}_{name}": sign
+    for kind in ("logical", "bitwise")
+    for name, sign in (("and", "&&"), ("or", "||"))
+}
+_ELEMENTWISE = {
+    **{name: f"{name}({{0}})" for name in [*_FUNCTIONS.split(), "sign"]},
+    **{name: f"{{0}} {sign} {{1}}" for name, sign in _OPERATORS.items()},
+    **{name: f"{name}({{0}}, {{1}})" for name in ("atan2", "pow", "fmod")},
+    "neg": "-{0}",
+    "reciprocal": "1 / {0}",
+    "rsqrt": "1 / sqrt({0})",
+    "abs": "fabs({0})",
+    "relu": "larger({0}, 0)",
+    "logical_not": "!{0}",
+    "bitwise_not": "!{0}",
+    "clone": "{0}",
+    "copy": "{1}",
+    "_to_copy": "{0}",
+    "maximum": "larger({0}, {1})",
+    "minimum": "smaller({0}, {1})",
+    "where": "{0} ? {1} : {2}",
+    "clamp": "",  # by the limits that are present
+}
+_REDUCTIONS = {
+    "sum": ("0", "{0} + {1}"),
+    "mean": ("0", "{0} + {1}"),
+    "amin": ("INFINITY", "smaller({0}, {1})"),
+    "amax": ("-INFINITY", "larger({0}, {1})"),
+}
+_ROWS, _COLUMNS = 32, 4  # of a matrix product that are summed at once
+Index = Sequence[str]
+
+
+class Constants:
+    """Arrays that the functions of a C file share, each stored once.
+
+    Args:
+        real: type of the numbers, ``double`` or ``float``.
+    """
+
+    def __init__(self, real: str):
+        self.real = real
+        self._names: dict[tuple[str, int, str], str] = {}
+
+    def name(self, values: Tensor) -> str:
+        """Return the name of the array with these values."""
+        kind = self.real if values.dtype.is_floating_point else "int"
+        numbers = ", ".join(self.number(x) for x in values.flatten().tolist())
+        key = kind, values.numel(), numbers
+        return self._names.setdefault(key, f"c{len(self._names)}")
+
+    def number(self, value: Any) -> str:
+        """Return a number as an operand."""
+        if isinstance(value, int):  # and bool
+            return f"{value:d}"
+        if math.isnan(value):
+            return "NAN"
+        text = f"{abs(value)!r}{'f' * (self.real == 'float')}"
+        text = text if math.isfinite(value) else "INFINITY"
+        return f"(-{text})" if value < 0 else text
+
+    def definitions(self) -> list[str]:
+        """Return the lines that define the arrays."""
+        return [
+            f"static const {kind} {name}[{size}] = {{{numbers}}};"
+            for (kind, size, numbers), name in self._names.items()
+        ]
+
+
+class _Buffers:
+    """Names of arrays on the stack. An array is used again once its values are not needed."""
+
+    def __init__(self) -> None:
+        self.sizes: dict[str, tuple[str, int]] = {}
+        self._free: list[str] = []
+
+    def take(self, kind: str, size: int) -> str:
+        for name in self._free:
+            if self.sizes[name] == (kind, size):
+                self._free.remove(name)
+                return name
+        name = f"x{len(self.sizes)}"
+        self.sizes[name] = kind, size
+        return name
+
+    def release(self, name: str) -> None:
+        if name in self.sizes:
+            self._free.append(name)
+
+
+def _storage(value: Tensor) -> int:
+    return value.untyped_storage().data_ptr()
+
+
+class CFunction:
+    """The body of a C function that evaluates a program.
+
+    An elementwise operation with a single use is written into the loop that uses it. A view costs
+    nothing: it is another index of its array.
+
+    Args:
+        program: the operations.
+        constants: arrays of the file.
+
+    Attributes:
+        lines: the statements.
+        stack: bytes of the arrays on the stack.
+    """
+
+    def __init__(self, program: Program, constants: Constants):
+        self.constants = constants
+        self.lines: list[str] = []
+        self._arrays: dict[int, str] = {}
+        self._buffers = _Buffers()
+        self._kept: list[Tensor] = []
+        graph = program.graph_module.graph
+        results = program.results()
+        for name, node in zip(program.inputs, graph.find_nodes(op="placeholder"), strict=True):
+            scalar = node.meta["val"].ndim == 0
+            self._arrays[_storage(node.meta["val"])] = f"(&{name})" if scalar else name
+        nodes = [node for node, value in program.nodes() if node.op == "call_function"]
+        self._inlined = {node for node in nodes if self._has_one_use(node) and node not in results}
+        statements = [node for node in nodes if node not in self._inlined]
+        last = {pointer: k for k, node in enumerate(statements) for pointer in self._reads(node)}
+        kept = {pointer for node in results for pointer in self._reads(node)}
+        for k, node in enumerate(statements):
+            self._write(node)
+            for pointer in self._reads(node):
+                if last[pointer] == k and pointer not in kept and pointer in self._arrays:
+                    self._buffers.release(self._arrays.pop(pointer))
+        for name, node in zip(program.outputs, results, strict=True):
+            value = torch.empty(node.meta["val"].shape)
+            self._kept.append(value)
+            self._arrays[_storage(value)] = name
+            self._assign(value, node)
+        sizes = self._buffers.sizes
+        self.lines[:0] = [f"{kind} {name}[{size}];" for name, (kind, size) in sizes.items()]
+        width = 8 if constants.real == "double" else 4
+        self.stack = sum(size * (width if kind == "real" else 4) for kind, size in sizes.values())
+
+    def _has_one_use(self, node: fx.Node) -> bool:
+        if operation(node) not in _ELEMENTWISE or len(node.users) != 1:
+            return False
+        (user,) = node.users
+        if operation(user) in _REDUCTIONS:
+            return True
+        same = operation(user) in _ELEMENTWISE
+        return same and user.meta["val"].numel() == node.meta["val"].numel()
+
+    def _reads(self, node: fx.Node) -> set[int]:
+        """Return the arrays of a node: its result and what its loop reads."""
+        value = node.meta["val"]
+        pointers = set()
+        if isinstance(value, Tensor) and node not in self._inlined:
+            pointers.add(_storage(value))
+        if node.op == "call_function" and operation(node) != "getitem":
+            for operand in node.all_input_nodes:
+                if operand in self._inlined:
+                    pointers |= self._reads(operand)
+                elif isinstance(operand.meta["val"], Tensor):
+                    pointers.add(_storage(operand.meta["val"]))
+        return pointers
+
+    # Operands and expressions.
+
+    def _element(self, value: Tensor, index: Index, constant: bool = False) -> str:
+        strides, offset = value.stride(), value.storage_offset()
+        if constant:
+            array = self.constants.name(value)
+            strides, offset = torch.empty(value.shape, device="meta").stride(), 0
+        else:
+            array = self._arrays[_storage(value)]
+        terms = [
+            i if stride == 1 else f"{stride} * ({i})"
+            for i, stride, size in zip(index, strides, value.shape, strict=True)
+            if stride and size > 1 and i != "0"
+        ]
+        return f"{array}[{' + '.join([*terms, *([str(offset)] if offset else [])]) or 0}]"
+
+    def _operand(self, operand: Any, index: Index) -> str:
+        """Return an operand at the index of a result, to which it is broadcast."""
+        if not isinstance(operand, fx.Node):
+            return self.constants.number(operand)
+        value = operand.meta["val"]
+        index = index[len(index) - value.ndim :]
+        index = ["0" if size == 1 else i for i, size in zip(index, value.shape, strict=True)]
+        constant = operand.op == "get_attr"
+        if constant and bool((value == value.flatten()[0]).all()):
+            return self.constants.number(value.flatten()[0].item())
+        if operand in self._inlined:
+            return f"({self._expression(operand, index)})"
+        return self._element(value, index, constant)
+
+    def _expression(self, node: fx.Node, index: Index) -> str:
+        name, arguments = operation(node), node.args
+        operands = [
+            self._operand(x, index) for x in arguments if isinstance(x, fx.Node | int | float)
+        ]
+        if name == "clamp":
+            low, high = (*arguments[1:], None, None)[:2]
+            text = operands[0]
+            if (low := node.kwargs.get("min", low)) is not None:
+                text = f"larger({text}, {self._operand(low, index)})"
+            if (high := node.kwargs.get("max", high)) is not None:
+                text = f"smaller({text}, {self._operand(high, index)})"
+            return text
+        if name == "pow" and arguments[1] in (2, 0.5):
+            return f"{'square' if arguments[1] == 2 else 'sqrt'}({operands[0]})"
+        if (alpha := node.kwargs.get("alpha", 1)) != 1:
+            operands[1] = f"({self.constants.number(alpha)} * {operands[1]})"
+        return _ELEMENTWISE[name].format(*operands)
+
+    # Statements.
+
+    def _loops(self, sizes: dict[str, int], body: list[str]) -> None:
+        """Write statements inside loops over indices, the outer first."""
+        loops = [f"for (int {i} = 0; {i} < {n}; {i}++)" for i, n in sizes.items() if n > 1]
+        if len(body) > 1:
+            loops.append("{")
+        self.lines += [*("  " * k + line for k, line in enumerate(loops))]
+        self.lines += ["  " * len(loops) + line for line in body]
+        if len(body) > 1:
+            self.lines.append("  " * (len(loops) - 1) + "}")
+
+    def _indices(self, value: Tensor, letter: str = "i") -> tuple[list[str], dict[str, int]]:
+        """Return an index of each dimension, and the sizes in the order of the memory."""
+        index = [f"{letter}{k}" if n > 1 else "0" for k, n in enumerate(value.shape)]
+        strides: Any = value.stride()
+        order = sorted(range(value.ndim), key=lambda k: -strides[k])
+        return index, {index[k]: value.shape[k] for k in order if value.shape[k] > 1}
+
+    def _assign(self, value: Tensor, source: fx.Node | float, pick: Any = None) -> None:
+        """Write a loop that copies a source; ``pick`` gives its index from that of the value."""
+        if value.numel():
+            index, sizes = self._indices(value)
+            operand = self._operand(source, pick(index) if pick else index)
+            self._loops(sizes, [f"{self._element(value, index)} = {operand};"])
+
+    def _declare(self, node: fx.Node) -> Tensor:
+        value: Tensor = node.meta["val"]
+        kind = "int" if value.dtype == torch.bool else "real"
+        size = value.untyped_storage().nbytes() // value.element_size()
+        self._arrays[_storage(value)] = self._buffers.take(kind, size)
+        return value
+
+    def _write(self, node: fx.Node) -> None:
+        value, name = node.meta["val"], operation(node)
+        if not isinstance(value, Tensor) or not value.numel() or _storage(value) in self._arrays:
+            return  # of several results, of no numbers, or a view
+        if name in _ELEMENTWISE:
+            self._declare(node)
+            index, sizes = self._indices(value)
+            self._loops(
+                sizes, [f"{self._element(value, index)} = {self._expression(node, index)};"]
+            )
+            return
+        write: Any = self._reduction if name in _REDUCTIONS else getattr(self, f"_{name}", None)
+        if write is None:
+            raise unsupported(node, "C code")
+        write(node, *node.args)
+
+    def _mm(self, node: fx.Node, left: fx.Node, right: fx.Node) -> None:
+        """Write a product by blocks of rows and columns, whose sums stay in registers."""
+        out, weights = self._declare(node), left
+        a, b = left.meta["val"], right.meta["val"]
+        if left.op != "get_attr" and right.op == "get_attr":  # (B^T A^T)^T
+            a, b, out, weights = b.mT, a.mT, out.mT, right
+        constant = weights.op == "get_attr"
+        (rows, depth), columns = a.shape, b.shape[1]
+        full = rows - rows % _ROWS
+        for first, end, width in ((0, full, _ROWS), (full, rows, rows - full)):
+            if first == end:
+                continue
+            block = a[first:end].unflatten(0, (-1, width)).transpose(1, 2)
+            weight = self._element(block, ["b", "k", "i"], constant)  # constants in this order
+            target = out[first:end].unflatten(0, (-1, width))
+            row = f"for (int i = 0; i < {width}; i++)"
+            for start in range(0, columns, _COLUMNS):
+                numbers = range(start, min(start + _COLUMNS, columns))
+                factors = [f"y{j} = {self._element(b, ['k', str(j)])}" for j in numbers]
+                sums = [f"s{j}[i] += {weight} * y{j};" for j in numbers]
+                copies = [
+                    f"{self._element(target, ['b', 'i', str(j)])} = s{j}[i];" for j in numbers
+                ]
+                body = [
+                    f"real {', '.join(f's{j}[{width}]' for j in numbers)};",
+                    f"{row} {' = '.join(f's{j}[i]' for j in numbers)} = 0;",
+                    f"for (int k = 0; k < {depth}; k++) {{",
+                    f"  const real {', '.join(factors)};",
+                    f"  {row} {{ {' '.join(sums)} }}",
+                    "}",
+                    f"{row} {{ {' '.join(copies)} }}",
+                ]
+                self._loops({"b": len(block)}, body)
+
+    def _reduction(self, node: fx.Node, source: fx.Node, dims: Any = None, keep: bool = False):
+        start, step = _REDUCTIONS[operation(node)]
+        value, shape = self._declare(node), source.meta["val"].shape
+        dims = [d % len(shape) for d in dims] if dims else [*range(len(shape))]
+        index, sizes = self._indices(value)
+        free = iter(index if not keep else [i for d, i in enumerate(index) if d not in dims])
+        full = [f"j{d}" if d in dims else next(free) for d in range(len(shape))]
+        inner = {f"j{d}": shape[d] for d in dims if shape[d] > 1}
+        target, operand = self._element(value, index), self._operand(source, full)
+        count = math.prod(inner.values()) if operation(node) == "mean" else 1
+        if value.numel() < 8:
+            loops = " ".join(f"for (int {i} = 0; {i} < {n}; {i}++)" for i, n in inner.items())
+            add = f"{loops} s = {step.format('s', operand)};"
+            self._loops(sizes, [f"real s = {start};", add, f"{target} = s / {count};"])
+        else:  # entries side by side do not wait for each other
+            self._loops(sizes, [f"{target} = {start};"])
+            self._loops({**inner, **sizes}, [f"{target} = {step.format(target, operand)};"])
+            self._loops(sizes if count > 1 else {}, [f"{target} /= {count};"][: count > 1])
+
+    def _cat(self, node: fx.Node, sources: Sequence[fx.Node], dim: int = 0) -> None:
+        value, start = self._declare(node), 0
+        for source in sources:
+            if source.meta["val"].numel():
+                size = source.meta["val"].shape[dim]
+                self._assign(value.narrow(dim, start, size), source)
+                start += size
+
+    def _constant_pad_nd(
+        self, node: fx.Node, source: fx.Node, pads: Sequence[int], fill: float = 0
+    ) -> None:
+        value = self._declare(node)
+        self._assign(value, fill)
+        for k, before in enumerate(pads[::2]):
+            dim = node.meta["val"].ndim - 1 - k
+            value = value.narrow(dim, before, source.meta["val"].shape[dim])
+        self._assign(value, source)
+
+    def _repeat(self, node: fx.Node, source: fx.Node, times: Sequence[int]) -> None:
+        shape = source.meta["val"].shape
+
+        def pick(index: Index) -> list[str]:
+            return [
+                f"{i} % {n}" for i, n in zip(index[len(times) - len(shape) :], shape, strict=True)
+            ]
+
+        self._assign(self._declare(node), source, pick)
+
+    def _index(self, node: fx.Node, source: fx.Node, indices: Sequence[fx.Node | None]) -> None:
+        tensors = [x for x in indices if x is not None]
+        first = indices.index(tensors[0])
+        if any(x is None for x in indices[first : first + len(tensors)]):
+            raise unsupported(node, "C code")
+        width = max(x.meta["val"].ndim for x in tensors)
+
+        def pick(index: Index) -> list[str]:
+            picked = [f"(int)({self._operand(x, index[first : first + width])})" for x in tensors]
+            return [*index[:first], *picked, *index[first + width :]]
+
+        self._assign(self._declare(node), source, pick)
+
+    def _index_select(self, node: fx.Node, source: fx.Node, dim: int, index: fx.Node) -> None:
+        self._index(node, source, [None] * (dim % node.meta["val"].ndim) + [index])
+
+    def _flip(self, node: fx.Node, source: fx.Node, dims: Sequence[int]) -> None:
+        shape = node.meta["val"].shape
+        turned = [d % len(shape) for d in dims]
+
+        def pick(index: Index) -> list[str]:
+            return [f"{shape[d] - 1} - {i}" if d in turned else i for d, i in enumerate(index)]
+
+        self._assign(self._declare(node), source, pick)
+
+    def _slice_scatter(
+        self, node: fx.Node, base: fx.Node, source: fx.Node, dim: int = 0, *part: int
+    ) -> None:
+        value = self._declare(node)
+        self._assign(value, base)
+        self._assign(torch.ops.aten.slice(value, dim, *part), source)
+
+    def _select_scatter(
+        self, node: fx.Node, base: fx.Node, source: fx.Node, dim: int, position: int
+    ) -> None:
+        value = self._declare(node)
+        self._assign(value, base)
+        self._assign(value.select(dim, position), source)

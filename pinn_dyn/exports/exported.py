@@ -1,0 +1,137 @@
+"""Functions in files for other programs, each compared with its original."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pinn_dyn.exports.program import Program, trace
+
+Real = Literal["double", "float"]
+Calls = Mapping[str, Callable[..., Sequence[np.ndarray]]]
+"""The functions of a written file by name, as called from Python."""
+
+TOLERANCES = {"double": 1e-9, "float": 1e-4}
+STATES = 200
+_WRITERS = {
+    ".c": "pinn_dyn.exports.c_file:write_c",
+    ".onnx": "pinn_dyn.exports.onnx_file:write_onnx",
+    ".casadi": "pinn_dyn.exports.casadi_function:write_casadi",
+}
+ENDINGS = tuple(_WRITERS)
+
+
+class ExportedFunction:
+    """A function of one state, and the states at which its file is compared with it.
+
+    Args:
+        name: the name in the file.
+        function: takes the inputs by position, and returns a tensor for each output.
+        inputs: values of each input by name, ``(200, *shape)``, float64.
+        outputs: names of the outputs.
+        about: units and meaning, for the file.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Tensor | tuple[Tensor, ...]],
+        inputs: Mapping[str, Tensor],
+        outputs: Sequence[str],
+        about: str = "",
+    ):
+        self.name, self.function, self.about = name, function, about
+        self.inputs, self.outputs = dict(inputs), list(outputs)
+
+    @cached_property
+    def program(self) -> Program:
+        """The operations of the function."""
+        example = {name: values[0] for name, values in self.inputs.items()}
+        return trace(self.function, example, self.outputs)
+
+    def compare(self, call: Callable[..., Sequence[np.ndarray]], tolerance: float) -> None:
+        """Compare with a function of arrays; differences are relative.
+
+        The scale is the norm of an output at the state, or its RMS over all states if larger.
+
+        Raises:
+            RuntimeError: if a difference exceeds the tolerance.
+        """
+        states = [*zip(*self.inputs.values(), strict=True)]
+        pairs = []
+        for state in states:
+            with torch.no_grad():
+                expected = self.function(*state)
+            expected = (expected,) if isinstance(expected, Tensor) else expected
+            pairs.append((expected, call(*(x.numpy() for x in state))))
+        for k, output in enumerate(self.outputs):
+            values = np.stack([np.ravel(expected[k].numpy()) for expected, _ in pairs])
+            results = np.stack([np.ravel(result[k]) for _, result in pairs])
+            finite = np.isfinite(values).all(-1)
+            norms = np.linalg.norm(values, axis=-1)
+            scale = np.fmax(norms, np.sqrt(np.mean(norms[finite] ** 2)) if finite.any() else 0.0)
+            error = np.linalg.norm(results - values, axis=-1) / np.where(scale > 0, scale, 1)
+            error = np.where(finite, error, np.where(np.isfinite(results).all(-1), np.inf, 0.0))
+            if not (error <= tolerance).all():
+                worst = int(np.argmax(np.nan_to_num(error, nan=np.inf)))
+                at = ", ".join(
+                    f"{name} = {np.round(x.numpy(), 4).tolist()}"
+                    for name, x in zip(self.inputs, states[worst], strict=True)
+                )
+                raise RuntimeError(
+                    f"{self.name}: {output} differs from the original by {error[worst]:.1e} "
+                    f"(relative, expected {tolerance:g}) at {at}: no file is written; check the "
+                    "condition numbers of M(q) and A(q) there, or export with real='double'"
+                )
+
+
+def write(
+    functions: Sequence[ExportedFunction],
+    path: Path,
+    info: Mapping[str, Any],
+    real: Real = "double",
+) -> Path:
+    """Write functions to a file of the format of its ending, and compare the file with them.
+
+    Args:
+        functions: the functions; only C files hold several.
+        path: ``.c``, ``.onnx`` or ``.casadi``; a ``.h`` goes beside a ``.c``.
+        info: names, gains and sizes that the file holds as JSON, together with the version.
+        real: type of the numbers.
+
+    Raises:
+        RuntimeError: if the file differs from the functions by more than 1e-9 (double) or 1e-4
+            (float), relative; no file is left.
+        TypeError: if the format lacks an operation.
+    """
+    module, writer = _WRITERS[path.suffix].split(":")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    version = importlib.import_module("pinn_dyn").__version__
+    text = json.dumps({"pinn_dyn": version, "real": real, **info})
+    # Written beside its place and then moved: a failure leaves the previous file, or none.
+    with TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
+        partial = Path(folder) / path.name
+        calls: Calls = getattr(importlib.import_module(module), writer)(
+            functions, partial, text, real
+        )
+        for function in functions if calls else ():
+            function.compare(calls[function.name], TOLERANCES[real])
+        for file in Path(folder).iterdir():
+            os.replace(file, path.parent / file.name)
+    return path
+
+
+def identifier(text: str) -> str:
+    """Return a name as it may stand in a C file."""
+    return re.sub(r"^(?=\d)", "_", re.sub(r"\W", "_", text, flags=re.ASCII))

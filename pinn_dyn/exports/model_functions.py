@@ -1,0 +1,101 @@
+"""The functions of a model that other programs call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.exports.exported import STATES, ExportedFunction
+from pinn_dyn.mechanics import ContinuousPredictor, MechanicalSystem, Predictor
+
+Ranges = Mapping[str, tuple[Tensor, Tensor]]
+"""Smallest and largest values of inputs by name, for the states of the comparison."""
+
+
+def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[ExportedFunction]:
+    """Return the functions of a model in float64, without gradients.
+
+    - mechanical systems: ``forward_dynamics(q, v, u)``, ``inverse_dynamics(q, v, a)`` and
+      ``terms(q)``, which are M, D, G and A, with matrices row by row;
+    - black boxes of the acceleration: ``forward_dynamics``;
+    - both: ``step(q, v, u, h)``, q and v after h seconds with u held, by the model's integrator;
+    - black boxes of the next state: ``next_state(q, v, u, u_next)`` after the model's step.
+
+    Args:
+        model: the model.
+        ranges: of q, v, u, a and h; the default is [-1, 1], and [0.5, 1.5] ms for h.
+
+    Raises:
+        TypeError: on a model without these functions, such as an ensemble.
+    """
+    n, m = model.num_coordinates, model.num_inputs
+    sizes = {"q": n, "v": n, "a": n, "u": m, "u_next": m}
+    ranges = {"h": (torch.tensor(5e-4), torch.tensor(1.5e-3)), **(ranges or {})}
+    if "u" in ranges:
+        ranges = {"u_next": ranges["u"], **ranges}
+    generator = torch.Generator().manual_seed(0)
+    one = torch.ones((), dtype=torch.float64)
+
+    def states(name: str) -> Tensor:
+        low, high = ranges.get(name, (-one, one))
+        shape = (STATES,) if name == "h" else (STATES, sizes[name])
+        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    def exported(name: str, inputs: str, outputs: str, about: str) -> ExportedFunction:
+        def function(*values: Tensor) -> Tensor | tuple[Tensor, ...]:
+            arguments = dict(zip(names, values, strict=True))
+            none = {x: values[0].new_zeros(0) for x in inputs.split() if x not in names}
+            result = available[name](**arguments, **none)
+            return result if isinstance(result, Tensor) else tuple(x for x in result if x.numel())
+
+        names = [x for x in inputs.split() if x == "h" or sizes[x]]
+        results = [x for x in outputs.split() if x != "A" or m]
+        return ExportedFunction(name, function, {x: states(x) for x in names}, results, about)
+
+    def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+        assert isinstance(model, ContinuousPredictor)
+        return model.state_derivative(torch.cat([q, v]), u)[n:]
+
+    def step(q: Tensor, v: Tensor, u: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+        assert isinstance(model, ContinuousPredictor)
+        system = model if isinstance(model, MechanicalSystem) and model.state == "qp" else None
+        start = torch.cat([q, system.momentum(q, v) if system else v])
+        inputs = u.expand(len(model.integrator.nodes), m)
+        q, v = (start + model.integration_step(0 * start, start, inputs, h)).split(n)
+        return q, system.velocity(q, v) if system else v
+
+    def next_state(q: Tensor, v: Tensor, u: Tensor, u_next: Tensor) -> tuple[Tensor, ...]:
+        x = torch.cat([q, v])
+        return (x + model.increment(x, u, u_next)).split(n)  # type: ignore[operator]
+
+    available: dict[str, Callable[..., Tensor | tuple[Tensor, ...]]] = {
+        "step": step,
+        "next_state": next_state,
+    }
+    forward = ("forward_dynamics", "q v u", "a", "Acceleration a.")
+    if isinstance(model, MechanicalSystem):
+        available |= {
+            "forward_dynamics": model.forward_dynamics,
+            "inverse_dynamics": model.inverse_dynamics,
+            "terms": model.terms,
+        }
+        functions = [
+            forward,
+            ("inverse_dynamics", "q v a", "tau", "Force tau = M a + C v + G + D v + F."),
+            ("terms", "q", "M D G A", "Terms M, D, G and A, matrices row by row."),
+        ]
+    elif isinstance(model, ContinuousPredictor):
+        available["forward_dynamics"] = acceleration
+        functions = [forward]
+    elif hasattr(model, "increment"):
+        about = f"State after {model.fixed_step:g} s, with u at its start and end."
+        return [exported("next_state", "q v u u_next", "q_next v_next", about)]
+    else:
+        raise TypeError(
+            f"a {type(model).__name__} has no function of a state to export; export a single model,"
+            " such as run.members[0] of an ensemble"
+        )
+    functions.append(("step", "q v u h", "q_next v_next", "State after h seconds, u held."))
+    return [exported(*function) for function in functions]

@@ -1,0 +1,190 @@
+"""Models as C files: compiled without a warning, and called at states of the test."""
+
+import json
+import logging
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.app.export import export
+from pinn_dyn.exports import exported
+from pinn_dyn.exports.c_code import Constants
+from pinn_dyn.exports.exported import ExportedFunction, write
+from pinn_dyn.exports.model_functions import model_functions
+from pinn_dyn.systems import RigidChain, SoftArm
+from tests.models.builders import (
+    CHAIN,
+    NONLINEAR,
+    TRANSPOSED,
+    VARIANTS,
+    make_model,
+    make_structured,
+    random_batch,
+)
+from tests.support.arm_urdf import ARM
+from tests.support.c_code import STRICT, compiled, function_of
+
+MODELS = {
+    **{
+        f"{kind}-{name}": lambda kind=kind, name=name: make_structured(kind, **VARIANTS[name])
+        for kind in ("lnn", "hnn")
+        for name in VARIANTS
+    },
+    **{f"{kind}-chain": lambda kind=kind: make_structured(kind, **CHAIN[kind]) for kind in CHAIN},
+    "transposed": lambda: make_structured("lnn", **TRANSPOSED),
+    "nonlinear": lambda: make_structured("lnn", **NONLINEAR),
+    "soft-arm": lambda: SoftArm(segments=2),
+    "rigid-chain": lambda: RigidChain(ARM),
+    "acceleration": lambda: make_model("acceleration"),
+    "next_state": lambda: make_model("next_state"),
+}
+FAST = ("lnn-constant-mass-fixed-damping-constant-input-3x3", "acceleration", "next_state")
+CASES = [pytest.param(x, marks=() if x in FAST else pytest.mark.slow, id=x) for x in MODELS]
+
+
+def assert_repeats(model, path, tolerance=1e-9):
+    library = compiled(path)
+    q, v, a, u = (x[0] for x in random_batch(model.num_coordinates, model.num_inputs, 1, seed=11))
+    h = torch.tensor(2e-3).double()
+    for function in model_functions(model):
+        values = {"q": q, "v": v, "a": a, "u": u, "u_next": 0.5 * u, "h": h}
+        arguments = [values[name] for name in function.inputs]
+        expected = function.function(*arguments)
+        expected = [expected] if isinstance(expected, torch.Tensor) else expected
+        call = function_of(path, f"{exported.identifier(path.stem)}_{function.name}", library)
+        for x, y in zip(call(*(x.numpy() for x in arguments)), expected, strict=True):
+            scale = np.abs(y.numpy()).max() + 1e-300
+            np.testing.assert_allclose(x, y.numpy().ravel(), rtol=0, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_c_code_of_a_model_repeats_it(case, tmp_path):
+    model = MODELS[case]().double().eval().requires_grad_(False)
+    assert_repeats(model, export(model, tmp_path / "new" / "my-arm.2.c"), 1e-12)
+
+
+def test_floats_are_repeated_to_their_precision(tmp_path):
+    model = MODELS["acceleration"]().eval().requires_grad_(False)
+    path = export(model, tmp_path / "arm.c", real="float")
+    assert "double" not in path.with_suffix(".h").read_text().replace("double precision", "")
+    assert_repeats(model, path, 1e-5)
+
+
+def test_a_step_integrates_as_the_prediction_does(tmp_path):
+    """Of (q, p) for a Hamiltonian network, whose velocities are learned."""
+    from pinn_dyn.mechanics import Signal
+
+    model = MODELS["hnn-constant-mass-fixed-damping-constant-input-3x3"]().requires_grad_(False)
+    (step,) = (f for f in model_functions(model) if f.name == "step")
+    q, v, _, u = (x[0] for x in random_batch(3, 3, 1))
+    times = torch.tensor([0.0, 0.01]).double()
+    x = torch.cat([q, model.momentum(q, v)])
+    end = model.predict(x, times, Signal(times, u.expand(2, 3), "hold"))[-1]
+    q_next, v_next = step.function(q, v, u, times[1])
+    torch.testing.assert_close(q_next, end[:3])
+    torch.testing.assert_close(v_next, model.velocity(end[:3], end[3:]))
+
+
+def assert_refused(tmp_path, message, error=RuntimeError, **options):
+    with pytest.raises(error, match=message):
+        write([SINE], tmp_path / "out" / "f.c", {}, **options)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+SINE = ExportedFunction("sine", torch.sin, {"x": torch.linspace(-1, 1, 200).double()[:, None]}, "y")
+
+
+def test_code_that_computes_something_else_leaves_no_file(tmp_path, monkeypatch):
+    table = {"sin": "cos({0})"}
+    monkeypatch.setattr("pinn_dyn.exports.c_code._ELEMENTWISE", table)
+    assert_refused(tmp_path, r"sine: y differs from the original by .* at x = \[")
+
+
+def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
+    monkeypatch.setattr("pinn_dyn.exports.c_code._ELEMENTWISE", {"sin": "{0} +* 1"})
+    assert_refused(tmp_path, r"cc does not compile f\.c: .*error")
+
+
+def test_without_a_compiler_the_file_is_written_and_said_to_be_untested(
+    tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setenv("CC", "/nonexistent")
+    path = write([SINE], tmp_path / "f.c", {})
+    assert "f.c was not compared with the model: no C compiler (/nonexistent)" in caplog.text
+    monkeypatch.delenv("CC")
+    np.testing.assert_allclose(function_of(path, "f_sine")(0.3), [[np.sin(0.3)]])
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        write([SINE], tmp_path / "f.c", {})
+    assert not caplog.text
+
+
+class Bessel(torch.nn.Module):
+    def forward(self, x):
+        return torch.special.bessel_j1(x) * 2
+
+
+def test_an_operation_without_c_code_is_named_with_its_head(tmp_path):
+    function = ExportedFunction("wave", Bessel(), SINE.inputs, "y")
+    with pytest.raises(TypeError, match=r"bessel_j1.*test_c_file\.py\", line \d+, in forward"):
+        write([function], tmp_path / "f.c", {})
+
+
+def test_the_compiler_sees_wrong_sizes_and_the_caller_the_version(tmp_path):
+    model = MODELS["acceleration"]().eval().requires_grad_(False)
+    export(model, tmp_path / "arm.c", about={"q": ["elbow (rad)", 'a "quoted" µ']})
+    program = '#include <stdio.h>\n#include "arm.h"\nint main(void) { double q[2] = {0}, a[%d];\n'
+    program += "#if arm_NUM_COORDINATES != 2 || arm_NUM_INPUTS != 2\n#error sizes\n#endif\n"
+    program += "arm_forward_dynamics(q, q, q, a); puts(arm_info()); return a[0] != a[0]; }\n"
+    command = ["cc", *STRICT, "-O1", "main.c", "arm.c", "-lm", "-o", "main"]
+    for size, accepted in ((2, True), (1, False)):
+        (tmp_path / "main.c").write_text(program % size)
+        result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert (result.returncode == 0) == accepted, result.stderr
+        assert accepted or "region of size 8" in result.stderr
+    text = subprocess.run(tmp_path / "main", capture_output=True, text=True, check=True).stdout
+    info = json.loads(text)
+    assert info["q"][1] == 'a "quoted" µ'
+    assert (len(info["sha256"]), info["model"]) == (64, "AccelerationMLP")
+
+
+# Operations that the models of this package do not use.
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: (x.sinh() - x.cosh().rsqrt()).clamp(-0.5, 2).sum(-1),
+        lambda x: torch.stack([x.amax(0), x.amin(0), x.mean(0), x.mean() + 0 * x[0]]),
+        lambda x: torch.linalg.inv(x[:5] @ x[:5].mT + torch.eye(5)) @ x[:5],
+        lambda x: torch.where((x > 0.3) & ~(x < 0.9), x, x.floor()).maximum(-x).tanh(),
+        lambda x: x.flip(0)[:, [2, 0, 1]] + x[[1]],
+        lambda x: torch.cross(x, x.roll(1, -1), dim=-1) + torch.softmax(x, -1),
+    ],
+)
+def test_operations_of_other_robots(function, tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    x = 4 * torch.rand(200, 40, 3, generator=generator, dtype=torch.float64) - 2
+    write([ExportedFunction("f", function, {"x": x}, "y")], tmp_path / "f.c", {})
+
+
+def test_entries_that_are_assigned_are_in_the_code(tmp_path):
+    def function(x):
+        y = x.clone()
+        y[1:3, 0] = 2 * x[0, :2]
+        y[0] = -y[2]
+        return y
+
+    x = torch.rand(200, 4, 3, generator=torch.Generator().manual_seed(0)).double()
+    write([ExportedFunction("f", function, {"x": x}, "y")], tmp_path / "f.c", {})
+
+
+def test_numbers_are_written_exactly():
+    constants = Constants("double")
+    values = [0.1, -1e-300, 1 / 3, float("inf"), float("-inf"), float("nan"), -0.0]
+    texts = [constants.number(x) for x in values]
+    assert texts[3:6] == ["INFINITY", "(-INFINITY)", "NAN"]
+    assert [float(texts[k].strip("()")) for k in (0, 1, 2)] == values[:3]
+    assert exported.identifier("7 arm-é") == "_7_arm__"
