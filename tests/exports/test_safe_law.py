@@ -1,0 +1,131 @@
+"""Laws with limits, guard and observer: the C file against the loop in Python."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.control import (
+    Actuator,
+    ComputedTorque,
+    DataRegion,
+    DisturbanceObserver,
+    Guarded,
+    Motion,
+    Tracking,
+    export_law,
+)
+from pinn_dyn.control.region import FallBack
+from tests.models.builders import VARIANTS, make_structured
+from tests.support.c_code import function_of
+
+PERIOD = 0.01
+LIMITS = dict(low=[-20.0, -9.0, -3.0], high=15.0, rate=400.0)
+REST = [np.zeros(3)] * 3
+
+
+@pytest.fixture(scope="module")
+def law():
+    variant = VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]
+    model = make_structured("lnn", **variant).requires_grad_(False)
+    return Tracking(model, 3.0, 0.5)
+
+
+def motion(steps):
+    """Measurements and references along a path, different at each instant."""
+    t = PERIOD * torch.arange(steps).double()[:, None] + torch.arange(3.0)
+    return [f(t + k) for k, f in enumerate((torch.sin, torch.cos, torch.sin, torch.cos, torch.sin))]
+
+
+def control_of(path, law, **options):
+    """The law of the file with its memory, as a loop calls it."""
+    call = function_of(export_law(law, path, period=PERIOD, **options), f"{path.stem}_control")
+    memory = [np.zeros(1 + 4 * 3)]
+
+    def control(*state):
+        size = 13 if isinstance(law, DisturbanceObserver) else 3
+        u, memory[0], status = call(*state, memory[0][:size])
+        return u, status
+
+    return control
+
+
+def test_an_observer_with_limits_gives_the_inputs_of_the_loop(law, tmp_path):
+    options = dict(bandwidth=20.0, max_rate=50.0)
+    observer = DisturbanceObserver(law, **options, actuator=Actuator(**LIMITS))
+    actuator = Actuator(**LIMITS)
+    control = control_of(tmp_path / "law.c", observer, actuator=actuator)
+    statuses = set()
+    for k, state in enumerate(zip(*motion(50), strict=True)):
+        u = observer(k * PERIOD, *state[:2], Motion(*state[2:]))
+        expected, changed = actuator(u, PERIOD)
+        result, status = control(*(x.numpy() for x in state))
+        np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-12)
+        assert status == int(changed.any())
+        statuses.add(status)
+    assert statuses == {0, 1}
+    assert observer.residual.abs().min() > 0.01
+
+
+@pytest.mark.parametrize("fallback", [None, "hold", "regulation"])
+def test_a_guard_falls_back_in_the_file_as_in_the_loop(law, tmp_path, fallback):
+    data = motion(100)
+    parts = [x.split(50) for x in data[:2]]
+    region = DataRegion(*parts, angles=[1], samples=77)
+    guarded = Guarded(law, region, threshold=1.5, fallback=fallback)
+    control = control_of(tmp_path / "law.c", guarded)
+    outside = []
+    for k, state in enumerate(zip(*motion(20), strict=True)):
+        far = (k % 5 == 4) * torch.tensor([0.0, 2 * torch.pi, 6.0 if k == 9 else 0.0])
+        q, v = state[0] + far, state[1]
+        expected = guarded(k * PERIOD, q, v, Motion(*state[2:]))
+        result, status = control(q.numpy(), v.numpy(), *(x.numpy() for x in state[2:]))
+        np.testing.assert_allclose(result, expected, rtol=1e-9, atol=1e-12)
+        outside.append(status)
+        assert region.nearest(q, v) == pytest.approx(float(region.distance(q, v)), rel=1e-9)
+    assert outside == [2 * (k == 9) for k in range(20)]
+
+
+def test_gains_of_another_unit_do_not_fall_back(law):
+    x = motion(50)
+    region = DataRegion([x[0]], [x[1]])
+    with pytest.raises(ValueError, match="ComputedTorque has not: use the fallback hold"):
+        Guarded(ComputedTorque(law.model, 1.0, 1.0), region, fallback="regulation")
+    assert "hold" in FallBack.__args__
+
+
+def test_numbers_that_are_not_finite_give_the_last_input(law, tmp_path):
+    observer = DisturbanceObserver(law, 20.0)
+    control = control_of(tmp_path / "law.c", observer, actuator=Actuator(**LIMITS))
+    good = [x[1].numpy() for x in motion(2)]
+    last, _ = control(*good)
+    for bad in (np.nan, np.inf):
+        for position in range(5):
+            state = [x.copy() for x in good]
+            state[position][1] = bad
+            u, status = control(*state)
+            np.testing.assert_array_equal(u, last)
+            assert status == 4
+    u, status = control(*good)
+    assert np.isfinite(u).all()
+    assert not status & 4
+
+
+def test_the_first_input_is_limited_from_zero(law, tmp_path):
+    control = control_of(tmp_path / "law.c", law, actuator=Actuator(rate=10.0))
+    u, status = control(*[10 * np.ones(3), *[np.zeros(3)] * 4])
+    np.testing.assert_allclose(np.abs(u), 0.1)
+    assert status == 1
+
+
+def test_what_a_file_cannot_hold_is_refused(law, tmp_path, caplog):
+    for controller, options, message in (
+        (DisturbanceObserver(law, 20.0), {}, "needs a fixed period"),
+        (law, {"actuator": Actuator(rate=1.0)}, "needs a fixed period"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export_law(controller, tmp_path / "law.c", **options)
+    with pytest.raises(ValueError, match=r"ends in '.so', expected one of .c, .onnx"):
+        export_law(law, tmp_path / "law.so")
+    with pytest.raises(TypeError, match="DisturbanceObserver has a memory: export it to .c"):
+        export_law(DisturbanceObserver(law, 20.0), tmp_path / "law.pt2")
+    assert not list(tmp_path.iterdir())
