@@ -147,15 +147,18 @@ def _without_robot(
 
 
 def _export(law: Controller, run: Run, config: dict[str, Any]) -> None:
-    path = export_law(
-        law,
-        config["export"],
-        actuator=build_part("actuator", config["actuator"]),
-        period=config["rate"] and 1 / config["rate"],
-        real=config["export_real"],
-        about={"q": run.labels, "u": run.input_labels},
-        ranges=ranges_of(run.statistics),
-    )
+    try:
+        path = export_law(
+            law,
+            config["export"],
+            actuator=build_part("actuator", config["actuator"]),
+            period=config["rate"] and 1 / config["rate"],
+            real=config["export_real"],
+            about={"q": run.labels, "u": run.input_labels},
+            ranges=ranges_of(run.statistics),
+        )
+    except (TypeError, RuntimeError, ImportError) as error:
+        raise ConfigError(f"export={config['export']}: {error}") from error
     log.info("%s holds the law; docs/realtime.md says how to call it", path)
 
 

@@ -10,13 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.program import Program, trace
+if TYPE_CHECKING:
+    from pinn_dyn.exports.program import Program
 
 Real = Literal["double", "float"]
 Calls = Mapping[str, Callable[..., Sequence[np.ndarray]]]
@@ -57,6 +58,8 @@ class ExportedFunction:
     @cached_property
     def program(self) -> Program:
         """The operations of the function."""
+        from pinn_dyn.exports.program import trace
+
         example = {name: values[0] for name, values in self.inputs.items()}
         return trace(self.function, example, self.outputs)
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 import pinn_dyn
 from pinn_dyn.app.config import CONF
-from pinn_dyn.models import LagrangianNetwork
+from pinn_dyn.control import DisturbanceObserver
 from tests.app.entry import (
     HIGH,
     LOW,
@@ -23,6 +23,7 @@ from tests.app.entry import (
     train,
 )
 from tests.app.pages import assert_says_how_it_came_about, page_of
+from tests.support.c_code import function_of
 
 
 def control(folder, run, *arguments):
@@ -113,15 +114,45 @@ def test_the_stability_report_has_the_conditions_and_every_set_point(tmp_path, l
     assert {"bound", "error", "measured_error", "holds"} <= set(points)
 
 
-def test_the_learned_law_is_exported(tmp_path, monkeypatch, lnn_run, undrawn):
-    """By what tests/control/test_export.py tests."""
-    exported = []
-    monkeypatch.setattr("pinn_dyn.app.control.export_law", lambda *given: exported.append(given))
-    path = tmp_path / "law.pt2"
-    control(tmp_path / "out", lnn_run, "rate=200", f"export={path}", "~controllers.pd")
-    ((law, given),) = exported
-    assert given == path
-    assert isinstance(law.model, LagrangianNetwork)
+def test_the_learned_law_is_exported_with_its_limits_and_guard(tmp_path, lnn_run, undrawn):
+    """By what tests/exports tests."""
+    path = tmp_path / "law.c"
+    words = ["rate=200", f"export={path}", "~controllers.pd", "~controllers.truth"]
+    words += ["actuator.high=0.5", "actuator.rate=20", "guard.threshold=2", "guard.fallback=hold"]
+    control(tmp_path / "out", lnn_run, *words)
+    control_law = function_of(path, "law_control")
+    size = pinn_dyn.load(lnn_run).model.num_coordinates
+    far = np.full(size, 50.0)
+    u, memory, status = control_law(far, far, far, far, far, np.full(size, 0.2))
+    np.testing.assert_allclose(u, 0.2)
+    np.testing.assert_allclose(memory, 0.2)
+    assert status == 2
+    header = path.with_suffix(".h").read_text()
+    for part in (
+        f"#define law_MEMORY_SIZE {size}",
+        '\\"period\\": 0.005',
+        '\\"fallback\\": \\"hold\\"',
+    ):
+        assert part in header
+
+
+def test_the_law_of_an_experiment_goes_to_every_kind_of_file(
+    tmp_path, monkeypatch, lnn_run, undrawn
+):
+    written = []
+    monkeypatch.setattr("pinn_dyn.control.export.write", lambda *given: written.append(given))
+    monkeypatch.setattr(
+        "pinn_dyn.control.export._export_package", lambda *given, **_: written.append(given)
+    )
+    words = ["rate=200", "~controllers.pd", "~controllers.truth", "duration=0.1", "settled_after=0"]
+    words += ["controllers=tracking", "exported_law=learned_observer", "export_real=float"]
+    for ending in ("c", "onnx", "casadi", "pt2"):
+        control(tmp_path / ending, lnn_run, f"export={tmp_path}/law.{ending}", *words)
+    ((law,), path, info, real), *_, package = written
+    assert (law.name, path.name, real) == ("control", "law.c", "float")
+    assert info["observer"] == {"bandwidth": 200.0}
+    assert [item[1].suffix for item in written] == [".c", ".onnx", ".casadi", ".pt2"]
+    assert isinstance(package[0], DisturbanceObserver)
 
 
 @pytest.mark.parametrize(
@@ -179,8 +210,8 @@ def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, capsys):
     np.testing.assert_allclose(np.linalg.eigvalsh(terms.M)[:, 0], table["mass_min"], rtol=1e-6)
     np.testing.assert_allclose(np.linalg.cond(terms.A), table["input_condition"], rtol=1e-6)
     for words, problem in (
-        (["~controllers.learned", "~controllers.truth"], "export: needs the controller 'learned'"),
-        (["guard.threshold=1"], "guard: example_log has no simulated robot"),
+        (["~controllers.learned", "~controllers.truth"], "export: exported_law is 'learned'"),
+        (["guard.threshold=1", "export=null"], "guard: example_log has no simulated robot"),
     ):
         assert problem in refused_text(capsys, *command, *words)
 

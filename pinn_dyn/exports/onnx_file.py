@@ -1,0 +1,210 @@
+"""ONNX files of functions, run by ONNX Runtime for a comparison."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, fx
+
+from pinn_dyn.exports.exported import Calls, ExportedFunction, Real
+from pinn_dyn.exports.program import operation, unsupported
+
+OPSET = 18
+_SAME = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh erf floor sign sigmoid"
+_SAME += " neg reciprocal abs relu add sub mul div pow"
+_ELEMENTWISE = {
+    **{name: name.capitalize() for name in _SAME.split()},
+    **{"maximum": "Max", "minimum": "Min", "where": "Where", "logical_not": "Not"},
+    **{"gt": "Greater", "ge": "GreaterOrEqual", "lt": "Less", "le": "LessOrEqual", "eq": "Equal"},
+    **{"bitwise_not": "Not", "logical_and": "And", "bitwise_and": "And"},
+    **{"logical_or": "Or", "bitwise_or": "Or", "mm": "MatMul", "clone": "Identity"},
+}
+_COMPOSED: dict[str, Callable[..., str]] = {
+    "log1p": lambda node, x, one: node("Log", [node("Add", [x, one])]),
+    "rsqrt": lambda node, x, one: node("Reciprocal", [node("Sqrt", [x])]),
+    "expm1": lambda node, x, one: node("Sub", [node("Exp", [x]), one]),
+}
+_MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
+_MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias detach copy"
+_MOVES += " slice_scatter select_scatter constant_pad_nd getitem"
+_REDUCTIONS = {"sum": "ReduceSum", "mean": "ReduceMean", "amin": "ReduceMin", "amax": "ReduceMax"}
+
+
+def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, real: Real) -> Calls:
+    """Write a function to an ONNX file of opset 18, whose inputs and outputs have its names.
+
+    ``metadata_props`` hold the fields of ``info``, and the SHA-256 of the graph.
+
+    Raises:
+        ImportError: without onnx and onnxruntime.
+        ValueError: on several functions.
+    """
+    try:
+        import onnx
+        import onnxruntime
+    except ImportError as error:
+        raise ImportError(
+            f"{path.name} needs {error.name}: pip install 'pinn_dyn[onnx]'"
+        ) from error
+    (function,) = functions
+    writer = _Writer(onnx.helper, np.float64 if real == "double" else np.float32)
+    graph = writer.graph(function)
+    opset = onnx.helper.make_opsetid("", OPSET)
+    model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8)
+    model.doc_string = function.about
+    fields = {**json.loads(info), "sha256": hashlib.sha256(graph.SerializeToString()).hexdigest()}
+    onnx.helper.set_model_props(
+        model, {key: x if isinstance(x, str) else json.dumps(x) for key, x in fields.items()}
+    )
+    onnx.checker.check_model(model)
+    onnx.save(model, path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"])
+    except Exception as error:
+        remedy = "export with real='float'" if real == "double" else "export to .c"
+        raise RuntimeError(
+            f"ONNX Runtime does not load {path.name} with {real} numbers: {error}: {remedy}"
+        ) from error
+
+    def call(*arguments: np.ndarray) -> list[np.ndarray]:
+        values = [np.asarray(x, writer.dtype) for x in arguments]
+        return list(session.run(None, dict(zip(function.inputs, values, strict=True))))
+
+    return {function.name: call}
+
+
+class _Writer:
+    """The nodes of a program as nodes of ONNX, with their names."""
+
+    def __init__(self, helper: Any, dtype: Any):
+        self.helper, self.dtype = helper, dtype
+        self.nodes: list[Any] = []
+        self.initializers: dict[str, Any] = {}
+        self.names: dict[fx.Node, Any] = {}
+
+    def graph(self, function: ExportedFunction) -> Any:
+        program = function.program
+        placeholders = program.graph_module.graph.find_nodes(op="placeholder")
+        self.names = dict(zip(placeholders, program.inputs, strict=True))
+        for node in program.graph_module.graph.nodes:
+            if node.op == "get_attr":
+                self.names[node] = self.constant(node.meta["val"])
+            elif node.op == "call_function":
+                self.names[node] = self._write(node)
+        for name, node in zip(program.outputs, program.results(), strict=True):
+            self.node("Identity", [self.names[node]], name)
+        kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(self.dtype))
+        inputs, outputs = (
+            [self.helper.make_tensor_value_info(name, kind, list(n)) for name, n in shapes.items()]
+            for shapes in (program.inputs, program.outputs)
+        )
+        return self.helper.make_graph(
+            self.nodes, function.name, inputs, outputs, [*self.initializers.values()]
+        )
+
+    def constant(self, value: Any, dtype: Any = None) -> str:
+        """Return the name of a constant, stored once."""
+        array = np.asarray(value)
+        if dtype is None and array.dtype not in (np.bool_, np.int64):
+            dtype = self.dtype
+        array = array.astype(dtype or array.dtype)
+        key = f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
+        if key not in self.initializers:
+            kind = self.helper.np_dtype_to_tensor_dtype(array.dtype)
+            name = f"c{len(self.initializers)}"
+            self.initializers[key] = self.helper.make_tensor(
+                name, kind, array.shape, array.tobytes(), raw=True
+            )
+        return str(self.initializers[key].name)
+
+    def node(self, kind: str, inputs: Sequence[str], output: str = "", **attributes: Any) -> str:
+        """Add a node, and return the name of its output."""
+        output = output or f"x{len(self.nodes)}"
+        self.nodes.append(self.helper.make_node(kind, inputs, [output], **attributes))
+        return output
+
+    def operand(self, x: Any, dtype: Any = None) -> str:
+        return self.names[x] if isinstance(x, fx.Node) else self.constant(x, dtype or self.dtype)
+
+    def real(self, x: Any) -> str:
+        """Return an operand as a number, also that of a comparison."""
+        name = self.operand(x)
+        if isinstance(x, fx.Node) and x.meta["val"].dtype in (torch.bool, torch.int64):
+            kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(self.dtype))
+            return self.node("Cast", [name], to=kind)
+        return name
+
+    def _write(self, node: fx.Node) -> Any:
+        name, arguments = operation(node), cast(tuple[Any, ...], node.args)
+        if name in _MOVES.split():
+            return self._move(node)
+        if name in _COMPOSED:
+            x, one = self.real(arguments[0]), self.operand(1.0)
+            return _COMPOSED[name](self.node, x, one)
+        if name in _REDUCTIONS:
+            x, dims, keep, *_ = (*arguments, None, False)
+            axes = [self.constant(list(dims), np.int64)] if dims else []
+            return self.node(_REDUCTIONS[name], [self.real(x), *axes], keepdims=int(bool(keep)))
+        if name in ("clamp", "ne", "_to_copy"):
+            return getattr(self, f"_{name.strip('_')}")(node, *node.args)
+        if name not in _ELEMENTWISE:
+            raise unsupported(node, "ONNX")
+        kind = _ELEMENTWISE[name]
+        logical = {"And": 2, "Or": 2, "Not": 1, "Where": 1}.get(kind, 0)
+        operands = [
+            self.operand(x) if k < logical else self.real(x) for k, x in enumerate(node.args)
+        ]
+        if (alpha := node.kwargs.get("alpha", 1)) != 1:
+            operands[1] = self.node("Mul", [operands[1], self.operand(alpha)])
+        return self.node(kind, operands)
+
+    def _ne(self, node: fx.Node, x: Any, y: Any) -> str:
+        return self.node("Not", [self.node("Equal", [self.real(x), self.real(y)])])
+
+    def _clamp(self, node: fx.Node, x: fx.Node, low: Any = None, high: Any = None) -> str:
+        name = self.real(x)
+        limits = ("Max", node.kwargs.get("min", low)), ("Min", node.kwargs.get("max", high))
+        for kind, limit in limits:
+            name = name if limit is None else self.node(kind, [name, self.operand(limit)])
+        return name
+
+    def _to_copy(self, node: fx.Node, x: fx.Node) -> str:
+        return self.real(x) if node.meta["val"].is_floating_point() else self.operand(x)
+
+    def _move(self, node: fx.Node) -> Any:
+        """Gather the numbers of a result from those of its operands.
+
+        The operation itself, applied to the positions of the numbers, says which.
+        """
+        flat: list[str] = []
+        count = 0
+
+        def positions(x: fx.Node) -> Tensor:
+            nonlocal count
+            value = x.meta["val"]
+            if isinstance(value, list | tuple) or value.dtype == torch.int64:
+                return value  # of a getitem, or indices
+            flat.append(self.node("Reshape", [self.operand(x), self.constant([-1], np.int64)]))
+            count += value.numel()
+            return torch.arange(count - value.numel(), count).reshape(value.shape)
+
+        if operation(node) == "getitem":
+            results, position = cast(tuple[Any, ...], node.args)
+            return self.names[results][position]
+        arguments: Any = fx.node.map_arg(node.args, positions)
+        if operation(node) == "constant_pad_nd":
+            flat.append(self.constant([float(cast(Any, (*node.args, 0.0)[2]))]))
+            arguments = (*arguments[:2], count)
+        source = self.node("Concat", flat, axis=0) if len(flat) > 1 else flat[0]
+        result = node.target(*arguments, **node.kwargs)  # type: ignore[operator]
+        if isinstance(result, Tensor):
+            return self.node("Gather", [source, self.constant(result)])
+        return [self.node("Gather", [source, self.constant(x)]) for x in result]
