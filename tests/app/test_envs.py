@@ -7,11 +7,14 @@ import pytest
 import torch
 
 import pinn_dyn
+from pinn_dyn.control import SimulatorPlant
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.testing import damped_oscillators, exact_solution
 from tests.support.closed_loops import Vanishing
+from tests.support.simulated_arms import simulated_by
+from tests.support.urdf_by_hand import SPATIAL
 
 gymnasium = pytest.importorskip("gymnasium", reason="the envs extra is not installed")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
@@ -112,6 +115,16 @@ def test_a_true_robot_moves_as_the_exact_solution():
     start = torch.from_numpy(states[0])
     expected = exact_solution(damped_oscillators(), start, t, u, "hold")
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-5)
+
+
+def test_a_simulated_robot_is_moved_by_its_simulator():
+    arm = simulated_by("MujocoArm")(SPATIAL)
+    env = RobotEnv(SimulatorPlant(arm, step=0.01), data=Recorded(2, 2), step=0.02)
+    (action,) = actions_of(env, 1)
+    start, moved = rolled_out(env, [action])
+    arm.set_state(*np.split(start, 2))
+    steps = [arm.step(action, 0.01) for _ in range(2)]
+    np.testing.assert_array_equal(moved, np.concatenate(steps[-1]))
 
 
 def test_episodes_start_in_the_data_and_repeat_with_their_seed():

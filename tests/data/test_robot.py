@@ -280,6 +280,8 @@ def test_everything_else_imports_without_a_simulator(tmp_path):
         for name, extra in (("BulletArm", "panda"), ("MujocoArm", "mujoco")):
             with pytest.raises(ImportError, match=re.escape(f"pip install 'pinn_dyn[{extra}]'")):
                 getattr(systems, name)("franka_panda/panda.urdf")
+        with pytest.raises(ImportError, match=re.escape("pip install 'pinn_dyn[envs]'")):
+            importlib.import_module("pinn_dyn.envs")
 
     with (tmp_path / "said.txt").open("w") as output:
         process = fork(work, output)
