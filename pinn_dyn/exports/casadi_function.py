@@ -1,0 +1,189 @@
+"""A program as a CasADi function, with exact derivatives."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, fx
+
+from pinn_dyn.exports.program import Program
+
+if TYPE_CHECKING:
+    import casadi
+
+# Elementwise operations with another name in CasADi, and with the same name.
+_NAMES = {"add": "plus", "sub": "minus", "mul": "times", "div": "rdivide", "pow": "power"}
+_NAMES |= {"abs": "fabs", "maximum": "fmax", "minimum": "fmin", "where": "if_else"}
+_NAMES |= {"logical_not": "logic_not", "logical_and": "logic_and", "logical_or": "logic_or"}
+_NAMES |= {"bitwise_not": "logic_not", "bitwise_and": "logic_and", "bitwise_or": "logic_or"}
+_SAME = "sqrt exp expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh erf sign floor"
+_NAMES |= {name: name for name in f"{_SAME} lt le gt ge eq ne".split()}
+# Operations that put numbers at other positions.
+_MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
+_MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias clone detach"
+_MOVES += " copy _to_copy slice_scatter select_scatter"
+
+
+def casadi_function(program: Program, name: str) -> casadi.Function:
+    """Return a program as a function of column vectors, which CasADi differentiates exactly.
+
+    An output with two axes is a matrix. The graph consists of matrix operations (``casadi.MX``).
+
+    Raises:
+        ImportError: without CasADi.
+        TypeError: on an operation that CasADi does not have.
+    """
+    ca = import_casadi()
+    graph = program.graph_module.graph
+    inputs = [ca.MX.sym(key, shape.numel()) for key, shape in program.inputs.items()]
+    writer = _Writer(ca, dict(zip(graph.find_nodes(op="placeholder"), inputs, strict=True)))
+    for node in graph.nodes:
+        if node.op == "get_attr":
+            writer.values[node] = ca.MX(ca.DM(node.meta["val"].flatten().tolist()))
+        elif node.op == "call_function":
+            writer.values[node] = writer.evaluate(node)
+    outputs = [
+        writer.matrix(node).T if node.meta["val"].ndim == 2 else writer.values[node]
+        for node in program.results()
+    ]
+    return ca.Function(name, inputs, outputs, list(program.inputs), list(program.outputs))
+
+
+def import_casadi() -> Any:
+    """Return the module ``casadi``."""
+    try:
+        import casadi
+    except ImportError as error:
+        raise ImportError("CasADi is not installed: pip install 'pinn_dyn[mpc]'") from error
+    return casadi
+
+
+def write_casadi(
+    functions: Sequence[Any], path: Path, info: str, real: str
+) -> Mapping[str, Callable[..., list[np.ndarray]]]:
+    """Write a function for ``casadi.Function.load``, and return it as read from the file.
+
+    A file holds a single function, of doubles, and no text.
+
+    Raises:
+        ValueError: on several functions, or on ``real="float"``.
+    """
+    if len(functions) != 1 or real != "double":
+        raise ValueError(f"{path} holds a single function of doubles: choose them, or write a .c")
+    (function,) = functions
+    casadi_function(function.program, function.name).save(str(path))
+    loaded = import_casadi().Function.load(str(path))
+    return {function.name: lambda *x: [np.array(y) for y in loaded.call([*map(np.ravel, x)])]}
+
+
+class _Writer:
+    """The nodes of a program as columns of numbers, in the order of the rows of their tensors."""
+
+    def __init__(self, ca: Any, values: dict[fx.Node, Any]):
+        self.ca, self.values = ca, values
+
+    def evaluate(self, node: fx.Node) -> Any:
+        """Return the numbers of an operation; a list for an operation with several results."""
+        target: Any = node.target
+        arguments: list[Any] = list(node.args)
+        if target is operator.getitem:
+            return self.values[arguments[0]][arguments[1]]
+        name = target._schema.name.split("::")[1]
+        if name in _MOVES.split():
+            return self._moved(target, arguments, node.kwargs)
+        shape = node.meta["val"].shape
+        if name == "constant_pad_nd":
+            source, pads, *fill = arguments
+            index = torch.constant_pad_nd(_positions(source) + 1, pads, 0)
+            return self.ca.vertcat(*(fill or [0.0]), self.values[source])[_flat(index)]
+        if name in ("mm", "bmm", "addmm"):
+            *bias, a, b = arguments
+            product = self._product(a, b)
+            return product + self._operand(bias[0], shape) if bias else product
+        if name == "sum":
+            source, dims, *_ = arguments
+            positions = _positions(source)
+            axes = [d % positions.ndim for d in dims]
+            order = [*(d for d in range(positions.ndim) if d not in axes), *axes]
+            numbers = self.values[source][_flat(positions.permute(order))]
+            return self.ca.sum1(self.ca.reshape(numbers, -1, shape.numel())).T
+        return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
+
+    def matrix(self, node: fx.Node) -> Any:
+        """Return the transpose of a matrix: CasADi stores columns."""
+        return self.ca.reshape(self.values[node], node.meta["val"].shape[1], -1)
+
+    def _product(self, a: fx.Node, b: fx.Node) -> Any:
+        (m, k), n = a.meta["val"].shape[-2:], b.meta["val"].shape[-1]
+        left = self.ca.reshape(self.values[a], k, -1)
+        right = self.ca.reshape(self.values[b], n, -1)
+        pairs = zip(self.ca.horzsplit(left, m), self.ca.horzsplit(right, k), strict=True)
+        return self.ca.veccat(*(self.ca.mtimes(y, x) for x, y in pairs))
+
+    def _moved(self, target: Any, arguments: list[Any], options: Mapping[str, Any]) -> Any:
+        """Return the numbers at the positions to which the operation puts their indices."""
+        sources: list[Any] = []
+
+        def positions(node: fx.Node) -> Tensor:
+            if node.meta["val"].dtype == torch.int64:
+                return node.meta["val"]
+            start = sum(x.numel() for x in sources)
+            sources.append(self.values[node])
+            return _positions(node, start)
+
+        options = {key: x for key, x in options.items() if key != "dtype"}
+        index = target(*fx.map_arg(arguments, positions), **options)
+        numbers = self.ca.vertcat(*sources)
+        if isinstance(index, Tensor):
+            return numbers[_flat(index)]
+        return [numbers[_flat(part)] for part in index]
+
+    def _operand(self, argument: Any, shape: torch.Size) -> Any:
+        if not isinstance(argument, fx.Node):
+            return argument
+        value = argument.meta["val"]
+        if value.numel() == 1 or value.shape == shape:
+            return self.values[argument]
+        return self.values[argument][_flat(_positions(argument).expand(shape))]
+
+    def _elementwise(self, node: fx.Node, name: str, x: list[Any]) -> Any:
+        ca, options = self.ca, node.kwargs
+        if options.get("alpha", 1) != 1:
+            x[1] = options["alpha"] * x[1]
+        if name in _NAMES:
+            return getattr(ca, _NAMES[name])(*x)
+        match name:
+            case "neg":
+                return -x[0]
+            case "reciprocal":
+                return 1 / x[0]
+            case "rsqrt":
+                return 1 / ca.sqrt(x[0])
+            case "sigmoid":
+                return 1 / (1 + ca.exp(-x[0]))
+            case "relu":
+                return ca.fmax(x[0], 0)
+            case "remainder":
+                return x[0] - x[1] * ca.floor(x[0] / x[1])
+            case "clamp":
+                low, high = [*x[1:], None, None][:2]
+                low, high = options.get("min", low), options.get("max", high)
+                value = x[0] if low is None else ca.fmax(x[0], low)
+                return value if high is None else ca.fmin(value, high)
+        raise TypeError(
+            f"CasADi has no operation {node.target}: the model cannot be exported to it"
+        )
+
+
+def _positions(node: Any, start: int = 0) -> Tensor:
+    shape = node.meta["val"].shape
+    return torch.arange(start, start + shape.numel()).reshape(shape)
+
+
+def _flat(index: Tensor) -> list[int]:
+    return index.flatten().tolist()
