@@ -15,6 +15,7 @@ from pinn_dyn.control.laws import (
 )
 from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.control.plants import SimulatorPlant, SystemPlant
+from pinn_dyn.control.predictive import PredictiveControl
 from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.control.references import PointToPoint, RandomSetPoints, SetPoint, Sines
 from pinn_dyn.control.region import DataRegion, Guarded
@@ -35,6 +36,7 @@ __all__ = [
     "Motion",
     "Plant",
     "PointToPoint",
+    "PredictiveControl",
     "ProportionalDerivative",
     "RandomSetPoints",
     "Reference",

@@ -125,6 +125,7 @@ class LoopRun:
         self._diagnostics: dict[str, Tensor] = defaultdict(lambda: self._q[..., 0] * torch.nan)
         self._stopped: list[str | None] = [None] * len(q0)
         controller.reset()
+        controller.follow(reference)
         if actuator is not None:
             actuator.reset()
 

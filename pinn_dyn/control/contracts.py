@@ -36,6 +36,9 @@ class Controller(abc.ABC):
     def reset(self) -> None:  # noqa: B027 - most laws have no memory
         """Forget the past, before a new run."""
 
+    def follow(self, reference: Reference) -> None:  # noqa: B027 - most laws do not look ahead
+        """Take the reference of a new run, for laws that look ahead."""
+
     @abc.abstractmethod
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u ``(*batch, M)`` at time t in s, from the measured q and v ``(*batch, N)``."""

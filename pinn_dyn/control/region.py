@@ -12,7 +12,7 @@ from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.control.contracts import Controller, Motion, Reference
 from pinn_dyn.control.laws import ComputedTorque, ModelBasedLaw, Regulation
 from pinn_dyn.mechanics.arrays import require_last_dim
 
@@ -142,6 +142,9 @@ class Guarded(Controller):
         self._distance: Tensor | None = None
         self._last: Tensor | None = None
         self._warned = False
+
+    def follow(self, reference: Reference) -> None:
+        self.law.follow(reference)
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         u = self.law(t, q, v, reference)

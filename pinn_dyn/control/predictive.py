@@ -1,0 +1,279 @@
+"""Model predictive control on a mechanical system, true or learned."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from pinn_dyn.control.contracts import Controller, Motion, Reference
+from pinn_dyn.control.effects import Actuator
+from pinn_dyn.control.shooting import Limits, Plan, ShootingProblem, Weights
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.mechanics.arrays import pseudo_inverse_times
+
+log = logging.getLogger(__name__)
+
+_FIRST_ITERATIONS = 20  # times as many iterations at the first instant, without a previous plan
+_LARGEST_GAP = 0.1  # of a plan that counts as a solution
+_Values = float | Sequence[float] | None
+_Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
+
+
+class _Memory(NamedTuple):
+    t: float
+    x: np.ndarray
+    u: np.ndarray
+    d: np.ndarray
+    plan: Plan | None
+    failures: int
+
+
+class PredictiveControl(Controller):
+    """Model predictive control with limits, through CasADi (``pip install 'pinn_dyn[mpc]'``).
+
+    At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starts
+    from the previous plan, and applies the first input of the plan. The law sees the reference
+    ahead of time if the loop calls :meth:`follow`, as :func:`close_loop` does.
+
+    u_ref is A^+ times the inverse dynamics of the reference, within the limits; it is zero for a
+    force that is not linear in the input. If the solver fails, the law holds the last input.
+
+    Args:
+        model: the mechanical system to plan with, in float64.
+        horizon: length of a plan, s.
+        step: step of a plan, s. It may differ from the period of the loop.
+        position_weight, velocity_weight: Q, one number or N.
+        input_weight, rate_weight: R of u - u_ref and S of du/dt, one number or M.
+        terminal_weight: P in multiples of Q; None for P of the linear-quadratic regulator at the
+            end of the reference.
+        actuator: hard limits of the input and of its rate.
+        q_low, q_high, v_max: soft limits of the state, one number or N; None for no limit.
+        limit_weight: rho, weight of a violated limit of the state.
+        iterations: quadratic programs per instant; the first instant may take 20 times as many.
+        observer_bandwidth: K_O in 1/s of an observer of the acceleration d that the model does not
+            explain, d_k+1 = d_k + (1 - exp(-K_O T)) (measured - d_k); None for d = 0.
+
+    Raises:
+        ImportError: without CasADi.
+        ValueError: on values that do not fit N or M, or a horizon below two steps.
+    """
+
+    def __init__(
+        self,
+        model: MechanicalSystem,
+        horizon: PositiveFloat,
+        step: PositiveFloat,
+        *,
+        position_weight: _Weight = 1.0,
+        velocity_weight: _Weight = 0.1,
+        input_weight: Annotated[float, Field(gt=0)] | Sequence[PositiveFloat] = 1e-3,
+        rate_weight: _Weight = 0.0,
+        terminal_weight: NonNegativeFloat | None = None,
+        actuator: Actuator | None = None,
+        q_low: _Values = None,
+        q_high: _Values = None,
+        v_max: _Values = None,
+        limit_weight: PositiveFloat = 1e3,
+        iterations: PositiveInt = 2,
+        observer_bandwidth: PositiveFloat | None = None,
+    ):
+        n, m = model.num_coordinates, model.num_inputs
+        super().__init__(n, m)
+        self.model, self.step = model, float(step)
+        steps = round(horizon / step)
+        if steps < 2:
+            raise ValueError(f"horizon is {horizon} s, expected two steps of {step} s or more")
+        actuator = actuator or Actuator()
+        x_weight = [
+            _row("position_weight", position_weight, n),
+            _row("velocity_weight", velocity_weight, n),
+        ]
+        v_high = _row("v_max", v_max, n, np.inf)
+        self.limits = Limits(
+            np.concatenate([_row("q_low", q_low, n, -np.inf), -v_high]),
+            np.concatenate([_row("q_high", q_high, n, np.inf), v_high]),
+            _row("actuator.low", actuator.low, m, -np.inf),
+            _row("actuator.high", actuator.high, m, np.inf),
+            _row("actuator.rate", actuator.rate, m, np.inf),
+        )
+        weights = Weights(
+            np.concatenate(x_weight),
+            _row("input_weight", input_weight, m),
+            _row("rate_weight", rate_weight, m),
+            limit_weight,
+        )
+        with torch.no_grad():
+            self._problem = ShootingProblem(model, self.step, steps, weights, self.limits)
+        self._terminal, self._iterations = terminal_weight, iterations
+        self._bandwidth = observer_bandwidth
+        self._reference: Reference | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        self._memory: list[_Memory] = []
+        self._diagnostics: dict[str, Tensor] = {}
+        self._references: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def follow(self, reference: Reference) -> None:
+        self._reference = reference
+
+    def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+        """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch.
+
+        Raises:
+            ValueError: on a time before the previous call, or a first state beyond its limits.
+        """
+        states = torch.cat([q, v], -1).reshape(-1, 2 * self.num_coordinates).double().cpu().numpy()
+        if len(self._memory) != len(states):
+            self._start(t, states)
+        elif t < self._memory[0].t:
+            raise ValueError(
+                f"t is {t:g} s, before the previous call at {self._memory[0].t:g} s: reset() "
+                "before a new run, and give a rate, since the law cannot act in continuous time"
+            )
+        x_ref, u_ref, P = self._ahead(t, len(states), reference)
+        values = [self._advance(k, t, x, x_ref[k], u_ref[k], P[k]) for k, x in enumerate(states)]
+        self._diagnostics = {
+            key: q.new_tensor([value[key] for value in values]).reshape(q.shape[:-1])
+            for key in values[0]
+        }
+        u = np.stack([memory.u for memory in self._memory])
+        return torch.from_numpy(u).to(q).reshape(*q.shape[:-1], self.num_inputs)
+
+    def diagnostics(self) -> dict[str, Tensor]:
+        """Return ``solve_time`` in s, ``iterations``, and 0 or 1 for a failure or missed deadline.
+
+        A deadline is missed if the solver takes longer than the period of the loop.
+        """
+        return self._diagnostics
+
+    def faults(self) -> dict[str, Tensor]:
+        """Return where the solver failed for longer than the horizon."""
+        if not self._diagnostics:
+            return {}
+        failed = self._diagnostics["solver_failed"]
+        count = torch.tensor([x.failures for x in self._memory]).reshape(failed.shape)
+        reason = "the solver found no plan for longer than the horizon"
+        return {reason: count > self._problem.steps}
+
+    def _start(self, t: float, states: np.ndarray) -> None:
+        """Forget the past; refuse states from which no plan is feasible."""
+        limits, n, m = self.limits, self.num_coordinates, self.num_inputs
+        outside = (states < limits.x_low - 1e-9) | (states > limits.x_high + 1e-9)
+        if outside.any():
+            run, i = (int(x) for x in np.argwhere(outside)[0])
+            name = f"q[{i}]" if i < n else f"v[{i - n}]"
+            raise ValueError(
+                f"no feasible plan: {name} of run {run} starts at {states[run, i]:.4g}, expected "
+                f"{limits.x_low[i]:.4g} to {limits.x_high[i]:.4g}: start inside, or widen the limit"
+            )
+        u = np.zeros(m).clip(limits.u_low, limits.u_high)
+        self._memory = [_Memory(t, x, u, np.zeros(n), None, 0) for x in states]
+
+    def _ahead(
+        self, t: float, count: int, now: Motion
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return x_ref ``(K, 2N, S)``, u_ref ``(K, M, S)`` and P ``(K, 2N, 2N)`` of the plans."""
+        problem, n = self._problem, self.num_coordinates
+        times = t + self.step * np.arange(problem.steps + 1)
+        motions = [now if self._reference is None else self._reference(float(x)) for x in times]
+        q, v, a = (
+            torch.stack([x.double().cpu().expand(count, n) for x in values], -2)
+            for values in zip(*motions, strict=True)
+        )
+        x = torch.cat([q, v], -1).numpy()
+        x_ref = x[:, 1:].transpose(0, 2, 1)
+        last = self._references
+        if last is not None and np.array_equal(last[0], x_ref):
+            return last
+        u = np.zeros((count, problem.steps + 1, self.num_inputs))
+        if self.model.input_affine:
+            with torch.no_grad():
+                A = self.model.input_matrix(q)
+                u = pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a)).numpy()
+        u = u.clip(self.limits.u_low, self.limits.u_high)
+        if self._terminal is None:
+            P = np.stack([problem.terminal_weight(x[k, -1], u[k, -1]) for k in range(count)])
+        else:
+            P = np.broadcast_to(
+                np.diag(self._terminal * problem.weights.state), (count, 2 * n, 2 * n)
+            )
+        self._references = x_ref, u[:, :-1].transpose(0, 2, 1), P
+        return self._references
+
+    def _advance(
+        self, k: int, t: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray, P: np.ndarray
+    ) -> dict[str, float]:
+        """Plan for a copy, store its input, and return its diagnostics."""
+        begin, problem, last = time.perf_counter(), self._problem, self._memory[k]
+        first = last.plan is None
+        period = t - last.t if t > last.t else self.step
+        d = self._disturbance(last, t, x)
+        iterations = self._iterations * (_FIRST_ITERATIONS if first else 1)
+        try:
+            plan = problem.solve(
+                *(x, last.u, d, x_ref, u_ref, P, self._guess(last, period, x, u_ref)),
+                period=period,
+                iterations=iterations,
+            )
+            failed = not plan.gap <= _LARGEST_GAP
+        except FloatingPointError:
+            failed = True
+        if failed:
+            self._memory[k] = last._replace(t=t, x=x, failures=last.failures + 1)
+        else:
+            u = plan.u[:, 0].clip(self.limits.u_low, self.limits.u_high)
+            self._memory[k] = _Memory(t, x, u, d, plan, 0)
+            if first:
+                self._warn_of_excess(k, plan)
+        duration = time.perf_counter() - begin
+        return {
+            "solve_time": duration,
+            "iterations": 0.0 if failed else float(plan.iterations),
+            "solver_failed": float(failed),
+            "missed_deadline": float(duration > period and not first),
+        }
+
+    def _guess(
+        self, last: _Memory, period: float, x: np.ndarray, u_ref: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the previous plan, shifted, or the state at rest with the reference's input."""
+        steps = self._problem.steps
+        if last.plan is None:
+            return np.tile(x[:, None], steps), u_ref
+        shift = np.minimum(np.arange(steps) + round(period / self.step), steps - 1)
+        return last.plan.x[:, shift], last.plan.u[:, shift]
+
+    def _disturbance(self, last: _Memory, t: float, x: np.ndarray) -> np.ndarray:
+        if self._bandwidth is None or t <= last.t:
+            return last.d
+        n, period = self.num_coordinates, t - last.t
+        modeled = self._problem.acceleration(np.concatenate([(last.x + x) / 2, last.u]))
+        measured = (x[n:] - last.x[n:]) / period - np.array(modeled).ravel()
+        return last.d - math.expm1(-self._bandwidth * period) * (measured - last.d)
+
+    def _warn_of_excess(self, k: int, plan: Plan) -> None:
+        """Warn if the first plan cannot keep a limit of the state."""
+        i, step = np.unravel_index(int(plan.excess.argmax()), plan.excess.shape)
+        if plan.excess[i, step] > 1e-2 * np.abs(plan.x[i]).max():
+            n = self.num_coordinates
+            log.warning(
+                f"the first plan of run {k} leaves the limits of "
+                f"{f'q[{i}]' if i < n else f'v[{i - n}]'} by {plan.excess[i, step]:.3g} after "
+                f"{(step + 1) * self.step:.3g} s: no input within its limits avoids this"
+            )
+
+
+def _row(name: str, value: _Values, size: int, missing: float = 0.0) -> np.ndarray:
+    array = np.asarray(missing if value is None else value, dtype=float)
+    if array.shape not in ((), (size,)):
+        raise ValueError(f"{name} is {array.tolist()}, expected 1 or {size} numbers")
+    return np.broadcast_to(array, (size,)).copy()
