@@ -81,7 +81,9 @@ def build_law(
     """Build one of ``config["controllers"]`` on the terms that it names, with its observer."""
     part = config["controllers"][name]
     model = learned if part["terms"] == "learned" else truth
+    accepted = inspect.signature(pkgutil.resolve_name(part["law"]["_target_"])).parameters
     gains = {f"{key}_gain": value for key, value in config["gains"].items()}
+    gains = {key: value for key, value in gains.items() if key in accepted}
     law = build_part(f"controllers.{name}.law", {**gains, **part["law"]}, model)
     if part.get("observer") is None:
         return law

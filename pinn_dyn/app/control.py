@@ -25,6 +25,7 @@ from pinn_dyn.control import (
     DataRegion,
     Guarded,
     ModelBasedLaw,
+    PredictiveControl,
     export_law,
     term_conditions,
 )
@@ -192,7 +193,7 @@ def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | Non
 
 
 def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
-    if not isinstance(law, ModelBasedLaw):
+    if not isinstance(law, ModelBasedLaw | PredictiveControl):
         raise ConfigError("a guard takes no observer: leave out guard.threshold or the observer")
     train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))

@@ -61,6 +61,9 @@ class PredictiveControl(Controller):
         observer_bandwidth: K_O in 1/s of an observer of the acceleration d that the model does not
             explain, d_k+1 = d_k + (1 - exp(-K_O T)) (measured - d_k); None for d = 0.
 
+    Attributes:
+        plans: the latest plan of each run, None where the solver failed.
+
     Raises:
         ImportError: without CasADi.
         ValueError: on values that do not fit N or M, or a horizon below two steps.
@@ -104,14 +107,14 @@ class PredictiveControl(Controller):
             _row("actuator.high", actuator.high, m, np.inf),
             _row("actuator.rate", actuator.rate, m, np.inf),
         )
-        weights = Weights(
+        self.weights = Weights(
             np.concatenate(x_weight),
             _row("input_weight", input_weight, m),
             _row("rate_weight", rate_weight, m),
             limit_weight,
         )
         with torch.no_grad():
-            self._problem = ShootingProblem(model, self.step, steps, weights, self.limits)
+            self.problem = ShootingProblem(model, self.step, steps, self.weights, self.limits)
         self._terminal, self._iterations = terminal_weight, iterations
         self._bandwidth = observer_bandwidth
         self._reference: Reference | None = None
@@ -132,21 +135,29 @@ class PredictiveControl(Controller):
             ValueError: on a time before the previous call, or a first state beyond its limits.
         """
         states = torch.cat([q, v], -1).reshape(-1, 2 * self.num_coordinates).double().cpu().numpy()
-        if len(self._memory) != len(states):
+        if not self._memory:
             self._start(t, states)
-        elif t < self._memory[0].t:
+        elif len(self._memory) != len(states) or t < self._memory[0].t:
             raise ValueError(
-                f"t is {t:g} s, before the previous call at {self._memory[0].t:g} s: reset() "
-                "before a new run, and give a rate, since the law cannot act in continuous time"
+                f"t is {t:g} s for {len(states)} runs, after {self._memory[0].t:g} s for "
+                f"{len(self._memory)}: reset() the law before new runs, and give a rate, since it "
+                "cannot act in continuous time"
             )
-        x_ref, u_ref, P = self._ahead(t, len(states), reference)
-        values = [self._advance(k, t, x, x_ref[k], u_ref[k], P[k]) for k, x in enumerate(states)]
+        begin = time.perf_counter()
+        ahead = self._ahead(t, len(states), reference)
+        shared = (time.perf_counter() - begin) / len(states)
+        values = [self._advance(k, t, x, *(y[k] for y in ahead)) for k, x in enumerate(states)]
         self._diagnostics = {
             key: q.new_tensor([value[key] for value in values]).reshape(q.shape[:-1])
             for key in values[0]
         }
+        self._diagnostics["solve_time"] += shared
         u = np.stack([memory.u for memory in self._memory])
         return torch.from_numpy(u).to(q).reshape(*q.shape[:-1], self.num_inputs)
+
+    @property
+    def plans(self) -> list[Plan | None]:
+        return [memory.plan for memory in self._memory]
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return ``solve_time`` in s, ``iterations``, and 0 or 1 for a failure or missed deadline.
@@ -162,7 +173,7 @@ class PredictiveControl(Controller):
         failed = self._diagnostics["solver_failed"]
         count = torch.tensor([x.failures for x in self._memory]).reshape(failed.shape)
         reason = "the solver found no plan for longer than the horizon"
-        return {reason: count > self._problem.steps}
+        return {reason: count > self.problem.steps}
 
     def _start(self, t: float, states: np.ndarray) -> None:
         """Forget the past; refuse states from which no plan is feasible."""
@@ -182,7 +193,7 @@ class PredictiveControl(Controller):
         self, t: float, count: int, now: Motion
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return x_ref ``(K, 2N, S)``, u_ref ``(K, M, S)`` and P ``(K, 2N, 2N)`` of the plans."""
-        problem, n = self._problem, self.num_coordinates
+        problem, n = self.problem, self.num_coordinates
         times = t + self.step * np.arange(problem.steps + 1)
         motions = [now if self._reference is None else self._reference(float(x)) for x in times]
         q, v, a = (
@@ -203,9 +214,7 @@ class PredictiveControl(Controller):
         if self._terminal is None:
             P = np.stack([problem.terminal_weight(x[k, -1], u[k, -1]) for k in range(count)])
         else:
-            P = np.broadcast_to(
-                np.diag(self._terminal * problem.weights.state), (count, 2 * n, 2 * n)
-            )
+            P = np.broadcast_to(np.diag(self._terminal * self.weights.state), (count, 2 * n, 2 * n))
         self._references = x_ref, u[:, :-1].transpose(0, 2, 1), P
         return self._references
 
@@ -213,11 +222,15 @@ class PredictiveControl(Controller):
         self, k: int, t: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray, P: np.ndarray
     ) -> dict[str, float]:
         """Plan for a copy, store its input, and return its diagnostics."""
-        begin, problem, last = time.perf_counter(), self._problem, self._memory[k]
+        begin, problem, last = time.perf_counter(), self.problem, self._memory[k]
         first = last.plan is None
         period = t - last.t if t > last.t else self.step
         d = self._disturbance(last, t, x)
+        if self._bandwidth is not None:
+            slopes = np.array(problem.jacobian(np.concatenate([x_ref[:, -1], u_ref[:, -1]])))
+            u_ref = u_ref - (np.linalg.pinv(slopes[:, 2 * self.num_coordinates :]) @ d)[:, None]
         iterations = self._iterations * (_FIRST_ITERATIONS if first else 1)
+        u, plan = last.u, None
         try:
             plan = problem.solve(
                 *(x, last.u, d, x_ref, u_ref, P, self._guess(last, period, x, u_ref)),
@@ -227,17 +240,15 @@ class PredictiveControl(Controller):
             failed = not plan.gap <= _LARGEST_GAP
         except FloatingPointError:
             failed = True
-        if failed:
-            self._memory[k] = last._replace(t=t, x=x, failures=last.failures + 1)
-        else:
+        if plan is not None and not failed:
             u = plan.u[:, 0].clip(self.limits.u_low, self.limits.u_high)
-            self._memory[k] = _Memory(t, x, u, d, plan, 0)
             if first:
                 self._warn_of_excess(k, plan)
+        self._memory[k] = _Memory(t, x, u, d, plan, last.failures + 1 if failed else 0)
         duration = time.perf_counter() - begin
         return {
             "solve_time": duration,
-            "iterations": 0.0 if failed else float(plan.iterations),
+            "iterations": float(plan.iterations if plan else 0),
             "solver_failed": float(failed),
             "missed_deadline": float(duration > period and not first),
         }
@@ -246,7 +257,7 @@ class PredictiveControl(Controller):
         self, last: _Memory, period: float, x: np.ndarray, u_ref: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the previous plan, shifted, or the state at rest with the reference's input."""
-        steps = self._problem.steps
+        steps = self.problem.steps
         if last.plan is None:
             return np.tile(x[:, None], steps), u_ref
         shift = np.minimum(np.arange(steps) + round(period / self.step), steps - 1)
@@ -256,7 +267,7 @@ class PredictiveControl(Controller):
         if self._bandwidth is None or t <= last.t:
             return last.d
         n, period = self.num_coordinates, t - last.t
-        modeled = self._problem.acceleration(np.concatenate([(last.x + x) / 2, last.u]))
+        modeled = self.problem.acceleration(np.concatenate([(last.x + x) / 2, last.u]))
         measured = (x[n:] - last.x[n:]) / period - np.array(modeled).ravel()
         return last.d - math.expm1(-self._bandwidth * period) * (measured - last.d)
 

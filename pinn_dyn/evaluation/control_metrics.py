@@ -38,7 +38,9 @@ class ClosedLoopMetrics(NamedTuple):
             - ``steady_state_error``, ``..._percent`` *: mean |e| and |e| / |s| of the last tenth;
             - ``input_rms``, ``input_peak``, ``input_square_integral`` (integral of |u|^2 over a
               run), ``input_variation_per_s`` (path length of u per second);
-            - ``saturated_...``: control instants of all runs with an input at a limit.
+            - ``saturated_...``: control instants of all runs with an input at a limit;
+            - ``solve_time_...``, ``missed_deadlines``, ``solver_failures``: of predictive control,
+              over the control instants of all runs; the largest time without the first instant.
         coordinates: one row per coordinate: RMS and largest error, and overshoot *.
         inputs: one row per input: RMS, peak and integral of the square.
     """
@@ -134,6 +136,15 @@ def closed_loop_metrics(
         applied = int(torch.isfinite(held).all(dim=-1).sum())
         summary["saturated_samples"] = saturated
         summary["saturated_percent"] = 100 * saturated / max(applied, 1)
+    if "solve_time" in record.diagnostics:
+        names = ("solve_time", "missed_deadline", "solver_failed")
+        times, missed, failed = (record.diagnostics[x].double().nan_to_num(0.0) for x in names)
+        summary |= {
+            "solve_time_median_ms": 1e3 * record.diagnostics["solve_time"].double().nanmedian(),
+            "solve_time_largest_ms": 1e3 * times[:, 1:].max(),
+            "missed_deadlines": int(missed.sum()),
+            "solver_failures": int(failed.sum()),
+        }
     inputs = {
         "rms": (mean(effort) / duration).sqrt(),
         "peak": marked(held.abs().amax(dim=1))[counted].amax(dim=0),

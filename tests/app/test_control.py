@@ -91,6 +91,21 @@ def test_limits_noise_delay_and_another_mass_reach_the_loop(tmp_path, results, l
     assert pd.read_csv(folder / "summary.csv")["saturated_samples"].sum() > 0
 
 
+def test_predictive_control_keeps_the_limits_and_reports_its_solver(tmp_path, lnn_run, undrawn):
+    pytest.importorskip("casadi")
+    words = ["controllers=mpc", "controllers.learned.law.horizon=0.06", "~controllers.truth"]
+    limits = ["actuator.low=-1.2", "actuator.high=0.1", "guard.threshold=1.0"]
+    folder = control(tmp_path, lnn_run, "rate=50", "duration=0.1", *words, *limits)
+    summary = pd.read_csv(folder / "summary.csv").set_index("controller")
+    assert summary.loc["learned", "solver_failures"] == 0
+    assert summary.loc["learned", "solve_time_median_ms"] > 0
+    assert np.isnan(summary.loc["clipped", "solve_time_median_ms"])
+    with np.load(folder / "record_learned.npz") as record:
+        assert record["u_wanted"].min() >= -1.2
+        assert record["u_wanted"].max() <= 0.1
+        assert {"solve_time", "distance"} <= set(record)
+
+
 def test_a_run_that_was_stopped_at_once_has_its_curves_and_its_report(tmp_path, lnn_run):
     words = ["gains.position=1e5", "gains.velocity=1e3", "rate=100", "duration=0.4", "runs=1"]
     words += ["settled_after=0.2", "~controllers.truth", "~controllers.pd"]

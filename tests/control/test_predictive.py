@@ -1,0 +1,180 @@
+"""Predictive control: optimal plans, limits, failures, references ahead of time."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import lsq_linear
+
+from pinn_dyn.control import (
+    Actuator,
+    PointToPoint,
+    PredictiveControl,
+    Regulation,
+    SetPoint,
+    SystemPlant,
+    close_loop,
+    close_loop_continuous,
+)
+from pinn_dyn.mechanics import MechanicalSystem
+from pinn_dyn.testing.linear_system import damped_oscillators
+
+pytest.importorskip("casadi")
+STEP = 0.05
+
+
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+class Pendulum(MechanicalSystem):
+    """A point mass on a rod of 0.5 m, driven by a motor; q = 0 hangs."""
+
+    def __init__(self, mass=1.0):
+        super().__init__(num_coordinates=1, num_inputs=1)
+        self.mass = mass
+
+    def mass_matrix(self, q):
+        return torch.full_like(q, self.mass / 4).unsqueeze(-1)
+
+    def potential_energy(self, q):
+        return -9.81 * self.mass / 2 * torch.cos(q[..., 0])
+
+    def damping_matrix(self, q):
+        return torch.full_like(q, 0.1).unsqueeze(-1)
+
+    def input_matrix(self, q):
+        return torch.ones_like(q).unsqueeze(-1)
+
+
+def run(law, reference=None, *, q0=0.0, v0=0.0, duration=1.0, mass=1.0, actuator=None):
+    reference = reference or SetPoint([1.0])
+    start = double([[q0]]), double([[v0]])
+    arguments = {"duration": duration, "rate": 1 / STEP, "actuator": actuator}
+    return close_loop(SystemPlant(Pendulum(mass)), law, reference, *start, **arguments)
+
+
+@pytest.fixture(scope="module")
+def law():
+    return PredictiveControl(Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
+
+
+def linear_problem(steps, Q, R):
+    """Return A, B of the midpoint rule, for two coupled springs."""
+    F, B = damped_oscillators().state_space()
+    left = np.linalg.inv(np.eye(4) - STEP / 2 * F)
+    return left @ (np.eye(4) + STEP / 2 * F), left @ (STEP * B)
+
+
+def test_without_limits_it_is_the_linear_quadratic_regulator():
+    system, x = damped_oscillators().requires_grad_(False), np.array([0.3, -0.2, 0.5, 0.1])
+    law = PredictiveControl(system, 0.3, STEP, velocity_weight=0.2, input_weight=0.05)
+    A, B = linear_problem(6, law.weights.state, law.weights.input)
+    Q, R = STEP * np.diag([1, 1, 0.2, 0.2]), STEP * 0.05 * np.eye(1)
+    P = solve_discrete_are(A, B, Q, R)
+    gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    u = law(0.0, *torch.from_numpy(x).split(2), SetPoint([0.0, 0.0])(0.0))
+    np.testing.assert_allclose(u, -gain @ x, rtol=1e-5)
+
+
+def test_with_limits_it_is_the_bounded_least_squares_solution():
+    system, x = damped_oscillators().requires_grad_(False), np.array([2.0, -1.0, 0.5, 0.1])
+    steps, high = 8, 1.5
+    settings = {"terminal_weight": 2.0, "actuator": Actuator(-high, high)}
+    law = PredictiveControl(system, steps * STEP, STEP, input_weight=1e-2, **settings)
+    A, B = linear_problem(steps, None, None)
+    free = [np.linalg.matrix_power(A, k + 1) @ x for k in range(steps)]
+    forced = np.zeros((steps, 4, steps))
+    for k in range(steps):
+        for j in range(k + 1):
+            forced[k, :, j] = (np.linalg.matrix_power(A, k - j) @ B)[:, 0]
+    weight = np.tile([1, 1, 0.1, 0.1], (steps, 1)) * STEP
+    weight[-1] = 2.0 * np.array([1, 1, 0.1, 0.1])
+    rows = np.sqrt(weight).reshape(-1, 1) * forced.reshape(-1, steps)
+    rows = np.vstack([rows, np.sqrt(STEP * 1e-2) * np.eye(steps)])
+    right = np.concatenate([-np.sqrt(weight).ravel() * np.ravel(free), np.zeros(steps)])
+    optimum = lsq_linear(rows, right, (-high, high), tol=1e-12).x
+    assert (np.abs(optimum) > high - 1e-6).sum() in range(1, steps)
+    law(0.0, *torch.from_numpy(x).split(2), SetPoint([0.0, 0.0])(0.0))
+    np.testing.assert_allclose(law.plans[0].u[0], optimum, atol=1e-4)
+
+
+def test_it_respects_the_limits_and_beats_the_clipped_law():
+    actuator = Actuator(-6.0, 6.0, rate=60.0)
+    settings = {"input_weight": 1e-3, "velocity_weight": 0.01, "v_max": 2.0, "actuator": actuator}
+    planned = run(PredictiveControl(Pendulum(), 0.6, STEP, **settings), duration=1.5)
+    clipped = run(Regulation(Pendulum(), 20.0, 1.0), duration=1.5, actuator=actuator)
+    assert planned.u.abs().max() <= 6.0
+    assert planned.u.diff(dim=1).abs().max() <= 60.0 * STEP + 1e-6
+    assert planned.u[0, 0].abs() <= 60.0 * STEP + 1e-6  # from zero
+    assert 1.8 < planned.v.max() < 2.05
+    assert clipped.v.max() > 2.2
+    assert (planned.q - 1).abs()[0, -6:].max() < 1e-2 < (clipped.q - 1).abs()[0, -6:].max()
+    assert planned.diagnostics["solver_failed"].sum() == 0
+
+
+def test_a_new_run_forgets_the_previous_run(law):
+    first, second = run(law, duration=0.5), run(law, duration=0.5)
+    torch.testing.assert_close(first.u, second.u, rtol=0, atol=0)
+
+
+def test_it_sees_the_reference_ahead_of_time(law):
+    move = PointToPoint([0.0], [1.5], duration=0.5, begin=0.3)
+    ahead = run(law, move)
+    law_without = PredictiveControl(Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01)
+    law_without.follow = lambda reference: None
+    errors = [(x.q - x.reference.q).abs().max() for x in (ahead, run(law_without, move))]
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_the_observer_removes_the_steady_error_of_a_wrong_model(law):
+    wrong = run(law, mass=1.2, duration=2.0)
+    observed = PredictiveControl(
+        Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01, observer_bandwidth=10.0
+    )
+    corrected = run(observed, mass=1.2, duration=2.0)
+    assert (corrected.q - 1)[0, -1].abs() < 1e-3 < 0.02 < (wrong.q - 1)[0, -1].abs()
+
+
+def test_a_failed_solver_holds_the_last_input_and_stops_after_a_horizon(law, monkeypatch):
+    solve = law.problem.solve
+
+    def failing(x, u0, *rest, **settings):
+        if calls.append(0) or len(calls) > 5:
+            raise FloatingPointError
+        return solve(x, u0, *rest, **settings)
+
+    calls = []
+    monkeypatch.setattr(law.problem, "solve", failing)
+    record = run(law, duration=1.5)
+    failed = record.diagnostics["solver_failed"][0].nan_to_num(1.0)
+    assert failed[:5].sum() == 0
+    assert failed[5:].all()
+    assert record.u[0, 4] != record.u[0, 3]
+    assert (record.u[0, 4:17] == record.u[0, 4]).all()
+    assert "the solver found no plan for longer than the horizon" in record.stopped[0]
+
+
+def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
+    settings = {"q_high": 0.5, "actuator": Actuator(-6.0, 6.0)}
+    law = PredictiveControl(Pendulum(), 0.6, STEP, **settings)
+    with pytest.raises(ValueError, match=r"no feasible plan: q\[0\] of run 0 starts at 0.8"):
+        run(law, SetPoint([0.2]), q0=0.8)
+    run(law, SetPoint([0.2]), duration=2 * STEP)
+    assert not caplog.text
+    run(law, SetPoint([0.2]), q0=0.3, v0=6.0, duration=2 * STEP)
+    assert "leaves the limits of q[0]" in caplog.text
+
+
+def test_continuous_time_is_refused(law):
+    start = double([[0.0]]), double([[0.0]])
+    settings = {"duration": 0.2, "samples_rate": 20.0}
+    with pytest.raises(ValueError, match="give a rate"):
+        close_loop_continuous(Pendulum(), law, SetPoint([1.0]), *start, **settings)
+
+
+def test_values_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match="v_max is"):
+        PredictiveControl(Pendulum(), 0.6, STEP, v_max=[1.0, 2.0])
+    with pytest.raises(ValueError, match="expected two steps"):
+        PredictiveControl(Pendulum(), 0.05, STEP)
