@@ -37,7 +37,8 @@ def test_value_and_jacobian_repeat_the_model(case):
     blocks = function.jacobian()(*arrays((q, v, u)), 0)
     jacobian = torch.func.jacrev(model.forward_dynamics, (0, 1, 2))(q, v, u)
     for block, reference in zip(blocks, jacobian, strict=True):
-        np.testing.assert_allclose(np.array(block), reference, 1e-9, 1e-9 * float(reference.abs().max()))
+        smallest = 1e-9 * float(reference.abs().max())
+        np.testing.assert_allclose(np.array(block), reference, 1e-9, smallest)
 
 
 def test_terms_are_matrices_and_survive_a_file(tmp_path):
