@@ -101,12 +101,11 @@ def _export_robot(model: Predictor, path: Path) -> Path:
     model = double_copy(model)
     chain = chain.double()
     with torch.no_grad():
-        offset, gain = model.constant_force(), model.input_gain() @ model.motors
-        bias, limit = [offset, 0 * offset, 0 * offset], torch.full_like(offset, torch.inf)
-        if servo := model.servo:
-            gain = servo.springs()
-            bias = [offset, -gain, -servo.damping_rates()]
-            limit[model.driven] = torch.inf if servo.affine else servo.largest_force()
+        servo, offset = model.servo, model.constant_force()
+        limit = torch.full_like(offset, torch.inf)
+        if servo and not servo.affine:
+            limit[model.driven] = servo.largest_force()
+        springs, damping = (servo.springs(), servo.damping_rates()) if servo else 2 * [0 * offset]
         drives = model.physical_constants()[_BODY_COLUMNS:]
         fast = torch.full_like(model.viscous(), torch.inf)
         constants = RobotConstants(
@@ -114,8 +113,8 @@ def _export_robot(model: Predictor, path: Path) -> Path:
             armature=model.rotor_inertia(),
             damping=model.viscous(),
             friction=(model.friction(fast) - model.friction(-fast)) / 2,
-            gain=gain,
-            bias=torch.stack(bias, dim=-1),
+            gain=springs if servo else model.input_gain() @ model.motors,
+            bias=torch.stack([offset, -springs, -damping], dim=-1),
             limit=limit,
             notes=[
                 f"Inertias, damping and friction identified by pinn_dyn {__version__}. Drives:",
