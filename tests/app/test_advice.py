@@ -146,8 +146,12 @@ def runs(lnn_run, mlp_run, hnn_run):
     return {"lnn": lnn_run, "mlp": mlp_run, "hnn": hnn_run}
 
 
+SLOW = ("too few windows", "gains that let the loop diverge")
+NAMES = [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in COMMANDS]
+
+
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_suggested_override_works(name, tmp_path, monkeypatch, runs):
     if name == "no compiler":
         monkeypatch.setattr("pinn_dyn.app.trainer.has_cpp_compiler", lambda: False)
