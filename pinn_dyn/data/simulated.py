@@ -75,6 +75,7 @@ class SimulatedSource(DataSource):
         duration: length of each training trajectory, s.
         test_duration: length of each validation and test trajectory, s; ``duration`` if None.
         step: sample time of the simulation, s.
+        dead_time: time after which the recorded input acts on the system, s.
         keep_every: keep every n-th sample, for a lower rate from the same simulation.
         train_initial_states: number of initial states for training.
         train_inputs: number of inputs for training.
@@ -100,6 +101,7 @@ class SimulatedSource(DataSource):
     duration: PositiveFloat
     test_duration: PositiveFloat | None = None
     step: PositiveFloat
+    dead_time: NonNegativeFloat = 0.0
     keep_every: PositiveInt = 1
     train_initial_states: PositiveInt
     train_inputs: PositiveInt
@@ -167,6 +169,7 @@ class SimulatedSource(DataSource):
         """Return the settings that the simulation depends on: the key of the cache."""
         keys = "system excitation initial_states duration test_duration step counts pairing seed"
         keys += " rtol atol" if self.q_limits is None else " rtol atol q_limits"
+        keys += " dead_time" if self.dead_time else ""
         return {"version": _VERSION} | {k: describe(getattr(self, k)) for k in keys.split()}
 
     def simulate(self) -> Arrays:
@@ -223,11 +226,15 @@ class SimulatedSource(DataSource):
         q0, v0, signals = zip(*draws, strict=True)
         size = len(q0[0])
         signal = joined(signals, rows // size, rows % size)
+
+        def acting(times: np.ndarray) -> np.ndarray:
+            return signal(times - self.dead_time)
+
         q, v = simulate(
             self.system,
             np.concatenate(q0)[rows],
             np.concatenate(v0)[rows],
-            signal,
+            acting,
             t,
             rtol=self.rtol,
             atol=self.atol,

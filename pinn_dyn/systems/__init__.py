@@ -6,6 +6,7 @@ from pinn_dyn.systems.protocols import Drawable, HasDomain, HasLimits, HasTip, S
 from pinn_dyn.systems.rigid_chain import RigidChain
 from pinn_dyn.systems.simulated_arm import SimulatedArm
 from pinn_dyn.systems.soft_arm import SoftArm
+from pinn_dyn.systems.tendon_arm import TendonArm
 
 __all__ = [
     "BulletArm",
@@ -18,4 +19,5 @@ __all__ = [
     "SimulatedArm",
     "SoftArm",
     "Stepped",
+    "TendonArm",
 ]

@@ -68,6 +68,20 @@ def splits(cache):
     return make_source(cache).load()
 
 
+def test_the_system_follows_the_recorded_input_after_the_dead_time(cache):
+    prompt, late = (
+        make_source(cache, excitation=MultiSine(**SINE), duration=0.4, dead_time=x).load().test[0]
+        for x in (0.0, 0.03)
+    )
+    assert torch.equal(late.u, prompt.u)
+    assert float((late.q - prompt.q).abs().max()) > 1e-3
+    acting = Signal(late.t, torch.cat([late.u[:3], late.u[:-3]]), "cubic")
+    a = (late.v[5:] - late.v[3:-2]) / 0.02  # at samples 4 to T - 2
+    expected = SoftArm().forward_dynamics(late.q[4:-1], late.v[4:-1], acting.u[4:-1])
+    prompt_a = SoftArm().forward_dynamics(late.q[4:-1], late.v[4:-1], late.u[4:-1])
+    assert (a - expected).norm() < 0.2 * (a - prompt_a).norm()
+
+
 def starts(trajectories):
     return {tuple(torch.cat([x.q[0], x.v[0]]).tolist()) for x in trajectories}
 
