@@ -24,7 +24,13 @@ from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.payload import identify_payload
 from pinn_dyn.exports.exported import Real
-from pinn_dyn.mechanics import MechanicalSystem, Predictor, Signal, double_copy
+from pinn_dyn.mechanics import (
+    ContinuousPredictor,
+    MechanicalSystem,
+    Predictor,
+    Signal,
+    double_copy,
+)
 from pinn_dyn.mechanics.arrays import require_finite
 from pinn_dyn.models import KnownMechanics, Statistics
 
@@ -303,6 +309,24 @@ class Run:
         system, (position, velocity) = self.system, self._motion_state(q=q, v=v)
         force = self._array("u", u, self.model.num_inputs, "M")
         return system.forward_dynamics(position, velocity, force).numpy()
+
+    def linearize(
+        self, q: Values, v: Values, u: Values, *, sample_time: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return A and B of the state (q, v), see :meth:`ContinuousPredictor.linearize`.
+
+        Raises:
+            TypeError: on a model that has no derivative of its state, or an ensemble.
+        """
+        if not isinstance(self.model, ContinuousPredictor):
+            raise TypeError(
+                f"a {type(self.model).__name__} has no single dx/dt to linearize: use a member "
+                "of run.members, or model=lnn, hnn, known or acceleration"
+            )
+        position, velocity = self._motion_state(q=q, v=v)
+        inputs = self._array("u", u, self.model.num_inputs, "M")
+        A, B = self.model.linearize(position, velocity, inputs, sample_time=sample_time)
+        return A.numpy(), B.numpy()
 
     def _motion_state(self, **values: Values) -> tuple[Tensor, ...]:
         return torch.broadcast_tensors(*(self._coordinates(*item) for item in values.items()))

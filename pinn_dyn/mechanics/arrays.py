@@ -33,6 +33,25 @@ def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
+def jacobians(function: Callable[..., Tensor], *values: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Return y = f(a, b, ...) ``(*batch, n)`` and dy/da, dy/db, ..., ``(*batch, n, m)`` each.
+
+    The function treats the rows ``(*batch, m)`` of its arguments independently.
+    """
+    slopes = []
+    values = tuple(value.contiguous() for value in values)
+    for index, value in enumerate(values):
+
+        def of_value(x: Tensor, index: int = index) -> Tensor:
+            return function(*values[:index], x, *values[index + 1 :])
+
+        unit = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)
+        # Forward mode, since torch.export records no torch.func.vjp.
+        columns = [torch.func.jvp(of_value, (value,), (e.expand_as(value),))[1] for e in unit]
+        slopes.append(torch.stack(columns, dim=-1))
+    return function(*values), slopes
+
+
 def pseudo_inverse_times(A: Tensor, tau: Tensor) -> Tensor:
     """Return A^+ tau, ``(*batch, M)``, for A ``(*batch, N, M)`` and tau ``(*batch, N)``.
 

@@ -11,7 +11,7 @@ import torch
 from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
-from pinn_dyn.mechanics.arrays import require_last_dim
+from pinn_dyn.mechanics.arrays import jacobians, require_last_dim
 from pinn_dyn.mechanics.integrators import RK4, Integrator
 from pinn_dyn.mechanics.rollout import path_between, require_start
 from pinn_dyn.mechanics.signal import Signal
@@ -102,6 +102,50 @@ class ContinuousPredictor(Predictor):
     @abc.abstractmethod
     def state_derivative(self, x: Tensor, u: Tensor) -> Tensor:
         """Return dx/dt, ``(*batch, S)``, of the state x ``(*batch, S)`` under u ``(*batch, M)``."""
+
+    def velocity_derivative(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return d(q, v)/dt, ``(*batch, 2N)``, at x = (q, v), also where the state is (q, p)."""
+        return self.state_derivative(x, u)
+
+    @final
+    def linearize(
+        self, q: Tensor, v: Tensor, u: Tensor, *, sample_time: float | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return A ``(*batch, 2N, 2N)`` and B ``(*batch, 2N, M)`` of the state x = (q, v)::
+
+            dx/dt = f(x, u),    A = df/dx,    B = df/du
+            [[A_d, B_d], [0, 1]] = expm(T [[A, B], [0, 0]])      with a sample time T: x_k+1, held u
+
+        Deviations from (q, v, u) follow A and B where f = (v, dv/dt) is zero, or along a motion.
+        The state is (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs
+        of servos are targets; elastic joints have their motors in q. Dry friction enters by its
+        slope at v, largest at v = 0.
+
+        Args:
+            q, v: ``(*batch, N)``.
+            u: ``(*batch, M)``.
+            sample_time: T, s; None returns the continuous pair.
+
+        Raises:
+            ValueError: on shapes, or a model with a learned input delay, which needs more states.
+        """
+        if self.input_history:
+            raise ValueError(
+                "the model has a learned input delay, which A and B of (q, v) lack: set its "
+                "attribute delay to None, and add the delay of learned_figures() to the design"
+            )
+        require_last_dim("q", q, self.num_coordinates, "N")
+        require_last_dim("v", v, self.num_coordinates, "N")
+        require_last_dim("u", u, self.num_inputs, "M")
+        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], u.shape[:-1])
+        q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
+        _, (A, B) = jacobians(self.velocity_derivative, torch.cat([q, v], dim=-1), u)
+        if sample_time is None:
+            return A, B
+        size = A.shape[-1]
+        block = torch.nn.functional.pad(torch.cat([A, B], dim=-1), (0, 0, 0, B.shape[-1]))
+        held = torch.linalg.matrix_exp(sample_time * block)[..., :size, :]
+        return held[..., :size], held[..., size:]
 
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
         """Return a function from r to k with (1 - s J) k = r, J the stiff part of df/dx (zero)."""

@@ -107,6 +107,11 @@ def test_own_robot():
     assert "M learned" in run("own_robot.py", "--steps", "2")
 
 
+def test_lqr():
+    """The gains of the true robot balance it, and an untrained model has gains of finite size."""
+    assert "K learned" in run("lqr.py", "--steps", "2")
+
+
 def test_identified_robot():
     pytest.importorskip("pinocchio", reason="the dev extra is not installed")
     torques = re.findall(r"(?:Pinocchio|the model): \[(.*)\]", run("identified_robot.py"))
