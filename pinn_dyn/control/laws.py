@@ -11,15 +11,21 @@ from pydantic import Field
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
-from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.mechanics.arrays import matvec, pseudo_inverse_times, require_last_dim
+from pinn_dyn.mechanics import InputSolver, MechanicalSystem
+from pinn_dyn.mechanics.arrays import (
+    jacobians,
+    matvec,
+    pseudo_inverse_times,
+    require_last_dim,
+)
+from pinn_dyn.mechanics.input_solver import Solution
 
 Gain = float | Sequence[float] | Tensor
 """One positive number for all coordinates, or N of them."""
 
 
 class ModelBasedLaw(Controller):
-    """A law u = law(q, v, q_ref, v_ref, a_ref) on the terms of a model, without memory.
+    """A law u = law(q, v, q_ref, v_ref, a_ref) on the terms of a model.
 
     The gains are diagonal, and A^+(q) is the pseudo-inverse of the input matrix of the model.
 
@@ -29,18 +35,28 @@ class ModelBasedLaw(Controller):
 
     Inputs are infinite or NaN where A loses its rank.
 
+    If the force f(q, v, u) is not linear in u, as for tendons with motor positions as inputs and
+    for servos that saturate, the solution u* of f(q, v, u*) = tau takes the place of A^+ tau, and
+    the Jacobian J = df/du at u* that of A. It is the only memory of a law that :class:`InputSolver`
+    starts from the previous u. Where it finds no u*, u is the previous u and the law has a fault.
+    With a model equal to the plant, the force is tau + J J^T (K_P e + K_D de/dt) up to second order
+    in the feedback. Near a set point stability is thus that of A A^T with J J^T in its place, as
+    long as J has full rank. Far from it, and with slack tendons, nothing is claimed.
+
+    A learned delay of the input stays in the loop as dead time and bounds the gains.
+
     Args:
         model: the mechanical system whose terms the law uses, in float64.
         position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.
-        max_condition: largest condition number of A(q) that is no fault.
+        max_condition: largest condition number of A(q), or J, that is no fault.
+        solver: tolerance, steps and limits of u*, for a force that is not linear in u.
 
     Attributes:
         position_gain, velocity_gain: diagonals of K_P and K_D, ``(N,)``, float64.
 
     Raises:
         TypeError: on a model that is no mechanical system.
-        ValueError: on bad gains, or a model with a delayed input, a force that is not linear in
-            the input, or a residual force.
+        ValueError: on bad gains, or a model with a residual force.
     """
 
     def __init__(
@@ -50,6 +66,7 @@ class ModelBasedLaw(Controller):
         velocity_gain: Gain,
         *,
         max_condition: Annotated[float, Field(ge=1)] = 1e6,
+        solver: InputSolver | None = None,
     ):
         if not isinstance(model, MechanicalSystem):
             raise TypeError(
@@ -62,10 +79,13 @@ class ModelBasedLaw(Controller):
         self.velocity_gain = diagonal_gain("velocity_gain", velocity_gain, self.num_coordinates)
         self.model = model
         self.max_condition = float(max_condition)
-        self._condition: Tensor | None = None
+        self.solver = solver or InputSolver()
+        self.reset()
 
     def reset(self) -> None:
-        self._condition = None
+        self._condition: Tensor | None = None
+        self._previous: Tensor | None = None
+        self._solution: Solution | None = None
 
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         """Return u ``(*batch, M)``; a reference ``(N,)`` serves the whole batch."""
@@ -73,31 +93,101 @@ class ModelBasedLaw(Controller):
         require_last_dim("v", v, self.num_coordinates, "N")
         for name, value in zip(reference._fields, reference, strict=True):
             require_last_dim(f"reference.{name}", value, self.num_coordinates, "N")
+        previous = self._previous
+        if previous is not None and previous.shape[:-1] != q.shape[:-1]:
+            previous = None
         with torch.no_grad():
-            A = self.model.input_matrix(q)
+            u, A, self._solution = self._input(q, v, reference, previous)
             self._condition = condition_number(A)
-            return self._input(A, q, v, reference)
+        if not self.model.input_affine:
+            self._previous = u
+        return u
 
-    def law(self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor) -> Tensor:
-        """Return u ``(*batch, M)`` by the formula alone, without checks and side effects."""
-        return self._input(self.model.input_matrix(q), q, v, Motion(q_ref, v_ref, a_ref))
+    def law(
+        self,
+        q: Tensor,
+        v: Tensor,
+        q_ref: Tensor,
+        v_ref: Tensor,
+        a_ref: Tensor,
+        u_previous: Tensor | None = None,
+    ) -> Tensor:
+        """Return u ``(*batch, M)`` by the formula alone, without checks and side effects.
+
+        If the force is not linear in u, the law takes all steps of its solver from ``u_previous``,
+        the u of the instant before.
+
+        Raises:
+            ValueError: on such a force without ``u_previous``.
+        """
+        if u_previous is None and not self.model.input_affine:
+            raise ValueError(
+                "the force of the model is not linear in u: the law needs u_previous, the u of the "
+                "instant before, as its sixth argument"
+            )
+        reference = Motion(q_ref, v_ref, a_ref)
+        return self._input(q, v, reference, u_previous, all_steps=True)[0]
 
     @abc.abstractmethod
-    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        """Return u by the formula of the law, given A(q) ``(*batch, N, M)``."""
+    def _forces(
+        self, q: Tensor, v: Tensor, reference: Motion
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Return tau and h of u = A^+ tau + A^T h, ``(*batch, N)`` each, or None for zero."""
+
+    def _input(
+        self,
+        q: Tensor,
+        v: Tensor,
+        reference: Motion,
+        previous: Tensor | None,
+        all_steps: bool = False,
+    ) -> tuple[Tensor, Tensor, Solution | None]:
+        """Return u, A or J ``(*batch, N, M)``, and the solution for a force not linear in u."""
+        tau, feedback = self._forces(q, v, reference)
+        model, solution = self.model, None
+        if model.input_affine:
+            A = model.input_matrix(q)
+            u = A.new_zeros(A[..., 0, :].shape) if tau is None else pseudo_inverse_times(A, tau)
+        elif tau is None:
+            u = model.typical_input(q)
+            A = jacobians(lambda x: model._applied_force(q, v, x), u)[1][0]
+        else:
+            solution = model.solve_input(self.solver, q, v, tau, previous, all_steps=all_steps)
+            u, A = solution.u, solution.J
+        if feedback is not None:
+            u = u + matvec(A.transpose(-1, -2), feedback)
+        if solution is not None:
+            held = model.typical_input(q) if previous is None else previous
+            held = held + 0 * solution.residual.unsqueeze(-1)  # NaN for a NaN state
+            u = torch.where(solution.converged.unsqueeze(-1), u, held)
+        return u, A, solution
 
     def _feedback(self, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
         K_P, K_D = self.position_gain.to(q), self.velocity_gain.to(q)
         return K_P * (reference.q - q) + K_D * (reference.v - v)
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """Return ``input_condition``, the condition number of A(q), ``(*batch,)``."""
-        return {} if self._condition is None else {"input_condition": self._condition}
+        """Return ``input_condition``, the condition number of A(q) or J, ``(*batch,)``.
 
-    def faults(self) -> dict[str, Tensor]:
-        """Return where the condition number of A(q) exceeds its limit or is NaN."""
+        And ``input_residual``, |f(q, v, u*) - tau| in the units of the force, not linear in u.
+        """
         if self._condition is None:
             return {}
+        numbers = {"input_condition": self._condition}
+        return numbers | (
+            {} if self._solution is None else {"input_residual": self._solution.residual}
+        )
+
+    def faults(self) -> dict[str, Tensor]:
+        """Return where A(q) or J is nearly singular or NaN, and where no input gives the force."""
+        if self._condition is None:
+            return {}
+        if self._solution is not None and not self._solution.converged.all():
+            reason = (
+                f"no input gives the force of the law to {self.solver.tolerance:g} within "
+                f"{self.solver.steps} steps, so the previous input is held"
+            )
+            return {reason: ~self._solution.converged}
         reason = (
             "the input matrix A(q) is nearly singular: its condition number exceeds "
             f"max_condition = {self.max_condition:g}"
@@ -110,12 +200,13 @@ class ProportionalDerivative(ModelBasedLaw):
 
         u = A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
 
-    Of the model only A is used; with A = I, torques at the joints, nothing of it. Arguments and
-    errors: :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
+    Of the model only A is used; with A = I, torques at the joints, nothing of it. A force that is
+    not linear in u has J at a typical input u_0 instead, and u_0 is added. Arguments and errors:
+    :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
     """
 
-    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        return matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
+    def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[None, Tensor]:
+        return None, self._feedback(q, v, reference)
 
 
 class Regulation(ModelBasedLaw):
@@ -131,9 +222,8 @@ class Regulation(ModelBasedLaw):
     unit.
     """
 
-    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        potential = pseudo_inverse_times(A, self.model.potential_force(q))
-        return potential + matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
+    def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
+        return self.model.potential_force(q), self._feedback(q, v, reference)
 
 
 class Tracking(ModelBasedLaw):
@@ -149,9 +239,8 @@ class Tracking(ModelBasedLaw):
     Units of the gains as for :class:`Regulation`.
     """
 
-    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
-        feed_forward = pseudo_inverse_times(A, self.model.inverse_dynamics(*reference))
-        return feed_forward + matvec(A.transpose(-1, -2), self._feedback(q, v, reference))
+    def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, Tensor]:
+        return self.model.inverse_dynamics(*reference), self._feedback(q, v, reference)
 
 
 class ComputedTorque(ModelBasedLaw):
@@ -165,9 +254,9 @@ class ComputedTorque(ModelBasedLaw):
     damped. Arguments and errors: :class:`ModelBasedLaw`.
     """
 
-    def _input(self, A: Tensor, q: Tensor, v: Tensor, reference: Motion) -> Tensor:
+    def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[Tensor, None]:
         a = reference.a + self._feedback(q, v, reference)
-        return pseudo_inverse_times(A, self.model.inverse_dynamics(q, v, a))
+        return self.model.inverse_dynamics(q, v, a), None
 
 
 def condition_number(A: Tensor) -> Tensor:

@@ -55,6 +55,9 @@ class DisturbanceObserver(Controller):
         actuator: limits of the plant's input, so that r does not wind up in saturation. Give an
             object of its own, since limits of the rate have a memory. u itself is not limited.
 
+    Raises:
+        ValueError: on a model whose force is not linear in the input.
+
     Attributes:
         residual: r of the latest call, ``(*batch, N)``, N or Nm; None before the first call.
         bandwidth, max_rate: as above; the rate is infinite without a limit.
@@ -69,6 +72,8 @@ class DisturbanceObserver(Controller):
         actuator: Actuator | None = None,
     ):
         super().__init__(law.num_coordinates, law.num_inputs)
+        if not law.model.input_affine:
+            raise ValueError("the observer needs a force A(q) u: remove controllers.<law>.observer")
         self.law = law
         self.bandwidth = float(bandwidth)
         self.max_rate = math.inf if max_rate is None else float(max_rate)

@@ -145,6 +145,8 @@ def prepare(
     require_last_dim("q", q, truth.num_coordinates, "N")
     if truth.num_coordinates != truth.num_inputs:
         raise ValueError(f"Proposition 1 needs N = M inputs, the robot has M = {truth.num_inputs}")
+    if not (model.input_affine and truth.input_affine):
+        raise ValueError("Proposition 1 needs a force A(q) u, linear in the input: stability=null")
     return double_copy(model, q.device), double_copy(truth, q.device), q.double()
 
 

@@ -1,5 +1,6 @@
 """The equations of mechanics: systems, states, trajectories and their integration."""
 
+from pinn_dyn.mechanics.input_solver import InputSolver
 from pinn_dyn.mechanics.integrators import RK4, Integrator, Rosenbrock
 from pinn_dyn.mechanics.predictor import ContinuousPredictor, Predictor, double_copy
 from pinn_dyn.mechanics.rollout import rollout
@@ -11,6 +12,7 @@ from pinn_dyn.mechanics.trajectory import State, Trajectory, samples_of, stack, 
 __all__ = [
     "RK4",
     "ContinuousPredictor",
+    "InputSolver",
     "Integrator",
     "Interpolation",
     "MechanicalSystem",

@@ -57,6 +57,7 @@ class Sum(MechanicalSystem):
     potential_energy = _total("potential_energy")
     damping_matrix = _total("damping_matrix")
     input_matrix = _total("input_matrix")
+    typical_input = _total("typical_input")
     _potential_force = _total("_potential_force")
     _inertial_force = _total("_inertial_force")
     _damping_force = _total("_damping_force")

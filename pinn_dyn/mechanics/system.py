@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, final
 
 import torch
@@ -16,6 +17,7 @@ from pinn_dyn.mechanics.arrays import (
     spd_solve,
     spd_solver,
 )
+from pinn_dyn.mechanics.input_solver import InputSolver, Solution
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 
 
@@ -47,7 +49,7 @@ class MechanicalSystem(ContinuousPredictor):
     force ``(*batch, N)``; SI units and radians.
 
     If the force is not linear in the input, ``input_affine`` is false, and :meth:`input_matrix` is
-    A at a typical input.
+    A at :meth:`typical_input`.
 
     A subclass implements the four abstract terms. The ``_``-methods derive all other quantities by
     automatic differentiation. A subclass with closed formulas may override them.
@@ -71,6 +73,10 @@ class MechanicalSystem(ContinuousPredictor):
     @abc.abstractmethod
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return A(q), ``(*batch, N, M)``."""
+
+    def typical_input(self, q: Tensor) -> Tensor:
+        """Return an input, ``(*batch, M)``, to start from where the force is not linear in it."""
+        return q.new_zeros(*q.shape[:-1], self.num_inputs)
 
     def _potential_force(self, q: Tensor) -> Tensor:
         return torch.func.grad(lambda x: self.potential_energy(x).sum())(q)
@@ -191,37 +197,49 @@ class MechanicalSystem(ContinuousPredictor):
         - M < N, under-actuated: the u of least ``|A u - tau|``. The acceleration is ``a`` only if
           tau lies in the range of A.
 
-        Entries are infinite or NaN where A loses its rank.
+        A force that is not linear in u is solved for u by :class:`InputSolver`; for M > N, u is
+        the solution closest to :meth:`typical_input`. With a learned delay, u acts later by the
+        delay. Entries are infinite or NaN where A loses its rank, or no input gives the force.
 
         Raises:
             ValueError: on shapes, or a model that :meth:`require_invertible_input` refuses.
         """
         self.require_invertible_input()
-        return pseudo_inverse_times(self.input_matrix(q), self.inverse_dynamics(q, v, a))
+        tau = self.inverse_dynamics(q, v, a)
+        if self.input_affine:
+            return pseudo_inverse_times(self.input_matrix(q), tau)
+        solution = self.solve_input(InputSolver(), q, v, tau)
+        return torch.where(solution.converged.unsqueeze(-1), solution.u, torch.nan)
+
+    @final
+    def solve_input(
+        self,
+        solver: InputSolver,
+        q: Tensor,
+        v: Tensor,
+        tau: Tensor,
+        previous: Tensor | None = None,
+        *,
+        all_steps: bool = False,
+    ) -> Solution:
+        """Return the input that gives a force at (q, v), see :class:`InputSolver`."""
+        force = partial(self._applied_force, q, v)
+        return solver(force, tau, self.typical_input(q), previous, all_steps=all_steps)
 
     @final
     def require_invertible_input(self) -> None:
-        """Check that the force is A(q) u at the same time, so that A^+ gives u.
+        """Check that the model has inputs, and no residual force, which may depend on all of u.
 
         Raises:
-            ValueError: on a delayed input, a force that is not linear in the input, a residual, or
-                no input.
+            ValueError: on no input, or a residual.
         """
         if not self.num_inputs:
             raise ValueError("the model has no inputs (u: []), so no control law can move it")
-        for present, problem, remedy in (
-            (self.input_history, "a learned input delay", "~model/delay"),
-            (
-                not self.input_affine,
-                "a force not linear in the input",
-                "model/input=network, or model.input.limit=null for servos",
-            ),
-            (self.has_residual, "a residual force", "~model/residual"),
-        ):
-            if present:
-                raise ValueError(
-                    f"the model has {problem}, which A(q) cannot invert: train with {remedy}"
-                )
+        if self.has_residual:
+            raise ValueError(
+                "the model has a residual force, which A(q) cannot invert: train with "
+                "~model/residual"
+            )
 
     @final
     def momentum(self, q: Tensor, v: Tensor) -> Tensor:

@@ -31,6 +31,10 @@ class InputMatrix(nn.Module, abc.ABC):
         """Return the generalized force A(q) u, ``(*batch, N)``."""
         return matvec(self(q), u)
 
+    def typical_input(self, q: Tensor) -> Tensor:
+        """Return a typical input of a force that is not linear in it, ``(*batch, M)``."""
+        return q.new_zeros(*q.shape[:-1], self.shape[1])
+
     def typical_force(self, u_rms: Tensor) -> Tensor:
         """Return the initial root mean square of each force, ``(N,)``; 1 without an input."""
         force = u_rms.square().mean().sqrt() if len(u_rms) else u_rms.new_ones(())
@@ -64,7 +68,7 @@ class NonlinearInput(InputMatrix):
     """tau = A(q, u) u with A(q, u) = scale_j * network(q, u), reshaped to N x M.
 
     This head is for inputs that are positions instead of forces, such as motors of tendons: a
-    tightened tendon becomes stiffer and pulls in a different direction. Controllers refuse it.
+    tightened tendon becomes stiffer and pulls in a different direction.
 
     The columns of the ``linear`` inputs are constants, and the network does not depend on these
     inputs, which prevents overfitting to motor rates.
@@ -108,7 +112,11 @@ class NonlinearInput(InputMatrix):
 
     def forward(self, q: Tensor) -> Tensor:
         """Return A(q, u) at the mean input, ``(*batch, N, M)``."""
-        return self._matrix(q, self.u_mean.expand(*q.shape[:-1], -1))
+        return self._matrix(q, self.typical_input(q))
+
+    def typical_input(self, q: Tensor) -> Tensor:
+        """Return the mean input of the data, ``(*batch, M)``."""
+        return self.u_mean.expand(*q.shape[:-1], -1)
 
     def force(self, q: Tensor, u: Tensor) -> Tensor:
         return matvec(self._matrix(q, u), u)

@@ -280,6 +280,9 @@ class KnownMechanics(LearnedConstants):
             return self.servo(q)
         return (self.input_gain() * self.motors.mT).expand(*q.shape, -1)
 
+    def typical_input(self, q: Tensor) -> Tensor:
+        return super().typical_input(q) if self.servo is None else self.servo.typical_input(q)
+
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.motor_force(q, q, u) if self.servo is None else self.servo.force(q, u)
 

@@ -83,6 +83,7 @@ class KnownSystem(LearnedConstants):
     potential_energy = _of_structure("potential_energy")
     damping_matrix = _of_structure("damping_matrix")
     input_matrix = _of_structure("input_matrix")
+    typical_input = _of_structure("typical_input")
     _potential_force = _of_structure("_potential_force")
     _inertial_force = _of_structure("_inertial_force")
     _acceleration = _of_structure("_acceleration")

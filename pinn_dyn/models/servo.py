@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
-from torch import Tensor
+from torch import Tensor, nn
 
 from pinn_dyn.models.input_matrix import InputMatrix
 from pinn_dyn.models.known_constants import Constants, Named
@@ -127,6 +127,11 @@ class Servo(InputMatrix):
         if self.shape[1] > len(columns):
             columns = torch.cat([columns, self.selection])
         return columns.mT.expand(*q.shape[:-1], -1, -1)
+
+    def typical_input(self, q: Tensor) -> Tensor:
+        """Return the targets that give no force at rest, ``(*batch, M)``."""
+        targets = q @ self.selection.mT
+        return nn.functional.pad(targets, (0, self.shape[1] - targets.shape[-1]))
 
     def torque(self, q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         """Return tau, ``(*batch, n)``."""

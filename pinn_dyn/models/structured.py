@@ -100,6 +100,9 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
     def input_matrix(self, q: Tensor) -> Tensor:
         return self.input(q)
 
+    def typical_input(self, q: Tensor) -> Tensor:
+        return self.input.typical_input(q)
+
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction(v)
 

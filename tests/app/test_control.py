@@ -20,7 +20,6 @@ from tests.app.entry import (
     TINY_TRAINING,
     refused_text,
     run_script,
-    train,
 )
 from tests.app.pages import assert_says_how_it_came_about, page_of
 from tests.support.c_code import function_of
@@ -199,13 +198,6 @@ def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
     text = refused(capsys, mlp_run)
     assert "black box" in text
     assert "model=lnn" in text
-
-
-def test_a_force_that_is_not_linear_in_the_input_is_refused(tmp_path, capsys):
-    run = train(tmp_path / "run", "model=lnn", "model/input=nonlinear", NO_FIGURES)
-    text = refused(capsys, run)
-    assert "force not linear in the input" in text
-    assert "model/input=network" in text
 
 
 @pytest.mark.slow

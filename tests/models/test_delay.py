@@ -5,7 +5,6 @@ from functools import partial
 import pytest
 import torch
 
-from pinn_dyn.control import Tracking
 from pinn_dyn.data.logs import SavitzkyGolayVelocity
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.ensembles import Ensemble
@@ -207,11 +206,9 @@ def make_scales():
     return pendulum_windows(steps=1, history=0.0, count=100).statistics()
 
 
-def test_sums_laws_and_ensembles_refuse_it_by_name():
+def test_sums_and_ensembles_refuse_it_by_name():
     model = make_model("lnn", LearnedDelay(0.1))
     with pytest.raises(ValueError, match=r"the part late of a sum learns a delay.*~late.delay"):
         Sum({"late": model, "other": make_model("lnn")})
-    with pytest.raises(ValueError, match="learned input delay"):
-        Tracking(model, 1.0, 1.0)
     with pytest.raises(ValueError, match=r"model/delay=learned.*one by one"):
         Ensemble([model, make_model("lnn", LearnedDelay(0.1))])

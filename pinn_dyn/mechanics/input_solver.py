@@ -1,0 +1,189 @@
+"""The input that gives a force which is not linear in the input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from pydantic import PositiveFloat, PositiveInt
+from torch import Tensor
+
+from pinn_dyn.mechanics.arrays import jacobians, matvec, spd_solve
+
+_LEAST, _FIRST, _SMALLER, _LARGER = 1e-10, 1e-2, 1e-1, 10.0  # damping mu, and its changes
+_SETTLED = 1e-4  # step relative to u of more inputs than coordinates
+
+
+class Solution(NamedTuple):
+    """Input u ``(*batch, M)``, J = dF/du there, |F(u) - tau|, and whether it is small enough."""
+
+    u: Tensor
+    J: Tensor
+    residual: Tensor
+    converged: Tensor
+
+
+@dataclass(frozen=True)
+class InputSolver:
+    """Damped Newton method for an input u with F(u) = tau, in batches and without branches::
+
+        u <- clamp(u + d),    d = d_0 + W J^T (J W J^T + mu |J W^(1/2)|^2 / N)^-1 (tau - F - J d_0)
+
+    with J = dF/du, and each row of F, J and tau divided by the norm of the row of J at the start.
+    W = 1 and mu = 1e-10. A step that increases |tau - F| is not taken; then mu grows, and
+    W = 1/|J_j|^2 moves inputs with little effect, such as slack tendons (Levenberg 1944; Marquardt
+    1963). For M > N, d_0 = u_0 - u moves u
+    towards the solution closest to a typical input u_0. For M < N,
+    u has the least |F - tau|.
+
+    Args:
+        tolerance: largest |F(u) - tau| relative to |tau| + |J| |u|.
+        steps: largest number of steps from each of two starts.
+        low, high: limits of u in its units, one number or M; None for no limit.
+    """
+
+    tolerance: PositiveFloat = 1e-8
+    steps: PositiveInt = 30
+    low: float | Sequence[float] | None = None
+    high: float | Sequence[float] | None = None
+
+    def __call__(
+        self,
+        force: Callable[[Tensor], Tensor],
+        tau: Tensor,
+        typical: Tensor,
+        previous: Tensor | None = None,
+        *,
+        all_steps: bool = False,
+    ) -> Solution:
+        """Solve F(u) = tau ``(*batch, N)``, first from the start with the shorter Newton step.
+
+        Where this does not succeed, solve from the other start.
+
+        Args:
+            force: F, maps ``(*batch, M)`` to ``(*batch, N)`` row by row.
+            tau: the force.
+            typical: u_0, ``(*batch, M)``, a start.
+            previous: another start, the input of the previous instant, ``(*batch, M)``.
+            all_steps: take all steps, so that the operations do not depend on the numbers.
+        """
+        if previous is None:
+            return self._solve(force, tau, typical, typical, all_steps)
+        least = torch.full_like(tau[..., :1], _LEAST)
+        points = [_linear(force, torch.ones_like(tau), u) for u in (previous, typical)]
+        nearer = torch.lt(*(_norm(_step(x.J, tau - x.F, least)) for x in points))
+        start, other = previous.where(nearer, typical), typical.where(nearer, previous)
+        first = self._solve(force, tau, typical, start, all_steps)
+        if not all_steps and bool(first.converged.all()):
+            return first
+        second = self._solve(force, tau, typical, other, all_steps)
+        done = first.converged
+        return Solution(
+            first.u.where(done.unsqueeze(-1), second.u),
+            first.J.where(done[..., None, None], second.J),
+            first.residual.where(done, second.residual),
+            done | second.converged,
+        )
+
+    def _solve(
+        self,
+        force: Callable[[Tensor], Tensor],
+        tau: Tensor,
+        typical: Tensor,
+        start: Tensor,
+        all_steps: bool,
+    ) -> Solution:
+        least = mu = torch.full_like(tau[..., :1], _LEAST)
+        unit = torch.ones_like(tau)
+        wide, tall = typical.shape[-1] > tau.shape[-1], typical.shape[-1] < tau.shape[-1]
+        if not tall:
+            rows = _linear(force, unit, start).J.square().sum(-1).sqrt()
+            unit = torch.where(rows > 0, 1 / rows, 1.0)
+        point, tau = _linear(force, unit, start), unit * tau
+        settled = torch.zeros_like(mu, dtype=torch.bool)
+        for _ in range(self.steps):
+            step = self._limited_step(point, tau, mu, typical)
+            trial = _linear(force, unit, self._clamped(point.u + step))
+            enough = self.tolerance * _size(trial, tau)
+            better = _error(trial, tau) <= torch.maximum(_error(point, tau), enough)
+            point = _chosen(better & ~settled, trial, point)
+            mu = torch.where(better, _SMALLER * mu, (_LARGER * mu).clamp(min=_FIRST))
+            mu = torch.maximum(mu, least)
+            settled = settled | (_error(point, tau) <= enough)
+            if wide:
+                settled = settled & (_norm(step) <= _SETTLED * _norm(point.u))
+            if not all_steps and bool(settled.all()):
+                break
+        converged = _error(point, tau) <= self.tolerance * _size(point, tau)
+        residual = _norm((tau - point.F) / unit)
+        J = point.J / unit.unsqueeze(-1)
+        return Solution(point.u, J, residual.squeeze(-1), converged.squeeze(-1))
+
+    def _limited_step(self, point: _Point, tau: Tensor, mu: Tensor, typical: Tensor) -> Tensor:
+        J, r, u = point.J, tau - point.F, point.u
+        wide = J.shape[-1] > J.shape[-2]
+        pull = (_LEAST / mu) ** 1.0 * (typical - u) if wide else torch.zeros_like(u)
+        step = pull + _step(J, r - matvec(J, pull), mu)
+        if self.low is None and self.high is None:
+            return step
+        free = self._clamped(u + step.sign()) != u
+        pull = pull * free
+        return pull + _step(J * free.unsqueeze(-2), r - matvec(J, pull), mu)
+
+    def _clamped(self, u: Tensor) -> Tensor:
+        low = -torch.inf if self.low is None else self.low
+        high = torch.inf if self.high is None else self.high
+        return u.clamp(*(torch.as_tensor(x, dtype=u.dtype, device=u.device) for x in (low, high)))
+
+
+class _Point(NamedTuple):
+    u: Tensor
+    F: Tensor
+    J: Tensor
+
+
+def _linear(force: Callable[[Tensor], Tensor], unit: Tensor, u: Tensor) -> _Point:
+    F, (J,) = jacobians(lambda x: unit * force(x), u)
+    return _Point(u, F, J)
+
+
+def _chosen(mask: Tensor, first: _Point, second: _Point) -> _Point:
+    u, F = first.u.where(mask, second.u), first.F.where(mask, second.F)
+    return _Point(u, F, first.J.where(mask.unsqueeze(-1), second.J))
+
+
+def _step(J: Tensor, r: Tensor, mu: Tensor) -> Tensor:
+    """Return W J^T (J W J^T + mu |J W^(1/2)|^2 / N)^-1 r, with W = 1 until mu has grown.
+
+    For M < N, this is (J^T J + mu |J|^2 / M)^-1 J^T r, which has no singular matrix.
+    """
+    if J.shape[-1] < J.shape[-2]:
+        gram = J.mT @ J
+        size = gram.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+        damping = torch.diag_embed(mu * size.expand(gram.shape[:-1]))
+        return spd_solve(gram + damping, matvec(J.mT, r))
+    columns = J.square().sum(-2)
+    columns = columns.clamp(min=1e-2 * columns.amax(-1, keepdim=True))
+    W = torch.where(mu < _FIRST, 1.0, 1 / columns)
+    K = J * W.unsqueeze(-2)
+    gram = K @ J.mT
+    size = gram.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+    return matvec(K.mT, spd_solve(gram + torch.diag_embed(mu * size.expand(r.shape)), r))
+
+
+def _error(point: _Point, tau: Tensor) -> Tensor:
+    """Return |tau - F|, ``(*batch, 1)``; for M < N, the part in the range of J."""
+    r, J = tau - point.F, point.J
+    if J.shape[-1] < J.shape[-2]:
+        r = matvec(J.mT, r) / J.square().sum((-2, -1)).sqrt().unsqueeze(-1)
+    return _norm(r)
+
+
+def _size(point: _Point, tau: Tensor) -> Tensor:
+    return _norm(tau) + point.J.square().sum((-2, -1)).sqrt().unsqueeze(-1) * _norm(point.u)
+
+
+def _norm(x: Tensor) -> Tensor:
+    return x.square().sum(-1, keepdim=True).sqrt()

@@ -1,0 +1,236 @@
+"""Laws on forces that are not linear in the input: tendons, learned A(q, u) u, limited servos."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from pinn_dyn.control import (
+    ComputedTorque,
+    DisturbanceObserver,
+    Motion,
+    ProportionalDerivative,
+    Regulation,
+    SetPoint,
+    SystemPlant,
+    Tracking,
+    certify,
+    close_loop,
+)
+from pinn_dyn.mechanics import InputSolver
+from pinn_dyn.mechanics.arrays import pseudo_inverse_times
+from pinn_dyn.models import Servo
+from pinn_dyn.systems import SoftArm, TendonArm
+from pinn_dyn.testing import ControllerContract, assert_near
+from pinn_dyn.testing.finite_differences import partial_derivatives
+from tests.models.builders import NONLINEAR, make_structured
+
+ARMS = {"square": TendonArm, "four-tendons": partial(TendonArm, tendons=4)}
+
+
+def draw(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1
+
+
+def arm_states(count=6, seed=0):
+    """q, v and a motion that taut tendons can follow."""
+    scale = torch.tensor([0.2, 0.2, 0.004], dtype=torch.float64)
+    offset = torch.tensor([0.0, 0.0, -0.024], dtype=torch.float64)
+    q, v, q_ref, v_ref, a_ref = draw(5, count, 3, seed=seed) * scale
+    return q + offset, 0.1 * v, Motion(q_ref + offset, 0.1 * v_ref, a_ref)
+
+
+def has_fault(law):
+    return any(mask.any() for mask in law.faults().values())
+
+
+@pytest.fixture(params=ARMS)
+def arm(request):
+    return ARMS[request.param]()
+
+
+# The solver.
+
+
+@pytest.mark.parametrize(("n", "m"), [(3, 3), (2, 4), (4, 2)])
+def test_a_linear_force_is_inverted_as_by_the_pseudo_inverse(n, m):
+    A, tau = draw(5, n, m) + 2 * torch.eye(n, m).double(), draw(5, n, seed=1)
+    expected = pseudo_inverse_times(A, tau)
+    solve = partial(InputSolver(), lambda u: (A @ u[..., None])[..., 0], tau)
+    for start in (torch.zeros(5, m).double(), 10 * draw(5, m, seed=2)):
+        solution = solve(torch.zeros(5, m).double(), start)
+        assert solution.converged.all()
+        assert_near(solution.u, expected, 1e-6)
+
+
+def test_of_more_tendons_than_coordinates_the_input_of_least_norm_is_found():
+    arm = ARMS["four-tendons"]()
+    q, v, motion = arm_states()
+    tau = arm.inverse_dynamics(q, v, motion.a)
+    u = arm.input_for(q, v, motion.a)
+    assert_near(arm._input_force(q, u), tau, 1e-7)
+    for _ in range(3):  # instants of a loop
+        u = arm.solve_input(InputSolver(), q, v, tau, u).u
+    for k in range(3):
+
+        def force(x, k=k):
+            return arm._input_force(q[k], torch.from_numpy(x)).numpy()
+
+        expected = minimize(
+            lambda x: x @ x,
+            u[k].numpy() + 0.1,
+            constraints={"type": "eq", "fun": lambda x, k=k: force(x) - tau[k].numpy()},
+            options={"ftol": 1e-14, "maxiter": 200},
+        )
+        assert np.linalg.norm(force(expected.x) - tau[k].numpy()) < 1e-6
+        assert float(u[k].norm()) < 1.02 * np.linalg.norm(expected.x)
+
+
+def test_limits_of_the_input_are_kept_where_another_input_gives_the_force():
+    arm = ARMS["four-tendons"]()
+    q, v, motion = arm_states()
+    tau = arm.inverse_dynamics(q, v, motion.a)
+    free = arm.input_for(q, v, motion.a)
+    low, high = float(free.min()) + 0.05, float(free.max()) - 0.05
+    solution = arm.solve_input(InputSolver(low=low, high=high), q, v, tau)
+    inside = solution.converged
+    assert inside.any()
+    assert not torch.equal(solution.u[inside], free[inside])
+    assert solution.u.min() >= low
+    assert solution.u.max() <= high
+    assert_near(arm._input_force(q, solution.u)[inside], tau[inside], 1e-7)
+
+
+def test_a_servo_that_saturates_gets_the_target_of_the_acceleration():
+    model = make_structured("lnn", input=partial(Servo, limit=[2.0, 2.0, 2.0]))
+    q, v = draw(2, 20, 3)
+    target = 0.2 * draw(20, 3, seed=3)
+    a = model.forward_dynamics(q, v, q + target).detach()
+    u = model.input_for(q, v, a).detach()
+    assert torch.isfinite(u).all(-1).double().mean() > 0.9
+    reached = torch.isfinite(u).all(-1)
+    assert_near(model.forward_dynamics(q, v, u)[reached], a[reached], 1e-6)
+
+
+# The laws.
+
+
+def test_the_laws_hold_follow_and_correct_as_with_a_matrix(arm):
+    q, v, motion = arm_states()
+    zero = torch.zeros_like(q)
+    hold = Regulation(arm, 5.0, 1.0)
+    a = arm.forward_dynamics(q, zero, hold(0.0, q, zero, Motion(q, zero, zero)))
+    assert_near(
+        a, zero, 1e-6, scale=arm.forward_dynamics(q, zero, arm.typical_input(q)).abs().max()
+    )
+    assert not has_fault(hold)
+    follow = Tracking(arm, 5.0, 1.0)(0.0, motion.q, motion.v, motion)
+    assert_near(arm.forward_dynamics(motion.q, motion.v, follow), motion.a, 1e-4)
+    kp, kd = torch.tensor([[30.0, 40.0, 50.0], [8.0, 9.0, 10.0]]).double()
+    u = ComputedTorque(arm, kp, kd)(0.0, q, v, motion)
+    expected = motion.a + kd * (motion.v - v) + kp * (motion.q - q)
+    assert_near(arm.forward_dynamics(q, v, u), expected, 1e-4)
+
+
+def test_the_feedback_passes_the_jacobian_at_the_solution(arm):
+    q, v, motion = arm_states()
+    feedback = 3.0 * (motion.q - q) + 0.5 * (motion.v - v)
+    held = arm.input_for(q, 0 * v, 0 * v)
+    for law, start in ((Regulation, held), (ProportionalDerivative, 0 * held)):
+        slopes = partial_derivatives(lambda u: arm._input_force(q, u), start, 1e-5)
+        u = law(arm, 3.0, 0.5)(0.0, q, v, motion)
+        assert_near(u - start, (slopes.mT @ feedback[..., None])[..., 0], 1e-5)
+
+
+def reachable_states():
+    """A learned A(q, u) u with three inputs, states, and a reference that inputs can give."""
+    model = make_structured("lnn", **NONLINEAR).requires_grad_(False)
+    q, v, u = draw(4, 2), draw(4, 2, seed=1), model.typical_input(draw(4, 2)) + 0.3 * draw(4, 3)
+    return model, q, v, Motion(q, v, model.forward_dynamics(q, v, u))
+
+
+def test_the_solution_starts_from_the_previous_input_until_a_reset(monkeypatch):
+    model, q, v, motion = reachable_states()
+    law = Tracking(model, 1.0, 0.1)
+    evaluations, force = [], type(model)._applied_force
+    monkeypatch.setattr(
+        type(model), "_applied_force", lambda *x: (evaluations.append(1), force(*x))[1]
+    )
+
+    def cost(q):
+        evaluations.clear()
+        law(0.0, q, v, motion)
+        return len(evaluations)
+
+    first, again = cost(q), cost(q + 1e-6)
+    law.reset()
+    assert cost(q + 1e-6) == first
+    assert again < first
+
+
+def test_a_force_that_no_input_gives_is_a_fault_of_its_row_that_holds_the_input():
+    arm = TendonArm()
+    q, v, motion = arm_states()
+    law = Tracking(arm, 5.0, 0.1)
+    before = law(0.0, q, v, motion)
+    assert not has_fault(law)
+    assert float(law.diagnostics()["input_residual"].max()) < 1e-6
+    a = motion.a.clone()
+    a[2, 2] = 1e3  # tendons cannot push
+    u = law(0.01, q, v, motion._replace(a=a))
+    ((reason, mask),) = law.faults().items()
+    assert "no input gives the force" in reason
+    assert mask.tolist() == [False, False, True, False, False, False]
+    assert torch.equal(u[2], before[2])
+    assert float(law.diagnostics()["input_residual"][2]) > 1.0
+    law(0.02, q, v, motion)
+    assert not has_fault(law)
+
+
+def test_the_formula_takes_the_previous_input_and_can_be_recorded():
+    model, q, v, motion = reachable_states()
+    law = Tracking(model, 2.0, 0.5, solver=InputSolver(steps=2))
+    u = 0.99 * Tracking(model, 2.0, 0.5)(0.0, q, v, motion)
+
+    def state(k):
+        return [x[k] for x in (q, v, *motion, u)]
+
+    recorded = make_fx(lambda *x: law.law(*x))(*state(0))
+    assert_near(recorded(*state(1)), law.law(*state(1)), 1e-12)
+    with pytest.raises(ValueError, match="needs u_previous"):
+        law.law(q, v, *motion)
+    law = Tracking(model, 2.0, 0.5)
+    forces = [model._applied_force(q, v, x) for x in (law.law(q, v, *motion, u), u / 0.99)]
+    assert_near(*forces, 1e-6)
+
+
+@pytest.mark.slow
+def test_the_regulator_holds_the_tendon_arm_under_friction_and_dead_time(arm):
+    q_ref = torch.tensor([[0.15, -0.1, -0.024], [-0.2, 0.1, -0.022]]).double()
+    q0 = torch.tensor([0.0, 0.0, -0.0085]).double().expand(2, 3)
+    law = Regulation(arm, [3.0, 3.0, 0.3], [0.1, 0.1, 0.003])
+    record = close_loop(
+        SystemPlant(arm), law, SetPoint(q_ref), q0, 0 * q0, duration=1.2, rate=250, delay=2
+    )
+    assert record.stopped == [None, None]
+    error = (record.q[:, -1] - q_ref).norm(dim=-1) / (q0 - q_ref).norm(dim=-1)
+    assert float(error.max()) < 0.01
+
+
+def test_the_observer_and_the_proposition_refuse_it_by_name():
+    arm = TendonArm()
+    with pytest.raises(ValueError, match=r"observer needs a force A\(q\) u"):
+        DisturbanceObserver(Regulation(arm, 1.0, 1.0), 10.0)
+    with pytest.raises(ValueError, match=r"needs a force A\(q\) u"):
+        certify(arm, SoftArm(), torch.zeros(1, 3), 1.0, 1.0)
+
+
+class TestLawOnServos(ControllerContract):
+    @pytest.fixture
+    def controller(self):
+        servo = partial(Servo, limit=[100.0, 100.0, 100.0])
+        return Tracking(make_structured("lnn", input=servo), 5.0, 1.0)
