@@ -52,7 +52,11 @@ class TestTendonArm(MechanicalSystemContract):
         friction = (0.02, 0.02, 0.1)
         speed = (0.5, 0.5, 0.5)
         return TendonArm(
-            segments, tendons=tendons, friction=friction, friction_speed=speed, slack=0.1
+            segments,
+            tendons=tendons,
+            friction=friction,
+            friction_speed=speed,
+            tendon_stiffness=20.0,
         )
 
     @pytest.fixture
