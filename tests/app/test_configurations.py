@@ -78,7 +78,6 @@ DATA = {
     "soft_arm_1": of_arm_1,
     "soft_arm_1_wide": of_arm_1_wide,
     "soft_arm_2": of_arm_2,
-    "soft_arm_tendon": of_arm_1,
     "panda": of_panda,
     "demo": of_arm_1,
     "example_log": of_logs,
