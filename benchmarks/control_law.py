@@ -1,15 +1,14 @@
-"""Time a control law for 7 joints at batch 1: compiled ahead of time, eager, and rigid-body code.
+"""Time a control law for 7 joints at batch 1 in each file format, eager, and rigid-body code.
 
     python benchmarks/control_law.py
     python benchmarks/control_law.py --run runs/panda/lnn-seed0/<date>
 
 The law is the paper's tracking law on a Lagrangian network of the size of experiment=panda.
 The network is untrained, since the weights do not change the time; `--run` takes a trained network.
-The rivals of the compiled law (pinn_dyn.control.export_law) are the eager law and the inverse
-dynamics of the same arm in PyBullet and Pinocchio, if installed. All take turns in one thread over
-the same random states. The script also compares the outputs of compiled and eager law. On a busy
-machine the scheduler determines the 99th percentile; `--real-time` uses the priority of a control
-loop.
+C code is timed in C, the others in Python. The rival is the inverse dynamics of the same arm in
+Pinocchio, if installed. All take turns in one thread over the same random states. The script also
+compares the outputs of each file with the eager law. On a busy machine the scheduler determines
+the 99th percentile; `--real-time` uses the priority of a control loop.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable
@@ -64,31 +64,14 @@ def untrained() -> MechanicalSystem:
     return model
 
 
-def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
-    """Return the inverse dynamics of the true arm at (q_ref, v_ref, a_ref) by each library."""
-    try:
-        import pybullet
-    except ImportError as error:
-        print(error)
-        return {}
-    path = str(read_urdf(PANDA, locked_joints=FINGERS).path)
-    pybullet.connect(pybullet.DIRECT)
-    body = pybullet.loadURDF(path, useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
-    pybullet.setGravity(0, 0, -9.81)
-    fingers = [0.0] * len(FINGERS)
-
-    def bullet(q: list[float], v: list[float], a: list[float]) -> Any:
-        at = (q + fingers, v + fingers, a + fingers)
-        return pybullet.calculateInverseDynamics(body, *at)[:JOINTS]
-
-    desired = states[:, 2:].numpy()
-    rivals: dict[str, Call] = {"PyBullet inverse dynamics": (bullet, desired.tolist())}
+def pinocchio_rival(states: torch.Tensor) -> dict[str, Call]:
+    """Return the inverse dynamics of the true arm at (q_ref, v_ref, a_ref)."""
     try:
         import pinocchio
     except ImportError:
         print("Pinocchio is not installed (pip install pin)")
-        return rivals
-    full = pinocchio.buildModelFromUrdf(path)
+        return {}
+    full = pinocchio.buildModelFromUrdf(str(read_urdf(PANDA, locked_joints=FINGERS).path))
     locked = [full.getJointId(name) for name in FINGERS]
     model = pinocchio.buildReducedModel(full, locked, pinocchio.neutral(full))
     data = model.createData()
@@ -96,10 +79,56 @@ def rigid_body_rivals(states: torch.Tensor) -> dict[str, Call]:
     def rnea(q: np.ndarray, v: np.ndarray, a: np.ndarray) -> Any:
         return pinocchio.rnea(model, data, q, v, a)
 
-    q, v, a = desired[0]
-    assert np.allclose(rnea(q, v, a), bullet(q.tolist(), v.tolist(), a.tolist()), rtol=1e-6)
-    rivals["Pinocchio inverse dynamics"] = (rnea, list(desired))
-    return rivals
+    return {"Pinocchio inverse dynamics": (rnea, list(states[:, 2:].numpy()))}
+
+
+TIMER = """
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+#include "law.h"
+enum {{ N = law_NUM_COORDINATES, STATES = {states}, CALLS = {calls} }};
+static double x[STATES][5][N], us[CALLS], u[law_NUM_INPUTS], memory[law_MEMORY_SIZE];
+static double now(void) {{
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return 1e6 * t.tv_sec + 1e-3 * t.tv_nsec;
+}}
+static int order(const void *a, const void *b) {{
+  const double d = *(const double *)a - *(const double *)b;
+  return (d > 0) - (d < 0);
+}}
+int main(void) {{
+  if (fread(x, sizeof x, 1, stdin) != 1) return 1;
+  for (int k = -{warm_up}; k < CALLS; k++) {{
+    double(*s)[N] = x[(k + {warm_up}) % STATES];
+    const double start = now();
+    law_control(s[0], s[1], s[2], s[3], s[4], memory, u, memory);
+    if (k >= 0) us[k] = now() - start;
+  }}
+  qsort(us, CALLS, sizeof *us, order);
+  printf("%.3f %.3f\\n", us[CALLS / 2], us[CALLS / 100 * 99]);
+}}
+"""
+
+
+def timed_in_c(folder: Path, flags: list[str], states: torch.Tensor, calls: int) -> Any:
+    """Compile law.c with a timer; return a function to its median and 99th percentile, us."""
+    text = TIMER.format(states=STATES, calls=calls, warm_up=WARM_UP)
+    (folder / "timer.c").write_text(text)
+    program = folder / f"timer{flags[0]}"
+    command = ["cc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", *flags, "timer.c", "law.c", "-lm"]
+    start = time.perf_counter()
+    subprocess.run([*command, "-o", program.name], cwd=folder, check=True)
+    print(f"cc {' '.join(flags)}: {time.perf_counter() - start:.1f} s")
+
+    def measure() -> tuple[float, float]:
+        data = states.numpy().tobytes()
+        result = subprocess.run([str(program)], input=data, capture_output=True, check=True)
+        median, late = result.stdout.split()
+        return float(median), float(late)
+
+    return measure
 
 
 def percentiles(call: Call, calls: int) -> tuple[float, float]:
@@ -135,30 +164,62 @@ def main() -> None:
     shape = (STATES, len(INPUTS), JOINTS)
     states = 4 * torch.rand(shape, generator=generator, dtype=torch.float64) - 2
     tensors = [tuple(x.clone() for x in state) for state in states]
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        path = export_law(eager, Path(folder) / "law.pt2")
-        print(f"export: {time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.1f} MB")
-        compiled = load_law(path)
-        bare = torch._inductor.aoti_load_package(str(path), run_single_threaded=True).loader
-
-    with torch.inference_mode():
-        expected = torch.stack([eager.law(*x) for x in tensors])
-        error = torch.stack([compiled(*x) for x in tensors]) - expected
-        worst = float((error.norm(dim=-1) / expected.norm(dim=-1)).max())
-        print(f"compiled against eager, {STATES} states: at most {worst:.1e} apart (relative)")
+    memory = np.zeros(JOINTS)
+    arrays = [tuple(x.numpy() for x in state) for state in tensors]
+    with tempfile.TemporaryDirectory() as name, torch.inference_mode(False):
+        folder, paths = Path(name), {}
+        for ending in ("c", "pt2", "onnx", "casadi"):
+            start = time.perf_counter()
+            try:
+                path = paths[ending] = export_law(eager, folder / f"law.{ending}")
+            except ImportError as error:
+                print(error)
+                continue
+            seconds, size = time.perf_counter() - start, path.stat().st_size / 1e6
+            print(f"export to .{ending}: {seconds:.1f} s, {size:.2f} MB")
+        compiled = load_law(paths["pt2"])
+        bare = torch._inductor.aoti_load_package(str(paths["pt2"]), run_single_threaded=True).loader
         calls: dict[str, Call] = {
-            "compiled, loaded by torch alone": (lambda *x: bare.run(list(x))[0], tensors),
-            "compiled, loaded by load_law": (compiled, tensors),
-            "eager": (eager.law, tensors),
-            **rigid_body_rivals(states),
+            "PyTorch .pt2": (lambda *x: bare.run(list(x))[0], tensors),
+            "PyTorch .pt2, load_law": (compiled, tensors),
         }
-        if arguments.real_time:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        times = [
-            {name: percentiles(call, arguments.calls) for name, call in calls.items()}
-            for _ in range(arguments.repetitions)
-        ]
+        if "onnx" in paths:
+            import onnxruntime
+
+            options = onnxruntime.SessionOptions()
+            options.intra_op_num_threads = 1
+            session = onnxruntime.InferenceSession(str(paths["onnx"]), options)
+            names = [item.name for item in session.get_inputs()]
+
+            def runtime(*x: np.ndarray) -> Any:
+                return session.run(["u"], dict(zip(names, [*x, memory], strict=True)))[0]
+
+            calls["ONNX Runtime"] = (runtime, arrays)
+        if "casadi" in paths:
+            import casadi
+
+            function = casadi.Function.load(str(paths["casadi"]))
+            calls["CasADi VM"] = (lambda *x: function(*x, memory)[0].full().ravel(), arrays)
+        timers = {
+            f"C, {' '.join(flags)}": timed_in_c(folder, flags, states, arguments.calls)
+            for flags in (["-O3", "-march=native"], ["-O2"])
+        }
+        calls |= {"eager": (eager.law, tensors)}
+        with torch.inference_mode():
+            expected = torch.stack([eager.law(*x) for x in tensors]).numpy()
+            errors = {}
+            for name, (call, values) in calls.items():
+                difference = np.stack([np.asarray(call(*x)) for x in values]) - expected
+                norms = np.linalg.norm(difference, axis=-1) / np.linalg.norm(expected, axis=-1)
+                errors[name] = f"{norms.max():.1e}"
+            calls |= pinocchio_rival(states)
+            if arguments.real_time:
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            times = [
+                {name: measure() for name, measure in timers.items()}
+                | {name: percentiles(call, arguments.calls) for name, call in calls.items()}
+                for _ in range(arguments.repetitions)
+            ]
 
     record = provenance()
     conditions = [
@@ -172,13 +233,13 @@ def main() -> None:
         writer = csv.writer(file)
         header = ["method", "repetition", "median_us", "p99_us", "relative_error", "calls"]
         writer.writerow([*header, "model", "scheduler", "hardware", "torch", "commit"])
-        for name in calls:
+        for name in times[0]:
             median, late = min((x[name] for x in times), key=lambda x: x[1])
             every = ", ".join(f"{x[name][0]:.0f}/{x[name][1]:.0f}" for x in times)
             print(f"{name:34s} median {median:6.1f}   p99 {late:6.1f}   of {every}")
             for repetition, x in enumerate(times, 1):
-                apart = f"{worst:.1e}" if name.startswith("compiled") else ""
-                row = [name, repetition, f"{x[name][0]:.1f}", f"{x[name][1]:.1f}", apart]
+                row = [name, repetition, f"{x[name][0]:.1f}", f"{x[name][1]:.1f}"]
+                row.append(errors.get(name, ""))
                 writer.writerow([*row, arguments.calls, *conditions])
 
 

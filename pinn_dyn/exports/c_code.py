@@ -199,7 +199,7 @@ class CFunction:
         else:
             array = self._arrays[_storage(value)]
         terms = [
-            i if stride == 1 else f"{stride} * ({i})"
+            i if stride == 1 else f"{stride} * {i}"
             for i, stride, size in zip(index, strides, value.shape, strict=True)
             if stride and size > 1 and i != "0"
         ]
@@ -250,19 +250,18 @@ class CFunction:
         if len(body) > 1:
             self.lines.append("  " * (len(loops) - 1) + "}")
 
-    def _indices(self, value: Tensor, letter: str = "i") -> tuple[list[str], dict[str, int]]:
+    def _indices(self, value: Tensor) -> tuple[list[str], dict[str, int]]:
         """Return an index of each dimension, and the sizes in the order of the memory."""
-        index = [f"{letter}{k}" if n > 1 else "0" for k, n in enumerate(value.shape)]
+        index = [f"i{k}" if n > 1 else "0" for k, n in enumerate(value.shape)]
         strides: Any = value.stride()
         order = sorted(range(value.ndim), key=lambda k: -strides[k])
         return index, {index[k]: value.shape[k] for k in order if value.shape[k] > 1}
 
-    def _assign(self, value: Tensor, source: fx.Node | float, pick: Any = None) -> None:
-        """Write a loop that copies a source; ``pick`` gives its index from that of the value."""
+    def _assign(self, value: Tensor, source: fx.Node | float) -> None:
+        """Write a loop that copies a source."""
         if value.numel():
             index, sizes = self._indices(value)
-            operand = self._operand(source, pick(index) if pick else index)
-            self._loops(sizes, [f"{self._element(value, index)} = {operand};"])
+            self._loops(sizes, [f"{self._element(value, index)} = {self._operand(source, index)};"])
 
     def _declare(self, node: fx.Node) -> Tensor:
         value: Tensor = node.meta["val"]
@@ -276,11 +275,9 @@ class CFunction:
         if not isinstance(value, Tensor) or not value.numel() or _storage(value) in self._arrays:
             return  # of several results, of no numbers, or a view
         if name in _ELEMENTWISE:
-            self._declare(node)
-            index, sizes = self._indices(value)
-            self._loops(
-                sizes, [f"{self._element(value, index)} = {self._expression(node, index)};"]
-            )
+            index, sizes = self._indices(self._declare(node))
+            expression = self._expression(node, index)
+            self._loops(sizes, [f"{self._element(value, index)} = {expression};"])
             return
         write: Any = self._reduction if name in _REDUCTIONS else getattr(self, f"_{name}", None)
         if write is None:
@@ -358,40 +355,21 @@ class CFunction:
             value = value.narrow(dim, before, source.meta["val"].shape[dim])
         self._assign(value, source)
 
-    def _repeat(self, node: fx.Node, source: fx.Node, times: Sequence[int]) -> None:
-        shape = source.meta["val"].shape
-
-        def pick(index: Index) -> list[str]:
-            return [
-                f"{i} % {n}" for i, n in zip(index[len(times) - len(shape) :], shape, strict=True)
-            ]
-
-        self._assign(self._declare(node), source, pick)
-
-    def _index(self, node: fx.Node, source: fx.Node, indices: Sequence[fx.Node | None]) -> None:
-        tensors = [x for x in indices if x is not None]
-        first = indices.index(tensors[0])
-        if any(x is None for x in indices[first : first + len(tensors)]):
+    def _move(self, node: fx.Node, source: fx.Node, *arguments: Any) -> None:
+        """Write a loop over a table of the positions of entries, by the operation itself."""
+        if any(x.op != "get_attr" for x in node.all_input_nodes if x is not source):
             raise unsupported(node, "C code")
-        width = max(x.meta["val"].ndim for x in tensors)
+        x = source.meta["val"]
+        size = x.untyped_storage().nbytes() // x.element_size()
+        positions = torch.arange(size).as_strided(x.shape, x.stride(), x.storage_offset())
+        arguments = fx.node.map_arg(arguments, lambda argument: argument.meta["val"])
+        table = node.target(positions, *arguments)  # type: ignore[operator]
+        value = self._declare(node)
+        index, sizes = self._indices(value)
+        entry = f"{self._arrays[_storage(x)]}[{self._element(table, index, constant=True)}]"
+        self._loops(sizes, [f"{self._element(value, index)} = {entry};"])
 
-        def pick(index: Index) -> list[str]:
-            picked = [f"(int)({self._operand(x, index[first : first + width])})" for x in tensors]
-            return [*index[:first], *picked, *index[first + width :]]
-
-        self._assign(self._declare(node), source, pick)
-
-    def _index_select(self, node: fx.Node, source: fx.Node, dim: int, index: fx.Node) -> None:
-        self._index(node, source, [None] * (dim % node.meta["val"].ndim) + [index])
-
-    def _flip(self, node: fx.Node, source: fx.Node, dims: Sequence[int]) -> None:
-        shape = node.meta["val"].shape
-        turned = [d % len(shape) for d in dims]
-
-        def pick(index: Index) -> list[str]:
-            return [f"{shape[d] - 1} - {i}" if d in turned else i for d, i in enumerate(index)]
-
-        self._assign(self._declare(node), source, pick)
+    _repeat = _index = _index_select = _flip = _move
 
     def _slice_scatter(
         self, node: fx.Node, base: fx.Node, source: fx.Node, dim: int = 0, *part: int

@@ -112,7 +112,7 @@ class _Writer:
 
     def constant(self, value: Any, dtype: Any = None) -> str:
         """Return the name of a constant, stored once."""
-        array = np.asarray(value)
+        array = np.asarray(value.detach() if isinstance(value, Tensor) else value)
         if dtype is None and array.dtype not in (np.bool_, np.int64):
             dtype = self.dtype
         array = array.astype(dtype or array.dtype)
