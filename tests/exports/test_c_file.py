@@ -161,7 +161,9 @@ def test_the_compiler_sees_wrong_sizes_and_the_caller_the_version(tmp_path):
         lambda x: torch.linalg.inv(x[:5] @ x[:5].mT + torch.eye(5)) @ x[:5],
         lambda x: torch.where((x > 0.3) & ~(x < 0.9), x, x.floor()).maximum(-x).tanh(),
         lambda x: x.flip(0)[:, [2, 0, 1]] + x[[1]],
-        lambda x: torch.nn.functional.pad(torch.cat([x[:0, :2], x[:, :2], x[:0, :2]]), (1, 0, 2, 0)),
+        lambda x: torch.nn.functional.pad(
+            torch.cat([x[:0, :2], x[:, :2], x[:0, :2]]), (1, 0, 2, 0)
+        ),
         lambda x: torch.nn.functional.pad(x[:0], (0, 0, 2, 0), value=3.0),
         lambda x: torch.cross(x, x.roll(1, -1), dim=-1) + torch.softmax(x, -1),
     ],
