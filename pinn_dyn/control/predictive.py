@@ -233,7 +233,7 @@ class PredictiveControl(Controller):
         u, plan = last.u, None
         try:
             plan = problem.solve(
-                *(x, last.u, d, x_ref, u_ref, P, self._guess(last, period, x, u_ref)),
+                *(x, last.u, d, x_ref, u_ref, P, self._guess(last, period, x, x_ref, u_ref)),
                 period=period,
                 iterations=iterations,
             )
@@ -244,7 +244,8 @@ class PredictiveControl(Controller):
             u = plan.u[:, 0].clip(self.limits.u_low, self.limits.u_high)
             if first:
                 self._warn_of_excess(k, plan)
-        self._memory[k] = _Memory(t, x, u, d, plan, last.failures + 1 if failed else 0)
+        failures = last.failures + 1 if failed else 0
+        self._memory[k] = _Memory(t, x, u, d, None if failed else plan, failures)
         duration = time.perf_counter() - begin
         return {
             "solve_time": duration,
@@ -254,12 +255,13 @@ class PredictiveControl(Controller):
         }
 
     def _guess(
-        self, last: _Memory, period: float, x: np.ndarray, u_ref: np.ndarray
+        self, last: _Memory, period: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the previous plan, shifted, or the state at rest with the reference's input."""
+        """Return the previous plan, shifted; without, a straight line to the reference or rest."""
         steps = self.problem.steps
         if last.plan is None:
-            return np.tile(x[:, None], steps), u_ref
+            share = np.linspace(1 / steps, 1, steps) * (last.failures % 2 == 0)
+            return x[:, None] + share * (x_ref - x[:, None]), u_ref
         shift = np.minimum(np.arange(steps) + round(period / self.step), steps - 1)
         return last.plan.x[:, shift], last.plan.u[:, shift]
 

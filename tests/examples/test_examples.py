@@ -154,3 +154,10 @@ def test_write_example_bag(home):
     (train,) = source.load().train
     assert len(train.t) == 298
     assert train.q[:, 0].std() > 1.2 * train.q[:, 1].std() > 0.1  # shoulder and elbow
+
+
+def test_swing_up(home):
+    pytest.importorskip("casadi")
+    out = run("swing_up.py", "--steps", "2", "--starts", "1", "--duration", "0.1")
+    assert re.search(r"upright within 0.05 rad: 0 of 1 starts", out)
+    assert "largest |u|" in out
