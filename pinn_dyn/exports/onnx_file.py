@@ -106,9 +106,9 @@ class _Writer:
             [self.helper.make_tensor_value_info(name, kind, list(n)) for name, n in shapes.items()]
             for shapes in (program.inputs, program.outputs)
         )
-        return self.helper.make_graph(
-            self.nodes, function.name, inputs, outputs, [*self.initializers.values()]
-        )
+        used = {name for node in self.nodes for name in node.input}
+        constants = [x for x in self.initializers.values() if x.name in used]
+        return self.helper.make_graph(self.nodes, function.name, inputs, outputs, constants)
 
     def constant(self, value: Any, dtype: Any = None) -> str:
         """Return the name of a constant, stored once."""

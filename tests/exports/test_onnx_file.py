@@ -34,6 +34,8 @@ def test_the_file_of_each_function_repeats_the_model(case, real, tmp_path):
         values = {"q": q, "v": v, "a": a, "u": u, "u_next": 0.5 * u, "h": h}
         values = {name: values[name] for name in function.inputs}
         session = session_of(path)
+        graph = onnx.load(path).graph
+        assert {x.name for x in graph.initializer} <= {x for node in graph.node for x in node.input}
         assert [x.name for x in session.get_outputs()] == list(function.outputs)
         results = session.run(None, {name: x.numpy().astype(dtype) for name, x in values.items()})
         expected = function.function(*values.values())
