@@ -31,7 +31,7 @@ def read_bag(path: Path, request: Request) -> Table:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     fields = list(dict.fromkeys(filter(None, [request.time, *request.columns])))
-    description = [5, str(path.absolute()), stats, fields, request.max_age]
+    description = [6, str(path.absolute()), stats, fields, request.max_age]
 
     def decode() -> dict[str, np.ndarray]:
         notes: list[str] = []
@@ -55,7 +55,7 @@ def read_bag(path: Path, request: Request) -> Table:
 def _decode(
     path: Path, columns: Sequence[str], max_age: float, notes: list[str]
 ) -> list[pd.DataFrame]:
-    """Return the values of each topic, at times of receipt if the stamps are of several clocks."""
+    """Return the values of each topic, on the clock of the first if the stamps are of several."""
     with open_bag(path) as bag:
         kinds = listed(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
         fields = _fields_of_topics(path, sorted(bag.topics, key=len, reverse=True), columns, kinds)
@@ -73,12 +73,16 @@ def _decode(
     for topic, content in rows.items():
         stamps, times = np.array([row[:2] for row in content], dtype=float).T
         delays[topic] = float(np.median((times - stamps)[stamps > 0])) if (stamps > 0).any() else 0
-    far = max(delays, key=lambda topic: abs(delays[topic]))
-    if receipt := max(delays.values()) - min(delays.values()) > max_age:
-        notes.append(f"stamps of {far} are off by {delays[far]:.4g} s: times of receipt")
     tables = {topic: np.array(x, dtype=object) for topic, x in rows.items()}
-    for table in tables.values() if receipt else ():
-        table[:, 0] = None
+    if max(delays.values()) - min(delays.values()) > max_age:
+        first = next(iter(tables))
+        clock = tables[first][np.argsort(tables[first][:, 1]), :2].astype(float)
+        clock = clock[clock[:, 0] > 0] if delays[first] else clock[:, [1, 1]]
+        for topic in tables.keys() - {first}:
+            received = tables[topic][:, 1].astype(float)
+            inside = received.clip(*clock[[0, -1], 1])
+            tables[topic][:, 0] = np.interp(inside, clock[:, 1], clock[:, 0]) + received - inside
+            notes.append(f"times of receipt put {topic} on the clock of {first}")
     return [_topic(path, x, list(fields[x]), table, kinds, notes) for x, table in tables.items()]
 
 
@@ -173,10 +177,15 @@ def _number(message: Any, field: str, location: str) -> float | None:
         return None  # the time of the message follows
     node = message
     parents: list[Any] = []
-    for step in field.split("/"):
+    steps = field.split("/")
+    while steps:
+        step = steps.pop(0)
         parents.insert(0, node)
         if hasattr(node, "__len__") and not isinstance(node, str):
             k = int(step) if step.isdigit() else _index(step, node, parents)
+            while k >= len(node) and steps:  # a name with a slash
+                step = f"{step}/{steps.pop(0)}"
+                k = _index(step, node, parents)
             if k >= len(node):
                 return None
             node = node[k]
