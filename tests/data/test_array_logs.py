@@ -95,8 +95,33 @@ def shared_clock(runs):
     return stacked(runs) | {"t": runs[0]["t"]}
 
 
+def time_first(runs):
+    """As parallel simulators log."""
+    return {name: np.moveaxis(x, 0, 1) for name, x in stacked(runs).items()}
+
+
+def test_a_star_stands_for_the_run_in_names_without_groups(tmp_path):
+    runs = {f"trial_{k}": motion(6.0, phase=k) for k in range(3)}
+    arrays = {f"{run}_{x}": table[x] for run, table in runs.items() for x in table}
+    np.savez(tmp_path / "run.npz", **arrays)
+    with pytest.raises(LogError, match=r"no variable 't' for the time, write 'trial_\*_t', and"):
+        source(tmp_path, files="run.npz", time="t").load()
+    log = source(
+        tmp_path,
+        files="run.npz",
+        time="trial_*_t",
+        q=dict(columns=["trial_*_q1", "trial_*_q2"], unit="rad"),
+        v=None,
+        u=dict(columns=["trial_*_u1", "trial_*_u2"], unit="Nm"),
+    )
+    for part in log.cleaned:
+        expected = runs[f"trial_{part.raw.run}"].set_index("t").loc[part.raw.t, ["q1", "q2"]]
+        np.testing.assert_array_equal(part.raw.q, expected)
+    assert {part.raw.run for part in log.cleaned} == {"0", "1", "2"}
+
+
 @pytest.mark.parametrize("kind", ["npz", "h5", "mat", "pt"])
-@pytest.mark.parametrize("form", [stacked, shared_clock, numbered])
+@pytest.mark.parametrize("form", [stacked, shared_clock, time_first, numbered])
 def test_arrays_of_several_runs(tmp_path, kind, form):
     tables = [motion(6.0, phase=k) for k in range(3)]
     runs = [
@@ -121,6 +146,7 @@ def test_arrays_of_several_runs(tmp_path, kind, form):
         for name, unit in (("q", "rad"), ("v", "rad/s"), ("u", "Nm"))
     }
     log = source(tmp_path, files=path.name, **columns)
+    assert len(log.warnings) == 1  # of all runs: the last row is left out
     recordings = {part.raw.run: part.raw for part in log.cleaned if part.split == "train"}
     for k, table in enumerate(tables):
         run = recordings[f"{k}"]

@@ -160,6 +160,7 @@ def test_a_bag_cut_short_is_named(tmp_path, name):
     formats.write_bag(tmp_path / name.split("/")[0], TABLE, version=version)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     cure = f" Repair it by rosbag reindex {path.name}" if version == 1 else ""
+    cure += " and rename it to run.bag" if path.suffix == ".active" else ""
     with pytest.raises(LogError, match=rf"{path.name}: cannot be read as .* cut short\?{cure}"):
         source(tmp_path, files=name, **formats.BAG).load()
 

@@ -133,14 +133,15 @@ def _runs(variables: Mapping[str, Any], request: Request) -> dict[str, dict[str,
     """Return the variables of each run.
 
     A run is a text that stands for the ``*`` of the columns, a number k of arrays ``t_k``, ``q_k``,
-    or an entry of the first axis of arrays ``(runs, T, N)``.
+    or an entry of arrays ``(runs, T, N)``, or ``(T, runs, N)`` if they are smooth along T.
     """
     runs: dict[str, dict[str, Any]] = {}
-    if before := [x.split("*")[0] for x in request.columns if "*" in x]:
+    if stars := [x.split("*") for x in request.columns if "*" in x]:
+        before, after = stars[0]
         for name, value in variables.items():
-            run, _, field = name.removeprefix(before[0]).partition("/")
-            if name.startswith(before[0]) and field:
-                runs.setdefault(run, {})[f"{before[0]}*/{field}"] = value
+            run, separator, field = name.removeprefix(before).partition(after[:1] or "/")
+            if name.startswith(before) and field:
+                runs.setdefault(run, {})[f"{before}*{separator}{field}"] = value
         return dict(sorted(runs.items(), key=lambda x: [len(x[0]), x[0]]))
     first = re.compile(rf"{re.escape(request.time)}_(\d+)")
     numbers = [match[1] for match in map(first.fullmatch, variables) if match]
@@ -150,15 +151,26 @@ def _runs(variables: Mapping[str, Any], request: Request) -> dict[str, dict[str,
             run: {x.removesuffix(end): y for x, y in variables.items() if x.endswith(end)}
             for run, end in ends.items()
         }
-    bases = {y for x in request.columns for y in (x, x.rpartition("_")[0]) if y in variables}
-    shapes = [variables[base].shape for base in bases]
-    stacks = {shape[:2] for shape in shapes if len(shape) == 3 and min(shape) > 1}
-    if not stacks:
+    bases = (y for x in request.columns for y in (x, x.rpartition("_")[0]) if y in variables)
+    stacked = [x for x in bases if len(variables[x].shape) == 3 and min(variables[x].shape) > 1]
+    if not stacked:
         return {"": dict(variables)}
+    rough = [_roughness(variables[stacked[0]], axis) for axis in (0, 1)]
+    before_run = (slice(None),) * (rough[0] < 0.5 and rough[1] > 1)
+    stacks = {variables[x].shape[:2] for x in stacked}
     return {
-        str(k): {x: y[k] if y.shape[:2] in stacks else y for x, y in variables.items()}
-        for k in range(next(iter(stacks))[0])
+        str(k): {
+            x: y[(*before_run, k)] if y.shape[:2] in stacks else y for x, y in variables.items()
+        }
+        for k in range(next(iter(stacks))[len(before_run)])
     }
+
+
+def _roughness(x: Any, axis: int) -> float:
+    """Return the second differences of an array over its first, which are small along the time."""
+    steps = np.diff(x, axis=axis)
+    total = np.abs(steps).sum() if x.shape[axis] > 9 else 0.0
+    return float(np.abs(np.diff(steps, axis=axis)).sum() / total) if total else np.inf
 
 
 def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) -> pd.DataFrame:
@@ -195,14 +207,16 @@ def table_of_arrays(path: Path, request: Request, variables: Mapping[str, Any]) 
             problem = f"{name!r} is of {arrays[base].dtype} {arrays[base].shape}, expected "
             problem += f"real numbers in {samples} rows."
         elif name not in columns and name == request.time:
-            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or '.'} "
+            runs = (re.sub(rf"\d+([_./]{re.escape(name)})$", r"*\1", x) for x in arrays)
+            run = next((f", write {x!r}, and so on." for x in runs if "*" in x), ".")
+            problem = f"no variable {name!r} for the time{did_you_mean(name, columns) or run} "
             rate = next((y for x, y in scalars.items() if _RATE.search(x)), 100)
             problem += f"Without a clock write time: {{rate: {rate}}}, in Hz."
         if problem:
             raise LogError(f"{path}: {problem} The file has {listed(sizes)}")
     table = pd.DataFrame(columns, index=pd.RangeIndex(1, samples + 1))
     if samples < longest:
-        table.attrs["notes"] = [f"the last of {longest} rows is left out: some have {samples}"]
+        table.attrs["notes"] = ["the last row is left out: some variables are a row shorter"]
     return table
 
 

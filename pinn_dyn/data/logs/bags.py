@@ -78,10 +78,10 @@ def _decode(
         first = next(iter(tables))
         clock = tables[first][np.argsort(tables[first][:, 1]), :2].astype(float)
         clock = clock[clock[:, 0] > 0] if delays[first] else clock[:, [1, 1]]
-        for topic in tables.keys() - {first}:
-            received = tables[topic][:, 1].astype(float)
-            inside = received.clip(*clock[[0, -1], 1])
-            tables[topic][:, 0] = np.interp(inside, clock[:, 1], clock[:, 0]) + received - inside
+        for topic in list(tables)[1:]:
+            times = tables[topic][:, 1].astype(float)
+            inside = times.clip(*clock[[0, -1], 1])
+            tables[topic][:, 0] = np.interp(inside, clock[:, 1], clock[:, 0]) + times - inside
             notes.append(f"times of receipt put {topic} on the clock of {first}")
     return [_topic(path, x, list(fields[x]), table, kinds, notes) for x, table in tables.items()]
 
@@ -177,24 +177,22 @@ def _number(message: Any, field: str, location: str) -> float | None:
         return None  # the time of the message follows
     node = message
     parents: list[Any] = []
-    steps = field.split("/")
-    while steps:
-        step = steps.pop(0)
+    name = ""
+    for step in field.split("/"):
+        name = f"{name}/{step}".lstrip("/")  # of a joint, with slashes
         parents.insert(0, node)
         if hasattr(node, "__len__") and not isinstance(node, str):
-            k = int(step) if step.isdigit() else _index(step, node, parents)
-            while k >= len(node) and steps:  # a name with a slash
-                step = f"{step}/{steps.pop(0)}"
-                k = _index(step, node, parents)
+            k = int(name) if name.isdigit() else _index(name, node, parents)
             if k >= len(node):
-                return None
+                continue
             node = node[k]
-        elif hasattr(node, step):
-            node = getattr(node, step)
+        elif hasattr(node, name):
+            node = getattr(node, name)
         else:
             paths = listed(path[1:] for path in _paths(message))
             raise LogError(f"{location}: no {field!r} in its messages, which have {paths}")
-    if node is None:  # of JSON
+        name = ""
+    if name or node is None:  # null of JSON
         return None
     seconds = _seconds(node)
     if seconds is None and not isinstance(node, (int, float, np.number, np.bool_)):

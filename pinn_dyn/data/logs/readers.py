@@ -66,7 +66,9 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
         cause = "save plain arrays:" if "allow_pickle" in text else "is it cut short?"
-        cause += f" Repair it by rosbag reindex {path.name}:" if suffix == ".bag" else ""
+        if suffix == ".bag":
+            rename = f" and rename it to {path.stem}" if path.suffix != ".bag" else ""
+            cause += f" Repair it by rosbag reindex {path.name}{rename}:"
         raise LogError(f"{path}: cannot be read as {suffix}, {cause} {text}") from error
     tables = content if isinstance(content, Mapping) else {"": content}
     if not any(map(len, tables.values())):

@@ -11,7 +11,7 @@ import pandas as pd
 
 from pinn_dyn.data.logs.checks import check_clock, check_rows
 from pinn_dyn.data.logs.columns import Columns
-from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.filling import fill
 from pinn_dyn.data.logs.joining import joined, widened
 from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
@@ -54,9 +54,10 @@ class Layout:
             }
         columns = [name for signal in self.signals.values() for name in signal.columns]
         tables = joined(tables, self.time, columns, self.trajectory)
+        notes = pd.Series({x: list(table.notes) for x, table in tables.items()}).explode().dropna()
+        for note, stems in notes.groupby(notes, sort=False):
+            report.warn("rows", f"{listed(stems.index)}: {note}")
         for stem, table in tables.items():
-            for note in table.notes:
-                report.warn("rows", f"{stem}: {note}")
             runs = table.runs(self.trajectory, stem)
             if self.trajectory is not None and len(tables) > 1:
                 runs = {f"{stem}:{run}": rows for run, rows in runs.items()}
