@@ -23,6 +23,7 @@ from pinn_dyn.app.trust import packages
 from pinn_dyn.control import (
     Controller,
     DataRegion,
+    DisturbanceObserver,
     Guarded,
     ModelBasedLaw,
     PredictiveControl,
@@ -72,6 +73,8 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["guard"].get("threshold") is not None:
+        if not isinstance(laws["learned"], ModelBasedLaw | PredictiveControl):
+            raise ConfigError("a guard takes no observer: leave out guard or the observer")
         laws["learned"] = _guarded(laws["learned"], config, source)
     if config["export"]:
         _export(laws[config["exported_law"]], run, config)
@@ -130,10 +133,7 @@ def _without_robot(
     """Export the law on a model of measured data, and write how well it is conditioned."""
     source = run.source
     if config["export"]:
-        law = build_law(config, config["exported_law"], learned, learned)
-        if config["guard"].get("threshold") is not None and config["exported_law"] == "learned":
-            law = _guarded(law, config, source)
-        _export(law, run, config)
+        _export(build_law(config, config["exported_law"], learned, learned), run, config)
     q = torch.cat([_thinned(item.q) for item in source.load().train])
     table = term_conditions(learned, q)
     table.to_csv(folder / "conditions.csv", index=False)
@@ -149,6 +149,8 @@ def _without_robot(
 
 def _export(law: Controller, run: Run, config: dict[str, Any]) -> None:
     try:
+        if config["guard"].get("threshold") is not None and not isinstance(law, Guarded):
+            law = _guarded(law, config, run.source)
         path = export_law(
             law,
             config["export"],
@@ -193,9 +195,8 @@ def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | Non
 
 
 def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
-    if not isinstance(law, ModelBasedLaw | PredictiveControl):
-        raise ConfigError("a guard takes no observer: leave out guard.threshold or the observer")
     train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
-    region = DataRegion(q, v, angles=getattr(law.model, "angles", ()))
+    model = (law.law if isinstance(law, DisturbanceObserver) else law).model  # type: ignore
+    region = DataRegion(q, v, angles=getattr(model, "angles", source.angles))
     return Guarded(law, region, **config["guard"])

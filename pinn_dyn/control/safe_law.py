@@ -26,7 +26,7 @@ class SafeLaw:
 
     1. The law and its observer give u.
     2. Outside the training data (a :class:`Guarded` law), the fall-back of the guard replaces u.
-    3. If u is not finite, the last u replaces it, and the observer keeps its memory.
+    3. If u is not finite, the last u replaces it. The observer keeps its memory while v is not.
     4. The actuator limits u.
 
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data) and 4 (not
@@ -73,7 +73,6 @@ class SafeLaw:
         reference = Motion(q_ref, v_ref, a_ref)
         last, memory = memory_in[:m], memory_in[m:]
         u = self.law.law(q, v, *reference)
-        finish: Callable[[Tensor], Tensor] = lambda applied: memory  # noqa: E731
         if self.observer:
             u, finish = self._observed(self.observer, q, v, u, last, memory)
         status = torch.zeros_like(q[0])
@@ -90,7 +89,9 @@ class SafeLaw:
             applied = torch.minimum(torch.maximum(u, last - change), last + change)
         applied = self.actuator.limit(applied)
         status = status + LIMITED * ((applied != u).to(u).sum() > 0)
-        memory = torch.where(finite, finish(applied), memory)
+        if self.observer:
+            after = finish(applied)
+            memory = torch.where(finite & ((after - after).sum() == 0), after, memory)
         return applied, status, torch.cat([applied, memory])
 
     def _observed(

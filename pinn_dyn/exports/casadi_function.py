@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -105,13 +106,17 @@ class _Writer:
             *bias, a, b = arguments
             product = self._product(a, b)
             return product + self._operand(bias[0], shape) if bias else product
-        if name == "sum":
+        if name in ("sum", "amin", "amax"):
             source, dims, *_ = arguments
             positions = _positions(source)
             axes = [d % positions.ndim for d in dims]
             order = [*(d for d in range(positions.ndim) if d not in axes), *axes]
             numbers = self.values[source][_flat(positions.permute(order))]
-            return self.ca.sum1(self.ca.reshape(numbers, -1, shape.numel())).T
+            columns = self.ca.reshape(numbers, -1, shape.numel())
+            if name == "sum":
+                return self.ca.sum1(columns).T
+            smaller_or_larger = self.ca.fmin if name == "amin" else self.ca.fmax
+            return functools.reduce(smaller_or_larger, self.ca.vertsplit(columns)).T
         return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
 
     def matrix(self, node: fx.Node) -> Any:

@@ -2,15 +2,19 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from PIL import Image
 
 import pinn_dyn
 from pinn_dyn.app.config import CONF
-from pinn_dyn.control import DisturbanceObserver
+from pinn_dyn.app.control import _guarded
+from pinn_dyn.control import DisturbanceObserver, Tracking
+from pinn_dyn.systems import RigidChain
 from tests.app.entry import (
     HIGH,
     LOW,
@@ -148,6 +152,30 @@ def test_the_learned_law_is_exported_with_its_limits_and_guard(tmp_path, lnn_run
         '\\"fallback\\": \\"hold\\"',
     ):
         assert part in header
+
+
+def test_the_guard_of_a_known_robot_counts_whole_turns_as_the_same_angle():
+    """A known robot has no network, so the data alone say which coordinates are angles."""
+    arm = RigidChain(str(CONF.parent / "examples" / "double_pendulum.urdf"))
+    q = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(0)).double()
+    train = [SimpleNamespace(q=x, v=torch.zeros_like(x)) for x in q]
+    source = SimpleNamespace(angles=(0, 1), load=lambda: SimpleNamespace(train=train))
+    region = _guarded(Tracking(arm, 1.0, 1.0), {"guard": {"threshold": 2.0}}, source).region
+    assert region.distance(q[0, 0] + 2 * torch.pi, train[0].v[0]) < 1e-6
+
+
+def test_the_guard_is_exported_with_the_observer(tmp_path, lnn_run, undrawn):
+    """Also if the exported law is not the learned law of the loop."""
+    path = tmp_path / "law.c"
+    words = ["rate=200", f"export={path}", "controllers=tracking", "exported_law=learned_observer"]
+    words += ["duration=0.1", "settled_after=0", "guard.threshold=2", "guard.fallback=hold"]
+    control(tmp_path / "out", lnn_run, *words)
+    size = pinn_dyn.load(lnn_run).model.num_coordinates
+    far = np.full(size, 50.0)
+    memory = np.concatenate([np.full(size, 0.2), np.zeros(1 + 3 * size)])
+    u, _, status = function_of(path, "law_control")(far, far, far, far, far, memory)
+    np.testing.assert_allclose(u, 0.2)
+    assert status == 2
 
 
 def test_the_law_of_an_experiment_goes_to_every_kind_of_file(

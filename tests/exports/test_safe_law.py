@@ -85,6 +85,24 @@ def test_a_guard_falls_back_in_the_file_as_in_the_loop(law, tmp_path, fallback):
     assert outside == [2 * (k == 9) for k in range(20)]
 
 
+def test_casadi_and_onnx_files_hold_the_guard(law, tmp_path):
+    casadi, onnxruntime = pytest.importorskip("casadi"), pytest.importorskip("onnxruntime")
+    x = motion(100)
+    guarded = Guarded(law, DataRegion(x[0].split(50), x[1].split(50)), fallback="hold")
+    near = [part[1].numpy() for part in motion(2)]
+    far = [near[0] + 20.0, *near[1:]]
+    function = casadi.Function.load(str(export_law(guarded, tmp_path / "law.casadi")))
+    session = onnxruntime.InferenceSession(export_law(guarded, tmp_path / "law.onnx"))
+    names = [item.name for item in session.get_inputs()]
+    for state, outside in ((near, False), (far, True)):
+        values = [*state, np.full(3, 0.2)]
+        for call in (function.call, lambda x: session.run(None, dict(zip(names, x, strict=True)))):
+            u, status, _ = (np.array(x).ravel() for x in call(values))
+            expected = values[-1] if outside else law.law(*map(torch.from_numpy, state))
+            np.testing.assert_allclose(u, expected, rtol=1e-9)
+            assert status == 2 * outside
+
+
 def test_gains_of_another_unit_do_not_fall_back(law):
     x = motion(50)
     region = DataRegion([x[0]], [x[1]])
@@ -108,6 +126,20 @@ def test_numbers_that_are_not_finite_give_the_last_input(law, tmp_path):
     u, status = control(*good)
     assert np.isfinite(u).all()
     assert not status & 4
+
+
+def test_a_held_input_does_not_spoil_the_memory_of_the_observer(law, tmp_path):
+    """An infinite velocity is outside the data, so the guard holds a finite input."""
+    x = motion(100)
+    region = DataRegion(x[0].split(50), x[1].split(50))
+    guarded = Guarded(DisturbanceObserver(law, 20.0), region, threshold=1.5, fallback="hold")
+    call = function_of(export_law(guarded, tmp_path / "law.c", period=PERIOD), "law_control")
+    good = [part[1].numpy() for part in motion(2)]
+    _, before, _ = call(*good, np.zeros(13))
+    _, after, status = call(good[0], np.full(3, np.inf), *good[2:], before)
+    np.testing.assert_array_equal(after, before)
+    assert status == 2
+    assert np.isfinite(call(*good, after)[1]).all()
 
 
 def test_the_first_input_is_limited_from_zero(law, tmp_path):
