@@ -80,7 +80,7 @@ class SafeLaw:
             outside = self.guard.region.nearest(q, v) > self.guard.threshold
             status = status + OUTSIDE * outside
             u = torch.where(outside, self.guard.fall_back(q, v, reference, u, last), u)
-        finite = (u - u).sum() == 0  # NaN for one that is not
+        finite = u.abs().sum() < torch.inf  # CasADi takes u - u for zero, also of NaN
         status = status + NOT_FINITE * ~finite
         u = torch.where(finite, u, last)
         applied = u
@@ -91,7 +91,7 @@ class SafeLaw:
         status = status + LIMITED * ((applied != u).to(u).sum() > 0)
         if self.observer:
             after = finish(applied)
-            memory = torch.where(finite & ((after - after).sum() == 0), after, memory)
+            memory = torch.where(finite & (after.abs().sum() < torch.inf), after, memory)
         return applied, status, torch.cat([applied, memory])
 
     def _observed(

@@ -85,22 +85,23 @@ def test_a_guard_falls_back_in_the_file_as_in_the_loop(law, tmp_path, fallback):
     assert outside == [2 * (k == 9) for k in range(20)]
 
 
-def test_casadi_and_onnx_files_hold_the_guard(law, tmp_path):
+def test_casadi_and_onnx_files_guard_against_far_and_missing_measurements(law, tmp_path):
     casadi, onnxruntime = pytest.importorskip("casadi"), pytest.importorskip("onnxruntime")
     x = motion(100)
     guarded = Guarded(law, DataRegion(x[0].split(50), x[1].split(50)), fallback="hold")
     near = [part[1].numpy() for part in motion(2)]
-    far = [near[0] + 20.0, *near[1:]]
+    far, missing = [near[0] + 20.0, *near[1:]], [near[0] * np.nan, *near[1:]]
     function = casadi.Function.load(str(export_law(guarded, tmp_path / "law.casadi")))
     session = onnxruntime.InferenceSession(export_law(guarded, tmp_path / "law.onnx"))
     names = [item.name for item in session.get_inputs()]
-    for state, outside in ((near, False), (far, True)):
+    for state, expected_status in ((near, 0), (far, 2), (missing, 4)):
         values = [*state, np.full(3, 0.2)]
         for call in (function.call, lambda x: session.run(None, dict(zip(names, x, strict=True)))):
             u, status, _ = (np.array(x).ravel() for x in call(values))
-            expected = values[-1] if outside else law.law(*map(torch.from_numpy, state))
+            good = law.law(*map(torch.from_numpy, state))
+            expected = values[-1] if expected_status else good
             np.testing.assert_allclose(u, expected, rtol=1e-9)
-            assert status == 2 * outside
+            assert status == expected_status
 
 
 def test_gains_of_another_unit_do_not_fall_back(law):
