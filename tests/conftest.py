@@ -49,9 +49,8 @@ def traced(monkeypatch):
 
     Each kind of program is built by one test.
     """
-    room = "pinn_dyn.mechanics.compilation"
-    monkeypatch.setattr(f"{room}._compile", lambda function, _: function)
-    monkeypatch.setattr(f"{room}.compile_fx_graph", lambda graph, *_: graph)
+    monkeypatch.setattr("pinn_dyn.mechanics.compilation._compile", lambda function, _: function)
+    monkeypatch.setattr("torch._inductor.compile", lambda graph, *_: graph)
 
 
 @pytest.fixture

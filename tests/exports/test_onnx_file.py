@@ -15,15 +15,15 @@ from pinn_dyn.exports.model_functions import model_functions
 from tests.exports.test_c_file import FAST, MODELS, Bessel
 from tests.models.builders import random_batch
 
-CASES = [pytest.param(x, marks=() if x in FAST[1:] else pytest.mark.slow, id=x) for x in MODELS]
+CASES = [(x, real) for x in FAST[1:] for real in ("double", "float")]
+SLOW = [pytest.param(x, "double", marks=pytest.mark.slow) for x in MODELS if x not in FAST[1:]]
 
 
 def session_of(path):
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
-@pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("case", "real"), [*CASES, *SLOW])
 def test_the_file_of_each_function_repeats_the_model(case, real, tmp_path):
     model = MODELS[case]().double().eval().requires_grad_(False)
     q, v, a, u = (x[0] for x in random_batch(model.num_coordinates, model.num_inputs, 1, seed=11))

@@ -7,13 +7,11 @@ from pinn_dyn.control import ComputedTorque
 from pinn_dyn.exports.decompositions import cholesky, qr, solve_triangular
 from pinn_dyn.exports.program import trace
 from pinn_dyn.systems import SoftArm
-from tests.models.builders import CHAIN, NONLINEAR, VARIANTS, make_structured, random_batch
+from tests.models.builders import CHAIN, VARIANTS, make_structured, random_batch
 
 MODELS = {
-    **{name: ("lnn", VARIANTS[name]) for name in ("silu-fixed-input-2x4", "networks-softplus-3x3")},
-    **{name: ("hnn", VARIANTS[name]) for name in ("friction-all-angles-2x1",)},
+    "over-actuated": ("lnn", VARIANTS["silu-fixed-input-2x4"]),
     "chain": ("hnn", CHAIN["hnn"]),
-    "nonlinear": ("lnn", NONLINEAR),
 }
 
 
@@ -23,10 +21,8 @@ def functions_of(model):
         "inverse_dynamics": (model.inverse_dynamics, "qva"),
         "terms": (lambda q: tuple(model.terms(q)), "q"),
     }
-    if model.input_affine:
-        law = ComputedTorque(model, 3.0, 0.4).law
-        names["law"] = (law, ["q", "v", "q_ref", "v_ref", "a_ref"])
-    return names
+    law = ComputedTorque(model, 3.0, 0.4).law
+    return {**names, "law": (law, ["q", "v", "q_ref", "v_ref", "a_ref"])}
 
 
 def assert_repeats(model):
@@ -56,6 +52,7 @@ def test_a_program_repeats_a_network(case):
     assert_repeats(make_structured(kind, **variant))
 
 
+@pytest.mark.slow
 def test_a_program_repeats_a_soft_arm():
     assert_repeats(SoftArm(segments=1))
 
