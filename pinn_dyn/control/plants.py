@@ -64,7 +64,7 @@ class SystemPlant(Plant):
             duration,
             rtol=share * self._rtol,
             atol=share * self._atol,
-            first_step=min(self._step, duration),
+            first_step=min(max(self._step, 10 * _SMALLEST_STEP), duration),
         )
         while solver.status == "running":
             solver.step()

@@ -56,6 +56,17 @@ def test_linear_system_moves_as_its_matrix_exponential(duration):
         torch.testing.assert_close(states[k], expected, rtol=0, atol=2e-8)
 
 
+def test_a_short_remainder_of_an_interval_does_not_stop_the_plant():
+    """The arm at rest lets the solver take 0.01 s, which leaves 5e-8 s of the second interval."""
+    plant = SystemPlant(SoftArm())
+    q = double([[0.0, 0.0, 0.2]])
+    plant.start(q, 0 * q)
+    for duration in (0.001, 0.01 + 5e-8, 0.01):
+        q, v = plant.advance(0 * q, duration)
+    assert q.isfinite().all()
+    assert v.isfinite().all()
+
+
 def test_copies_at_rest_do_not_hide_the_error_of_one_that_moves():
     system = LinearSystem([[1.0]], [[100.0]], [[0.0]], [[1.0]])
     q0 = torch.zeros(2_000, 1, dtype=torch.float64)
