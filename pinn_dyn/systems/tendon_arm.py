@@ -104,23 +104,24 @@ class TendonArm(SoftArm):
         slope = 0.5 * self.tendon_stiffness.to(q) * (1 + s / (s * s + self.slack**2).sqrt())
         return -self.spool * self.routing.to(q).mT * slope.unsqueeze(-2)
 
-    def tensions(self, q: Tensor, u: Tensor) -> Tensor:
+    def typical_input(self, q: Tensor) -> Tensor:
+        """Return the angles that give each tendon its pretension, up to slack, ``(*batch, M)``."""
+        return -q @ self.routing.to(q).mT / self.spool
+
+    def tensions(self, q: Tensor, u: Tensor | float) -> Tensor:
         """Return T, ``(*batch, M)``, N."""
-        return self._tensions(self._stretch(q, u))
+        s = self._stretch(q, u)
+        return 0.5 * self.tendon_stiffness.to(s) * (s + (s * s + self.slack**2).sqrt())
 
     def _stretch(self, q: Tensor, u: Tensor | float) -> Tensor:
         start = self.pretension / self.tendon_stiffness.to(q)
         return q @ self.routing.to(q).mT + self.spool * u + start
 
-    def _tensions(self, s: Tensor) -> Tensor:
-        return 0.5 * self.tendon_stiffness.to(s) * (s + (s * s + self.slack**2).sqrt())
-
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
-        change = self.tensions(q, u) - self._tensions(self._stretch(q, 0.0))
-        return -change @ self.routing.to(q)
+        return (self.tensions(q, 0.0) - self.tensions(q, u)) @ self.routing.to(q)
 
     def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
-        tendons = self._tensions(self._stretch(q, 0.0)) @ self.routing.to(q)
+        tendons = self.tensions(q, 0.0) @ self.routing.to(q)
         return super()._potential_force_of(q, jacobian) + tendons
 
     def _friction_force(self, v: Tensor) -> Tensor:
