@@ -121,8 +121,7 @@ class TendonArm(SoftArm):
         return (self.tensions(q, 0.0) - self.tensions(q, u)) @ self.routing.to(q)
 
     def _potential_force_of(self, q: Tensor, jacobian: Tensor) -> Tensor:
-        tendons = self.tensions(q, 0.0) @ self.routing.to(q)
-        return super()._potential_force_of(q, jacobian) + tendons
+        return super()._potential_force_of(q, jacobian) + self.tensions(q, 0.0) @ self.routing.to(q)
 
     def _friction_force(self, v: Tensor) -> Tensor:
         return self.friction.to(v) * (v / self.friction_speed.to(v)).tanh()

@@ -5,7 +5,9 @@ import json
 import pytest
 from hydra._internal.config_repository import ConfigRepository as Hydra
 
+from pinn_dyn.app.build import build_reference
 from pinn_dyn.app.config import CONF, composed
+from pinn_dyn.systems import TendonArm
 from tests.app.entry import (
     NO_FIGURES,
     ROOT,
@@ -59,6 +61,11 @@ def of_arm_2(folder):
     return [*TINY_DATA, STRIDE, *short]
 
 
+def of_tendons(folder):
+    coarse = ["dataset.rtol=0.001", "dataset.atol=0.0001"]  # tendons are stiff
+    return [*of_arm_1(folder), *coarse, "optimizer.cutoff=20"]
+
+
 def of_panda(folder):
     pytest.importorskip("pybullet", reason="the Panda is simulated by PyBullet: pinn_dyn[panda]")
     counts = ["dataset.train=2", "dataset.validation=1", "dataset.test=1"]
@@ -78,6 +85,7 @@ DATA = {
     "soft_arm_1": of_arm_1,
     "soft_arm_1_wide": of_arm_1_wide,
     "soft_arm_2": of_arm_2,
+    "soft_arm_tendon": of_tendons,
     "panda": of_panda,
     "demo": of_arm_1,
     "example_log": of_logs,
@@ -90,7 +98,7 @@ DATA = {
 
 
 # A least-squares fit counts as one step and would go on until it converges.
-FITTED = ("known", "ur10e")
+FITTED = ("known", "soft_arm_tendon", "ur10e")
 SHORT_FIT = ["optimizer.evaluations=2", "optimizer.samples=200", "data.steps=2"]
 
 
@@ -116,6 +124,17 @@ def test_every_experiment_trains(tmp_path, monkeypatch, experiment):
         f"hydra.run.dir={folder}",
     )
     assert_trained(folder, steps=1 if experiment in FITTED else 2)
+
+
+def test_taut_tendons_hold_the_set_points_of_their_experiment():
+    config = composed("control", ["experiment=soft_arm_tendon/regulation", "run=any"])
+    arm = TendonArm()
+    q = build_reference(config, arm)(0.0).q
+    u = arm.input_for(q, 0 * q, 0 * q)
+    assert q.shape == (24, 3)
+    assert arm.tensions(q, u).min() > 1.0
+    a = arm.forward_dynamics(q, 0 * q, u)
+    assert a.abs().max() < 1e-2
 
 
 @pytest.mark.parametrize("model", [x for x in MODELS if x not in ("lnn", "hnn")])
