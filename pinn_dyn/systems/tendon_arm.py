@@ -105,8 +105,9 @@ class TendonArm(SoftArm):
         return -self.spool * self.routing.to(q).mT * slope.unsqueeze(-2)
 
     def typical_input(self, q: Tensor) -> Tensor:
-        """Return the angles that give each tendon its pretension, up to slack, ``(*batch, M)``."""
-        return -q @ self.routing.to(q).mT / self.spool
+        """Return the angles that keep the pretension, ``(*batch, M)``; 0 for redundant tendons."""
+        angles = -q @ self.routing.to(q).mT / self.spool
+        return angles if self.num_inputs == self.num_coordinates else 0 * angles
 
     def tensions(self, q: Tensor, u: Tensor | float) -> Tensor:
         """Return T, ``(*batch, M)``, N."""
