@@ -31,29 +31,24 @@ if TYPE_CHECKING:
 
 __version__ = "0.4.0"
 
-_MODULES = {
-    "DataSource": "pinn_dyn.data",
-    "LogSource": "pinn_dyn.data",
-    "MechanicalSystem": "pinn_dyn.mechanics",
-    "Run": "pinn_dyn.app.run",
-    "Signal": "pinn_dyn.mechanics",
-    "SoftArm": "pinn_dyn.systems",
-    "Splits": "pinn_dyn.data",
-    "Terms": "pinn_dyn.mechanics",
-    "Trajectory": "pinn_dyn.mechanics",
-    "check": "pinn_dyn.evaluation.log_check",
-    "close_loop": "pinn_dyn.evaluation.closed_loops",
-    "dataset": "pinn_dyn.app.build",
-    "design_excitation": "pinn_dyn.evaluation.excitation_design",
-    "evaluate": "pinn_dyn.app.evaluation",
-    "fit": "pinn_dyn.app.fit",
-    "load": "pinn_dyn.app.run_folder",
-    "train": "pinn_dyn.app.training",
+_NAMES = {
+    "pinn_dyn.app.build": "dataset",
+    "pinn_dyn.app.evaluation": "evaluate",
+    "pinn_dyn.app.fit": "fit",
+    "pinn_dyn.app.run": "Run",
+    "pinn_dyn.app.run_folder": "load",
+    "pinn_dyn.app.training": "train",
+    "pinn_dyn.data": "DataSource LogSource Splits",
+    "pinn_dyn.evaluation.closed_loops": "close_loop",
+    "pinn_dyn.evaluation.excitation_design": "design_excitation",
+    "pinn_dyn.evaluation.log_check": "check",
+    "pinn_dyn.mechanics": "MechanicalSystem Signal Terms Trajectory",
+    "pinn_dyn.systems": "SoftArm",
 }
 
-__all__ = [*_MODULES]
-__getattr__ = lazy_attributes(__name__, _MODULES)
+__all__ = " ".join(_NAMES.values()).split()
+__getattr__ = lazy_attributes(__name__, _NAMES)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_MODULES])
+    return sorted([*globals(), *__all__])

@@ -75,7 +75,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     A motion that diverges ends the episode (``terminated``) in its last finite state, with the
     reward of that state for all remaining steps, as if the robot stayed there.
     ``info["distance"]`` is the distance from the training data
-    (:class:`~pinn_dyn.control.DataRegion`), 1 at the edge. A learned model is wrong far beyond.
+    (:class:`~pinn_dyn.control.DataRegion`), 1 at the edge. Far beyond, a learned model is wrong.
 
     Args:
         robot: a run or its folder, a mechanical system, or a plant such as
@@ -89,7 +89,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         u_low, u_high: limits of the inputs, ``(M,)``; None for the range of the training data.
 
     Raises:
-        TypeError: if the model is no mechanical system, or ``data`` is missing.
+        TypeError: if the model is not a mechanical system, or ``data`` is missing.
     """
 
     action_space: gymnasium.spaces.Box
@@ -108,7 +108,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         robot = load(robot) if isinstance(robot, (str, Path)) else robot
         data = robot if data is None and isinstance(robot, Run) else data
         if data is None:
-            raise TypeError("a robot that is no run needs training data: set data")
+            raise TypeError("data is missing: a robot that is not a run needs training data")
         source = data.source if isinstance(data, Run) else data
         train = source.load().train
         sample_time = float(train[0].t[1] - train[0].t[0])

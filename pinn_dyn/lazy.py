@@ -8,24 +8,24 @@ from typing import Any
 
 
 class LazyNames(dict[str, Any]):
-    """Objects by name, each imported at its first use; ``modules`` has their modules."""
+    """Objects by name, each imported at its first use; ``names`` lists those of each module."""
 
-    def __init__(self, modules: Mapping[str, str]):
+    def __init__(self, names: Mapping[str, str]):
         super().__init__()
-        self._modules = modules
+        self.modules = {name: module for module in names for name in names[module].split()}
 
     def __missing__(self, name: str) -> Any:
-        self[name] = getattr(importlib.import_module(self._modules[name]), name)
+        self[name] = getattr(importlib.import_module(self.modules[name]), name)
         return self[name]
 
 
-def lazy_attributes(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+def lazy_attributes(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """Return a ``__getattr__`` for a package that imports its names at their first use."""
-    names = LazyNames(modules)
+    objects = LazyNames(names)
 
     def get(name: str) -> Any:
-        if name not in modules:
+        if name not in objects.modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return names[name]
+        return objects[name]
 
     return get

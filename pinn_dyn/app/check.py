@@ -37,7 +37,7 @@ def check(cfg: DictConfig) -> None:
     print(f"\n{report}\n\nthe page is {report.save(folder, command_line())}")
     if structure is not None:
         options = [option for option in report.options if "friction" not in option]  # the default
-        print(f"a training of its constants: {_training(options, known=True)}")
+        print(f"a training of its constants: {_training(options, True)}")
     elif report.options:
         names = {"model/input=servo": "targets of servos", "model/friction=coulomb": "dry friction"}
         effects = " and ".join(names[option] for option in report.options if option in names)
@@ -49,18 +49,18 @@ def check(cfg: DictConfig) -> None:
         raise ConfigError(f"{source.name}: a training makes no sense: {'; '.join(report.problems)}")
 
 
-def _training(options: list[str], known: bool = False) -> str:
+def _training(options: list[str], with_structure: bool = False) -> str:
     """Return the command that trains a Lagrangian network on this data set, for a shell.
 
-    With ``known``, the command identifies the structure that the check was called with.
+    The command identifies the structure that the check was called with, if ``with_structure``.
     """
     parts = shlex.split(command_line())
     program = Path(parts.pop(parts[0] == "python"))  # behind the name of the interpreter
-    others = ("hydra.", "longest_delay=") + (() if known else ("model",))
-    parts = [x for x in parts if not x.startswith(others)]
+    dropped = ("hydra.", "longest_delay=") + (() if with_structure else ("model",))
+    parts = [x for x in parts if not x.startswith(dropped)]
     name = program.with_name(program.name.replace("check", "train"))
     parts.insert(parts[:1] == ["python"], str(name))
     if not any(x.startswith("dataset=") for x in parts):
         parts.append(f"dataset={HydraConfig.get().runtime.choices['dataset']}")
-    model = ["experiment=known"] if known else ["model=lnn", "data=multi_step"]
+    model = ["experiment=known"] if with_structure else ["model=lnn", "data=multi_step"]
     return shlex.join([*parts, *model, *options])

@@ -10,8 +10,8 @@ import torch
 
 from pinn_dyn import __version__
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.exports.exported import ENDINGS, Real, write
-from pinn_dyn.exports.model_functions import Ranges, model_functions
+from pinn_dyn.exports.exported import ENDINGS, Ranges, Real, write
+from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
 from pinn_dyn.systems import RigidChain
@@ -32,18 +32,18 @@ def export(
 ) -> Path:
     """Write a model to a file for other programs, in the format of the ending of the path.
 
-    - ``.c`` (with ``.h``): its functions, see :func:`~.exports.model_functions.model_functions`;
-    - ``.onnx``, ``.casadi``: one of these functions;
+    - ``.c`` (with ``.h``): the functions of :func:`~.exports.model_functions.model_functions`;
+    - ``.onnx``, ``.casadi``: a single one of these functions;
     - ``.urdf``, ``.xml`` (MJCF): the identified robot of a run of model=known.
 
     Args:
         model: a model or a known system.
         path: the file.
-        what: name of the function, ``forward_dynamics`` by default (``next_state`` for models
-            that have no other); of a ``.c`` file the default is all.
-        real: type of the numbers, for ``.c`` and ``.onnx``.
-        statistics: ranges of the training data, in which the file is compared with the model;
-            without them within [-1, 1].
+        what: name of the function. The default is all functions in a ``.c`` file, otherwise
+            ``forward_dynamics``, or ``next_state`` of a model without it.
+        real: type of the numbers in a ``.c`` or ``.onnx`` file.
+        statistics: of the training data. The file is compared with the model in their ranges, or
+            within [-1, 1].
         about: fields for the information in the file, such as names of coordinates.
 
     Raises:
@@ -76,7 +76,7 @@ def export(
 
 
 def ranges_of(statistics: Statistics) -> Ranges:
-    """Return the ranges of the training data, of v, a and u twice their standard deviations."""
+    """Return the range of q in the training data, and two standard deviations of v, a and u."""
     v, a, u = 2 * statistics.v_std, 2 * statistics.acceleration, statistics.u_mean
     h = torch.tensor(statistics.step)
     return {

@@ -158,8 +158,8 @@ class Run:
         """Write the model to a C, ONNX, CasADi, URDF or MJCF file, see :func:`~.app.export.export`.
 
         Args:
-            path: the file, whose ending chooses the format.
-            what: name of the function, for a file of a single function.
+            path: the file; its ending selects the format.
+            what: name of a function to write.
             real: type of the numbers in a ``.c`` or ``.onnx`` file, ``double`` or ``float``.
         """
         about = {"q": self.labels, "u": self.input_labels}
@@ -320,8 +320,8 @@ class Run:
         """
         if not isinstance(self.model, ContinuousPredictor):
             raise TypeError(
-                f"a {type(self.model).__name__} has no single dx/dt to linearize: use a member "
-                "of run.members, or model=lnn, hnn, known or acceleration"
+                f"a {type(self.model).__name__} has no dx/dt to linearize: use a member of "
+                "run.members, or model=lnn, hnn, known or acceleration"
             )
         position, velocity = self._motion_state(q=q, v=v)
         inputs = self._array("u", u, self.model.num_inputs, "M")

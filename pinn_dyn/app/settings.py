@@ -28,20 +28,18 @@ if TYPE_CHECKING:
 
 TYPES = LazyNames(
     {
-        **dict.fromkeys(("Callback", "Trainer"), "lightning"),
-        "Logger": "lightning.pytorch.loggers",
-        "Optimizer": "torch.optim",
-        "LRScheduler": "torch.optim.lr_scheduler",
-        **dict.fromkeys(
-            ("Actuator", "Controller", "Plant", "Reference", "Sensor"), "pinn_dyn.control"
-        ),
-        **dict.fromkeys(("DataSource", "DynamicsData", "InitialStates"), "pinn_dyn.data"),
-        "RolloutValidator": "pinn_dyn.evaluation",
-        **dict.fromkeys(("JointValues", "MotionLimits"), "pinn_dyn.evaluation.motion_limits"),
-        "Predictor": "pinn_dyn.mechanics",
-        "Structure": "pinn_dyn.models.known",
-        "RigidChain": "pinn_dyn.systems",
-        **dict.fromkeys(("LeastSquares", "WindowLoss"), "pinn_dyn.training"),
+        "lightning": "Callback Trainer",
+        "lightning.pytorch.loggers": "Logger",
+        "torch.optim": "Optimizer",
+        "torch.optim.lr_scheduler": "LRScheduler",
+        "pinn_dyn.control": "Actuator Controller Plant Reference Sensor",
+        "pinn_dyn.data": "DataSource DynamicsData InitialStates",
+        "pinn_dyn.evaluation": "RolloutValidator",
+        "pinn_dyn.evaluation.motion_limits": "JointValues MotionLimits",
+        "pinn_dyn.mechanics": "Predictor",
+        "pinn_dyn.models.known": "Structure",
+        "pinn_dyn.systems": "RigidChain",
+        "pinn_dyn.training": "LeastSquares WindowLoss",
     }
 )
 """Names in the annotations below, which are imported when a configuration is checked."""

@@ -87,7 +87,8 @@ def epochs(steps: int, validations: int) -> tuple[int, int, int]:
     if remainder or not between:
         multiple = max(between, 1) * validations
         raise ConfigError(
-            f"trainer.steps is {steps}, no multiple of validations: set trainer.steps={multiple}"
+            f"trainer.steps is {steps}, expected a multiple of validations: set "
+            f"trainer.steps={multiple}"
         )
     fewest = -(-between // LONGEST_EPOCH)
     parts = next((n for n in range(fewest, 10 * fewest) if between % n == 0), 1)

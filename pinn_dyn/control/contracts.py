@@ -37,7 +37,7 @@ class Controller(abc.ABC):
         """Forget the past, before a new run."""
 
     def follow(self, reference: Reference) -> None:  # noqa: B027 - most laws do not look ahead
-        """Take the reference of a new run, for laws that look ahead."""
+        """Store the reference of a new run, for laws that look ahead."""
 
     @abc.abstractmethod
     def __call__(self, t: float, q: Tensor, v: Tensor, reference: Motion) -> Tensor:

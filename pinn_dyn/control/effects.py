@@ -44,20 +44,22 @@ class Actuator:
         """Return to an input of zero, before a new run."""
         self._previous = None
 
-    def limit(self, u: Tensor) -> Tensor:
-        """Clip u ``(*batch, M)`` to [low, high]; NaN stays NaN."""
+    def limit(self, u: Tensor, previous: Tensor | None = None, interval: float = 0.0) -> Tensor:
+        """Limit u ``(*batch, M)``, ``interval`` s after the input ``previous``; NaN stays NaN.
+
+        The rate is not limited without ``previous``.
+        """
+        if self.rate is not None and previous is not None:
+            change = interval * _like(self.rate, u)
+            u = u.clamp(previous - change, previous + change)
         low = -torch.inf if self.low is None else self.low
         high = torch.inf if self.high is None else self.high
         return u.clamp(_like(low, u), _like(high, u))
 
     def __call__(self, u: Tensor, interval: float) -> tuple[Tensor, Tensor]:
         """Limit u ``(*batch, M)``, ``interval`` s after the previous call; also mask changes."""
-        applied = u
-        if self.rate is not None:
-            change = interval * _like(self.rate, u)
-            previous = torch.zeros_like(u) if self._previous is None else self._previous
-            applied = u.clamp(previous - change, previous + change)
-        self._previous = self.limit(applied)
+        previous = torch.zeros_like(u) if self._previous is None else self._previous
+        self._previous = self.limit(u, previous, interval)
         return self._previous, self._previous != u
 
 

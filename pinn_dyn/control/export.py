@@ -19,8 +19,14 @@ from pinn_dyn.control.laws import ModelBasedLaw
 from pinn_dyn.control.region import Guarded
 from pinn_dyn.control.safe_law import SafeLaw
 from pinn_dyn.data.whole import write_whole
-from pinn_dyn.exports.exported import ENDINGS, STATES, ExportedFunction, Real, write
-from pinn_dyn.exports.model_functions import Ranges
+from pinn_dyn.exports.exported import (
+    ENDINGS,
+    ExportedFunction,
+    Ranges,
+    Real,
+    drawn_states,
+    write,
+)
 
 log = logging.getLogger(__name__)
 
@@ -71,8 +77,8 @@ def export_law(
 ) -> Path:
     """Write a law to a file for other programs, see docs/realtime.md.
 
-    - ``.c`` (with ``.h``), ``.onnx`` and ``.casadi``: the :class:`~.safe_law.SafeLaw`, that is the
-      law, its observer, its guard and the limits of the input, with explicit memory.
+    - ``.c`` (with ``.h``), ``.onnx`` and ``.casadi``: the :class:`~.safe_law.SafeLaw`, which is
+      the law with its observer, its guard and the limits of the input, and explicit memory.
     - ``.pt2``: the law alone, by AOTInductor, for PyTorch without this package.
 
     Args:
@@ -86,7 +92,8 @@ def export_law(
 
     Raises:
         ValueError: on another ending, or a missing period.
-        TypeError: on a controller that is no law of a model, or an operation that a format lacks.
+        TypeError: on a controller that is not a law of a model, or an operation that the format
+            does not have.
         RuntimeError: if the file cannot be compiled or loaded, or does not repeat the law to 1e-9
             (``.pt2``: 1e-5, float: 1e-4).
     """
@@ -98,16 +105,7 @@ def export_law(
         raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
     safe = SafeLaw(controller, actuator, period)
     n, m = safe.law.num_coordinates, safe.law.num_inputs
-    generator = torch.Generator().manual_seed(0)
-    unit = torch.ones((), dtype=torch.float64)
-
-    def states(name: str, size: int) -> Tensor:
-        low, high = (ranges or {}).get(name, (-unit, unit))
-        values = torch.rand(STATES, size, generator=generator, dtype=torch.float64)
-        return low + (high - low) * values
-
-    inputs = {name: states(name.removesuffix("_ref"), n) for name in INPUTS}
-    inputs["memory_in"] = states("memory", safe.memory_size)
+    inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": safe.memory_size}, ranges)
     inputs["memory_in"][:, m : m + 1].round_()  # of an observer: called before or not
     info = {
         "law": type(safe.law).__name__,

@@ -35,15 +35,15 @@ class ModelBasedLaw(Controller):
 
     Inputs are infinite or NaN where A loses its rank.
 
-    If the force f(q, v, u) is not linear in u, as for tendons with motor positions as inputs and
-    for servos that saturate, the solution u* of f(q, v, u*) = tau takes the place of A^+ tau, and
-    the Jacobian J = df/du at u* that of A. It is the only memory of a law that :class:`InputSolver`
-    starts from the previous u. Where it finds no u*, u is the previous u and the law has a fault.
+    The force f(q, v, u) is not linear in u for tendons with motor positions as inputs, and for
+    servos that saturate. The solution u* of f(q, v, u*) = tau then replaces A^+ tau, and the
+    Jacobian J = df/du at u* replaces A. :class:`InputSolver` starts from the previous u, which is
+    the only memory of the law. If there is no u*, the law returns the previous u and has a fault.
     With a model equal to the plant, the force is tau + J J^T (K_P e + K_D de/dt) up to second order
-    in the feedback. Near a set point stability is thus that of A A^T with J J^T in its place, as
-    long as J has full rank. Far from it, and with slack tendons, nothing is claimed.
+    in the feedback. Near a set point, the law is stable as with A A^T if J has full rank. This does
+    not hold far from the set point or with slack tendons.
 
-    A learned delay of the input stays in the loop as dead time and bounds the gains.
+    A learned delay of the input stays in the loop as dead time and limits the gains.
 
     Args:
         model: the mechanical system whose terms the law uses, in float64.
@@ -114,16 +114,16 @@ class ModelBasedLaw(Controller):
     ) -> Tensor:
         """Return u ``(*batch, M)`` by the formula alone, without checks and side effects.
 
-        If the force is not linear in u, the law takes all steps of its solver from ``u_previous``,
-        the u of the instant before.
+        If the force is not linear in u, the solver takes all its steps from ``u_previous``, the u
+        of the previous instant.
 
         Raises:
             ValueError: on such a force without ``u_previous``.
         """
         if u_previous is None and not self.model.input_affine:
             raise ValueError(
-                "the force of the model is not linear in u: the law needs u_previous, the u of the "
-                "instant before, as its sixth argument"
+                "the force of the model is not linear in u: pass the u of the previous instant as "
+                "u_previous, the sixth argument"
             )
         reference = Motion(q_ref, v_ref, a_ref)
         return self._input(q, v, reference, u_previous, all_steps=True)[0]
@@ -169,17 +169,17 @@ class ModelBasedLaw(Controller):
     def diagnostics(self) -> dict[str, Tensor]:
         """Return ``input_condition``, the condition number of A(q) or J, ``(*batch,)``.
 
-        And ``input_residual``, |f(q, v, u*) - tau| in the units of the force, not linear in u.
+        ``input_residual`` is |f(q, v, u*) - tau| in the units of the force, not linear in u.
         """
         if self._condition is None:
             return {}
         numbers = {"input_condition": self._condition}
-        return numbers | (
-            {} if self._solution is None else {"input_residual": self._solution.residual}
-        )
+        if self._solution is not None:
+            numbers["input_residual"] = self._solution.residual
+        return numbers
 
     def faults(self) -> dict[str, Tensor]:
-        """Return where A(q) or J is nearly singular or NaN, and where no input gives the force."""
+        """Return, by reason, where A(q) or J is nearly singular or NaN, or u* does not exist."""
         if self._condition is None:
             return {}
         if self._solution is not None and not self._solution.converged.all():
@@ -200,9 +200,9 @@ class ProportionalDerivative(ModelBasedLaw):
 
         u = A(q)^T (K_P (q_ref - q) + K_D (v_ref - v))
 
-    Of the model only A is used; with A = I, torques at the joints, nothing of it. A force that is
-    not linear in u has J at a typical input u_0 instead, and u_0 is added. Arguments and errors:
-    :class:`ModelBasedLaw`. Units of the gains as for :class:`Regulation`.
+    The law uses A of the model only. For a force that is not linear in u, J at a typical input u_0
+    replaces A, and u_0 is added. Arguments and errors: :class:`ModelBasedLaw`. Units of the gains
+    as for :class:`Regulation`.
     """
 
     def _forces(self, q: Tensor, v: Tensor, reference: Motion) -> tuple[None, Tensor]:

@@ -22,7 +22,7 @@ from pinn_dyn.mechanics.arrays import pseudo_inverse_times
 log = logging.getLogger(__name__)
 
 _FIRST_ITERATIONS = 20  # times as many iterations at the first instant, without a previous plan
-_LARGEST_GAP = 0.1  # of a plan that counts as a solution
+_LARGEST_GAP = 0.1  # largest gap of a plan that counts as a solution
 _Values = float | Sequence[float] | None
 _Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
 
@@ -39,11 +39,11 @@ class _Memory(NamedTuple):
 class PredictiveControl(Controller):
     """Model predictive control with limits, through CasADi (``pip install 'pinn_dyn[mpc]'``).
 
-    At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starts
-    from the previous plan, and applies the first input of the plan. The law sees the reference
-    ahead of time if the loop calls :meth:`follow`, as :func:`close_loop` does.
+    At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starting
+    from the previous plan, and applies the first input of the plan. The plan follows the future
+    reference if the loop calls :meth:`follow`, as :func:`close_loop` does.
 
-    u_ref is A^+ times the inverse dynamics of the reference, within the limits; it is zero for a
+    u_ref is A^+ times the inverse dynamics of the reference, within the limits. It is zero for a
     force that is not linear in the input. If the solver fails, the law holds the last input.
 
     Args:
@@ -140,7 +140,7 @@ class PredictiveControl(Controller):
         elif len(self._memory) != len(states) or t < self._memory[0].t:
             raise ValueError(
                 f"t is {t:g} s for {len(states)} runs, after {self._memory[0].t:g} s for "
-                f"{len(self._memory)}: reset() the law before new runs, and give a rate, since it "
+                f"{len(self._memory)}: reset() the law before new runs, and set a rate, since it "
                 "cannot act in continuous time"
             )
         begin = time.perf_counter()
@@ -160,14 +160,14 @@ class PredictiveControl(Controller):
         return [memory.plan for memory in self._memory]
 
     def diagnostics(self) -> dict[str, Tensor]:
-        """Return ``solve_time`` in s, ``iterations``, and 0 or 1 for a failure or missed deadline.
+        """Return ``solve_time`` in s, ``iterations``, ``solver_failed`` and ``missed_deadline``.
 
-        A deadline is missed if the solver takes longer than the period of the loop.
+        Both marks are 0 or 1. A deadline is missed if a call takes longer than the loop's period.
         """
         return self._diagnostics
 
     def faults(self) -> dict[str, Tensor]:
-        """Return where the solver failed for longer than the horizon."""
+        """Return, by reason, the runs whose solver failed for longer than the horizon."""
         if not self._diagnostics:
             return {}
         failed = self._diagnostics["solver_failed"]
@@ -257,7 +257,10 @@ class PredictiveControl(Controller):
     def _guess(
         self, last: _Memory, period: float, x: np.ndarray, x_ref: np.ndarray, u_ref: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the previous plan, shifted; without, a straight line to the reference or rest."""
+        """Return the previous plan, shifted in time, or the first guess.
+
+        The first guess is a straight line to the reference, or rest after every second failure.
+        """
         steps = self.problem.steps
         if last.plan is None:
             share = np.linspace(1 / steps, 1, steps) * (last.failures % 2 == 0)

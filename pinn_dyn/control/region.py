@@ -88,7 +88,7 @@ class DataRegion:
         return torch.as_tensor(np.where(finite, nearest / self.radius, np.nan)).to(q)
 
     def nearest(self, q: Tensor, v: Tensor) -> Tensor:
-        """Return the distance ``()`` of a state ``(N,)``, by tensor operations to be exported."""
+        """Return the distance ``()`` of a state ``(N,)`` by tensor operations, for exports."""
         x = torch.cat([q, v])
         linear = [k for k in range(len(x)) if k not in self.angles]
         features = torch.cat([x[linear], x[self.angles].sin(), x[self.angles].cos()])
@@ -131,8 +131,8 @@ class Guarded(Controller):
         if fallback == "regulation":
             if not isinstance(law, ModelBasedLaw) or isinstance(law, ComputedTorque):
                 raise ValueError(
-                    f"fallback regulation needs gains in Nm/rad, which {type(law).__name__} has "
-                    "not: use the fallback hold"
+                    f"fallback regulation needs gains in Nm/rad, and those of "
+                    f"{type(law).__name__} have other units: use the fallback hold"
                 )
             self._regulation = Regulation(law.model, law.position_gain, law.velocity_gain)
         self.reset()
@@ -164,7 +164,7 @@ class Guarded(Controller):
         return u
 
     def fall_back(self, q: Tensor, v: Tensor, reference: Motion, u: Tensor, last: Tensor) -> Tensor:
-        """Return the input outside the data, ``(*batch, M)``; u is that of the law."""
+        """Return the input outside the data, ``(*batch, M)``, from the law's u and the last u."""
         if self.fallback == "hold":
             return last
         with torch.no_grad():

@@ -30,9 +30,9 @@ class SafeLaw:
     4. The actuator limits u.
 
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data) and 4 (not
-    finite). The memory is zero before the first call. It begins with the last u ``(M,)``; that of
-    an observer follows: 1 after the first call, r, M v and f + A u / 2, ``(N,)`` each. The observer
-    is the :class:`DisturbanceObserver` with the limits of the actuator, from input to input.
+    finite). The memory is zero before the first call. It holds the last u ``(M,)``. An observer
+    adds 1 after the first call, and r, M v and (f + A u) / 2, ``(N,)`` each. The observer
+    computes as :class:`DisturbanceObserver` with the limits of the actuator.
 
     Args:
         controller: a law of a model, also with an observer or a guard.
@@ -83,11 +83,7 @@ class SafeLaw:
         finite = u.abs().sum() < torch.inf  # CasADi takes u - u for zero, also of NaN
         status = status + NOT_FINITE * ~finite
         u = torch.where(finite, u, last)
-        applied = u
-        if self.actuator.rate is not None:
-            change = (self.period or 0.0) * torch.as_tensor(self.actuator.rate, dtype=u.dtype)
-            applied = torch.minimum(torch.maximum(u, last - change), last + change)
-        applied = self.actuator.limit(applied)
+        applied = self.actuator.limit(u, last, self.period or 0.0)
         status = status + LIMITED * ((applied != u).to(u).sum() > 0)
         if self.observer:
             after = finish(applied)

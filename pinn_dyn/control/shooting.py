@@ -12,7 +12,7 @@ from pinn_dyn.exports.casadi_function import casadi_function, import_casadi
 from pinn_dyn.exports.program import trace
 from pinn_dyn.mechanics import MechanicalSystem
 
-_STEP_SIZES = 0.5 ** np.arange(7)  # of the line search
+_STEP_SIZES = 0.5 ** np.arange(7)  # steps that the line search tries
 _CONVERGED = 1e-4  # largest change of a number in the last iteration, relative
 
 
@@ -152,8 +152,8 @@ class ShootingProblem:
             return solve_discrete_are(A, B, Q, R)
         except np.linalg.LinAlgError as error:
             raise ValueError(
-                f"no linear law holds the model at q = {x[:n].round(4).tolist()} ({error}): give "
-                "terminal_weight as a number"
+                f"no linear law holds the model at q = {x[:n].round(4).tolist()} ({error}): set "
+                "terminal_weight to a number"
             ) from error
 
     def solve(
@@ -169,12 +169,12 @@ class ShootingProblem:
         period: float,
         iterations: int,
     ) -> Plan:
-        """Return a plan from a state x0 ``(2N,)``, where u0 ``(M,)`` was applied before.
+        """Return a plan from a state.
 
         Args:
-            x0, u0, d: state, input before, and additional acceleration ``(N,)``.
+            x0, u0, d: state ``(2N,)``, previous input ``(M,)``, additional acceleration ``(N,)``.
             x_ref, u_ref: references ``(2N, S)`` and ``(M, S)``.
-            P: terminal weight.
+            P: terminal weight, ``(2N, 2N)``.
             guess: states and inputs of a plan to start from.
             period: time since u0 was applied, s.
             iterations: largest number of quadratic programs.

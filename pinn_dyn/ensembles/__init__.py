@@ -14,7 +14,7 @@ __all__ = ["Ensemble", "EnsembleData", "EnsembleLearner", "posterior_draws"]
 __getattr__ = lazy_attributes(
     __name__,
     {
-        "EnsembleData": "pinn_dyn.ensembles.data",
-        "EnsembleLearner": "pinn_dyn.ensembles.learner",
+        "pinn_dyn.ensembles.data": "EnsembleData",
+        "pinn_dyn.ensembles.learner": "EnsembleLearner",
     },
 )

@@ -62,7 +62,5 @@ __all__ = [
     "trajectory_figure",
 ]
 
-_VALIDATION = "pinn_dyn.evaluation.validation"
-__getattr__ = lazy_attributes(
-    __name__, {"RolloutFigures": _VALIDATION, "RolloutValidator": _VALIDATION}
-)
+_NAMES = {"pinn_dyn.evaluation.validation": "RolloutFigures RolloutValidator"}
+__getattr__ = lazy_attributes(__name__, _NAMES)

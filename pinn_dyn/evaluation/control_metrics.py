@@ -39,8 +39,8 @@ class ClosedLoopMetrics(NamedTuple):
             - ``input_rms``, ``input_peak``, ``input_square_integral`` (integral of |u|^2 over a
               run), ``input_variation_per_s`` (path length of u per second);
             - ``saturated_...``: control instants of all runs with an input at a limit;
-            - ``solve_time_...``, ``missed_deadlines``, ``solver_failures``: of predictive control,
-              over the control instants of all runs; the largest time without the first instant.
+            - ``solve_time_...``, ``missed_deadlines``, ``solver_failures``: of predictive control
+              over all control instants; the largest time leaves out the first instant.
         coordinates: one row per coordinate: RMS and largest error, and overshoot *.
         inputs: one row per input: RMS, peak and integral of the square.
     """

@@ -96,7 +96,7 @@ class Constants:
 
 
 class _Buffers:
-    """Names of arrays on the stack. An array is used again once its values are not needed."""
+    """Names of arrays on the stack. Arrays whose values are not needed any more are reused."""
 
     def __init__(self) -> None:
         self.sizes: dict[str, tuple[str, int]] = {}
@@ -150,11 +150,11 @@ class CFunction:
         self._inlined = {node for node in nodes if self._has_one_use(node) and node not in results}
         statements = [node for node in nodes if node not in self._inlined]
         last = {pointer: k for k, node in enumerate(statements) for pointer in self._reads(node)}
-        kept = {pointer for node in results for pointer in self._reads(node)}
+        results_of = {pointer for node in results for pointer in self._reads(node)}
         for k, node in enumerate(statements):
             self._write(node)
             for pointer in self._reads(node):
-                if last[pointer] == k and pointer not in kept and pointer in self._arrays:
+                if last[pointer] == k and pointer not in results_of and pointer in self._arrays:
                     self._buffers.release(self._arrays.pop(pointer))
         for name, node in zip(program.outputs, results, strict=True):
             value = torch.empty(node.meta["val"].shape)

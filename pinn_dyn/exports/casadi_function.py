@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, fx
 
-from pinn_dyn.exports.program import Program
+from pinn_dyn.exports.program import MOVES, Program, operation, unsupported
 
 if TYPE_CHECKING:
     import casadi
@@ -24,10 +24,6 @@ _NAMES |= {"logical_not": "logic_not", "logical_and": "logic_and", "logical_or":
 _NAMES |= {"bitwise_not": "logic_not", "bitwise_and": "logic_and", "bitwise_or": "logic_or"}
 _SAME = "sqrt exp expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh erf sign floor"
 _NAMES |= {name: name for name in f"{_SAME} lt le gt ge eq ne".split()}
-# Operations that put numbers at other positions.
-_MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
-_MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias clone detach"
-_MOVES += " copy _to_copy slice_scatter select_scatter"
 
 
 def casadi_function(program: Program, name: str) -> casadi.Function:
@@ -69,13 +65,13 @@ def write_casadi(
 ) -> Mapping[str, Callable[..., list[np.ndarray]]]:
     """Write a function for ``casadi.Function.load``, and return it as read from the file.
 
-    A file holds a single function, of doubles, and no text.
+    The file does not hold ``info``.
 
     Raises:
-        ValueError: on several functions, or on ``real="float"``.
+        ValueError: on ``real="float"``.
     """
-    if len(functions) != 1 or real != "double":
-        raise ValueError(f"{path} holds a single function of doubles: choose them, or write a .c")
+    if real != "double":
+        raise ValueError(f"{path}: CasADi computes with doubles: set real='double', or write a .c")
     (function,) = functions
     casadi_function(function.program, function.name).save(str(path))
     loaded = import_casadi().Function.load(str(path))
@@ -94,8 +90,8 @@ class _Writer:
         arguments: list[Any] = list(node.args)
         if target is operator.getitem:
             return self.values[arguments[0]][arguments[1]]
-        name = target._schema.name.split("::")[1]
-        if name in _MOVES.split():
+        name = operation(node)
+        if name in MOVES.split() or name in ("clone", "_to_copy"):
             return self._moved(target, arguments, node.kwargs)
         shape = node.meta["val"].shape
         if name == "constant_pad_nd":
@@ -180,9 +176,7 @@ class _Writer:
                 low, high = options.get("min", low), options.get("max", high)
                 value = x[0] if low is None else ca.fmax(x[0], low)
                 return value if high is None else ca.fmin(value, high)
-        raise TypeError(
-            f"CasADi has no operation {node.target}: the model cannot be exported to it"
-        )
+        raise unsupported(node, "CasADi")
 
 
 def _positions(node: Any, start: int = 0) -> Tensor:

@@ -23,6 +23,9 @@ Real = Literal["double", "float"]
 Calls = Mapping[str, Callable[..., Sequence[np.ndarray]]]
 """The functions of a written file by name, as called from Python."""
 
+Ranges = Mapping[str, tuple[Tensor, Tensor]]
+"""Smallest and largest values of inputs by name, for the states of the comparison."""
+
 TOLERANCES = {"double": 1e-9, "float": 1e-4}
 STATES = 200
 _WRITERS = {
@@ -34,7 +37,7 @@ ENDINGS = tuple(_WRITERS)
 
 
 class ExportedFunction:
-    """A function of one state, and the states at which its file is compared with it.
+    """A function of a single state, and the states where its file is compared with it.
 
     Args:
         name: the name in the file.
@@ -64,9 +67,10 @@ class ExportedFunction:
         return trace(self.function, example, self.outputs)
 
     def compare(self, call: Callable[..., Sequence[np.ndarray]], tolerance: float) -> None:
-        """Compare with a function of arrays; differences are relative.
+        """Compare with a function of arrays.
 
-        The scale is the norm of an output at the state, or its RMS over all states if larger.
+        A difference is relative to the norm of the output at the state, or to the RMS of the norms
+        over all states if this is larger.
 
         Raises:
             RuntimeError: if a difference exceeds the tolerance.
@@ -116,7 +120,7 @@ def write(
     Raises:
         RuntimeError: if the file differs from the functions by more than 1e-9 (double) or 1e-4
             (float), relative; no file is left.
-        TypeError: if the format lacks an operation.
+        TypeError: if the format does not have an operation.
     """
     module, writer = _WRITERS[path.suffix].split(":")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -133,6 +137,25 @@ def write(
         for file in Path(folder).iterdir():
             os.replace(file, path.parent / file.name)
     return path
+
+
+def drawn_states(
+    sizes: Mapping[str, int | None], ranges: Ranges | None = None
+) -> dict[str, Tensor]:
+    """Return 200 values of inputs by name, ``(200, size)``, or ``(200,)`` for the size None.
+
+    They are uniform within the range of an input, or [-1, 1], with a fixed seed. ``q_ref`` and
+    ``u_next`` have the ranges of ``q`` and ``u``.
+    """
+    generator = torch.Generator().manual_seed(0)
+    unit = torch.ones((), dtype=torch.float64)
+    values = {}
+    for name, size in sizes.items():
+        low, high = (ranges or {}).get(name.partition("_")[0], (-unit, unit))
+        shape = (STATES,) if size is None else (STATES, size)
+        share = torch.rand(shape, generator=generator, dtype=torch.float64)
+        values[name] = low + (high - low) * share
+    return values
 
 
 def identifier(text: str) -> str:

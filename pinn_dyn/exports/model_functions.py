@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from pinn_dyn.exports.exported import STATES, ExportedFunction
+from pinn_dyn.exports.exported import ExportedFunction, Ranges, drawn_states
 from pinn_dyn.mechanics import ContinuousPredictor, MechanicalSystem, Predictor
-
-Ranges = Mapping[str, tuple[Tensor, Tensor]]
-"""Smallest and largest values of inputs by name, for the states of the comparison."""
 
 
 def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[ExportedFunction]:
@@ -31,17 +28,9 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
         TypeError: on a model without these functions, such as an ensemble.
     """
     n, m = model.num_coordinates, model.num_inputs
-    sizes = {"q": n, "v": n, "a": n, "u": m, "u_next": m}
-    ranges = {"h": (torch.tensor(5e-4), torch.tensor(1.5e-3)), **(ranges or {})}
-    if "u" in ranges:
-        ranges = {"u_next": ranges["u"], **ranges}
-    generator = torch.Generator().manual_seed(0)
-    one = torch.ones((), dtype=torch.float64)
-
-    def states(name: str) -> Tensor:
-        low, high = ranges.get(name, (-one, one))
-        shape = (STATES,) if name == "h" else (STATES, sizes[name])
-        return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+    sizes = {"q": n, "v": n, "a": n, "u": m, "u_next": m, "h": None}
+    steps = torch.tensor([5e-4, 1.5e-3], dtype=torch.float64)
+    states = drawn_states(sizes, {"h": (steps[0], steps[1]), **(ranges or {})})
 
     def exported(name: str, inputs: str, outputs: str, about: str) -> ExportedFunction:
         def function(*values: Tensor) -> Tensor | tuple[Tensor, ...]:
@@ -50,9 +39,9 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
             result = available[name](**arguments, **none)
             return result if isinstance(result, Tensor) else tuple(x for x in result if x.numel())
 
-        names = [x for x in inputs.split() if x == "h" or sizes[x]]
+        names = [x for x in inputs.split() if sizes[x] != 0]
         results = [x for x in outputs.split() if x != "A" or m]
-        return ExportedFunction(name, function, {x: states(x) for x in names}, results, about)
+        return ExportedFunction(name, function, {x: states[x] for x in names}, results, about)
 
     def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         assert isinstance(model, ContinuousPredictor)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, fx
 
 from pinn_dyn.exports.exported import Calls, ExportedFunction, Real
-from pinn_dyn.exports.program import operation, unsupported
+from pinn_dyn.exports.program import MOVES, operation, unsupported
 
 OPSET = 18
 _SAME = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh erf floor sign sigmoid"
@@ -26,13 +26,10 @@ _ELEMENTWISE = {
     **{"logical_or": "Or", "bitwise_or": "Or", "mm": "MatMul", "clone": "Identity"},
 }
 _COMPOSED: dict[str, Callable[..., str]] = {
-    "log1p": lambda node, x, one: node("Log", [node("Add", [x, one])]),
-    "rsqrt": lambda node, x, one: node("Reciprocal", [node("Sqrt", [x])]),
-    "expm1": lambda node, x, one: node("Sub", [node("Exp", [x]), one]),
+    "log1p": lambda node, x, unit: node("Log", [node("Add", [x, unit])]),
+    "rsqrt": lambda node, x, unit: node("Reciprocal", [node("Sqrt", [x])]),
+    "expm1": lambda node, x, unit: node("Sub", [node("Exp", [x]), unit]),
 }
-_MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
-_MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias detach copy"
-_MOVES += " slice_scatter select_scatter constant_pad_nd getitem"
 _REDUCTIONS = {"sum": "ReduceSum", "mean": "ReduceMean", "amin": "ReduceMin", "amax": "ReduceMax"}
 
 
@@ -135,7 +132,7 @@ class _Writer:
         return self.names[x] if isinstance(x, fx.Node) else self.constant(x, dtype or self.dtype)
 
     def real(self, x: Any) -> str:
-        """Return an operand as a number, also that of a comparison."""
+        """Return an operand as a number, also the result of a comparison."""
         name = self.operand(x)
         if isinstance(x, fx.Node) and x.meta["val"].dtype in (torch.bool, torch.int64):
             kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(self.dtype))
@@ -144,11 +141,10 @@ class _Writer:
 
     def _write(self, node: fx.Node) -> Any:
         name, arguments = operation(node), cast(tuple[Any, ...], node.args)
-        if name in _MOVES.split():
+        if name in MOVES.split() or name in ("constant_pad_nd", "getitem"):
             return self._move(node)
         if name in _COMPOSED:
-            x, one = self.real(arguments[0]), self.operand(1.0)
-            return _COMPOSED[name](self.node, x, one)
+            return _COMPOSED[name](self.node, self.real(arguments[0]), self.operand(1.0))
         if name in _REDUCTIONS:
             x, dims, keep, *_ = (*arguments, None, False)
             axes = [self.constant(list(dims), np.int64)] if dims else []
@@ -182,7 +178,7 @@ class _Writer:
     def _move(self, node: fx.Node) -> Any:
         """Gather the numbers of a result from those of its operands.
 
-        The operation itself, applied to the positions of the numbers, says which.
+        The operation itself is applied to the positions of the numbers.
         """
         flat: list[str] = []
         count = 0

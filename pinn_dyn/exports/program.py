@@ -12,6 +12,10 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
 
+MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select"
+MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias detach copy"
+MOVES += " slice_scatter select_scatter"
+"""Operations that put numbers at other positions."""
 _OF_SHAPES_ALONE = (torch.ops.aten.full_like.default, torch.ops.aten.new_zeros.default)
 
 
@@ -63,11 +67,11 @@ def operation(node: fx.Node) -> str:
 
 
 def unsupported(node: fx.Node, form: str) -> TypeError:
-    """Return the error for an operation that a form of export lacks, with its place."""
+    """Return the error for an operation that an export does not have, with its line of code."""
     trace = (node.meta.get("stack_trace") or "").strip().split("\n")[0]
-    place = f", {trace[0].lower() + trace[1:]}" if trace else ""
+    line = f", {trace[0].lower() + trace[1:]}" if trace else ""
     return TypeError(
-        f"{node.target}{place}: {form} has no such operation, write the head with others"
+        f"{node.target}{line}: {form} has no such operation, write the head with others"
     )
 
 

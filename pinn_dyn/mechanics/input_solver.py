@@ -12,12 +12,13 @@ from torch import Tensor
 
 from pinn_dyn.mechanics.arrays import jacobians, matvec, spd_solve
 
-_LEAST, _FIRST, _SMALLER, _LARGER = 1e-10, 1e-2, 1e-1, 10.0  # damping mu, and its changes
+_SMALLEST, _FIRST = 1e-10, 1e-2  # damping mu, at the start and after the first failed step
+_SMALLER, _LARGER = 0.1, 10.0  # its changes after a step
 _SETTLED = 1e-4  # step relative to u of more inputs than coordinates
 
 
 class Solution(NamedTuple):
-    """Input u ``(*batch, M)``, J = dF/du there, |F(u) - tau|, and whether it is small enough."""
+    """Input u ``(*batch, M)``, J = dF/du at u, and |F(u) - tau| with its test ``(*batch,)``."""
 
     u: Tensor
     J: Tensor
@@ -31,12 +32,13 @@ class InputSolver:
 
         u <- clamp(u + d),    d = d_0 + W J^T (J W J^T + mu |J W^(1/2)|^2 / N)^-1 (tau - F - J d_0)
 
-    with J = dF/du, and each row of F, J and tau divided by the norm of the row of J at the start.
-    W = 1 and mu = 1e-10. A step that increases |tau - F| is not taken; then mu grows, and
-    W = 1/|J_j|^2 moves inputs with little effect, such as slack tendons (Levenberg 1944; Marquardt
-    1963). For M > N, d_0 = u_0 - u moves u
-    towards the solution closest to a typical input u_0. For M < N,
-    u has the least |F - tau|.
+    with J = dF/du. Rows of F, J and tau are divided by the norm of the row of J at the start. A
+    solution starts with W = 1 and mu = 1e-10. A step that increases |tau - F| is rejected. Then mu
+    grows, and W = 1/|J_j|^2 moves inputs with little effect, such as slack tendons. For M > N,
+    d_0 = u_0 - u leads to the solution closest to a typical input u_0; otherwise d_0 = 0. For
+    M < N, u minimizes |F - tau|.
+
+    Source: Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters".
 
     Args:
         tolerance: largest |F(u) - tau| relative to |tau| + |J| |u|.
@@ -71,14 +73,14 @@ class InputSolver:
         """
         if previous is None:
             return self._solve(force, tau, typical, typical, all_steps)
-        least = torch.full_like(tau[..., :1], _LEAST)
+        mu = torch.full_like(tau[..., :1], _SMALLEST)
         points = [_linear(force, torch.ones_like(tau), u) for u in (previous, typical)]
-        nearer = torch.lt(*(_norm(_step(x.J, tau - x.F, least)) for x in points))
-        start, other = previous.where(nearer, typical), typical.where(nearer, previous)
-        first = self._solve(force, tau, typical, start, all_steps)
+        nearer = torch.lt(*(_norm(_step(x.J, tau - x.F, mu)) for x in points))
+        near, far = previous.where(nearer, typical), typical.where(nearer, previous)
+        first = self._solve(force, tau, typical, near, all_steps)
         if not all_steps and bool(first.converged.all()):
             return first
-        second = self._solve(force, tau, typical, other, all_steps)
+        second = self._solve(force, tau, typical, far, all_steps)
         done = first.converged
         return Solution(
             first.u.where(done.unsqueeze(-1), second.u),
@@ -95,7 +97,7 @@ class InputSolver:
         start: Tensor,
         all_steps: bool,
     ) -> Solution:
-        least = mu = torch.full_like(tau[..., :1], _LEAST)
+        mu = torch.full_like(tau[..., :1], _SMALLEST)
         unit = torch.ones_like(tau)
         wide, tall = typical.shape[-1] > tau.shape[-1], typical.shape[-1] < tau.shape[-1]
         if not tall:
@@ -110,7 +112,7 @@ class InputSolver:
             better = _error(trial, tau) <= torch.maximum(_error(point, tau), enough)
             point = _chosen(better & ~settled, trial, point)
             mu = torch.where(better, _SMALLER * mu, (_LARGER * mu).clamp(min=_FIRST))
-            mu = torch.maximum(mu, least)
+            mu = mu.clamp(min=_SMALLEST)
             settled = settled | (_error(point, tau) <= enough)
             if wide:
                 settled = settled & (_norm(step) <= _SETTLED * _norm(point.u))
@@ -124,7 +126,7 @@ class InputSolver:
     def _limited_step(self, point: _Point, tau: Tensor, mu: Tensor, typical: Tensor) -> Tensor:
         J, r, u = point.J, tau - point.F, point.u
         wide = J.shape[-1] > J.shape[-2]
-        pull = (_LEAST / mu) ** 1.0 * (typical - u) if wide else torch.zeros_like(u)
+        pull = _SMALLEST / mu * (typical - u) if wide else torch.zeros_like(u)
         step = pull + _step(J, r - matvec(J, pull), mu)
         if self.low is None and self.high is None:
             return step

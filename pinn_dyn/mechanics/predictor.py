@@ -116,10 +116,10 @@ class ContinuousPredictor(Predictor):
             dx/dt = f(x, u),    A = df/dx,    B = df/du
             [[A_d, B_d], [0, 1]] = expm(T [[A, B], [0, 0]])      with a sample time T: x_k+1, held u
 
-        Deviations from (q, v, u) follow A and B where f = (v, dv/dt) is zero, or along a motion.
-        The state is (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs
-        of servos are targets; elastic joints have their motors in q. Dry friction enters by its
-        slope at v, largest at v = 0.
+        A and B describe deviations from an equilibrium (f = 0) or from a motion. The state is
+        (q, v), m or rad and m/s or rad/s, also of models that integrate (q, p). Inputs of servos
+        are targets; elastic joints have their motors in q. Dry friction enters by its slope at v,
+        which is largest at v = 0.
 
         Args:
             q, v: ``(*batch, N)``.
@@ -131,7 +131,7 @@ class ContinuousPredictor(Predictor):
         """
         if self.input_history:
             raise ValueError(
-                "the model has a learned input delay, which A and B of (q, v) lack: set its "
+                "the model has a learned input delay, which A and B do not contain: set its "
                 "attribute delay to None, and add the delay of learned_figures() to the design"
             )
         require_last_dim("q", q, self.num_coordinates, "N")

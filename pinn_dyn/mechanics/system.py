@@ -75,7 +75,7 @@ class MechanicalSystem(ContinuousPredictor):
         """Return A(q), ``(*batch, N, M)``."""
 
     def typical_input(self, q: Tensor) -> Tensor:
-        """Return an input, ``(*batch, M)``, to start from where the force is not linear in it."""
+        """Return an input ``(*batch, M)`` where the search for an input with a force starts."""
         return q.new_zeros(*q.shape[:-1], self.num_inputs)
 
     def _potential_force(self, q: Tensor) -> Tensor:
@@ -197,9 +197,9 @@ class MechanicalSystem(ContinuousPredictor):
         - M < N, under-actuated: the u of least ``|A u - tau|``. The acceleration is ``a`` only if
           tau lies in the range of A.
 
-        A force that is not linear in u is solved for u by :class:`InputSolver`; for M > N, u is
-        the solution closest to :meth:`typical_input`. With a learned delay, u acts later by the
-        delay. Entries are infinite or NaN where A loses its rank, or no input gives the force.
+        If the force is not linear in u, :class:`InputSolver` finds u; for M > N, the solution
+        closest to :meth:`typical_input`. With a learned delay, u acts after the delay. Entries are
+        infinite or NaN where A loses its rank, or no input gives the force.
 
         Raises:
             ValueError: on shapes, or a model that :meth:`require_invertible_input` refuses.
@@ -222,16 +222,16 @@ class MechanicalSystem(ContinuousPredictor):
         *,
         all_steps: bool = False,
     ) -> Solution:
-        """Return the input that gives a force at (q, v), see :class:`InputSolver`."""
+        """Return the input that gives the force tau ``(*batch, N)``, see :class:`InputSolver`."""
         force = partial(self._applied_force, q, v)
         return solver(force, tau, self.typical_input(q), previous, all_steps=all_steps)
 
     @final
     def require_invertible_input(self) -> None:
-        """Check that the model has inputs, and no residual force, which may depend on all of u.
+        """Check that the model has inputs, and no residual force, which may depend on u.
 
         Raises:
-            ValueError: on no input, or a residual.
+            ValueError: on a model without inputs, or with a residual force.
         """
         if not self.num_inputs:
             raise ValueError("the model has no inputs (u: []), so no control law can move it")

@@ -12,7 +12,7 @@ from pinn_dyn.systems.simulated_arm import SimulatedArm
 
 
 class _World:
-    """A PyBullet client that holds one arm, where only gravity and given torques act."""
+    """A PyBullet client that holds one arm, where only gravity and the applied torques act."""
 
     def __init__(self, text: str, gravity: tuple[float, ...]):
         import pybullet as bullet
@@ -33,7 +33,7 @@ class _World:
         undamped = {"linearDamping": 0, "angularDamping": 0, "jointDamping": 0}
         inertias = ET.fromstring(text).findall("link[@name!='base']//inertia")
         for joint, inertia in zip(self._joints, inertias, strict=True):
-            # The reader of PyBullet drops moments that no body has.
+            # The reader of PyBullet drops unphysical moments.
             moments = [float(inertia.get(key, 0.0)) for key in ("ixx", "iyy", "izz")]
             bullet.changeDynamics(body, joint, localInertiaDiagonal=moments, **undamped, **client)
         # PyBullet holds every joint by a velocity motor unless the motor has no force.

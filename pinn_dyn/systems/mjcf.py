@@ -124,12 +124,12 @@ def _unread(mujoco: Any, model: Any) -> list[str]:
     """Return what acts on the robot in MuJoCo but is not part of a URDF."""
     is_joint = model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)
     closed = model.eq_active0.astype(bool) & ~(is_joint & ~model.eq_data[:, 2:5].any(1))
-    found = {
+    effects = {
         "springs of joints": model.jnt_stiffness.any(),
         "gravity compensation": model.body_gravcomp.any(),
         "closed loops and nonlinear equalities": closed.any(),
     }
-    notes = [name for name, is_found in found.items() if is_found]
+    notes = [name for name, is_present in effects.items() if is_present]
     if not np.allclose(gravity := model.opt.gravity, [0, 0, -9.81], atol=0.02):
         text = ",".join(f"{x:g}" for x in gravity)
         notes.append(f"gravity (set model.structure.gravity=[{text}])")

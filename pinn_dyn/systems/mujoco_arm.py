@@ -10,7 +10,7 @@ from pinn_dyn.systems.simulated_arm import SimulatedArm
 
 
 class _World:
-    """A MuJoCo model of one arm, where only gravity and given torques act."""
+    """A MuJoCo model of one arm, where only gravity and the applied torques act."""
 
     def __init__(self, text: str, gravity: tuple[float, ...]):
         import mujoco
@@ -20,8 +20,8 @@ class _World:
         spec.option.gravity = gravity
         spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         moments = {}
-        # The compiler refuses moments that no body has, which other simulators take as they are.
-        for body in spec.bodies[2:]:  # behind the world and the base
+        # The compiler refuses unphysical moments, which other simulators accept.
+        for body in spec.bodies[2:]:  # after the world and the base
             moments[body.name] = body.fullinertia[:3].copy()
             body.fullinertia, body.inertia = [math.nan, 0, 0, 0, 0, 0], np.ones(3)
         model = self._model = spec.compile()
@@ -40,7 +40,7 @@ class _World:
     def step(self, force: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
         self._model.opt.timestep = step
         self._data.qfrc_applied[self._joints] = force
-        # Not mj_step, which starts again from zero where a motion diverges.
+        # mj_step would start again from zero when a motion diverges.
         self._mujoco.mj_forward(self._model, self._data)
         self._mujoco.mj_Euler(self._model, self._data)
         self.velocity = self._data.qvel[self._joints]

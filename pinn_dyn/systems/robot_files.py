@@ -110,8 +110,8 @@ def updated_urdf(robot: RigidChain, constants: RobotConstants, folder: Path) -> 
 def new_mjcf(robot: RigidChain, constants: RobotConstants, folder: Path) -> str:
     """Return an MJCF of the bodies, joints and drives of a robot, without shapes.
 
-    An actuator computes gain * ctrl and the bias, so that ctrl is the input of the model. The force
-    of a servo has a sharp limit. Joints that follow others are coupled by equalities.
+    An actuator computes gain * ctrl plus the bias, so that ctrl is the input of the model. The
+    force of a servo has a hard limit. Equalities couple the joints that follow others.
     """
     file, tree = UrdfFile(robot.urdf), robot.tree
     names = {file.ends[name][1]: name for name in file.joints}

@@ -48,9 +48,9 @@ class World(Protocol):
 class SimulatedArm(RigidChain):
     """A rigid chain with joint limits that a simulator moves in time steps of its own.
 
-    A subclass names the ``simulator`` (a Python package), how to ``install`` it, and the class of
-    its :class:`World`. Arms of the same URDF and gravity
-    share a world: set the state of each before its steps.
+    A subclass states the ``simulator`` (a Python package), the command to ``install`` it, and the
+    class of its :class:`World`. Arms of the same URDF and gravity share a world: call
+    :meth:`set_state` before the steps of an arm.
 
     Args:
         urdf, locked_joints, gravity, tip, mass_scale, payload: arguments of :class:`RigidChain`.
@@ -130,7 +130,7 @@ class SimulatedArm(RigidChain):
         self._world.put(q, v)
 
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return q and v, ``(N,)`` each, after a step of semi-implicit Euler under ``(N,)``, Nm::
+        """Return q and v, ``(N,)`` each, after ``step`` s under the torque u ``(N,)``, Nm::
 
         v_k+1 = v_k + step M^-1 (u_k - D v_k - C v_k - G),   q_k+1 = q_k + step v_k+1
         """

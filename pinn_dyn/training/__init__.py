@@ -38,9 +38,8 @@ __all__ = [
 __getattr__ = lazy_attributes(
     __name__,
     {
-        "COVARIANCE": "pinn_dyn.training.least_squares_learner",
-        "DynamicsLearner": "pinn_dyn.training.learner",
-        "LeastSquaresLearner": "pinn_dyn.training.least_squares_learner",
-        "WholeCheckpoints": "pinn_dyn.training.checkpoints",
+        "pinn_dyn.training.checkpoints": "WholeCheckpoints",
+        "pinn_dyn.training.learner": "DynamicsLearner",
+        "pinn_dyn.training.least_squares_learner": "COVARIANCE LeastSquaresLearner",
     },
 )

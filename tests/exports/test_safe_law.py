@@ -107,7 +107,7 @@ def test_casadi_and_onnx_files_guard_against_far_and_missing_measurements(law, t
 def test_gains_of_another_unit_do_not_fall_back(law):
     x = motion(50)
     region = DataRegion([x[0]], [x[1]])
-    with pytest.raises(ValueError, match="ComputedTorque has not: use the fallback hold"):
+    with pytest.raises(ValueError, match="ComputedTorque have other units: use the fallback hold"):
         Guarded(ComputedTorque(law.model, 1.0, 1.0), region, fallback="regulation")
     assert "hold" in FallBack.__args__
 
