@@ -113,7 +113,11 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         train = source.load().train
         sample_time = float(train[0].t[1] - train[0].t[0])
         self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
-        self.plant = _plant(robot)
+        if isinstance(robot, Run):
+            robot = ModelPlant(double_copy(robot.system), step=robot.statistics.step)
+        elif isinstance(robot, MechanicalSystem):
+            robot = SystemPlant(double_copy(robot))
+        self.plant = robot
         self.reward, self.steps = reward, max(1, round(duration / self.dt))
         q, v = (
             [x[:: max(1, len(x) // _SAMPLES)].double() for x in values]
@@ -160,12 +164,6 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _info(self) -> dict[str, Any]:
         return {"distance": float(self.region.distance(*self._state))}
-
-
-def _plant(robot: Run | MechanicalSystem | Plant) -> Plant:
-    if isinstance(robot, Run):
-        return ModelPlant(double_copy(robot.system), step=robot.statistics.step)
-    return SystemPlant(double_copy(robot)) if isinstance(robot, MechanicalSystem) else robot
 
 
 gymnasium.register("pinn_dyn/Robot-v0", entry_point="pinn_dyn.envs:RobotEnv")

@@ -146,7 +146,7 @@ class CFunction:
         for name, node in zip(program.inputs, graph.find_nodes(op="placeholder"), strict=True):
             scalar = node.meta["val"].ndim == 0
             self._arrays[_storage(node.meta["val"])] = f"(&{name})" if scalar else name
-        nodes = [node for node, value in program.nodes() if node.op == "call_function"]
+        nodes = [node for node in graph.nodes if node.op == "call_function"]
         self._inlined = {node for node in nodes if self._has_one_use(node) and node not in results}
         statements = [node for node in nodes if node not in self._inlined]
         last = {pointer: k for k, node in enumerate(statements) for pointer in self._reads(node)}
@@ -371,16 +371,10 @@ class CFunction:
 
     _repeat = _index = _index_select = _flip = _move
 
-    def _slice_scatter(
-        self, node: fx.Node, base: fx.Node, source: fx.Node, dim: int = 0, *part: int
-    ) -> None:
+    def _scatter(self, node: fx.Node, base: fx.Node, source: fx.Node, *part: int) -> None:
         value = self._declare(node)
         self._assign(value, base)
-        self._assign(torch.ops.aten.slice(value, dim, *part), source)
+        view = getattr(torch.ops.aten, operation(node).removesuffix("_scatter"))
+        self._assign(view(value, *part), source)
 
-    def _select_scatter(
-        self, node: fx.Node, base: fx.Node, source: fx.Node, dim: int, position: int
-    ) -> None:
-        value = self._declare(node)
-        self._assign(value, base)
-        self._assign(value.select(dim, position), source)
+    _slice_scatter = _select_scatter = _scatter

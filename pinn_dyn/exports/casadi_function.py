@@ -98,33 +98,23 @@ class _Writer:
             source, pads, *fill = arguments
             index = torch.constant_pad_nd(_positions(source) + 1, pads, 0)
             return self.ca.vertcat(*(fill or [0.0]), self.values[source])[_flat(index)]
-        if name in ("mm", "bmm", "addmm"):
-            *bias, a, b = arguments
-            product = self._product(a, b)
-            return product + self._operand(bias[0], shape) if bias else product
-        if name in ("sum", "amin", "amax"):
-            source, dims, *_ = arguments
+        if name == "mm":
+            return self.ca.vec(self.ca.mtimes(*map(self.matrix, reversed(arguments))))
+        if name in ("sum", "mean", "amin", "amax"):
+            source, dims, *_ = (*arguments, None)
             positions = _positions(source)
-            axes = [d % positions.ndim for d in dims]
+            axes = [d % positions.ndim for d in dims or range(positions.ndim)]
             order = [*(d for d in range(positions.ndim) if d not in axes), *axes]
             numbers = self.values[source][_flat(positions.permute(order))]
             columns = self.ca.reshape(numbers, -1, shape.numel())
-            if name == "sum":
-                return self.ca.sum1(columns).T
-            smaller_or_larger = self.ca.fmin if name == "amin" else self.ca.fmax
-            return functools.reduce(smaller_or_larger, self.ca.vertsplit(columns)).T
+            if name in ("sum", "mean"):
+                return self.ca.sum1(columns).T / (columns.size1() if name == "mean" else 1)
+            return functools.reduce(getattr(self.ca, f"f{name[1:]}"), self.ca.vertsplit(columns)).T
         return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
 
     def matrix(self, node: fx.Node) -> Any:
         """Return the transpose of a matrix: CasADi stores columns."""
         return self.ca.reshape(self.values[node], node.meta["val"].shape[1], -1)
-
-    def _product(self, a: fx.Node, b: fx.Node) -> Any:
-        (m, k), n = a.meta["val"].shape[-2:], b.meta["val"].shape[-1]
-        left = self.ca.reshape(self.values[a], k, -1)
-        right = self.ca.reshape(self.values[b], n, -1)
-        pairs = zip(self.ca.horzsplit(left, m), self.ca.horzsplit(right, k), strict=True)
-        return self.ca.veccat(*(self.ca.mtimes(y, x) for x, y in pairs))
 
     def _moved(self, target: Any, arguments: list[Any], options: Mapping[str, Any]) -> Any:
         """Return the numbers at the positions to which the operation puts their indices."""

@@ -10,6 +10,8 @@ from torch import Tensor
 from pinn_dyn.exports.exported import ExportedFunction, Ranges, drawn_states
 from pinn_dyn.mechanics import ContinuousPredictor, MechanicalSystem, Predictor
 
+Outputs = Tensor | tuple[Tensor, ...]
+
 
 def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[ExportedFunction]:
     """Return the functions of a model in float64, without gradients.
@@ -32,18 +34,21 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     steps = torch.tensor([5e-4, 1.5e-3], dtype=torch.float64)
     states = drawn_states(sizes, {"h": (steps[0], steps[1]), **(ranges or {})})
 
-    def exported(name: str, inputs: str, outputs: str, about: str) -> ExportedFunction:
-        def function(*values: Tensor) -> Tensor | tuple[Tensor, ...]:
+    def exported(
+        function: Callable[..., Outputs], inputs: str, outputs: str, about: str
+    ) -> ExportedFunction:
+        def of_present_inputs(*values: Tensor) -> Outputs:
             arguments = dict(zip(names, values, strict=True))
             none = {x: values[0].new_zeros(0) for x in inputs.split() if x not in names}
-            result = available[name](**arguments, **none)
+            result = function(**arguments, **none)
             return result if isinstance(result, Tensor) else tuple(x for x in result if x.numel())
 
         names = [x for x in inputs.split() if sizes[x] != 0]
         results = [x for x in outputs.split() if x != "A" or m]
-        return ExportedFunction(name, function, {x: states[x] for x in names}, results, about)
+        values = {x: states[x] for x in names}
+        return ExportedFunction(function.__name__, of_present_inputs, values, results, about)
 
-    def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
+    def forward_dynamics(q: Tensor, v: Tensor, u: Tensor) -> Tensor:
         assert isinstance(model, ContinuousPredictor)
         return model.state_derivative(torch.cat([q, v]), u)[n:]
 
@@ -59,32 +64,24 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
         x = torch.cat([q, v])
         return (x + model.increment(x, u, u_next)).split(n)  # type: ignore[operator]
 
-    available: dict[str, Callable[..., Tensor | tuple[Tensor, ...]]] = {
-        "step": step,
-        "next_state": next_state,
-    }
-    forward = ("forward_dynamics", "q v u", "a", "Acceleration a.")
+    functions: list[tuple[Callable[..., Outputs], str, str, str]]
+    last = (step, "q v u h", "q_next v_next", "State after h seconds, u held.")
     if isinstance(model, MechanicalSystem):
-        available |= {
-            "forward_dynamics": model.forward_dynamics,
-            "inverse_dynamics": model.inverse_dynamics,
-            "terms": model.terms,
-        }
+        force, terms = "Force tau = M a + C v + G + D v + F.", "M, D, G and A, matrices row by row."
         functions = [
-            forward,
-            ("inverse_dynamics", "q v a", "tau", "Force tau = M a + C v + G + D v + F."),
-            ("terms", "q", "M D G A", "Terms M, D, G and A, matrices row by row."),
+            (model.forward_dynamics, "q v u", "a", "Acceleration a."),
+            (model.inverse_dynamics, "q v a", "tau", force),
+            (model.terms, "q", "M D G A", terms),
+            last,
         ]
     elif isinstance(model, ContinuousPredictor):
-        available["forward_dynamics"] = acceleration
-        functions = [forward]
+        functions = [(forward_dynamics, "q v u", "a", "Acceleration a."), last]
     elif hasattr(model, "increment"):
         about = f"State after {model.fixed_step:g} s, with u at its start and end."
-        return [exported("next_state", "q v u u_next", "q_next v_next", about)]
+        functions = [(next_state, "q v u u_next", "q_next v_next", about)]
     else:
         raise TypeError(
             f"a {type(model).__name__} has no function of a state to export; export a single model,"
             " such as run.members[0] of an ensemble"
         )
-    functions.append(("step", "q v u h", "q_next v_next", "State after h seconds, u held."))
     return [exported(*function) for function in functions]

@@ -44,14 +44,6 @@ class Program:
         """Return the outputs in eager PyTorch."""
         return self.graph_module(*arguments)
 
-    def nodes(self) -> list[tuple[fx.Node, Tensor]]:
-        """Return the operations and constants in order, each with its example value."""
-        return [
-            (node, node.meta["val"])
-            for node in self.graph_module.graph.nodes
-            if node.op in ("call_function", "get_attr") and isinstance(node.meta["val"], Tensor)
-        ]
-
     def results(self) -> list[fx.Node]:
         """Return the nodes of the outputs."""
         (output,) = self.graph_module.graph.find_nodes(op="output")

@@ -169,7 +169,7 @@ def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
 def test_continuous_time_is_refused(law):
     start = double([[0.0]]), double([[0.0]])
     settings = {"duration": 0.2, "samples_rate": 20.0}
-    with pytest.raises(ValueError, match="give a rate"):
+    with pytest.raises(ValueError, match="set a rate"):
         close_loop_continuous(Pendulum(), law, SetPoint([1.0]), *start, **settings)
 
 
