@@ -122,8 +122,8 @@ class ModelBasedLaw(Controller):
         """
         if u_previous is None and not self.model.input_affine:
             raise ValueError(
-                "the force of the model is not linear in u: pass the u of the previous instant as "
-                "u_previous, the sixth argument"
+                "the force of the model is not linear in u: the law needs u_previous, the u of the "
+                "previous instant, as its sixth argument"
             )
         reference = Motion(q_ref, v_ref, a_ref)
         return self._input(q, v, reference, u_previous, all_steps=True)[0]
