@@ -108,7 +108,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         robot = load(robot) if isinstance(robot, (str, Path)) else robot
         data = robot if data is None and isinstance(robot, Run) else data
         if data is None:
-            raise TypeError("data is missing: a robot that is not a run needs training data")
+            raise TypeError("a robot that is not a run needs training data: set data")
         source = data.source if isinstance(data, Run) else data
         train = source.load().train
         sample_time = float(train[0].t[1] - train[0].t[0])
