@@ -93,7 +93,9 @@ def _export_robot(model: Predictor, path: Path) -> Path:
     chain = getattr(structure, "chain", structure)  # the links of elastic joints
     if not isinstance(model, KnownMechanics) or not isinstance(chain, RigidChain):
         kind = type(model).__name__
-        reason = "its network would be lost" if isinstance(model, KnownAndNetwork) else "no bodies"
+        reason = (
+            "its network would be lost" if isinstance(model, KnownAndNetwork) else "nothing fitted"
+        )
         raise TypeError(f"a {kind} has no robot file ({reason}): export a run of model=known")
     if path.suffix == ".xml" and (model.elastic or model.num_inputs > len(model.driven)):
         kind = "elastic joints" if model.elastic else "feed-forward forces"

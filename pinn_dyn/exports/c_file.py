@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import os
+import shlex
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
@@ -93,7 +94,8 @@ def _signature(function: ExportedFunction, name: str, real: Real) -> str:
 def _compiled(path: Path) -> ctypes.CDLL | None:
     """Compile a C file and load it; return None, with a warning, without a compiler."""
     names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    compiler = next(filter(None, map(shutil.which, names)), None)
+    commands = [shlex.split(name) for name in names]  # CC may hold options
+    compiler = next((words for words in commands if shutil.which(words[0])), None)
     if compiler is None:
         log.warning(
             "%s was not compared with the model: no C compiler (%s) is installed, set CC to one",
@@ -104,12 +106,13 @@ def _compiled(path: Path) -> ctypes.CDLL | None:
     library = path.with_suffix(".so")
     flags = ["-std=c99", "-O1", "-fPIC", "-shared", "-o", library.name]
     result = subprocess.run(
-        [compiler, *flags, path.name, "-lm"], cwd=path.parent, capture_output=True, text=True
+        [*compiler, *flags, path.name, "-lm"], cwd=path.parent, capture_output=True, text=True
     )
     if result.returncode:
         lines = [*result.stderr.splitlines(), "no message"]
         problem = next((line for line in lines if "error" in line), lines[0])
-        raise RuntimeError(f"{compiler} does not compile {path.name}: {problem}; set CC to another")
+        name = shlex.join(compiler)
+        raise RuntimeError(f"{name} does not compile {path.name}: {problem}; set CC to another")
     loaded = ctypes.CDLL(str(library))
     library.unlink()
     return loaded
