@@ -102,6 +102,10 @@ def test_the_posture_is_the_nearest_and_a_circle_closes(arm, helix):
 
 
 @pytest.mark.parametrize("changes", [{"pitch": 2.0}, {"radius": 0.3, "turns": 0.5}])
-def test_a_helix_out_of_reach_is_refused(arm, changes):
-    with pytest.raises(ValueError, match=r"the (arm cannot follow|tip misses) the helix"):
+def test_a_helix_out_of_reach_is_refused_and_a_smaller_one_is_not(arm, changes):
+    with pytest.raises(
+        ValueError, match=r"the (arm cannot follow|tip misses) the helix.*take a smaller radius"
+    ):
         Helix(arm, POSTURE, **{**FAST, **changes})
+    smaller = {name: value if name == "turns" else value / 10 for name, value in changes.items()}
+    assert Helix(arm, POSTURE, **{**FAST, **smaller}).path_error < 1e-3
