@@ -105,12 +105,13 @@ def limits(values: Tensor, margin: float = 0.3) -> tuple[float, float]:
 
 
 def log_limits(curves: Sequence[Tensor]) -> tuple[float, float]:
-    """Return the ends of a logarithmic axis: three decades on both sides of the best curve."""
+    """Return the ends of a logarithmic axis: three decades around the best curve, and its top."""
     positive = [curve[(curve > 0) & torch.isfinite(curve)].double() for curve in curves]
     positive = [curve for curve in positive if len(curve)] or [torch.ones(1)]
-    best = min(float(curve.median()) for curve in positive)
+    best, top = min((float(curve.median()), float(curve.max())) for curve in positive)
     values = torch.cat(positive)
-    low, high = max(float(values.min()), 1e-3 * best), min(float(values.max()), 1e3 * best)
+    low = max(float(values.min()), 1e-3 * best)
+    high = min(float(values.max()), max(1e3 * best, top))
     return low / 1.5, 1.5 * high
 
 

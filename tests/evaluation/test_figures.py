@@ -22,7 +22,7 @@ from pinn_dyn.evaluation import (
     tip_path_figure,
     trajectory_figure,
 )
-from pinn_dyn.evaluation.plots import BASELINE
+from pinn_dyn.evaluation.plots import BASELINE, log_limits
 from pinn_dyn.mechanics import Signal, Trajectory
 from pinn_dyn.systems import SoftArm
 
@@ -186,3 +186,10 @@ def test_a_sweep_has_a_line_through_the_means_over_seeds():
     np.testing.assert_allclose(drawn["lnn (1 of 6 diverged)"].get_ydata(), [3.0, 0.2, 0.02])
     np.testing.assert_allclose(drawn["mlp"].get_ydata(), [20.0, 2.0, 0.2])
     assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+
+
+def test_a_logarithmic_axis_shows_where_a_converging_curve_starts():
+    fast = torch.logspace(0, -8, 100)  # the error of a control law
+    low, high = log_limits([fast, 1e6 * torch.ones(100)])
+    assert low < 1e-6
+    assert 1 <= high < 10
