@@ -115,7 +115,7 @@ class ModelBasedLaw(Controller):
         """Return u ``(*batch, M)`` by the formula alone, without checks and side effects.
 
         If the force is not linear in u, the solver takes all its steps from ``u_previous``, the u
-        of the previous instant.
+        of the previous instant. u is NaN where no input gives the force.
 
         Raises:
             ValueError: on such a force without ``u_previous``.
@@ -158,7 +158,8 @@ class ModelBasedLaw(Controller):
             u = u + matvec(A.transpose(-1, -2), feedback)
         if solution is not None:
             held = model.typical_input(q) if previous is None else previous
-            held = held + 0 * solution.residual.unsqueeze(-1)  # NaN for a NaN state
+            # NaN for a NaN state, and for the formula alone.
+            held = held + (torch.nan if all_steps else 0 * solution.residual.unsqueeze(-1))
             u = torch.where(solution.converged.unsqueeze(-1), u, held)
         return u, A, solution
 

@@ -168,7 +168,7 @@ class Guarded(Controller):
         if self.fallback == "hold":
             return last
         with torch.no_grad():
-            return self._regulation.law(q, v, *reference) if self.fallback else u
+            return self._regulation.law(q, v, *reference, last) if self.fallback else u
 
     def diagnostics(self) -> dict[str, Tensor]:
         """Return those of the law, ``distance``, and ``outside`` as 0 or 1."""

@@ -72,7 +72,7 @@ class SafeLaw:
         m = self.law.num_inputs
         reference = Motion(q_ref, v_ref, a_ref)
         last, memory = memory_in[:m], memory_in[m:]
-        u = self.law.law(q, v, *reference)
+        u = self.law.law(q, v, *reference, last)
         if self.observer:
             u, finish = self._observed(self.observer, q, v, u, last, memory)
         status = torch.zeros_like(q[0])

@@ -16,7 +16,11 @@ MOVES = "view _unsafe_view reshape permute transpose t expand unsqueeze squeeze 
 MOVES += " diagonal repeat index index_select cat split_with_sizes unbind flip alias detach copy"
 MOVES += " slice_scatter select_scatter"
 """Operations that put numbers at other positions."""
-_OF_SHAPES_ALONE = (torch.ops.aten.full_like.default, torch.ops.aten.new_zeros.default)
+_OF_SHAPES_ALONE = (
+    torch.ops.aten.full_like.default,
+    torch.ops.aten.new_zeros.default,
+    torch.ops.aten._new_zeros_with_same_feature_meta.default,
+)
 
 
 class Program:

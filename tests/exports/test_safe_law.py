@@ -11,10 +11,13 @@ from pinn_dyn.control import (
     DisturbanceObserver,
     Guarded,
     Motion,
+    Regulation,
     Tracking,
     export_law,
 )
 from pinn_dyn.control.region import FallBack
+from pinn_dyn.mechanics import InputSolver
+from pinn_dyn.systems import TendonArm
 from tests.models.builders import VARIANTS, make_structured
 from tests.support.c_code import function_of
 
@@ -162,3 +165,20 @@ def test_what_a_file_cannot_hold_is_refused(law, tmp_path, caplog):
     with pytest.raises(TypeError, match="DisturbanceObserver has a memory: export it to"):
         export_law(DisturbanceObserver(law, 20.0), tmp_path / "law.pt2")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_law_that_solves_for_its_input_starts_from_the_last(tmp_path):
+    arm = TendonArm()
+    law = Regulation(arm, [3.0, 3.0, 0.3], [0.1, 0.1, 0.003], solver=InputSolver(steps=2))
+    call = function_of(export_law(law, tmp_path / "law.c"), "law_control")
+    q, zero = torch.tensor([0.05, -0.1, -0.02]).double(), torch.zeros(3).double()
+    previous = 0.95 * arm.input_for(q, zero, zero)
+    for q_ref, status in ((1.05 * q, 0), (torch.nan * q, 4)):
+        u, memory, flags = call(*(x.numpy() for x in (q, zero, q_ref, zero, zero, previous)))
+        expected = previous if status else law.law(q, zero, q_ref, zero, zero, previous)
+        np.testing.assert_allclose(u, expected, rtol=1e-9)
+        assert flags == status
+        np.testing.assert_array_equal(memory, u)
+    law = Regulation(arm, 3.0, 0.1, solver=InputSolver(low=5.0, high=5.1))
+    assert law.law(q, zero, q, zero, zero, previous).isnan().all()  # no input gives the force
