@@ -14,7 +14,7 @@ from pinn_dyn.exports.exported import ENDINGS, Ranges, Real, write
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Predictor, double_copy
 from pinn_dyn.models import KnownAndNetwork, KnownMechanics, Statistics
-from pinn_dyn.systems import RigidChain
+from pinn_dyn.systems import HasDomain, RigidChain
 from pinn_dyn.systems.robot_files import RobotConstants, new_mjcf, updated_urdf
 
 _WRITERS = {".urdf": updated_urdf, ".xml": new_mjcf}
@@ -43,7 +43,7 @@ def export(
             ``forward_dynamics``, or ``next_state`` of a model without it.
         real: type of the numbers in a ``.c`` or ``.onnx`` file.
         statistics: of the training data. The file is compared with the model in their ranges, or
-            within [-1, 1].
+            within [-1, 1] and the domain of the equation of motion.
         about: fields for the information in the file, such as names of coordinates.
 
     Raises:
@@ -59,7 +59,8 @@ def export(
         endings = ", ".join([*ENDINGS, *_WRITERS])
         raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
     model = double_copy(model).requires_grad_(False)
-    functions = model_functions(model, None if statistics is None else ranges_of(statistics))
+    ranges = _within_domain(model) if statistics is None else ranges_of(statistics)
+    functions = model_functions(model, ranges)
     names = [function.name for function in functions]
     if what is None and path.suffix != ".c":
         what = names[0]
@@ -86,6 +87,19 @@ def ranges_of(statistics: Statistics) -> Ranges:
         "u": (u - 2 * statistics.u_std, u + 2 * statistics.u_std),
         "h": (0.5 * h, h),
     }
+
+
+def _within_domain(model: Predictor) -> Ranges:
+    """Return a range of q in which the equation of motion holds, at most [-1, 1]."""
+    radius = torch.ones(model.num_coordinates, dtype=torch.float64)
+    if isinstance(model, HasDomain):
+        for _ in range(10):
+            try:
+                model.check_domain(-radius.numpy(), radius.numpy())
+                break
+            except ValueError:
+                radius = radius / 2
+    return {"q": (-radius, radius)}
 
 
 def _export_robot(model: Predictor, path: Path) -> Path:
