@@ -74,7 +74,9 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["guard"].get("threshold") is not None:
         if not isinstance(laws["learned"], ModelBasedLaw | PredictiveControl):
-            raise ConfigError("a guard takes no observer: leave out guard or the observer")
+            raise ConfigError(
+                "a guard takes no observer: leave out guard.threshold or the observer"
+            )
         laws["learned"] = _guarded(laws["learned"], config, source)
     if config["export"]:
         _export(laws[config["exported_law"]], run, config)
