@@ -206,7 +206,7 @@ def test_a_force_that_no_input_gives_is_a_fault_of_its_row_that_holds_the_input(
 
 def test_the_formula_takes_the_previous_input_and_can_be_recorded():
     model, q, v, motion = reachable_states()
-    law = Tracking(model, 2.0, 0.5, solver=InputSolver(steps=2))
+    law = Tracking(model, 2.0, 0.5, solver=InputSolver(steps=6))
     u = 0.99 * Tracking(model, 2.0, 0.5)(0.0, q, v, motion)
 
     def state(k):
