@@ -41,11 +41,11 @@ def model_builder(config: dict[str, Any]) -> ModelBuilder:
 
 def training_arguments(config: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Build the arguments of :func:`~pinn_dyn.train` from the configuration of train.py."""
+    from pinn_dyn.app.trainer import tensorboard  # imports Lightning, which takes seconds
+
     optimizer = config["optimizer"]
     settings = {k: x for k, x in config["trainer"].items() if not k.startswith("_")}
     builders = ("data", "loss", "scheduler", "validator")
-    from pinn_dyn.app.trainer import tensorboard  # imports Lightning, which takes seconds
-
     return {
         "source": build_source(config),
         "model": model_builder(config),

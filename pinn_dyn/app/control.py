@@ -199,6 +199,6 @@ def _initial_states(config: dict[str, Any]) -> tuple[Tensor | None, Tensor | Non
 def _guarded(law: Controller, config: dict[str, Any], source: DataSource) -> Controller:
     train = source.load().train
     q, v = ([_thinned(getattr(item, name)) for item in train] for name in ("q", "v"))
-    model = (law.law if isinstance(law, DisturbanceObserver) else law).model  # type: ignore
+    model = (law.law if isinstance(law, DisturbanceObserver) else law).model  # type: ignore[attr-defined]
     region = DataRegion(q, v, angles=getattr(model, "angles", source.angles))
     return Guarded(law, region, **config["guard"])

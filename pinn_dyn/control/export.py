@@ -137,7 +137,7 @@ def _export_package(controller: Controller, path: Path, limited: bool) -> Path:
     if limited or isinstance(controller, Guarded):
         log.warning("%s holds no limits and no guard of the input: use .c or .onnx", path.name)
     controller = controller.law if isinstance(controller, Guarded) else controller
-    if not isinstance(controller, ModelBasedLaw):
+    if not isinstance(controller, ModelBasedLaw) or not controller.model.input_affine:
         raise TypeError(f"{type(controller).__name__} has a memory: export it to .c or .onnx")
     generator = torch.Generator().manual_seed(0)
     shape = (_CHECKS, len(INPUTS), controller.num_coordinates)

@@ -61,13 +61,7 @@ class _World:
 
 
 class BulletArm(SimulatedArm):
-    """An arm of N joints with motors and viscous friction, moved by PyBullet::
-
-        M(q) dv/dt + C(q, v) v + G(q) + damping v = u
-
-    q ``(*batch, N)`` rad, v rad/s, u motor torques ``(*batch, N)`` Nm. Arguments, attributes and
-    errors: :class:`~pinn_dyn.systems.simulated_arm.SimulatedArm`.
-    """
+    """A :class:`~pinn_dyn.systems.simulated_arm.SimulatedArm` that PyBullet moves."""
 
     simulator = "pybullet"
     install = "pip install 'pinn_dyn[panda]' (Python 3.10, 3.11), or use pinn_dyn.systems.MujocoArm"

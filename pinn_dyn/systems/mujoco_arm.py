@@ -48,13 +48,7 @@ class _World:
 
 
 class MujocoArm(SimulatedArm):
-    """An arm of N joints with motors and viscous friction, moved by MuJoCo::
-
-        M(q) dv/dt + C(q, v) v + G(q) + damping v = u
-
-    q ``(*batch, N)`` rad, v rad/s, u motor torques ``(*batch, N)`` Nm. Arguments, attributes and
-    errors: :class:`~pinn_dyn.systems.simulated_arm.SimulatedArm`.
-    """
+    """A :class:`~pinn_dyn.systems.simulated_arm.SimulatedArm` that MuJoCo moves."""
 
     simulator = "mujoco"
     install = "pip install 'pinn_dyn[mujoco]'"

@@ -46,7 +46,11 @@ class World(Protocol):
 
 
 class SimulatedArm(RigidChain):
-    """A rigid chain with joint limits that a simulator moves in time steps of its own.
+    """An arm with joint limits, motors and viscous friction that a simulator moves in time steps::
+
+        M(q) dv/dt + C(q, v) v + G(q) + damping v = u
+
+    q ``(*batch, N)`` rad or m, v rad/s or m/s, u torques or forces ``(*batch, N)``, Nm or N.
 
     A subclass states the ``simulator`` (a Python package), the command to ``install`` it, and the
     class of its :class:`World`. Arms of the same URDF and gravity share a world: call

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from pinn_dyn.control.export import export_law, load_law
-from pinn_dyn.control.laws import Tracking
+from pinn_dyn.control.laws import Regulation, Tracking
 from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.models import NetworkCholesky, NetworkInput, NetworkPotential, Positive
+from pinn_dyn.systems import TendonArm
 from tests.models.builders import make_structured
 
 needs_compiler = pytest.mark.skipif(not has_cpp_compiler(), reason="there is no C++ compiler")
@@ -122,3 +123,9 @@ def test_another_checksum_is_refused_before_the_file_is_loaded(tmp_path):
     path.write_bytes(b"no law")
     with pytest.raises(ValueError, match=r"law\.pt2 has the SHA-256 \w{64}, expected 0{64}"):
         load_law(path, sha256="0" * 64)
+
+
+def test_a_law_that_solves_for_its_input_has_no_package(tmp_path):
+    law = Regulation(TendonArm(), 1.0, 0.1)
+    with pytest.raises(TypeError, match=r"has a memory: export it to \.c or \.onnx"):
+        export_law(law, tmp_path / "law.pt2")

@@ -96,7 +96,7 @@ def shared_clock(runs):
 
 
 def time_first(runs):
-    """As parallel simulators log."""
+    """Runs of parallel simulators, ``(T, runs, N)``."""
     return {name: np.moveaxis(x, 0, 1) for name, x in stacked(runs).items()}
 
 

@@ -73,7 +73,7 @@ def test_floats_are_repeated_to_their_precision(tmp_path):
 
 
 def test_a_step_integrates_as_the_prediction_does(tmp_path):
-    """Of (q, p) for a Hamiltonian network, whose velocities are learned."""
+    """A step of a Hamiltonian network moves (q, p), and returns v."""
     from pinn_dyn.mechanics import Signal
 
     model = MODELS["hnn-constant-mass-fixed-damping-constant-input-3x3"]().requires_grad_(False)
