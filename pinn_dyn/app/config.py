@@ -27,6 +27,8 @@ from pinn_dyn.spelling import did_you_mean
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONFIG = "config.yaml"  # in the folder of a run
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
+_QUICK = ("trainer", "optimizer", "model", "scheduler", "loss", "dataset")
+"""Keys that are checked first: a typo in them is answered before PyTorch Lightning is imported."""
 
 
 # The name of an experiment, or else the last two folders of the path of a run.
@@ -71,8 +73,9 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     """
     config = cfg if isinstance(cfg, dict) else plain(cfg)
     check_keys(SETTINGS[command], config)
-    if isinstance(model := config.get("model"), dict) and "_target_" in model:
-        check_value("model", model)  # imports less than the other keys: a faster answer to a typo
+    for key in _QUICK:
+        if isinstance(part := config.get(key), dict) and "_target_" in part:
+            check_value(key, part)
     check_arguments(SETTINGS[command], config)
     return config
 

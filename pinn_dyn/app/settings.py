@@ -91,7 +91,8 @@ class TrainerArguments:
     profiler: Literal["simple", "advanced"] | None = None
 
 
-STAND_INS["lightning.pytorch.trainer.trainer.Trainer"] = TrainerArguments
+for _name in ("lightning.Trainer", "lightning.pytorch.trainer.trainer.Trainer"):
+    STAND_INS[_name] = TrainerArguments
 
 
 @dataclass(kw_only=True)

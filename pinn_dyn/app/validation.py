@@ -32,7 +32,7 @@ _PLAIN = (bool, int, float, str, type(None), Any)  # The optimizers of PyTorch s
 _OPTIMIZER = {"lr": PositiveFloat, "weight_decay": NonNegativeFloat, "eps": PositiveFloat}
 
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
-STAND_INS: dict[str, type] = {}
+STAND_INS: dict[Any, type] = {}
 """Names of classes of other packages, and dataclasses with the arguments to accept for them."""
 SET_BY_PROGRAM = {
     *("data.batches_per_epoch", "data.source", "plant.system", "optimizer.maximize"),
@@ -248,6 +248,8 @@ def _object(hints: Sequence[Any], short: bool = False) -> Any:
 
 
 def _maker(name: Any, kinds: Sequence[Any], title: str) -> Any:
+    if object in kinds and name in STAND_INS:  # without an import that takes seconds
+        return STAND_INS[name]
     try:
         maker = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
