@@ -73,9 +73,15 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     """
     config = cfg if isinstance(cfg, dict) else plain(cfg)
     check_keys(SETTINGS[command], config)
+    mistakes = []
     for key in _QUICK:
         if isinstance(part := config.get(key), dict) and "_target_" in part:
-            check_value(key, part)
+            try:
+                check_value(key, part)
+            except ConfigError as error:
+                mistakes.append(str(error))
+    if mistakes:
+        raise ConfigError("\n".join(mistakes))
     check_arguments(SETTINGS[command], config)
     return config
 
