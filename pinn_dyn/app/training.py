@@ -307,15 +307,16 @@ def build_predictor(
 
 
 def _check_windows(model: Predictor, windows: DynamicsData) -> None:
-    """Refuse windows without the momenta or the past inputs that the model needs."""
+    """Refuse windows without the momenta or the past that the model needs."""
     if model.state == "qp" and windows.windows.p.shape[-1] == 0:
         raise ValueError(
             f"{windows.source.name} has no momenta p: set model.state=qv, or use model=lnn"
         )
+    model.acting_input(windows.windows.input)  # a held input has no delay to learn
     if model.input_history > windows.history:
         raise ValueError(
-            f"delay.longest is {model.input_history} s, and data.history {windows.history} s: set "
-            f"data.history={model.input_history}"
+            f"the model uses {model.input_history} s before its start, but data.history is "
+            f"{windows.history} s: set data.history={model.input_history}"
         )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 from typing import Annotated, Literal
 
 import lightning as L
@@ -35,7 +34,8 @@ class DynamicsData(L.LightningDataModule):
         batches_per_epoch: batches in an epoch of the trainer.
         seed: seed of the windows and their order.
         coverage: evenness of the windows over the configurations, see :func:`draw_windows`.
-        history: time before a window over which the input is kept, for models of a delay, s.
+        history: time before a window over which q and u are kept, for models of a delay or with a
+            memory, s.
     """
 
     def __init__(
@@ -85,9 +85,7 @@ class DynamicsData(L.LightningDataModule):
             ValueError: on a batch larger than the number of windows.
         """
         runs, stride, count = self.splits.train, self._samples(), self.pairs
-        sample = float(runs[0].t[1] - runs[0].t[0])
-        span = self.steps * stride + math.ceil(self.history / sample - 1e-6)
-        starts = sum(max(len(x.t) - span, 0) for x in runs)
+        starts = sum(max(len(x.t) - self.steps * stride, 0) for x in runs)
         if count != "all" and 0 < starts < count:
             log.info("data.pairs is %d, all %d windows of the short data are used", count, starts)
             count, self.batch_size = starts, min(self.batch_size, starts)

@@ -35,8 +35,8 @@ class StoredSource(DataSource):
     def load(self) -> Splits:
         content = self._read()
 
-        def unpack(t: Any, q: Any, v: Any, u: Any, past: Any, interpolation: Any) -> Trajectory:
-            return Trajectory(q, v, Signal(t, u, interpolation), past=past)
+        def unpack(t: Any, q: Any, v: Any, u: Any, interpolation: Any, **past: Any) -> Trajectory:
+            return Trajectory(q, v, Signal(t, u, interpolation), **past)
 
         return Splits(**{split: [unpack(**item) for item in content[split]] for split in SPLITS})
 
@@ -65,6 +65,7 @@ def store(source: DataSource, path: Path) -> None:
             {
                 **{key: getattr(x, key).clone() for key in "tqvu"},
                 "past": x.past,
+                "past_q": x.past_q,
                 "interpolation": x.input.interpolation,
             }
             for x in trajectories

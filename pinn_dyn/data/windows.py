@@ -17,7 +17,15 @@ from pinn_dyn.mechanics import Signal, State, Trajectory
 from pinn_dyn.mechanics.signal import stacked
 from pinn_dyn.models.statistics import Statistics
 
-_ROWS = ("q", "v", "p", "dq", "dv", "dp")  # have one row for each window, as the input has
+_ROWS = (
+    "q",
+    "v",
+    "p",
+    "dq",
+    "dv",
+    "dp",
+    "past_q",
+)  # have one row for each window, as the input has
 
 
 @dataclass(frozen=True)
@@ -32,7 +40,8 @@ class Windows:
         p: momentum at the start, ``(B, N)``; empty ``(B, 0)`` where there is none.
         dq, dv, dp: increments from the start to each step, ``(B, H, N)``, of double precision.
         input: u, with samples ``(B, past + H * stride + 1, M)``.
-        past: samples of the input before the start, for models of a delay.
+        past_q: q at the steps before the start, the latest first, ``(B, past // stride, N)``.
+        past: samples of the input before the start, for models of a delay or with a memory.
     """
 
     t: Tensor
@@ -43,6 +52,7 @@ class Windows:
     dv: Tensor
     dp: Tensor
     input: Signal
+    past_q: Tensor
     past: int = field(default=0, kw_only=True)
 
     def __len__(self) -> int:
@@ -82,9 +92,10 @@ class Windows:
         """Samples of the input from the start on, ``(B, H * stride + 1, M)``."""
         return self.input.u[..., self.past :, :]
 
-    def start(self, state: State) -> Tensor:
-        """Return the state at the start, ``(B, 2N)``: (q, v) or (q, p)."""
-        return torch.cat([self.q, self.v if state == "qv" else self.p], dim=-1)
+    def start(self, state: State, past: int = 0) -> Tensor:
+        """Return (q, v) or (q, p) at the start and n = ``past`` earlier q, ``(B, 2N + nN)``."""
+        earlier = self.past_q[..., :past, :].flatten(-2)
+        return torch.cat([self.q, self.v if state == "qv" else self.p, earlier], dim=-1)
 
     def increments(self, state: State) -> Tensor:
         """Return the increments of (q, v) or (q, p) to each step, ``(B, H, 2N)``."""
@@ -155,11 +166,11 @@ def draw_windows(
         stride: samples in a step.
         seed: seed of the starts.
         coverage: c, from 0 to 1.
-        history: time before each start over which the input is kept, s.
+        history: time before each start over which q and u are kept, s. Before the earliest sample
+            they are constant.
 
     Raises:
-        ValueError: on a history of a held input, differing sample times, or more windows than
-            starts.
+        ValueError: on differing sample times, or more windows than starts.
     """
     span = steps * stride
     sample = float(trajectories[0].t[1] - trajectories[0].t[0])
@@ -168,18 +179,14 @@ def draw_windows(
             raise ValueError(
                 f"training trajectory {k} has sample times other than {sample:g} s: resample it"
             )
-    if history and trajectories[0].input.interpolation == "hold":
-        raise ValueError(
-            "a delay cannot be learned from an input that is held between its samples: set "
-            "dataset.interpolation=linear, or measure the delay by check.py and shift the input"
-        )
     past = math.ceil(history / sample - 1e-6)
+    trajectories = [item.since(history) for item in trajectories]
     starts = torch.tensor([max(item.t.shape[0] - span - past, 0) for item in trajectories])
     total = int(starts.sum())
     count = max(total, 1) if count is None else count
     if total < count:
         raise ValueError(
-            f"{count} windows of {span + past} samples do not fit, the training trajectories have "
+            f"{count} windows of {span} samples do not fit, the training trajectories have "
             f"only {total} starts: take fewer pairs, a shorter window or more data"
         )
     generator = torch.Generator().manual_seed(seed)
@@ -216,6 +223,7 @@ def draw_windows(
         dv=v[:, 1:] - v[:, :1],
         dp=p[:, 1:] - p[:, :1],
         input=stacked(inputs, t),
+        past_q=torch.stack([x.q[k - past : k].flip(0)[stride - 1 :: stride] for x, k in origins]),
         past=past,
     )
 

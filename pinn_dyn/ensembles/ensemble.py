@@ -46,6 +46,7 @@ class Ensemble(Predictor):
         continuous = [item for item in members if isinstance(item, ContinuousPredictor)]
         self.stack = ContinuousStack(continuous) if continuous else DiscreteStack(members)
         self.penalized = first.penalized
+        self.past_steps, self.input_history = first.past_steps, first.input_history
         limits = joint_limits([given_limits(item) for item in members])
         set_output_limits(self.stack.template.model, limits)
 

@@ -93,6 +93,7 @@ class DiscreteStack(Predictor):
     def __init__(self, members: Sequence[Predictor]):
         first = members[0]
         super().__init__(first.num_coordinates, first.num_inputs, first.state)
+        self.past_steps = first.past_steps
         self.template: Template[Predictor] = Template(members)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:

@@ -91,8 +91,8 @@ def predict_trajectories(
     """
     stride = 1 if step is None else samples_of("step", step, truth.t)
     copy = model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0])
-    x0 = truth.states(model.state, slice(1))[:, 0].double()
-    input = truth.input_since(model.input_history).to(truth.q.device, torch.float64)
+    x0 = truth.states(model.state, slice(1), model.past_steps, stride)[:, 0].double()
+    input = truth.since(model.input_history).input.to(truth.q.device, torch.float64)
     states = _roll_out(copy, x0, truth.t[::stride], input)
     paths = states[..., : model.num_coordinates]
     v_hat = _velocities(copy, states)
@@ -129,8 +129,9 @@ def predict_windows(
             f"window is {window} s, but the trajectories last only {truth.duration:g} s"
         )
     last = windows * samples
-    x0 = truth.states(model.state, slice(0, last, samples)).double()
-    input = truth.input_since(model.input_history)
+    starts = slice(0, last, samples)
+    x0 = truth.states(model.state, starts, model.past_steps, stride).double()
+    input = truth.since(model.input_history).input
     past = input.t.shape[0] - truth.t.shape[0]
     input = input.part(slice(past + last + 1)).to(truth.q.device, torch.float64)
     size = past + samples + 1  # neighbors share the sample between them, and their past
@@ -165,7 +166,7 @@ def model_for_roll_outs(
 def _roll_out(model: Predictor, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
     """Return the states ``(E, B, T, 2N)`` at the times t; E is 1 unless for an ensemble."""
     if isinstance(model, Ensemble):
-        return x0.unsqueeze(-2) + model.member_increments(x0, t, input)
+        return x0[..., None, : 2 * model.num_coordinates] + model.member_increments(x0, t, input)
     return model.predict(x0, t, input).unsqueeze(0)
 
 

@@ -81,7 +81,7 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
         functions = [(next_state, "q v u u_next", "q_next v_next", about)]
     else:
         raise TypeError(
-            f"a {type(model).__name__} has no function of a state to export; export a single model,"
-            " such as run.members[0] of an ensemble"
+            f"a {type(model).__name__} has no function of a state (q, v) to export: export a model "
+            "without a memory; of an ensemble a single model, such as run.members[0]"
         )
     return [exported(*function) for function in functions]

@@ -27,11 +27,14 @@ class Predictor(nn.Module, abc.ABC):
         fixed_step: step of a discrete-time model in s, or None if any step is possible.
         penalized: true if training adds :meth:`penalty` to the loss.
         input_history: time before the start in which the model uses the input, s.
+        past_steps: number n of earlier q that the model uses, a step apart, the latest first. They
+            follow the state in x0 ``(*batch, 2N + nN)``; without them the robot was at rest.
     """
 
     fixed_step: float | None = None
     penalized: bool = False
     input_history: float = 0.0
+    past_steps: int = 0
 
     def __init__(
         self, num_coordinates: PositiveInt, num_inputs: NonNegativeInt, state: State = "qv"
@@ -61,7 +64,7 @@ class Predictor(nn.Module, abc.ABC):
         """Return the acting input at the samples of a trajectory, ``(*batch, T, M)``."""
         if not self.input_history:
             return truth.u
-        input = self.acting_input(truth.input_since(self.input_history))
+        input = self.acting_input(truth.since(self.input_history).input)
         return input.at(truth.t).movedim(0, -2)
 
     def learned_figures(self) -> dict[str, float]:
@@ -75,10 +78,12 @@ class Predictor(nn.Module, abc.ABC):
         Raises:
             ValueError: if a size is wrong, times do not increase, or the state is not finite.
         """
-        require_last_dim("x0", x0, 2 * self.num_coordinates, "2N")
+        size = 2 * self.num_coordinates
+        past = self.past_steps * self.num_coordinates if x0.shape[-1] > size else 0
+        require_last_dim("x0", x0, size + past, "2N")
         require_last_dim("u", input.u, self.num_inputs, "M")
         require_start(x0, t, input)
-        return x0.unsqueeze(-2) + self.increments(x0, t, input)
+        return x0[..., None, :size] + self.increments(x0, t, input)
 
     def _require_step(self, t: Tensor) -> None:
         step, spacing = self.fixed_step or 0.0, t.double().diff()

@@ -25,7 +25,8 @@ class Trajectory:
         input: u at T times, ``(*batch, T, M)``, and its interpolation.
         momentum: function from (q, v) to p = M(q) v on the CPU, ``(*batch, N)``, for simulated
             data; None for measured data.
-        past: the K samples of u before the first sample, ``(*batch, K, M)``, or None if unknown.
+        past, past_q: the K samples of u, ``(*batch, K, M)``, and of q, ``(*batch, K, N)``, before
+            the first sample; None if unknown.
 
     Raises:
         ValueError: if there are fewer than two samples, or shapes do not match.
@@ -36,6 +37,7 @@ class Trajectory:
     input: Signal
     momentum: Callable[[Tensor, Tensor], Tensor] | None = None
     past: Tensor | None = None
+    past_q: Tensor | None = None
 
     def __post_init__(self) -> None:
         samples = self.t.shape[0]
@@ -63,23 +65,40 @@ class Trajectory:
         """Time from the first to the last sample, s."""
         return float(self.t[-1] - self.t[0])
 
-    def input_since(self, history: float) -> Signal:
-        """Return u from ``history`` s before the start on; unknown input is the earliest sample."""
+    def since(self, history: float) -> Trajectory:
+        """Return the motion from ``history`` s before the start on.
+
+        Unknown samples of q and u are the earliest, so the robot rests before. v does not count.
+        """
         step = self.t[1] - self.t[0]
         count = math.ceil(history / float(step) - 1e-6)
         if count < 1:
-            return self.input
-        past = _extended(self.u[..., :0, :] if self.past is None else self.past, self.u, count)
+            return self
         before = self.t[0] - step * torch.arange(count, 0, -1).to(self.t)
-        t, u = torch.cat([before, self.t]), torch.cat([past, self.u], dim=-2)
-        return Signal(t, u, self.input.interpolation)
+        q, u = (
+            torch.cat([_extended(past, values, count), values], dim=-2)
+            for past, values in ((self.past_q, self.q), (self.past, self.u))
+        )
+        v = torch.cat([_extended(None, self.v, count), self.v], dim=-2)
+        input = Signal(torch.cat([before, self.t]), u, self.input.interpolation)
+        return Trajectory(q, v, input, self.momentum)
 
-    def states(self, state: State, samples: slice = slice(None)) -> Tensor:
+    def states(
+        self, state: State, samples: slice = slice(None), past: int = 0, stride: int = 1
+    ) -> Tensor:
         """Return states (q, v) or (q, p) at the chosen samples, ``(*batch, T, 2N)``.
+
+        With ``past`` = n each is followed by n earlier q, ``stride`` samples apart, ``(nN,)``.
 
         Raises:
             ValueError: if momenta are needed and M is unknown.
         """
+        if past:
+            step = float(self.t[1] - self.t[0])
+            q = self.since(past * stride * step).q
+            start = torch.arange(self.t.shape[0])[samples, None]
+            earlier = q[..., start + stride * torch.arange(past - 1, -1, -1), :].flatten(-2)
+            return torch.cat([self.states(state, samples), earlier], dim=-1)
         q, v = self.q[..., samples, :], self.v[..., samples, :]
         if state == "qv":
             return torch.cat([q, v], dim=-1)
@@ -91,9 +110,9 @@ class Trajectory:
 
     def to(self, device: torch.device | str) -> Trajectory:
         """Move the trajectory to a device."""
-        past = None if self.past is None else self.past.to(device)
-        moved = {name: getattr(self, name).to(device) for name in ("q", "v", "input")}
-        return replace(self, **moved, past=past)
+        names = ("q", "v", "input", "past", "past_q")
+        values = {name: getattr(self, name) for name in names}
+        return replace(self, **{k: x.to(device) for k, x in values.items() if x is not None})
 
     def until(self, horizon: float) -> Trajectory:
         """Return the part up to ``horizon`` seconds after the start.
@@ -140,7 +159,8 @@ def stack(trajectories: list[Trajectory]) -> Trajectory:
         q=torch.stack([item.q for item in trajectories]),
         v=torch.stack([item.v for item in trajectories]),
         input=stacked([item.input for item in trajectories], first.t - first.t[0]),
-        past=_stacked_past(trajectories),
+        past=_stacked([(item.past, item.u) for item in trajectories]),
+        past_q=_stacked([(item.past_q, item.q) for item in trajectories]),
     )
 
 
@@ -160,19 +180,19 @@ def stack_until(trajectories: Sequence[Trajectory], duration: float | None = Non
     return stack([item.until(duration) for item in long_enough or [longest]])
 
 
-def _stacked_past(trajectories: list[Trajectory]) -> Tensor | None:
-    pasts = [item.u[..., :0, :] if item.past is None else item.past for item in trajectories]
-    count = max(past.shape[-2] for past in pasts)
-    extended = [_extended(p, item.u, count) for p, item in zip(pasts, trajectories, strict=True)]
-    return torch.stack(extended) if count else None
+def _stacked(pasts: list[tuple[Tensor | None, Tensor]]) -> Tensor | None:
+    count = max(0 if past is None else past.shape[-2] for past, _ in pasts)
+    return torch.stack([_extended(*item, count) for item in pasts]) if count else None
 
 
-def _extended(past: Tensor, u: Tensor, count: int) -> Tensor:
-    """Return the last ``count`` samples before u, filled up with the earliest known sample."""
+def _extended(past: Tensor | None, values: Tensor, count: int) -> Tensor:
+    """Return the last ``count`` samples before values, filled up with the earliest sample."""
+    if past is None:
+        past = values[..., :0, :]
     past = past[..., max(past.shape[-2] - count, 0) :, :]
-    first = torch.cat([past, u], dim=-2)[..., :1, :]
+    first = torch.cat([past, values], dim=-2)[..., :1, :]
     missing = count - past.shape[-2]
-    return torch.cat([first.expand(*u.shape[:-2], missing, u.shape[-1]), past], dim=-2)
+    return torch.cat([first.expand(*values.shape[:-2], missing, values.shape[-1]), past], dim=-2)
 
 
 def samples_of(name: str, duration: float, t: Tensor) -> int:

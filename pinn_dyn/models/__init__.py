@@ -38,6 +38,7 @@ from pinn_dyn.models.residual import NetworkResidual
 from pinn_dyn.models.scales import Scales
 from pinn_dyn.models.servo import Servo
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.models.subspace_encoder import SubspaceEncoder
 
 __all__ = [
     "MLP",
@@ -76,4 +77,5 @@ __all__ = [
     "Servo",
     "Statistics",
     "Stribeck",
+    "SubspaceEncoder",
 ]

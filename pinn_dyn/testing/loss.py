@@ -28,7 +28,9 @@ def random_windows(count, seed=0):
     q, v, p = normal(2), normal(2), normal(2)
     dq, dv, dp = (STEP * normal(1, 2) for _ in range(3))
     input = Signal(t, normal(3, 2))
-    return Windows(t=t[[0, 2]], q=q, v=v, p=p, dq=dq, dv=dv, dp=dp, input=input)
+    return Windows(
+        t=t[[0, 2]], q=q, v=v, p=p, dq=dq, dv=dv, dp=dp, input=input, past_q=q[:, None][:, :0]
+    )
 
 
 def small_model(seed=0):

@@ -160,10 +160,10 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
         ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
         ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
         ("dataset.test.piece=7.0", ["test: ", "no stretch lasts 7 s"]),
-        ("data.history=0.1 dataset.interpolation=hold", ["held between its samples"]),
+        ("model/delay=learned dataset.interpolation=hold", ["dataset.interpolation=linear"]),
         (
             "model/delay=learned data.history=0.05",
-            ["delay.longest is 0.1 s", "set data.history=0.1"],
+            ["uses 0.1 s before its start", "set data.history=0.1"],
         ),
     ],
 )

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pinn_dyn.data import draw_windows
 from pinn_dyn.data.logs import UNITS, Butterworth, Columns, LogError, SplitGaps
 from pinn_dyn.data.logs.splits import default_split
+from pinn_dyn.data.stored import StoredSource, store
 from pinn_dyn.mechanics import stack
 from tests.data.logs_files import motion, source, write
 
@@ -272,11 +273,23 @@ def test_whole_runs_of_unequal_length_are_one_roll_out_each(tmp_path):
     assert "2 trajectories of 2.5 to 3 s" in log.report
 
 
-def test_pieces_know_the_input_before_them(folder):
-    """What a model of a delay looks back at; the first piece of a stretch has none."""
+def test_pieces_know_the_motion_before_them(folder):
+    """Models of a delay or with a memory look back. The first piece of a stretch has no past."""
     first, second = source(folder, u=dict(columns=["u1", "u2"], unit="Nm")).load().test
     assert len(first.past) == 0
-    assert torch.equal(second.past, first.u[-51:-1])
+    count = len(second.past)
+    assert count == min(200, len(first.t) - 1)  # 2 s
+    assert torch.equal(second.past, first.u[-count - 1 : -1])
+    assert torch.equal(second.past_q, first.q[-count - 1 : -1])
+
+
+def test_a_stored_source_keeps_the_motion_before_its_pieces(folder, tmp_path):
+    log = source(folder, u=dict(columns=["u1", "u2"], unit="Nm"))
+    store(log, tmp_path / "data.pt")
+    stored = StoredSource(str(tmp_path / "data.pt"), "log", log.labels, log.input_labels)
+    for before, after in zip(log.load().test, stored.load().test, strict=True):
+        assert torch.equal(before.past, after.past)
+        assert torch.equal(before.past_q, after.past_q)
 
 
 @pytest.mark.parametrize("runs", [1, 3, 6])

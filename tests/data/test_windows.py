@@ -62,10 +62,9 @@ def trajectories():
 def test_windows_are_distinct_slices_of_their_trajectories(
     lengths, steps, stride, past, coverage, interpolation, seed
 ):
-    past = 0 if interpolation == "hold" else past  # a held input has no slope to learn a delay by
     items = [make_trajectory(k, n, interpolation=interpolation) for k, n in enumerate(lengths)]
     span = steps * stride
-    count = sum(max(n - span - past, 0) for n in lengths)
+    count = sum(n - span for n in lengths)
     windows = draw(
         items,
         count=count,
@@ -94,7 +93,12 @@ def test_windows_are_distinct_slices_of_their_trajectories(
             assert torch.equal(part.v[row], item.v[k])
             assert torch.equal(part.dq[row], item.q[knots] - item.q[k])
             assert torch.equal(part.dv[row], item.v[knots] - item.v[k])
-            assert torch.equal(part.input.u[row], item.u[k - past : k + length * stride + 1])
+            samples = torch.arange(k - past, k + length * stride + 1).clamp(min=0)
+            assert torch.equal(part.input.u[row], item.u[samples])
+            steps_back = (k - stride * torch.arange(1, past // stride + 1)).clamp(min=0)
+            assert torch.equal(part.past_q[row], item.q[steps_back])
+            start = torch.cat([item.q[k], item.v[k], item.q[steps_back].flatten()])
+            assert torch.equal(part.start("qv", past // stride)[row], start)
             assert torch.equal(part.u[row], item.u[k : k + length * stride + 1])
 
 

@@ -60,7 +60,7 @@ def test_input_history_is_the_latest_input_before_the_start(known):
     """Three samples of 0.1 s are needed. Where fewer are known, the earliest value is held."""
     item = trajectory()
     past = torch.arange(2.0 * known, dtype=torch.float64).reshape(known, 2)
-    signal = dataclasses.replace(item, past=past if known else None).input_since(0.25)
+    signal = dataclasses.replace(item, past=past if known else None).since(0.25).input
     torch.testing.assert_close(signal.t[:4], torch.tensor([-0.3, -0.2, -0.1, 0.0]).double())
     assert torch.equal(signal.u[3:], item.u)
     latest = past[-3:] if known else item.u[:1]

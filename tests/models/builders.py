@@ -26,6 +26,7 @@ from pinn_dyn.models import (
     Positive,
     Scales,
     Statistics,
+    SubspaceEncoder,
 )
 
 STEP = 0.02
@@ -147,11 +148,15 @@ def make_structured(
 
 
 def make_model(kind, n=2, m=2, dtype=torch.float64):
-    """One of the four models."""
+    """One of the five models."""
     if kind in ("lnn", "hnn"):
         return make_structured(kind, n, m, dtype=dtype)
     torch.manual_seed(7)
-    black_box = {"next_state": NextStateMLP, "acceleration": AccelerationMLP}[kind]
+    black_box = {
+        "next_state": NextStateMLP,
+        "acceleration": AccelerationMLP,
+        "subnet": partial(SubspaceEncoder, history=3 * STEP, latent=5),
+    }[kind]
     return perturb(black_box(make_statistics(n, m), hidden=[6, 5]).to(dtype))
 
 

@@ -1,4 +1,4 @@
-"""What all four models share: batch shapes, precision, saving, copying, compiling."""
+"""What all five models share: batch shapes, precision, saving, copying, compiling."""
 
 import copy
 import io
@@ -11,7 +11,8 @@ from pinn_dyn.mechanics import Signal
 from pinn_dyn.testing import assert_near
 from tests.models.builders import STEP, make_model, perturb, random_batch
 
-KINDS = ["lnn", "hnn", "next_state", "acceleration"]
+KINDS = ["lnn", "hnn", "next_state", "acceleration", "subnet"]
+DISCRETE = ("next_state", "subnet")
 T = STEP * torch.arange(4, dtype=torch.float64)
 
 
@@ -74,12 +75,12 @@ def test_a_saved_model_carries_its_scales(kind):
     model_of_other_data = make_model(kind)
     x0, u = windows()
     # A step is one of these scales: the saved black box has learned another one.
-    t = 1.25 * T if kind == "next_state" else T
+    t = 1.25 * T if kind in DISCRETE else T
     model_of_other_data.load_state_dict(model.state_dict())
     assert torch.equal(
         model_of_other_data.predict(x0, t, Signal(t, u)), model.predict(x0, t, Signal(t, u))
     )
-    if kind != "next_state":
+    if kind not in DISCRETE:
         assert not torch.allclose(
             make_model(kind).predict(x0, t, Signal(t, u)), model.predict(x0, t, Signal(t, u))
         )

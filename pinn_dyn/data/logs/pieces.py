@@ -13,7 +13,7 @@ from pinn_dyn.data.logs.recording import Recording
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.mechanics import Interpolation, Signal, Trajectory
 
-_PAST = 0.5  # s before a piece whose inputs are kept for models of a delay
+_PAST = 2.0  # s before a piece that are kept for models of a delay or with a memory
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def pieces_of(
         LogError: if a piece is no multiple of the sample time, or longer than every stretch.
     """
     if part.piece == "whole":
-        pieces = [replace(item, past=item.u[:0]) for item in stretches]
+        pieces = list(stretches)
         return pieces, f"{summary(pieces, step)}, each one roll-out"
     span = round(part.piece / step)
     if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
@@ -62,7 +62,7 @@ def pieces_of(
     pieces = [
         replace(
             item.rows(slice(first, first + span + 1)),
-            past=item.u[max(first - round(_PAST / step), 0) : first],
+            past=item.rows(slice(max(first - round(_PAST / step), 0), first)),
         )
         for item in stretches
         for first in _starts(len(item), span)
@@ -85,8 +85,10 @@ def trajectory(recording: Recording, step: float, interpolation: Interpolation) 
     assert recording.v is not None
     q, v, u = (torch.from_numpy(x.copy()) for x in (recording.q, recording.v, recording.u))
     t = torch.arange(len(recording), dtype=torch.float64) * step
-    past = None if recording.past is None else torch.from_numpy(recording.past.copy())
-    return Trajectory(q, v, Signal(t, u, interpolation), past=past)
+    past, past_q = None, None
+    if recording.past is not None:
+        past, past_q = (torch.from_numpy(x.copy()) for x in (recording.past.u, recording.past.q))
+    return Trajectory(q, v, Signal(t, u, interpolation), past=past, past_q=past_q)
 
 
 def summary(recordings: Sequence[Recording], step: float) -> str:

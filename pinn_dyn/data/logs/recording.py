@@ -47,7 +47,7 @@ class Recording:
         q: configuration, ``(T, N)``.
         v: velocity, ``(T, N)``, or None while there is none.
         u: input, ``(T, M)``.
-        past: u of the samples right before, ``(K, M)``, or None.
+        past: the samples right before, or None.
     """
 
     run: str
@@ -55,7 +55,7 @@ class Recording:
     q: np.ndarray
     v: np.ndarray | None
     u: np.ndarray
-    past: np.ndarray | None = None
+    past: Recording | None = None
 
     def __len__(self) -> int:
         return self.t.shape[0]

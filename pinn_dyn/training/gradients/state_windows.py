@@ -24,7 +24,7 @@ class StateWindows(Windows):
         x0 = windows.start(state).mT.contiguous().mT
         return cls(**values, x0=x0, dx=windows.increments(state))
 
-    def start(self, state: State) -> Tensor:
+    def start(self, state: State, past: int = 0) -> Tensor:
         return self.x0
 
     def increments(self, state: State) -> Tensor:

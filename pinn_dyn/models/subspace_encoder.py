@@ -1,0 +1,128 @@
+"""Black box with a memory: a latent state that an encoder reads from the past."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field, PositiveInt
+from torch import Tensor, nn
+
+from pinn_dyn.mechanics import Predictor, Signal
+from pinn_dyn.models.mlp import Activation
+from pinn_dyn.models.statistics import Statistics
+
+
+class LinearAndMLP(nn.Module):
+    """y = W x + b + MLP(x). W and the first layer of the MLP are one matrix.
+
+    Args:
+        inputs, outputs: sizes of x and y.
+        hidden, activation: widths and activation of the hidden layers.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, hidden: Sequence[PositiveInt], activation: Activation
+    ):
+        super().__init__()
+        self._activation = getattr(F, activation)
+        self._sizes = [outputs, hidden[0]]
+        self.first = nn.Linear(inputs, outputs + hidden[0])
+        self.layers = nn.ModuleList(
+            nn.Linear(a, b) for a, b in itertools.pairwise([*hidden, outputs])
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return y, ``(*batch, outputs)``."""
+        return self.after_first(self.first(x))
+
+    def after_first(self, first: Tensor) -> Tensor:
+        """Return y from the products of the first matrix."""
+        y, h = first.split(self._sizes, dim=-1)
+        for layer in self.layers:
+            h = layer(self._activation(h))
+        return y + h
+
+
+class SubspaceEncoder(Predictor):
+    """State-space network whose latent state z an encoder reads from the past (SUBNET)::
+
+        z_0     = encoder(q_0, v_0, q_-1, ... q_-n, u_0, ... u_-n)
+        z_{k+1} = z_k + transition(z_k, u_k, u_{k+1})
+        y_k     = output(z_k) + fade^k (y_0 - output(z_0)),      y = (q, v)
+
+    y, q and u are normalized by their means and standard deviations. Each network is the sum of a
+    linear map and an MLP. The last term starts the prediction at the measured y_0; fade, between 0
+    and 1 for each entry, is learned. Training on windows of many steps is the truncated simulation
+    loss.
+
+    z may hold states that are not measured, such as those of actuators. Where q and u before the
+    start are unknown, they are constant: the robot was at rest. There is no state of the robot for
+    a control law, and no function of a state to export.
+
+    Source: Beintema, Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system
+    identification". The fading term is not part of it.
+
+    Args:
+        statistics: scales of the data.
+        history: time before the start that the encoder sees, s; n steps of the training windows.
+            Pieces of a log keep 2 s.
+        latent: size of z.
+        hidden, activation: widths and activation of the hidden layers of all networks.
+    """
+
+    mean: Tensor
+    std: Tensor
+    step: Tensor
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        history: Annotated[float, Field(ge=0, le=2)] = 0.5,
+        latent: PositiveInt = 12,
+        hidden: Sequence[PositiveInt] = (64,),
+        activation: Activation = "tanh",
+    ):
+        size, inputs = statistics.num_coordinates, statistics.num_inputs
+        super().__init__(size, inputs)
+        self.input_history = history
+        self.past_steps = n = int(history / statistics.step + 1e-6)
+        for name, values in zip(("mean", "std"), statistics.network_input(1), strict=True):
+            q, v, u = values.float().split([size, size, inputs])
+            self.register_buffer(name, torch.cat([q, v, *[q] * n, *[u] * (n + 1)]))
+        self.register_buffer("step", torch.tensor(statistics.step, dtype=torch.float64))
+        self.encoder = LinearAndMLP(len(self.mean), latent, hidden, activation)
+        self.transition = LinearAndMLP(latent + 2 * inputs, latent, hidden, activation)
+        self.output = LinearAndMLP(latent, 2 * size, hidden, activation)
+        self.fade = nn.Parameter(torch.zeros(2 * size))
+
+    @property
+    def fixed_step(self) -> float:  # type: ignore[override]
+        """Step of the training windows, s."""
+        return float(self.step)
+
+    def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
+        """Apply the network step by step, of which ``t`` must have the length."""
+        self._require_step(t)
+        size, n = self.num_coordinates, self.past_steps
+        before = t[0] - self.step.to(t) * torch.arange(n + 1, device=t.device)
+        at_rest = [x0[..., :size]] * n  # cut off if the past is known
+        past = torch.cat([x0, *at_rest], dim=-1)[..., : (2 + n) * size]
+        past = torch.cat([past, *input.at(before).to(x0)], dim=-1)
+        z = self.encoder((past - self.mean) / self.std)
+        path = [z]
+        ends = torch.cat(input.stages(t, (0.0, 1.0)).to(x0).unbind(1), dim=-1)
+        mean, std = (x[len(x) - self.num_inputs :].repeat(2) for x in (self.mean, self.std))
+        first = self.transition.first
+        of_z, of_u = first.weight.tensor_split([z.shape[-1]], dim=1)
+        for drive in F.linear((ends - mean) / std, of_u, first.bias):  # all steps in one product
+            z = z + self.transition.after_first(drive + z @ of_z.T)
+            path.append(z)
+        y = self.output(torch.stack(path, dim=-2))
+        mean, std = self.mean[: 2 * size], self.std[: 2 * size]
+        offset = (x0[..., None, : 2 * size] - mean) / std - y[..., :1, :]
+        steps = torch.arange(len(t), device=t.device)[:, None]
+        return std * (y - y[..., :1, :] + offset * (torch.sigmoid(self.fade) ** steps - 1))
