@@ -8,37 +8,7 @@ import torch
 
 from pinn_dyn.exports.casadi_function import casadi_function, write_casadi
 from pinn_dyn.exports.program import trace
-from pinn_dyn.systems import SoftArm
-from tests.models.builders import CHAIN, NONLINEAR, VARIANTS, make_structured, random_batch
-
-MODELS = {
-    "networks": lambda: make_structured("lnn", **VARIANTS["networks-softplus-3x3"]),
-    "friction": lambda: make_structured("hnn", **VARIANTS["friction-all-angles-2x1"]),
-    "wide-input": lambda: make_structured("lnn", **VARIANTS["silu-fixed-input-2x4"]),
-    "chain": lambda: make_structured("hnn", **CHAIN["hnn"]),
-    "nonlinear-input": lambda: make_structured("lnn", **NONLINEAR),
-    "two-segments": lambda: SoftArm(segments=2),
-}
-
-
-def arrays(tensors):
-    return [x.numpy() for x in tensors]
-
-
-@pytest.mark.parametrize("case", MODELS)
-def test_value_and_jacobian_repeat_the_model(case):
-    model = MODELS[case]().requires_grad_(False) if case != "two-segments" else MODELS[case]()
-    states = zip(*random_batch(model.num_coordinates, model.num_inputs, batch=2), strict=True)
-    example, (q, v, _, u) = states
-    inputs = dict(q=example[0], v=example[1], u=example[3])
-    function = casadi_function(trace(model.forward_dynamics, inputs, ["a"]), "forward_dynamics")
-    expected = model.forward_dynamics(q, v, u)
-    np.testing.assert_allclose(np.array(function(*arrays((q, v, u))))[:, 0], expected, 1e-9)
-    blocks = function.jacobian()(*arrays((q, v, u)), 0)
-    jacobian = torch.func.jacrev(model.forward_dynamics, (0, 1, 2))(q, v, u)
-    for block, reference in zip(blocks, jacobian, strict=True):
-        smallest = 1e-9 * float(reference.abs().max())
-        np.testing.assert_allclose(np.array(block), reference, 1e-9, smallest)
+from tests.models.builders import VARIANTS, make_structured, random_batch
 
 
 def test_terms_are_matrices_and_survive_a_file(tmp_path):
