@@ -54,6 +54,12 @@ def traced(monkeypatch):
 
 
 @pytest.fixture
+def few_states(monkeypatch):
+    """Compare an export with its original at ten states of 200."""
+    monkeypatch.setattr("pinn_dyn.exports.exported.STATES", 10)
+
+
+@pytest.fixture
 def undrawn(monkeypatch):
     """No pictures and no pages of the programs: they take longer than all else."""
     monkeypatch.setattr("pinn_dyn.app.control_results._figures", lambda *_: {})

@@ -92,8 +92,10 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         actuator=build_part("actuator", config["actuator"]),
         sensor=sensor if noisy else None,
         progress=True,
-        **{key: config[key] for key in ("duration", "rate", "samples_rate", "delay")},
-        **{key: config[key] for key in ("settle_fraction", "settled_after")},
+        **{
+            key: config[key]
+            for key in ("duration", "rate", "samples_rate", "delay", "settled_after")
+        },
     )
     for name, record in result.records.items():
         for index, reason in enumerate(record.stopped):

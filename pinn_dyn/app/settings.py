@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pinn_dyn.app.validation import STAND_INS, Seed
 from pinn_dyn.lazy import LazyNames
@@ -170,10 +170,8 @@ class ControlSettings:
     export: str | None
     exported_law: str
     export_real: Literal["double", "float"]
-    settle_fraction: Annotated[float, Field(gt=0, lt=1)]
     settled_after: NonNegativeFloat
     trajectory: NonNegativeInt
-    animate: bool
     threads: PositiveInt
     trust: Names | None = None
     controllers: Mapping[str, Law | Mapping[str, Any]]

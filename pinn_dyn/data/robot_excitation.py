@@ -64,12 +64,12 @@ class TrackedMultiSine(RobotExcitation):
     """
 
     frequency: Bounds
-    harmonics: PositiveInt
     reach: Fraction
     amplitude: Annotated[Sequence[Fraction], Field(min_length=2, max_length=2)]
     speed: Fraction
     torque: Fraction
-    bandwidth: PositiveFloat
+    harmonics: PositiveInt = 4
+    bandwidth: PositiveFloat = 10.0
 
     def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
         """Draw references and their tracking law."""
@@ -145,9 +145,9 @@ class TorqueMultiSine(RobotExcitation):
     """
 
     frequency: Bounds
-    harmonics: PositiveInt
     amplitude: Fraction
     reach: Fraction
+    harmonics: PositiveInt = 4
 
     def draw(self, robot: SimulatedArm, t: np.ndarray, rngs: Generators) -> Plan:
         """Draw torque signals and centres."""

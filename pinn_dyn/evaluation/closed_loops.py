@@ -51,12 +51,9 @@ class ControlResult:
     @property
     def coordinates(self) -> pd.DataFrame:
         """One row per law and coordinate."""
-        return _concatenated({name: m.coordinates for name, m in self.metrics.items()})
-
-    @property
-    def inputs(self) -> pd.DataFrame:
-        """One row per law and input."""
-        return _concatenated({name: m.inputs for name, m in self.metrics.items()})
+        tables = {name: m.coordinates for name, m in self.metrics.items()}
+        table = pd.concat(tables, names=["controller"])
+        return table.reset_index("controller").reset_index(drop=True)
 
     def save(self, folder: Path | str) -> None:
         """Write the tables as CSV files and the records as ``record_<law>.npz``."""
@@ -64,7 +61,6 @@ class ControlResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_table(self.table, folder, "summary")
         write_table(self.coordinates, folder, "coordinates")
-        write_table(self.inputs, folder, "inputs")
         for name, record in self.records.items():
             arrays: dict[str, Any] = {
                 **{key: getattr(record, key).numpy() for key in ("t", "q", "v", "u", "u_wanted")},
@@ -113,7 +109,6 @@ def close_loops(
     actuator: Actuator | None = None,
     sensor: Sensor | None = None,
     delay: int = 0,
-    settle_fraction: float = 0.02,
     settled_after: float | None = None,
     progress: bool = False,
 ) -> ControlResult:
@@ -131,7 +126,7 @@ def close_loops(
         actuator: limits of the input.
         sensor: noise of the measurement.
         delay: dead time of the input, control instants.
-        settle_fraction, settled_after: see :func:`closed_loop_metrics`.
+        settled_after: see :func:`closed_loop_metrics`.
         progress: log lines of progress.
 
     Raises:
@@ -159,7 +154,6 @@ def close_loops(
             )
         metrics[name] = closed_loop_metrics(
             records[name],
-            settle_fraction=settle_fraction,
             settled_after=settled_after,
             u_low=None if actuator is None else actuator.low,
             u_high=None if actuator is None else actuator.high,
@@ -179,7 +173,3 @@ def _check_reference(
         times = np.linspace(0.0, duration, 101).tolist()
         visited = torch.cat([q0, *(reference(t).q.reshape(-1, sizes[1]) for t in times)]).numpy()
         robot.check_domain(visited.min(0), visited.max(0))
-
-
-def _concatenated(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
-    return pd.concat(tables, names=["controller"]).reset_index("controller").reset_index(drop=True)

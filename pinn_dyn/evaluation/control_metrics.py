@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from pinn_dyn.control.record import ClosedLoopRecord
 
 # A coordinate whose step is below this part of the largest step has no overshoot.
 _SMALL_STEP = 0.05
+_SETTLED = 0.02  # part of the step
 
 Limit = Tensor | Sequence[float] | float | None
 
@@ -32,7 +33,7 @@ class ClosedLoopMetrics(NamedTuple):
             - ``runs``, ``stopped``: number of runs, and of stopped runs;
             - ``rms_error``, ``mean_error``, ``max_error``: sqrt(mean e_i^2), mean and largest |e|;
             - ``step_error_after_<T>_s_...`` *: largest |e| / |s| from T on;
-            - ``settling_time_...`` *: time after which |e| < ``settle_fraction`` |s|, and
+            - ``settling_time_...`` *: time after which |e| < 0.02 |s|, and
               ``never_settled``, the number of runs without it;
             - ``overshoot_...`` *: largest distance beyond the set point over the coordinate's step;
             - ``steady_state_error``, ``..._percent`` *: mean |e| and |e| / |s| of the last tenth;
@@ -42,18 +43,15 @@ class ClosedLoopMetrics(NamedTuple):
             - ``solve_time_...``, ``missed_deadlines``, ``solver_failures``: of predictive control
               over all control instants; the largest time leaves out the first instant.
         coordinates: one row per coordinate: RMS and largest error, and overshoot *.
-        inputs: one row per input: RMS, peak and integral of the square.
     """
 
     summary: dict[str, float]
     coordinates: pd.DataFrame
-    inputs: pd.DataFrame
 
 
 def closed_loop_metrics(
     record: ClosedLoopRecord,
     *,
-    settle_fraction: float = 0.02,
     settled_after: float | None = None,
     u_low: Limit = None,
     u_high: Limit = None,
@@ -62,7 +60,6 @@ def closed_loop_metrics(
 
     Args:
         record: K runs of a control law, with at least two samples.
-        settle_fraction: part of the step within which the error has settled.
         settled_after: time from which the step error is taken, s; None leaves it out.
         u_low, u_high: limits of the inputs, one number or M; None for no limit.
     """
@@ -104,7 +101,7 @@ def closed_loop_metrics(
             name = f"step_error_after_{settled_after:g}_s"
             summary[f"{name}_mean_percent"] = mean(ratio)
             summary[f"{name}_worst_percent"] = ratio.max()
-        settling = marked(_settling_times(norm, t, settle_fraction * size))
+        settling = marked(_settling_times(norm, t, _SETTLED * size))
         beyond = (-error * step.sign()[:, None]).amax(dim=1).clamp(min=0)
         steps = step.abs()
         large = steps >= _SMALL_STEP * steps.amax(dim=1, keepdim=True)
@@ -145,16 +142,10 @@ def closed_loop_metrics(
             "missed_deadlines": int(missed.sum()),
             "solver_failures": int(failed.sum()),
         }
-    inputs = {
-        "rms": (mean(effort) / duration).sqrt(),
-        "peak": marked(held.abs().amax(dim=1))[counted].amax(dim=0),
-        "square_integral": mean(effort),
-    }
-    return ClosedLoopMetrics(
-        {k: x.item() if isinstance(x, Tensor) else x for k, x in summary.items()},
-        _numbered("coordinate", "q", coordinates),
-        _numbered("input", "u", inputs),
-    )
+    table = pd.DataFrame({name: x.tolist() for name, x in coordinates.items()})
+    table.insert(0, "coordinate", [f"q{i + 1}" for i in range(len(table))])
+    numbers = {k: x.item() if isinstance(x, Tensor) else x for k, x in summary.items()}
+    return ClosedLoopMetrics(numbers, table)
 
 
 def stopped_runs(record: ClosedLoopRecord) -> Tensor:
@@ -187,9 +178,3 @@ def _settling_times(norm: Tensor, t: Tensor, bound: Tensor) -> Tensor:
 def _nanmax(values: Tensor) -> Tensor:
     largest = values.nan_to_num(-1.0, posinf=math.inf).amax(dim=0)
     return torch.where(values.isnan().all(dim=0), torch.nan, largest)
-
-
-def _numbered(kind: str, letter: str, columns: Mapping[str, Tensor]) -> pd.DataFrame:
-    table = pd.DataFrame({name: x.tolist() for name, x in columns.items()})
-    table.insert(0, kind, [f"{letter}{i + 1}" for i in range(len(table))])
-    return table

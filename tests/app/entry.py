@@ -29,7 +29,6 @@ SET_POINTS = [
     "settled_after=0.03",
     "gains.position=5",
     "gains.velocity=0.5",
-    "animate=false",
 ]
 
 TINY_DATA = [

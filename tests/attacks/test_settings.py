@@ -197,7 +197,6 @@ MISTAKES = {
         stability={region: a}
         stability={region: a, q_low: [x], q_high: [1], samples: 5}
         stability={region: [a], q_low: [0], q_high: [1], samples: 5}
-        settle_fraction=1
         run=[x]
         checkpoint=none
         member=-1
@@ -222,10 +221,8 @@ MISTAKES = {
         delay=-1
         stability=3
         export=3
-        settle_fraction=2
         settled_after=-1
         trajectory=x
-        animate=1
         ruun=x
     """,
     "gather": """

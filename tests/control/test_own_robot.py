@@ -1,34 +1,26 @@
-"""A user's robot of a few methods: it follows a helix, is drawn, and steps by itself."""
+"""A user's robot of a few methods: it follows a helix, and steps by itself."""
 
 import numpy as np
 import pytest
 import torch
 
 from pinn_dyn.control import Helix, SimulatorPlant
-from pinn_dyn.control.contracts import Motion
-from pinn_dyn.control.record import ClosedLoopRecord
-from pinn_dyn.evaluation import animate
 from pinn_dyn.mechanics import MechanicalSystem
 
 
 class Crane(MechanicalSystem):
     """A turning column, a boom and a jib, with a point mass at the tip of each."""
 
-    z_is_down = False
-
     def __init__(self):
         super().__init__(3, 3)
 
-    def lines(self, q):
+    def tip_position(self, q):
         turn, boom, jib = q.unbind(-1)
         radius = torch.stack([0 * turn, 0.4 * boom.cos(), 0.3 * (boom + jib).cos()], -1)
         height = torch.stack([0.5 + 0 * turn, 0.4 * boom.sin(), 0.3 * (boom + jib).sin()], -1)
         r, z = radius.cumsum(-1), height.cumsum(-1)
         points = torch.stack([r * turn.cos()[..., None], r * turn.sin()[..., None], z], -1)
-        return torch.cat([torch.zeros_like(points[..., :1, :]), points], -2).unsqueeze(-3)
-
-    def tip_position(self, q):
-        return self.lines(q)[..., -1, -1, :]
+        return points[..., -1, :]
 
     def mass_matrix(self, q):
         return torch.eye(3, dtype=q.dtype).expand(*q.shape, 3)
@@ -57,15 +49,6 @@ def test_the_tip_of_a_robot_of_ones_own_runs_along_the_helix():
         height = 0.5 + 0.4 * np.sin(boom) + 0.3 * np.sin(boom + jib)
         tip = [reach * np.cos(turn), reach * np.sin(turn), height]
         np.testing.assert_allclose(tip, helix.path(t), rtol=0, atol=1e-6)
-
-
-def test_a_robot_of_ones_own_is_drawn(tmp_path):
-    t = torch.linspace(0, 0.3, 4, dtype=torch.float64)
-    q = torch.tensor(POSTURE, dtype=torch.float64) + t[:, None]
-    motion = Motion(*[q[None]] * 3)
-    record = ClosedLoopRecord(t, q[None], 0 * q[None], 0 * q[None], 0 * q[None], motion, [None])
-    animate(record, 0, Crane(), tmp_path / "crane.gif")
-    assert (tmp_path / "crane.gif").stat().st_size > 1000
 
 
 class Hopping:

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from pinn_dyn.app.export import _within_domain
-from pinn_dyn.exports import exported
 from pinn_dyn.exports.casadi_function import casadi_function
 from pinn_dyn.exports.exported import write
 from pinn_dyn.exports.model_functions import model_functions
@@ -36,10 +35,10 @@ CASES = [pytest.param(x, marks=() if x in FAST else pytest.mark.slow, id=x) for 
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.usefixtures("few_states")
 def test_the_files_of_a_model_repeat_it(case, tmp_path, monkeypatch):
-    """The writers compare their files with the model, here at ten states."""
+    """The writers compare their files with the model."""
     onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
-    monkeypatch.setattr(exported, "STATES", 10)
     monkeypatch.setenv("CC", " ".join(["cc", *STRICT]))
     model = MODELS[case]().double().eval().requires_grad_(False)
     # A step repeats forward dynamics four times.

@@ -21,6 +21,8 @@ from pinn_dyn.systems import TendonArm
 from tests.models.builders import VARIANTS, make_structured
 from tests.support.c_code import function_of
 
+pytestmark = pytest.mark.usefixtures("few_states")
+
 PERIOD = 0.01
 LIMITS = dict(low=[-20.0, -9.0, -3.0], high=15.0, rate=400.0)
 REST = [np.zeros(3)] * 3

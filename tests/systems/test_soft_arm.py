@@ -147,8 +147,8 @@ def test_backbone_matches_a_composition_of_rotations(segments, motion):
     s = np.linspace(0, 1, 7)
     points = SoftArm(segments).backbone(torch.from_numpy(q).expand(2, -1), torch.from_numpy(s))
     assert points.shape == (2, segments, 7, 3)
-    tips = SoftArm(segments).lines(torch.from_numpy(q))[..., -1, :]
-    np.testing.assert_allclose(tips, backbone(q, s)[1], rtol=0, atol=1e-14)
+    tips = SoftArm(segments).tip_position(torch.from_numpy(q))
+    np.testing.assert_allclose(tips, backbone(q, s)[1][-1], rtol=0, atol=1e-14)
     np.testing.assert_allclose(points[1], backbone(q, s)[0], rtol=0, atol=1e-14)
 
 
