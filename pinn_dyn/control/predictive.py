@@ -39,6 +39,8 @@ class _Memory(NamedTuple):
 class PredictiveControl(Controller):
     """Model predictive control with limits, through CasADi (``pip install 'pinn_dyn[mpc]'``).
 
+    With a C compiler, the model is compiled first, which takes some seconds.
+
     At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starting
     from the previous plan, and applies the first input of the plan. The plan follows the future
     reference if the loop calls :meth:`follow`, as :func:`close_loop` does.
@@ -113,8 +115,7 @@ class PredictiveControl(Controller):
             _row("rate_weight", rate_weight, m),
             limit_weight,
         )
-        with torch.no_grad():
-            self.problem = ShootingProblem(model, self.step, steps, self.weights, self.limits)
+        self.problem = ShootingProblem(model, self.step, steps, self.weights, self.limits)
         self._terminal, self._iterations = terminal_weight, iterations
         self._bandwidth = observer_bandwidth
         self._reference: Reference | None = None
@@ -227,7 +228,7 @@ class PredictiveControl(Controller):
         period = t - last.t if t > last.t else self.step
         d = self._disturbance(last, t, x)
         if self._bandwidth is not None:
-            slopes = np.array(problem.jacobian(np.concatenate([x_ref[:, -1], u_ref[:, -1]])))
+            slopes = problem.slopes(np.concatenate([x_ref[:, -1], u_ref[:, -1]])[None])[0]
             u_ref = u_ref - (np.linalg.pinv(slopes[:, 2 * self.num_coordinates :]) @ d)[:, None]
         iterations = self._iterations * (_FIRST_ITERATIONS if first else 1)
         u, plan = last.u, None
@@ -272,8 +273,8 @@ class PredictiveControl(Controller):
         if self._bandwidth is None or t <= last.t:
             return last.d
         n, period = self.num_coordinates, t - last.t
-        modeled = self.problem.acceleration(np.concatenate([(last.x + x) / 2, last.u]))
-        measured = (x[n:] - last.x[n:]) / period - np.array(modeled).ravel()
+        modeled = self.problem.accelerations(np.concatenate([(last.x + x) / 2, last.u]))
+        measured = (x[n:] - last.x[n:]) / period - modeled
         return last.d - math.expm1(-self._bandwidth * period) * (measured - last.d)
 
     def _warn_of_excess(self, k: int, plan: Plan) -> None:

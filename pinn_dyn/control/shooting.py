@@ -7,12 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.linalg import solve_discrete_are
+from torch import Tensor
 
-from pinn_dyn.exports.casadi_function import casadi_function, import_casadi
-from pinn_dyn.exports.program import trace
+from pinn_dyn.exports.c_library import compiled_rows
+from pinn_dyn.exports.casadi_function import import_casadi
 from pinn_dyn.mechanics import MechanicalSystem
 
 _STEP_SIZES = 0.5 ** np.arange(7)  # steps that the line search tries
+_DIFFERENCE = 1e-7  # change of a state or input for a slope, relative to the larger of 1 and it
 _CONVERGED = 1e-4  # largest change of a number in the last iteration, relative
 
 
@@ -81,15 +83,13 @@ class ShootingProblem:
         self.weights, self.limits = weights, limits
         bounded = (limits.x_low, limits.x_high, limits.rate)
         self._rows = [np.flatnonzero(np.isfinite(x)).tolist() for x in bounded]
-        example = {"q": torch.full((n,), 0.1), "v": torch.full((n,), 0.1), "u": torch.zeros(m)}
-        example = {key: x.double() for key, x in example.items()}
-        dynamics = casadi_function(trace(model.forward_dynamics, example, ["a"]), "dynamics")
-        ca = import_casadi()
-        z = ca.MX.sym("z", 2 * n + m)
-        a = dynamics.call([z[:n], z[n : 2 * n], z[2 * n :]], True, False)[0]
-        self.acceleration = ca.Function("acceleration", [z], [a])
-        self.jacobian = ca.Function("jacobian", [z], [ca.jacobian(a, z)])
-        self._transcribe(ca)
+        self._transcribe(import_casadi())
+
+        def dynamics(z: Tensor) -> Tensor:
+            return model.forward_dynamics(*z.split([n, n, m], dim=-1))
+
+        with torch.no_grad():
+            self._dynamics = compiled_rows(dynamics, torch.full((2 * n + m,), 0.1).double())
 
     def _transcribe(self, ca: Any) -> None:
         (n, m), h, steps = self.sizes, self.step, self.steps
@@ -113,27 +113,39 @@ class ShootingProblem:
         )
         before = ca.horzcat(x0, X[:, :-1])
         middle = ca.vertcat((before + X) / 2, U)
-        a = ca.MX.sym("a", n, steps)
-        slope = ca.vertcat(middle[n : 2 * n, :], a + ca.repmat(d, 1, steps))
+        a, slopes = ca.MX.sym("a", n, steps), ca.MX.sym("slopes", n, (2 * n + m) * steps)
+        rate = ca.vertcat(middle[n : 2 * n, :], a + ca.repmat(d, 1, steps))
         rows = ca.veccat(
-            X - before - h * slope,
+            X - before - h * rate,
             X[lows, :] + excess[lows, :],
             X[highs, :] - excess[highs, :],
             change[rated, :],
         )
-        blocks = ca.diagcat(*ca.horzsplit(self.jacobian.map(steps)(middle), 2 * n + m))
+        blocks = ca.diagcat(*ca.horzsplit(slopes, 2 * n + m))
         of_states = ca.mtimes(blocks, ca.jacobian(ca.vec(middle), w))
         jacobian = ca.jacobian(rows, w) + ca.mtimes(ca.jacobian(rows, ca.vec(a)), of_states)
-        rows = ca.Function("rows", [*arguments, a], [rows])(
-            *arguments, self.acceleration.map(steps)(middle)
-        )
         hessian, gradient = ca.hessian(cost, w)
-        self._values = ca.Function("values", arguments, [cost, rows])
-        self._slopes = ca.Function("slopes", arguments, [gradient, jacobian])
+        self._values = ca.Function("values", [*arguments, a], [cost, rows])
+        self._slopes = ca.Function("slopes", [*arguments, slopes], [gradient, jacobian])
         self._hessian = ca.Function("hessian", [P], [hessian])
         parts = {"h": hessian.sparsity(), "a": jacobian.sparsity()}
         quiet = {"error_on_fail": False, "print_time": False}
         self._quadratic = ca.conic("quadratic", "piqp", parts, quiet)
+
+    def accelerations(self, z: np.ndarray) -> np.ndarray:
+        """Return a ``(..., N)`` at the states and inputs z = (q, v, u), ``(..., 2N + M)``."""
+        with torch.no_grad():
+            return self._dynamics(torch.from_numpy(z)).numpy()
+
+    def slopes(self, z: np.ndarray) -> np.ndarray:
+        """Return da/dz, ``(K, N, 2N + M)``, at K states and inputs, by forward differences.
+
+        They take less time than exact derivatives of networks.
+        """
+        moved = z + _DIFFERENCE * np.maximum(1, np.abs(z))
+        points = np.where(np.eye(z.shape[-1], dtype=bool), moved[:, None], z[:, None])
+        a = self.accelerations(np.concatenate([z[:, None], points], axis=1))
+        return ((a[:, 1:] - a[:, :1]) / (moved - z)[..., None]).transpose(0, 2, 1)
 
     def terminal_weight(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return P of the linear-quadratic regulator at a state ``(2N,)`` and input ``(M,)``.
@@ -142,7 +154,7 @@ class ShootingProblem:
             ValueError: if no input stabilizes the linear system.
         """
         (n, _), h = self.sizes, self.step
-        slopes = np.array(self.jacobian(np.concatenate([x, u])))
+        slopes = self.slopes(np.concatenate([x, u])[None])[0]
         A = np.vstack([np.eye(n, 2 * n, n), slopes[:, : 2 * n]])
         B = np.vstack([np.zeros_like(slopes[:, 2 * n :]), slopes[:, 2 * n :]])
         left = np.eye(2 * n) - h / 2 * A
@@ -204,12 +216,20 @@ class ShootingProblem:
         def violation(rows: np.ndarray) -> float:
             return float(np.maximum(rows_low - rows, rows - rows_high).clip(min=0).sum())
 
+        def evaluated(w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Return the points of the accelerations, the cost, and the rows."""
+            x, u = w[: free.size].reshape(steps, 2 * n), w[free.size :][: m * steps]
+            points = np.hstack([(np.vstack([x0, x[:-1]]) + x) / 2, u.reshape(steps, m)])
+            cost, rows = self._values(w, *arguments, self.accelerations(points).T)
+            return points, np.array(cost).ravel(), np.array(rows).ravel()
+
         penalty = 0.0
-        cost, rows = (np.array(x).ravel() for x in self._values(w, *arguments))
+        points, cost, rows = evaluated(w)
         count = 0
         while count < iterations:
             count += 1
-            gradient, jacobian = self._slopes(w, *arguments)
+            slopes = np.concatenate(self.slopes(points), axis=-1)
+            gradient, jacobian = self._slopes(w, *arguments, slopes)
             solution = self._quadratic(
                 h=H,
                 g=gradient,
@@ -227,7 +247,7 @@ class ShootingProblem:
             expected = float(np.array(gradient).ravel() @ change_of_w) - penalty * violation(rows)
             for size in _STEP_SIZES:
                 trial = w + size * change_of_w
-                cost, rows = (np.array(x).ravel() for x in self._values(trial, *arguments))
+                points, cost, rows = evaluated(trial)
                 if float(cost[0]) + penalty * violation(rows) <= merit + 1e-4 * size * expected:
                     break
             w = trial

@@ -91,28 +91,44 @@ def _signature(function: ExportedFunction, name: str, real: Real) -> str:
     return f"{kind} {name}_{function.name}({', '.join(parameters)})"
 
 
-def _compiled(path: Path) -> ctypes.CDLL | None:
-    """Compile a C file and load it; return None, with a warning, without a compiler."""
-    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    commands = [shlex.split(name) for name in names]  # CC may hold options
-    compiler = next((words for words in commands if shutil.which(words[0])), None)
-    if compiler is None:
-        log.warning(
-            "%s was not compared with the model: no C compiler (%s) is installed, set CC to one",
-            path.name,
-            ", ".join(names),
-        )
-        return None
-    library = path.with_suffix(".so")
-    flags = ["-std=c99", "-O1", "-fPIC", "-shared", "-o", library.name]
-    result = subprocess.run(
-        [*compiler, *flags, path.name, "-lm"], cwd=path.parent, capture_output=True, text=True
-    )
+def find_compiler() -> list[str] | None:
+    """Return the command of the C compiler, which CC may set with options, or None without one."""
+    commands = [shlex.split(name) for name in _compilers()]
+    return next((words for words in commands if shutil.which(words[0])), None)
+
+
+def _compilers() -> list[str]:
+    return [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
+
+
+def compile_c(compiler: Sequence[str], flags: Sequence[str], source: Path) -> Path:
+    """Compile a C file to a library beside it.
+
+    Raises:
+        RuntimeError: if the compiler fails.
+    """
+    library = source.with_suffix(".so")
+    command = [*compiler, *flags, "-o", library.name, source.name, "-lm"]
+    result = subprocess.run(command, cwd=source.parent, capture_output=True, text=True)
     if result.returncode:
         lines = [*result.stderr.splitlines(), "no message"]
         problem = next((line for line in lines if "error" in line), lines[0])
         name = shlex.join(compiler)
-        raise RuntimeError(f"{name} does not compile {path.name}: {problem}; set CC to another")
+        raise RuntimeError(f"{name} does not compile {source.name}: {problem}; set CC to another")
+    return library
+
+
+def _compiled(path: Path) -> ctypes.CDLL | None:
+    """Compile a C file and load it; return None, with a warning, without a compiler."""
+    compiler = find_compiler()
+    if compiler is None:
+        log.warning(
+            "%s was not compared with the model: no C compiler (%s) is installed, set CC to one",
+            path.name,
+            ", ".join(_compilers()),
+        )
+        return None
+    library = compile_c(compiler, ["-std=c99", "-O1", "-fPIC", "-shared"], path)
     loaded = ctypes.CDLL(str(library))
     library.unlink()
     return loaded

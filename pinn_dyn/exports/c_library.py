@@ -1,0 +1,90 @@
+"""C code that is compiled for this process."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import logging
+import os
+import subprocess
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from torch import Tensor
+
+from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
+from pinn_dyn.exports.c_file import compile_c, find_compiler
+from pinn_dyn.exports.program import trace
+
+log = logging.getLogger(__name__)
+
+_FLAGS = ["-std=gnu99", "-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared"]
+_FLAGS += ["-D__FAST_MATH__"]  # makes glibc declare exp, tanh and so on of vectors, nothing else
+
+
+def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return y = f(x) for the rows of float64 tensors, in C.
+
+    The function itself is returned if there is no C compiler or no C code for an operation.
+
+    Args:
+        function: takes ``(*batch, n)`` and returns ``(*batch, m)``, rows independently.
+        x: example of a row, ``(n,)``.
+    """
+    try:
+        program = trace(function, {"x": x}, ["y"])
+        constants = Constants("double")
+        lines = CFunction(program, constants).lines
+        (n,), (m,) = x.shape, function(x).shape
+        code = ["typedef double real;", PRELUDE, *constants.definitions()]
+        code += ["static void row(const real *restrict x, real *restrict y)", "{", *lines, "}"]
+        code += [
+            "void rows(long count, const real *x, real *y)",
+            f"{{ for (; count > 0; count--, x += {n}, y += {m}) row(x, y); }}",
+        ]
+        library = load_code("\n".join([*code, ""]))
+
+        def call(values: Tensor) -> Tensor:
+            values = values.contiguous()
+            result = values.new_empty(*values.shape[:-1], m)
+            pointers = (ctypes.c_void_p(array.data_ptr()) for array in (values, result))
+            library.rows(ctypes.c_long(result.numel() // m), *pointers)
+            return result
+
+        torch.testing.assert_close(call(x), function(x), rtol=1e-9, atol=1e-12, equal_nan=True)
+        return call
+    except Exception:  # from a head that cannot be traced, a compiler or a full disk
+        log.debug("no C code for %s", function, exc_info=True)
+        return function
+
+
+def load_code(code: str) -> ctypes.CDLL:
+    """Compile C code for this processor, unless the cache folder has the library, and load it.
+
+    Raises:
+        FileNotFoundError: without a C compiler.
+        RuntimeError: if the compiler fails.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise FileNotFoundError("no C compiler is installed: set CC to one")
+    digest = hashlib.sha256((code + _target(*compiler)).encode()).hexdigest()
+    folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
+    library = folder / f"{digest}.so"
+    if not library.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder) as name:
+            source = Path(name) / "code.c"
+            source.write_text(code)
+            os.replace(compile_c(compiler, _FLAGS, source), library)
+    return ctypes.CDLL(str(library))
+
+
+@cache
+def _target(*compiler: str) -> str:
+    """Return the version of a compiler and its flags for this processor."""
+    command = [*compiler, *_FLAGS, "-###", "-E", "-x", "c", "-"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stderr
