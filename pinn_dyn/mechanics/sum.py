@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pinn_dyn.mechanics.integrators import RK4, Integrator
+from pinn_dyn.mechanics.integrators import Integrator, with_friction
 from pinn_dyn.mechanics.system import MechanicalSystem
 
 
@@ -48,10 +48,11 @@ class Sum(MechanicalSystem):
                     f"use ~{name}.delay, and shift the input by the step InputDelay"
                 )
         super().__init__(*next(iter(sizes.values())))
-        self.integrator = integrator or RK4()
         self.parts = nn.ModuleDict(parts)
         self.input_affine = all(part.input_affine for part in parts.values())
         self.has_residual = any(part.has_residual for part in parts.values())
+        self.sticking = any(part.sticking for part in parts.values())
+        self.integrator = with_friction(integrator, self.sticking)
 
     mass_matrix = _total("mass_matrix")
     potential_energy = _total("potential_energy")
@@ -63,6 +64,7 @@ class Sum(MechanicalSystem):
     _damping_force = _total("_damping_force")
     _friction_force = _total("_friction_force")
     _friction_slope = _total("_friction_slope")
+    _sliding_force = _total("_sliding_force")
     _input_force = _total("_input_force")
     _applied_force = _total("_applied_force")
     _residual_force = _total("_residual_force")

@@ -19,6 +19,7 @@ from pinn_dyn.mechanics.arrays import (
 )
 from pinn_dyn.mechanics.input_solver import InputSolver, Solution
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
+from pinn_dyn.mechanics.sliding import Sliding
 
 
 class Terms(NamedTuple):
@@ -41,8 +42,9 @@ class MechanicalSystem(ContinuousPredictor):
 
         dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) v - F(v) + A(q) u + r,  v = dH/dp
 
-    F(v) is dry friction, with v^T F(v) >= 0. r(q, v, u) is a residual force for effects that are
-    not mechanical (``has_residual``). Both are zero by default, as in the paper.
+    F(v) is dry friction, with v^T F(v) >= 0. With ``sticking`` friction, coordinates stick
+    in roll-outs (:class:`~.integrators.Sticking`). r(q, v, u) is a residual force for effects that
+    are not mechanical (``has_residual``). Both are zero by default, as in the paper.
 
     Symbols: q configuration ``(*batch, N)``, v velocity ``(*batch, N)``, a acceleration
     ``(*batch, N)``, p momentum ``(*batch, N)``, u input ``(*batch, M)``, tau = A(q) u generalized
@@ -56,6 +58,7 @@ class MechanicalSystem(ContinuousPredictor):
     """
 
     input_affine: bool = True
+    sticking: bool = False
     has_residual: bool = False
 
     @abc.abstractmethod
@@ -104,6 +107,10 @@ class MechanicalSystem(ContinuousPredictor):
 
     def _friction_slope(self, v: Tensor) -> Tensor:
         return torch.zeros_like(v)
+
+    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+        """Return the friction of coordinates that slide forward in a ``share`` of the time."""
+        return self._friction_force(v)
 
     def _stiffness_matrix(self, q: Tensor) -> Tensor | None:
         """Return stiff terms K(q) of dG/dq, ``(*batch, N, N)``, or None, for implicit methods."""
@@ -292,6 +299,16 @@ class MechanicalSystem(ContinuousPredictor):
             return self.momentum_derivative(x, u)
         return self.velocity_derivative(x, u)
 
+    def _resistance(self, q: Tensor, step: Tensor) -> Tensor:
+        """Return D + s K, ``(*batch, N, N)``."""
+        damping, stiffness = self.damping_matrix(q), self._stiffness_matrix(q)
+        return damping if stiffness is None else damping + step * stiffness
+
+    @final
+    def sliding(self, x: Tensor, u: Tensor, h: Tensor, implicit: bool) -> Sliding:
+        """Return the dynamics of a step of h s from x with sticking friction."""
+        return Sliding(self, x, u, h, implicit)
+
     @final
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
         """Return a function from r to k with (1 - s J) k = r, where J has the stiff terms::
@@ -305,11 +322,8 @@ class MechanicalSystem(ContinuousPredictor):
         q, v = x.chunk(2, dim=-1)
         if self.state == "qp":
             v = self._velocity(q, v)
-        mass = self.mass_matrix(q)
-        resistance = self.damping_matrix(q) + torch.diag_embed(self._friction_slope(v))
-        stiffness = self._stiffness_matrix(q)
-        if stiffness is not None:
-            resistance = resistance + step * stiffness
+        mass, stiffness = self.mass_matrix(q), self._stiffness_matrix(q)
+        resistance = self._resistance(q, step) + torch.diag_embed(self._friction_slope(v))
         inverse = spd_solver(mass + step * resistance)
 
         def solve(rate: Tensor) -> Tensor:

@@ -16,7 +16,12 @@ _SMALLEST_WIDTH = 0.01
 
 
 class Friction(nn.Module, abc.ABC):
-    """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0."""
+    """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
+
+    With ``sticking``, roll-outs use :meth:`sliding` instead of F.
+    """
+
+    sticking: bool = False
 
     @abc.abstractmethod
     def forward(self, v: Tensor) -> Tensor:
@@ -25,6 +30,13 @@ class Friction(nn.Module, abc.ABC):
     @abc.abstractmethod
     def slope(self, v: Tensor) -> Tensor:
         """Return dF_i/dv_i >= 0, ``(*batch, N)``. F_i depends on v_i alone."""
+
+    def sliding(self, v: Tensor, share: Tensor) -> Tensor:
+        """Return the force at speed |v| of coordinates that slide forward in a share of the time.
+
+        The default is F(v), without a jump at v = 0.
+        """
+        return self(v)
 
     def physical_constants(self) -> list[Named]:
         """Return the learned constants in physical units. The default has none."""
@@ -48,9 +60,11 @@ class CoulombFriction(Friction):
     """Smooth Coulomb law F_i(v) = c_i tanh(v_i / w_i) with learned c_i > 0 and w_i > 0.
 
     c_i is the friction level of coordinate i (N or Nm), of which the force has reached 76 % at the
-    speed w_i (m/s or rad/s). The law has no stiction. Source: Armstrong-Helouvry, Dupont and
-    Canudas de Wit (1994), "A survey of models, analysis tools and compensation methods for the
-    control of machines with friction".
+    speed w_i (m/s or rad/s). A ``sticking`` law is smooth for control laws, torques and the
+    identification only. Its roll-outs use the limit of w = 0, in which a coordinate at rest under a
+    load below c_i does not move (:class:`~pinn_dyn.mechanics.sliding.Sliding`). Source:
+    Armstrong-Helouvry, Dupont and Canudas de Wit (1994), "A survey of models, analysis tools and
+    compensation methods for the control of machines with friction".
 
     Args:
         scales: scales of the data. The value is a typical generalized force, ``(N,)``.
@@ -58,6 +72,7 @@ class CoulombFriction(Friction):
         width: initial w in units of the typical speeds, without the added minimum of 0.01. The
             default is 0.1 for a network, and 0.03 for known mechanics.
         spread: prior standard deviation of log c and log w, for known mechanics only.
+        sticking: true for roll-outs with sticking. The default is true for known mechanics only.
     """
 
     def __init__(
@@ -67,10 +82,12 @@ class CoulombFriction(Friction):
         level: PositiveFloat = 0.1,
         width: PositiveFloat | None = None,
         spread: PositiveFloat = 1.0,
+        sticking: bool | None = None,
     ):
         super().__init__()
         if width is None:
             width = 0.03 if scales.prior else 0.1
+        self.sticking = scales.prior if sticking is None else sticking
         forces = [joint.force for joint in scales.joints]
         speeds = [joint.speed for joint in scales.joints]
         v_std, floor = scales.statistics.v_std, _SMALLEST_WIDTH
@@ -87,22 +104,31 @@ class CoulombFriction(Friction):
         return [*self._levels(), width]
 
     def forward(self, v: Tensor) -> Tensor:
-        return self._level(v)[0] * torch.tanh(v / self.width())
+        return self._level(v) * torch.tanh(v / self.width())
+
+    def sliding(self, v: Tensor, share: Tensor) -> Tensor:
+        forward, backward = self._levels_at(v)
+        return share * forward - (1 - share) * backward
 
     def slope(self, v: Tensor) -> Tensor:
         """Return c_i (1 - tanh(v_i / w_i)^2) / w_i + dc_i/dv_i tanh(v_i / w_i)."""
-        level, level_slope = self._level(v)
         width = self.width()
         sign = torch.tanh(v / width)
-        slope = level / width * (1 - sign**2)
-        return slope if level_slope is None else slope + level_slope * sign
+        return self._level(v) / width * (1 - sign**2) + self._level_slope(v) * sign
 
     def _levels(self) -> list[Named]:
         return [self.level.named()]
 
-    def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the level at v and its slope in v, or None where the slope is zero."""
-        return self.level(), None
+    def _levels_at(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the levels of forward and backward motion at the speed |v|."""
+        level = self.level()
+        return level, level
+
+    def _level(self, v: Tensor) -> Tensor:
+        return torch.where(v > 0, *self._levels_at(v))
+
+    def _level_slope(self, v: Tensor) -> Tensor:
+        return torch.zeros_like(v)
 
 
 class AsymmetricCoulomb(CoulombFriction):
@@ -122,9 +148,9 @@ class AsymmetricCoulomb(CoulombFriction):
             constants.append(Named(names, self.level.units, values, lower=0.0))
         return constants
 
-    def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _levels_at(self, v: Tensor) -> tuple[Tensor, Tensor]:
         level, ratio = self.level(), self.ratio()
-        return torch.where(v > 0, level * ratio, level / ratio), None
+        return level * ratio, level / ratio
 
 
 class Stribeck(AsymmetricCoulomb):
@@ -142,8 +168,12 @@ class Stribeck(AsymmetricCoulomb):
     def physical_constants(self) -> list[Named]:
         return [*super().physical_constants(), self.rise.named(), self.speed.named()]
 
-    def _level(self, v: Tensor) -> tuple[Tensor, Tensor | None]:
-        level, _ = super()._level(v)
-        speed = self.speed()
-        rise = self.rise() * torch.exp(-((v / speed) ** 2))
-        return level + rise, -2 * v / speed**2 * rise
+    def _levels_at(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        forward, backward = super()._levels_at(v)
+        return forward + self._rise(v), backward + self._rise(v)
+
+    def _level_slope(self, v: Tensor) -> Tensor:
+        return -2 * v / self.speed() ** 2 * self._rise(v)
+
+    def _rise(self, v: Tensor) -> Tensor:
+        return self.rise() * torch.exp(-((v / self.speed()) ** 2))

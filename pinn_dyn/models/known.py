@@ -11,7 +11,8 @@ import torch
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, Integrator
+from pinn_dyn.mechanics import Integrator
+from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.elastic import ElasticJoints, Springs
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.known_constants import Constants, Named, PhysicalBodies, RealConstants
@@ -127,7 +128,6 @@ class KnownMechanics(LearnedConstants):
             )
         super().__init__(size, statistics.num_inputs)
         self.structure = structure
-        self.integrator = integrator or RK4()
         # Rods for the links of an arm. The last body has no link, so a single rod has no size.
         generic = 100.0 if len(driven) > 1 else math.inf
         self._largest_ratio = 5.0 if start == "prior" else generic
@@ -158,6 +158,8 @@ class KnownMechanics(LearnedConstants):
             [joint.force for joint in motors.joints],
         )
         self.friction = friction(scales)
+        self.sticking = self.friction.sticking
+        self.integrator = with_friction(integrator, self.sticking)
         self.elastic = Springs(elastic) if elastic else None
         self.gain: Constants | None = None
         if gain_spread > 0 and self.servo is None:
@@ -232,12 +234,16 @@ class KnownMechanics(LearnedConstants):
         force = self.input_gain() * u if self.servo is None else self.servo.torque(q, v, u)
         return force @ self.motors
 
-    def drive_force(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return r a + D v + F(v) - o - motor force, ``(*batch, N)``.
+    def drive_force(
+        self, q: Tensor, v: Tensor, a: Tensor, u: Tensor, share: Tensor | None = None
+    ) -> Tensor:
+        """Return r a + D v + F - o - motor force, ``(*batch, N)``.
 
-        The terms Y pi and the forces of elastic joints are not in this force.
+        F is the smooth law, or the sliding friction of a share of forward motion. The terms Y pi
+        and the forces of elastic joints are not in this force.
         """
-        resistance = self.rotor_inertia() * a + self.viscous() * v + self.friction(v)
+        friction = self.friction(v) if share is None else self.friction.sliding(v, share)
+        resistance = self.rotor_inertia() * a + self.viscous() * v + friction
         return resistance - self.constant_force() - self.motor_force(q, v, u)
 
     def force_ratio(self, q: Tensor, v: Tensor, a: Tensor) -> tuple[Tensor, float]:
@@ -321,3 +327,6 @@ class KnownMechanics(LearnedConstants):
 
     def _friction_slope(self, v: Tensor) -> Tensor:
         return self.friction.slope(v)
+
+    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+        return self.friction.sliding(v, share)

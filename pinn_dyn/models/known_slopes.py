@@ -27,8 +27,8 @@ class KnownSlopes(Slopes):
         super().__init__(model)
         self._bodies = self._body_slopes()
 
-    def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        return self.by_regressor(self.model.structure.regressor(q, v, a), q, v, a, u)
+    def by_parameters(self, *at: Tensor) -> Tensor:
+        return self.by_regressor(self.model.structure.regressor(*at[:3]), *at)
 
     def by_regressor(self, regressor: Tensor, *at: Tensor) -> Tensor:
         def elements(m: Any) -> Tensor:
@@ -39,11 +39,12 @@ class KnownSlopes(Slopes):
         drives = self._drive_slopes(elements, at[0])
         return torch.cat([regressor @ self._bodies, drives], dim=-1)
 
-    def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
+    def by_state(self, *at: Tensor) -> Tensor:
+        q, v, a, *inputs = at
         by_q, by_v = self.model.structure.force_slopes(q, v, a, self.model.bodies())
         state = q.clone().requires_grad_(), v.clone().requires_grad_()
         with torch.enable_grad():
-            force = self.model.drive_force(*state, a, u).sum()
+            force = self.model.drive_force(*state, a, *inputs).sum()
             drives = torch.autograd.grad(force, state, materialize_grads=True)
         by_q, by_v = (x + torch.diag_embed(y) for x, y in zip((by_q, by_v), drives, strict=True))
         if self.model.elastic is not None:

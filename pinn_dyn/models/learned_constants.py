@@ -78,14 +78,17 @@ class Slopes:
     def __init__(self, model: LearnedConstants):
         self.model: Any = model
 
-    def by_parameters(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return de/dz, ``(B, N, P)``, from samples ``(B, N)`` and ``(B, M)``."""
-        function, z = self._of_parameters(lambda model, *sample: model.missing_force(*sample))
-        return vmap(jacrev(function), in_dims=(None, 0, 0, 0, 0))(z, q, v, a, u)
+    def by_parameters(self, *at: Tensor) -> Tensor:
+        """Return de/dz, ``(B, N, P)``, from samples q, v, a ``(B, N)`` and u ``(B, M)``.
 
-    def by_state(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
-        """Return de/d(q, v), ``(B, N, 2N)``, from samples ``(B, N)`` and ``(B, M)``."""
-        return torch.cat(vmap(jacrev(self.model.missing_force, (0, 1)))(q, v, a, u), dim=-1)
+        After them, a sticking law takes the share of forward motion (:class:`~.sliding.Sliding`).
+        """
+        function, z = self._of_parameters(lambda model, *sample: model.missing_force(*sample))
+        return vmap(jacrev(function), in_dims=(None, *(0 for _ in at)))(z, *at)
+
+    def by_state(self, *at: Tensor) -> Tensor:
+        """Return de/d(q, v), ``(B, N, 2N)``, from the samples of :meth:`by_parameters`."""
+        return torch.cat(vmap(jacrev(self.model.missing_force, (0, 1)))(*at), dim=-1)
 
     def gain(self) -> Tensor:
         """Return dk/dz, ``(N, P)``, of the drive gains."""

@@ -8,7 +8,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, Integrator, MechanicalSystem, State
+from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
+from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky
 from pinn_dyn.models.delay import DelayedPredictor, LearnedDelay
 from pinn_dyn.models.friction import Friction
@@ -55,7 +56,6 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         delay: LearnedDelay | None,
     ):
         super().__init__(statistics.num_coordinates, statistics.num_inputs, state)
-        self.integrator = integrator or RK4()
         self.delay = delay
         self.angles = tuple(angles)
         u_rms = statistics.u_rms
@@ -66,6 +66,13 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         self.potential = potential(self._scales(statistics, energy))
         self.damping = damping(self._scales(statistics, (force / statistics.v_std).sqrt()))
         self.friction = friction(self._scales(statistics, force))
+        self.sticking = self.friction.sticking
+        if self.sticking and state == "qp":
+            raise ValueError(
+                "friction that sticks needs the state (q, v), not momenta: set model.state=qv, or "
+                "model.friction.sticking=false for the smooth law"
+            )
+        self.integrator = with_friction(integrator, self.sticking)
         self.input_affine = self.input.affine
         self.residual = residual and residual(self._scales(statistics, force))
         self.has_residual = self.penalized = residual is not None
@@ -108,6 +115,9 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
 
     def _friction_slope(self, v: Tensor) -> Tensor:
         return self.friction.slope(v)
+
+    def _sliding_force(self, v: Tensor, share: Tensor) -> Tensor:
+        return self.friction.sliding(v, share)
 
     def _input_force(self, q: Tensor, u: Tensor) -> Tensor:
         return self.input.force(q, u)

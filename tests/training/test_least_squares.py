@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import itertools
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -30,8 +31,9 @@ PENDULUM = robot(
 )
 
 
-def robot_model(start, seed=None):
-    model = known_model(PENDULUM, locked_joints=(), friction=CoulombFriction, start=start)
+def robot_model(start, seed=None, sticking=False):
+    friction = partial(CoulombFriction, sticking=sticking)
+    model = known_model(PENDULUM, locked_joints=(), friction=friction, start=start)
     if seed is not None:
         generator = torch.Generator().manual_seed(seed)
         for parameter in model.parameters():
@@ -60,6 +62,21 @@ def held_out_error(model, truth, run):
     with torch.no_grad():
         a, expected = (m.forward_dynamics(run.q, run.v, run.u) for m in (model, truth))
     return float((a - expected).norm() / expected.norm())
+
+
+def test_roll_outs_fit_friction_that_sticks():
+    """A load below the friction level holds; only roll-outs that stick fit such windows."""
+    truth = robot_model("prior", seed=1, sticking=True)
+    with torch.no_grad():
+        truth.friction.level.z += 1.5
+    runs = motions(truth, range(2), seconds=3.0, rate=100.0)
+    assert float((runs[0].v == 0).double().mean()) > 0.03
+    windows = draw_windows(runs, count=30, steps=2, stride=4, seed=0)
+    model = robot_model("prior", sticking=True)
+    result = LeastSquares(cutoff=20.0, evaluations=6).fit(model, runs, windows)
+    ratio = model.friction.level() / truth.friction.level()
+    assert result.residual < 0.05  # 0.2 with the smooth law
+    assert float(ratio.log().abs().max()) < 0.05  # 0.6 with the smooth law
 
 
 @pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "roll-outs"])

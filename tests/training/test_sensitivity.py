@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.mechanics import RK4
 from pinn_dyn.models import Servo, Stribeck
 from pinn_dyn.models.learned_constants import Slopes
 from pinn_dyn.training.sensitivity import rollout_slopes
-from tests.support.known import elastic_model, known_arm, known_model, windows_of
+from tests.support.known import elastic_model, known_arm, known_model, motion, windows_of
 
 MODELS = {
     "Stribeck": lambda: known_model(gain_spread=0.3, friction=Stribeck),
@@ -103,4 +104,19 @@ def test_roll_outs_by_the_parameters(model, substeps):
     increments = partial(model.increments, windows.start("qv"), windows.t, windows.input)
     directions = some_directions(model)
     expected = differences(model, lambda: increments()[:, 1:], directions)
+    assert_close(rollout_slopes(model, windows) @ directions.T, expected)
+
+
+def test_roll_outs_with_stops_by_the_parameters():
+    """Joints stop, turn and stick within the windows."""
+    model = known_model(friction=Stribeck)
+    windows = draw_windows([motion(model, seconds=1.0)], count=20, steps=6, stride=2, seed=0)
+    x0 = windows.start("qv")
+    increments = partial(model.increments, x0, windows.t, windows.input)
+    with torch.no_grad():
+        v = (x0[:, None] + increments()).chunk(2, dim=-1)[1]
+    assert (v == 0).any()
+    assert (v[:, 1:] * v[:, :-1] < 0).any()
+    directions = some_directions(model)
+    expected = differences(model, lambda: increments()[:, 1:], directions, step=1e-6)
     assert_close(rollout_slopes(model, windows) @ directions.T, expected)

@@ -45,11 +45,13 @@ class Integrator(abc.ABC):
         nodes: times of the stages in a step, from 0 to 1.
         order: exponent of the error O(h^order).
         mean_input: true to shift the inputs at the nodes so that their mean is that over the step.
+        implicit: true for a method that is stable where damping outweighs inertia.
     """
 
     nodes: tuple[float, ...]
     order: int
     mean_input: bool = False
+    implicit: bool = False
 
     def __init__(self, substeps: PositiveInt = 1):
         self.substeps = substeps

@@ -30,6 +30,7 @@ class Rosenbrock(Integrator):
     nodes = (0.0, 1.0)
     order = 2
     mean_input = True
+    implicit = True
 
     def step(
         self, dynamics: Dynamics, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
