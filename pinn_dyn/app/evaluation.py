@@ -49,7 +49,8 @@ def evaluate(
         source: another data set to test on; None takes the data of the training.
         split: ``test``, or ``validation`` for choosing settings.
         horizon: length of the rollouts, s; None takes the shortest trajectory, 5 s at most.
-        step: step of the rollouts, s; None takes the training step of each run.
+        step: step of the rollouts and between the compared times, s; None takes the training step
+            of each run.
         windows: times between two resets to the measured state, s, one windowed error each; None
             takes those of 0.1, 0.5 and 1 s that fit.
         thresholds: names and values of the valid prediction times, in the units of q.
@@ -78,7 +79,7 @@ def evaluate(
     steps = [run.model.fixed_step or step or run.statistics.step for run in runs]
     if message := too_long_for(motions, max(steps), source.labels):
         log.warning("%s: %s", source.name, message)
-    stride = common_stride(steps, truth.t)
+    stride = common_stride(steps if step is None else [*steps, step], truth.t)
     grid = stride * truth.duration / (len(truth.t) - 1)
 
     models = model_names([run.config["model_name"] for run in runs], [run.config for run in runs])

@@ -142,7 +142,7 @@ class Signal:
         times = torch.stack([*inner, end], dim=-1)
         index = torch.searchsorted(self.t, times, right=True) - 1
         if self.interpolation == "hold":
-            index[:, -1] = torch.searchsorted(self.t, end) - 1
+            index[:, -1] = torch.searchsorted(self.t, end.contiguous()) - 1
         return self._at(times, index)
 
     def means(self, grid: Tensor) -> Tensor:

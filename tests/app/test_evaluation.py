@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.image import imread
 
 import pinn_dyn
@@ -87,6 +88,19 @@ def test_figures_and_the_page_are_written(evaluation, hnn_run):
     record = json.loads((evaluation / "provenance.json").read_text())
     assert record["config"]["horizon"] == 0.1
     assert record["dataset"]["name"] == "soft_arm_1"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_model_of_finer_steps_is_compared_at_the_times_of_the_step(mlp_run):
+    """The mean over more times would not compare with models of the longer step."""
+    run = pinn_dyn.load(mlp_run)
+    fine, coarse = (
+        pinn_dyn.evaluate(run, horizon=0.08, windows=[0.04], step=x).predictions["mlp"]
+        for x in (None, 0.02)
+    )
+    assert run.model.fixed_step == pytest.approx(0.01)
+    assert torch.equal(coarse.q_hat, fine.q_hat[:, ::2])
+    assert torch.equal(coarse.t, fine.t[::2])
 
 
 @pytest.mark.usefixtures("undrawn")
