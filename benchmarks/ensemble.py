@@ -38,7 +38,7 @@ from pinn_dyn.mechanics import Predictor, Signal
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.training import SOAP, IncrementLoss, MidpointLoss, ParameterVector
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
-from pinn_dyn.training.learner import clipped
+from pinn_dyn.training.adamw import clipped
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000

@@ -22,6 +22,7 @@ from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor, Predictor, Trajectory
 from pinn_dyn.models.output_limits import free_weights, output_limits, set_output_limits
 from pinn_dyn.models.statistics import Statistics
+from pinn_dyn.training.adamw import CompiledAdamW, clipped
 from pinn_dyn.training.errors import NonFiniteLossError
 from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.losses import Penalized, WindowLoss
@@ -85,7 +86,8 @@ class DynamicsLearner(L.LightningModule):
         self.loss = Penalized(loss) if model.penalized else loss
         self.validator = validator
         self._optimizer, self._scheduler, self._compile = optimizer, scheduler, compile
-        self._clip_value, self._by_value = gradient_clip_val, gradient_clip_algorithm == "value"
+        self._clipping = gradient_clip_val, gradient_clip_algorithm == "value"
+        self._compiled: CompiledAdamW | None = None
         self._losses: list[Tensor] = []  # losses of this epoch
 
     def gradients(self, vector: ParameterVector, steps: int) -> Engine:
@@ -100,24 +102,19 @@ class DynamicsLearner(L.LightningModule):
         before = loop.batch_progress.current.ready - 1  # steps of this epoch
         if before == 0:
             self._losses.clear()  # of an interrupted epoch
-        # Without the hooks of Lightning around a step, which take as long as AdamW.
-        optimizer = self.optimizers(use_pl_optimizer=False)
         schedule = self.lr_schedulers()
-        step, until, done = self.global_step, time.monotonic() + BLOCK_SECONDS, 0
-        count = len(self._losses)
+        step, until, count = self.global_step, time.monotonic() + BLOCK_SECONDS, len(self._losses)
+        done = 0
         try:
             for batch, _, _ in islice(dataloader_iter, self._steps_until_due(before)):
-                optimizer.step(self._closure(batch, step + done))  # type: ignore[union-attr, arg-type]
+                self._take_step(batch, step + done)
                 schedule.step()  # type: ignore[union-attr]
                 done += 1
                 if time.monotonic() > until:
                     break
         finally:
-            loop.manual_optimization.optim_step_progress.increment_by(done)
-            # Lightning counts a single step. Loggers and monitors use the private counter.
-            loop.batch_progress.increment_by(done - 1)
-            loop._batches_that_stepped += done - 1
-            if self.device.type == "cuda" and (new := self._losses[count:]):
+            self._count_steps(done)
+            if new := self._losses[count:]:
                 self._refuse_non_finite(torch.stack(new), step)
         period = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if period and self.global_step % period == 0:
@@ -127,6 +124,29 @@ class DynamicsLearner(L.LightningModule):
                 logger.log_metrics(figures, self.global_step - 1)
         if before + done >= trainer.num_training_batches:
             self.log_losses(torch.stack(self._losses).mean(0))
+
+    def _count_steps(self, done: int) -> None:
+        """Count steps in the loop of Lightning, which has no public way to count several."""
+        loop = self.trainer.fit_loop.epoch_loop
+        loop.manual_optimization.optim_step_progress.increment_by(done)
+        # Lightning counts a single step. Loggers and monitors use the private counter.
+        loop.batch_progress.increment_by(done - 1)
+        loop._batches_that_stepped += done - 1
+
+    def _take_step(self, batch: Windows, step: int) -> None:
+        """Take an optimizer step on a batch, by one program if possible."""
+        # The step is restored from a checkpoint, so a resumed training has the same progress.
+        windows = self.loss.selected(batch, step / self._steps)
+        # Without the hooks of Lightning around a step, which take as long as AdamW.
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        losses = None
+        if self._compiled is not None:
+            losses = self._gradients.step(windows, self._compiled)  # type: ignore[attr-defined]
+        if losses is None:
+            losses = optimizer.step(self._closure(windows))  # type: ignore[union-attr, arg-type]
+        if self._vector.parameters[0].grad is None:  # the trainer clears them at first
+            self._vector.show_gradients()
+        self._losses.append(losses)
 
     def _steps_until_due(self, before: int) -> int:
         """Return the number of steps until Lightning may have something to do."""
@@ -144,21 +164,14 @@ class DynamicsLearner(L.LightningModule):
             due.append(trainer.max_steps - self.global_step)
         return max(1, min(due))
 
-    def _closure(self, batch: Windows, step: int) -> Callable[[], Tensor]:
-        """Return a function that sets the gradient of a batch and returns the loss."""
-        # The step is restored from a checkpoint, so a resumed training has the same progress.
-        windows = self.loss.selected(batch, step / self._steps)
+    def _closure(self, windows: Windows) -> Callable[[], Tensor]:
+        """Return a function that sets the gradient of a batch and returns the losses."""
 
         def closure() -> Tensor:
             losses, gradient = self._gradients(windows)
-            if not losses.is_cuda:  # on a GPU it would wait: see training_step
-                self._refuse_non_finite(losses[None], step)
             gradient = self.trainer.strategy.reduce(gradient)  # mean over processes
-            self._vector.gradient.copy_(clipped(gradient, self._clip_value, self._by_value))
-            if self._vector.parameters[0].grad is None:  # the trainer clears them at first
-                self._vector.show_gradients()
-            self._losses.append(losses)
-            return losses.sum()  # over the members of an ensemble
+            self._vector.gradient.copy_(clipped(gradient, *self._clipping))
+            return losses
 
         return closure
 
@@ -232,18 +245,8 @@ class DynamicsLearner(L.LightningModule):
         self._gradients = self.gradients(self._vector, self._steps)
         optimizer = self.built_optimizer(self._vector)
         scheduler = self._scheduler(optimizer, total_steps=self._steps)
+        compiled = isinstance(self._gradients, Compiled) and self.trainer.world_size == 1
+        if compiled and self.device.type == "cpu" and CompiledAdamW.supports(optimizer):
+            self._compiled = CompiledAdamW(optimizer, self._vector, *self._clipping)
         schedule = {"scheduler": scheduler, "interval": "step", "name": "train/learning_rate"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}
-
-
-def clipped(gradient: Tensor, largest: float | None, by_value: bool = False) -> Tensor:
-    """Clip a gradient ``(*members, P)`` to the largest norm of each member, or value, if any."""
-    if largest is None:
-        return gradient
-    if by_value:
-        return gradient.clamp(-largest, largest)
-    norm = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
-    # The usual case by one operation instead of five. On a GPU this would wait.
-    if norm.numel() == 1 and not norm.is_cuda and float(norm) < largest:
-        return gradient
-    return gradient * (largest / (norm + 1e-6)).clamp(max=1.0)

@@ -14,7 +14,7 @@ from torch.optim.lr_scheduler import OneCycleLR
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.models import AccelerationMLP
 from pinn_dyn.training import SOAP, DynamicsLearner, IncrementLoss, NonFiniteLossError
-from pinn_dyn.training.learner import clipped
+from pinn_dyn.training.adamw import clipped
 from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
 

@@ -14,6 +14,7 @@ from pinn_dyn.mechanics.compilation import (
     CompiledDynamics,
     integrated_by,
 )
+from pinn_dyn.training.adamw import CompiledAdamW
 from pinn_dyn.training.gradients.program import LossProgram, weighted_sum
 from pinn_dyn.training.gradients.state_windows import StateWindows
 from pinn_dyn.training.losses import WindowLoss
@@ -36,22 +37,31 @@ class Compiled:
         self._program = LossProgram(loss, model, vector)
         self.evaluations = EvaluationCount(loss, model)
 
+    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Tensor | None:
+        """Take a step on a batch and return the loss, or None if this is not worth a program."""
+        part = self._part(windows)
+        if part is None or len(windows) >= 2 * part or windows.q.is_cuda:
+            return None
+        return self._program.step(windows, optimizer)
+
     def __call__(self, windows: Windows) -> tuple[Tensor, Tensor]:
-        evaluations = self.evaluations(windows)
-        on_cpu = windows.q.device.type == "cpu"
-        if self._worth_a_program(evaluations, on_cpu):
-            part = CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)
+        if (part := self._part(windows)) is not None:
             return self._program(windows, part)
+        on_cpu = windows.q.device.type == "cpu"
         if not on_cpu or len(windows) < 2 * CHUNK:
             return self._loss_and_gradient(windows)
         parts = windows.split(CHUNK)
         shares = [len(part) / len(windows) for part in parts]
         return weighted_sum(shares, map(self._loss_and_gradient, parts))
 
-    def _worth_a_program(self, evaluations: int, on_cpu: bool) -> bool:
+    def _part(self, windows: Windows) -> int | None:
+        """Return the windows that a program computes at once, or None without a program."""
+        evaluations, on_cpu = self.evaluations(windows), windows.q.device.type == "cpu"
         # On a GPU a program replaces thousands of launches.
         long = not on_cpu or self.steps >= STEPS_FOR_PROGRAM
-        return evaluations == 1 or (evaluations <= MOST_EVALUATIONS and long)
+        if evaluations > 1 and (evaluations > MOST_EVALUATIONS or not long):
+            return None
+        return CHUNK * MOST_EVALUATIONS // evaluations if on_cpu else len(windows)
 
     def _loss(self, windows: Windows) -> Tensor:
         with integrated_by(self.model, self._integrator):

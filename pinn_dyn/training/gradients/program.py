@@ -15,6 +15,7 @@ from torch.func import functional_call
 from pinn_dyn.data.windows import Windows
 from pinn_dyn.mechanics import ContinuousPredictor
 from pinn_dyn.mechanics.compilation import Unrolled, compile_graph, integrated_by
+from pinn_dyn.training.adamw import MOVED, CompiledAdamW
 from pinn_dyn.training.gradients.state_windows import StateWindows
 from pinn_dyn.training.losses import WindowLoss
 from pinn_dyn.training.parameter_vector import ParameterVector
@@ -47,26 +48,53 @@ class LossProgram:
         self, values: Iterable[Tensor], batches: list[Windows]
     ) -> Iterable[list[Tensor]]:
         """Return loss and gradient of each batch at its parameter values ``(P,)``."""
-        names = _ROWS[self._loss.model.state]
-        arguments: list[tuple[Tensor, ...]] = []
-        for value, batch in zip(values, batches, strict=True):
-            rows = [getattr(batch, name) for name in names] + [batch.input.u]
-            rows += [] if batch.input.rate is None else [batch.input.rate]
-            arguments.append((value, *(row.contiguous() for row in rows)))
+        arguments = [
+            (value, *self._rows(batch)) for value, batch in zip(values, batches, strict=True)
+        ]
         # Compile before the threads call the program.
-        programs = list(map(self._program, batches, arguments))
+        programs = [
+            self._program(self._traced(batch), *pair)
+            for *pair, batch in zip(batches, arguments, batches, strict=True)
+        ]
+        return self._run(programs, arguments)
+
+    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Tensor:
+        """Take a step of the optimizer on a batch on the CPU, and return the loss."""
+        evaluate = self._traced(windows)
+
+        def step(*arguments: Tensor) -> list[Tensor]:
+            moved, rows = arguments[:MOVED], arguments[MOVED:]
+            loss, gradient = evaluate(moved[0], *rows)
+            optimizer.step(gradient, *moved)
+            return [loss]
+
+        arguments = (*optimizer.next_arguments(), *self._rows(windows))
+        ((loss,),) = self._run([self._program(step, windows, arguments)], [arguments])
+        return loss
+
+    def _rows(self, windows: Windows) -> list[Tensor]:
+        rows = [getattr(windows, name) for name in _ROWS[self._loss.model.state]]
+        rows += [windows.input.u] + ([] if windows.input.rate is None else [windows.input.rate])
+        return [row.contiguous() for row in rows]
+
+    def _run(
+        self, programs: list[Program], arguments: list[tuple[Tensor, ...]]
+    ) -> Iterable[list[Tensor]]:
         # A single batch also runs in the pool, since small products are faster with one thread.
         threads = torch.get_num_threads()
         alone = threads == 1 or self._vector.values.is_cuda
         run = map if alone else _pool(threads).map
         return run(_call, programs, arguments)
 
-    def _program(self, windows: Windows, arguments: tuple[Any, ...]) -> Program:
-        key = (windows.dq.shape, windows.dq.dtype)
+    def _program(
+        self, function: Program, windows: Windows, arguments: tuple[Tensor, ...]
+    ) -> Program:
+        key = (len(arguments), windows.dq.shape, windows.dq.dtype)
         if key not in self._programs:
+            examples = tuple(value.clone() for value in arguments)  # a step changes them
             with torch.no_grad():
-                self._programs[key] = compile_graph(self._traced(windows), arguments)
-                self._programs[key](*arguments)
+                self._programs[key] = compile_graph(function, examples)
+                self._programs[key](*examples)
         return self._programs[key]
 
     def _traced(self, windows: Windows) -> Program:

@@ -1,0 +1,63 @@
+"""Steps of AdamW within the program of a batch are those of torch."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+from torch.optim import AdamW
+
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.training import MidpointLoss, ParameterVector, one_cycle
+from pinn_dyn.training.adamw import CompiledAdamW, clipped
+from pinn_dyn.training.gradients import Compiled, Eager
+from tests.models.builders import make_model
+from tests.support.windows import make_windows, one_step
+
+STEPS = 6
+
+
+def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
+    """The weights and the state of the optimizer after steps of either way."""
+    vector = ParameterVector(model.parameters())
+    loss = MidpointLoss(one_step(size=2), model).double()
+    optimizer = AdamW([vector.values], lr=0.05, weight_decay=0.1, fused=True)
+    scheduler = one_cycle(optimizer, total_steps=STEPS, warm_up=0.5)
+    if compiled:
+        engine = Compiled(loss, model, vector, STEPS_FOR_PROGRAM)
+        program = CompiledAdamW(optimizer, vector, *clipping)
+    if state is not None:
+        optimizer.load_state_dict(state[0])
+        scheduler.load_state_dict(state[1])
+    for k in steps:
+        batch = make_windows(8, size=2, seed=k)
+        if compiled:
+            assert engine.step(batch, program) is not None
+        else:
+            _, gradient = Eager(loss, model, vector)(batch)
+            vector.gradient.copy_(clipped(gradient, *clipping))
+            optimizer.step()
+        scheduler.step()
+    state = copy.deepcopy((optimizer.state_dict(), scheduler.state_dict()))
+    return vector.values.detach().clone(), vector.gradient.clone(), state
+
+
+@pytest.mark.parametrize("clipping", [(None, False), (0.3, False), (0.02, True)])
+def test_weights_gradients_and_moments_are_those_of_the_optimizer(traced, clipping):
+    model = make_model("lnn")
+    run = partial(trained, clipping=clipping)
+    (values, gradient, state), (expected, slope, other) = (
+        run(copy.deepcopy(model), compiled=compiled) for compiled in (True, False)
+    )
+    torch.testing.assert_close(values, expected, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(gradient, slope, rtol=1e-8, atol=1e-12)
+    torch.testing.assert_close(state[0]["state"], other[0]["state"], rtol=1e-8, atol=1e-12)
+    assert float(state[0]["state"][0]["step"]) == STEPS
+
+
+def test_steps_go_on_from_a_saved_state_of_the_optimizer(traced):
+    model = make_model("lnn")
+    whole, _, _ = trained(copy.deepcopy(model), (0.3, False), compiled=True)
+    _, _, state = trained(model, (0.3, False), compiled=True, steps=range(3))
+    resumed, _, _ = trained(model, (0.3, False), True, state, range(3, STEPS))
+    assert torch.equal(resumed, whole)
