@@ -102,12 +102,13 @@ class DynamicsLearner(L.LightningModule):
         before = loop.batch_progress.current.ready - 1  # steps of this epoch
         if before == 0:
             self._losses.clear()  # of an interrupted epoch
-        schedule = self.lr_schedulers()
+        # Without the hooks of Lightning around a step, which take as long as AdamW.
+        optimizer, schedule = self.optimizers(use_pl_optimizer=False), self.lr_schedulers()
         step, until, count = self.global_step, time.monotonic() + BLOCK_SECONDS, len(self._losses)
         done = 0
         try:
             for batch, _, _ in islice(dataloader_iter, self._steps_until_due(before)):
-                self._take_step(batch, step + done)
+                self._take_step(optimizer, batch, step + done)  # type: ignore[arg-type]
                 schedule.step()  # type: ignore[union-attr]
                 done += 1
                 if time.monotonic() > until:
@@ -133,17 +134,15 @@ class DynamicsLearner(L.LightningModule):
         loop.batch_progress.increment_by(done - 1)
         loop._batches_that_stepped += done - 1
 
-    def _take_step(self, batch: Windows, step: int) -> None:
+    def _take_step(self, optimizer: Optimizer, batch: Windows, step: int) -> None:
         """Take an optimizer step on a batch, by one program if possible."""
         # The step is restored from a checkpoint, so a resumed training has the same progress.
         windows = self.loss.selected(batch, step / self._steps)
-        # Without the hooks of Lightning around a step, which take as long as AdamW.
-        optimizer = self.optimizers(use_pl_optimizer=False)
-        losses = None
+        losses: Any = None
         if self._compiled is not None:
             losses = self._gradients.step(windows, self._compiled)  # type: ignore[attr-defined]
         if losses is None:
-            losses = optimizer.step(self._closure(windows))  # type: ignore[union-attr, arg-type]
+            losses = optimizer.step(self._closure(windows))
         if self._vector.parameters[0].grad is None:  # the trainer clears them at first
             self._vector.show_gradients()
         self._losses.append(losses)

@@ -52,10 +52,8 @@ class LossProgram:
             (value, *self._rows(batch)) for value, batch in zip(values, batches, strict=True)
         ]
         # Compile before the threads call the program.
-        programs = [
-            self._program(self._traced(batch), *pair)
-            for *pair, batch in zip(batches, arguments, batches, strict=True)
-        ]
+        pairs = zip(batches, arguments, strict=True)
+        programs = [self._program(self._traced(batch), batch, rows) for batch, rows in pairs]
         return self._run(programs, arguments)
 
     def step(self, windows: Windows, optimizer: CompiledAdamW) -> Tensor:
