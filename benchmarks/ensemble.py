@@ -37,8 +37,8 @@ from pinn_dyn.ensembles.learner import MemberSOAP
 from pinn_dyn.mechanics import Predictor, Signal
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.training import SOAP, IncrementLoss, MidpointLoss, ParameterVector
-from pinn_dyn.training.gradients import Compiled, Eager, Engine
 from pinn_dyn.training.adamw import clipped
+from pinn_dyn.training.gradients import Compiled, Eager, Engine
 
 HERE = Path(__file__).parent
 N, STEP, PAIRS = 3, 2e-3, 8000

@@ -142,7 +142,7 @@ class DynamicsLearner(L.LightningModule):
         if self._compiled is not None:
             losses = self._gradients.step(windows, self._compiled)  # type: ignore[attr-defined]
         if losses is None:
-            losses = optimizer.step(self._closure(windows))
+            losses = optimizer.step(self._closure(windows))  # type: ignore[arg-type]
         if self._vector.parameters[0].grad is None:  # the trainer clears them at first
             self._vector.show_gradients()
         self._losses.append(losses)
