@@ -17,6 +17,7 @@ from pinn_dyn.models.triangular import UNROLLED, square
 
 _DIAGONAL_MARGIN = 0.2
 """Margin of the outputs beyond the data: a factor of at least exp(-0.2) = 0.82 for a softplus."""
+_CACHED = 1024  # configurations that are evaluated at once, in the cache
 _MARGIN = 0.1
 """Margin of all other outputs, in units of their range on the data."""
 
@@ -137,7 +138,7 @@ class NetworkCholesky(CholeskyFactor):
     def limits_at(self, q: Tensor) -> Tensor:
         """Return the smallest and largest outputs at q ``(B, N)``, and the margins, ``(3, K)``."""
         with torch.no_grad():
-            y = self.network(q)
+            y = torch.cat([self.network(part) for part in q.split(_CACHED)])
         low, high = y.amin(0), y.amax(0)
         margin = (_MARGIN * (high - low)).clamp(min=1e-3)  # of an output that is constant
         margin[: self.size] = _DIAGONAL_MARGIN

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import torch
 from torch import Tensor
 from torch.optim import AdamW, Optimizer
 
 from pinn_dyn.training.parameter_vector import ParameterVector
 
-MOVED = 5
+MOVED = 6
 """Number of arguments of :meth:`CompiledAdamW.step` after the gradient."""
 
 
@@ -55,26 +54,26 @@ class CompiledAdamW:
         options = optimizer.defaults
         return type(optimizer) is AdamW and not (options["amsgrad"] or options["maximize"])
 
-    def next_arguments(self) -> tuple[Tensor, ...]:
-        """Count a step and return the arguments of :meth:`step` after the gradient."""
+    def arguments(self) -> tuple[Tensor, ...]:
+        """Return the arguments of :meth:`step` after the gradient, MOVED in number."""
         (group,), state = self._optimizer.param_groups, self._optimizer.state[self._vector.values]
-        beta1, beta2 = group["betas"]
-        state["step"] += 1
-        number, rate = float(state["step"]), group["lr"]
-        root = math.sqrt(1 - beta2**number)
-        factors = (1 - rate * group["weight_decay"], -rate / (1 - beta1**number), root)
-        values = self._vector.values.detach()
-        moments = state["exp_avg"], state["exp_avg_sq"]
-        return values, self._vector.gradient, *moments, torch.tensor(factors, dtype=values.dtype)
+        moved = self._vector.values.detach(), self._vector.gradient
+        moments = state["exp_avg"], state["exp_avg_sq"], state["step"]
+        # A schedule changes the rate, and possibly the decay of the moments.
+        numbers = group["lr"], *group["betas"], group["weight_decay"], group["eps"]
+        return *moved, *moments, torch.from_numpy(np.array(numbers))
 
     def step(self, gradient: Tensor, *arguments: Tensor) -> None:
-        """Move the parameters by operations that can be traced."""
-        values, shown, mean, square, (decay, rate, root) = arguments
-        (group,) = self._optimizer.param_groups
-        beta1, beta2 = group["betas"]
+        """Move the parameters and count the step by operations that can be traced."""
+        values, shown, mean, square, count, numbers = arguments
+        rate, beta1, beta2, decay, eps = numbers.unbind()
         gradient = clipped(gradient, self._largest, self._by_value)
-        mean.lerp_(gradient, 1 - beta1)
-        square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-        update = rate * mean / (square.sqrt() / root + group["eps"])
-        values.mul_(decay).add_(update)
+        count += 1
+        size = rate / (1 - beta1**count)  # in double precision, since 1 - b^k cancels
+        root = torch.sqrt(1 - beta2**count)
+        scalars = (1 - rate * decay, size, root, eps, 1 - beta1, beta2, 1 - beta2)
+        kept, size, root, eps, new, beta2, new_square = (x.to(values) for x in scalars)
+        mean += new * (gradient - mean)
+        square.copy_(beta2 * square + new_square * gradient * gradient)
+        values.copy_(kept * values - size * mean / (torch.sqrt(square) / root + eps))
         shown.copy_(gradient)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.optim import AdamW
 
-from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
+from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM, compile_graph
 from pinn_dyn.training import MidpointLoss, ParameterVector, one_cycle
 from pinn_dyn.training.adamw import CompiledAdamW, clipped
 from pinn_dyn.training.gradients import Compiled, Eager
@@ -42,8 +42,18 @@ def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
     return vector.values.detach().clone(), vector.gradient.clone(), state
 
 
-@pytest.mark.parametrize("clipping", [(None, False), (0.3, False), (0.02, True)])
-def test_weights_gradients_and_moments_are_those_of_the_optimizer(traced, clipping):
+@pytest.mark.parametrize(
+    ("clipping", "built"),
+    [
+        ((None, False), False),
+        ((0.02, True), False),
+        ((0.3, False), False),
+        pytest.param((0.3, False), True, marks=pytest.mark.slow),
+    ],
+)
+def test_weights_gradients_and_moments_are_those_of_the_optimizer(request, clipping, built):
+    if not built:
+        request.getfixturevalue("traced")
     model = make_model("lnn")
     run = partial(trained, clipping=clipping)
     (values, gradient, state), (expected, slope, other) = (
@@ -61,3 +71,10 @@ def test_steps_go_on_from_a_saved_state_of_the_optimizer(traced):
     _, _, state = trained(model, (0.3, False), compiled=True, steps=range(3))
     resumed, _, _ = trained(model, (0.3, False), True, state, range(3, STEPS))
     assert torch.equal(resumed, whole)
+
+
+def test_a_program_has_equal_constants_once(traced):
+    constants = torch.ones(2), torch.ones(2), torch.zeros(2)
+    graph = compile_graph(lambda x: [(x * c).tanh() for c in constants], (torch.ones(2),))
+    assert len(graph.graph.find_nodes(op="get_attr")) == 2
+    assert [y.tolist() for y in graph(torch.ones(2))] == [c.tanh().tolist() for c in constants]

@@ -66,7 +66,7 @@ class LossProgram:
             optimizer.step(gradient, *moved)
             return [loss]
 
-        arguments = (*optimizer.next_arguments(), *self._rows(windows))
+        arguments = (*optimizer.arguments(), *self._rows(windows))
         ((loss,),) = self._run([self._program(step, windows, arguments)], [arguments])
         return loss
 
