@@ -72,8 +72,8 @@ class CompiledAdamW:
         size = rate / (1 - beta1**count)  # in double precision, since 1 - b^k cancels
         root = torch.sqrt(1 - beta2**count)
         scalars = (1 - rate * decay, size, root, eps, 1 - beta1, beta2, 1 - beta2)
-        kept, size, root, eps, new, beta2, new_square = (x.to(values) for x in scalars)
-        mean += new * (gradient - mean)
-        square.copy_(beta2 * square + new_square * gradient * gradient)
-        values.copy_(kept * values - size * mean / (torch.sqrt(square) / root + eps))
+        shrink, size, root, eps, weight, beta2, weight2 = (x.to(values) for x in scalars)
+        mean += weight * (gradient - mean)
+        square.copy_(beta2 * square + weight2 * gradient * gradient)
+        values.copy_(shrink * values - size * mean / (torch.sqrt(square) / root + eps))
         shown.copy_(gradient)
