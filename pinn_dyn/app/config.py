@@ -19,7 +19,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.settings import SETTINGS
+from pinn_dyn.app.settings import SETTINGS, annotation
 from pinn_dyn.app.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
 
@@ -75,11 +75,13 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     check_keys(SETTINGS[command], config)
     mistakes = []
     for key in _QUICK:
-        if isinstance(part := config.get(key), dict) and "_target_" in part:
-            try:
-                check_value(key, part)
-            except ConfigError as error:
-                mistakes.append(str(error))
+        if not isinstance(part := config.get(key), dict) or "_target_" not in part:
+            continue
+        is_trainer = part["_target_"] == "lightning.Trainer"
+        try:
+            check_value(key, part, object if is_trainer else annotation(command, key))
+        except ConfigError as error:
+            mistakes.append(str(error))
     if mistakes:
         raise ConfigError("\n".join(mistakes))
     check_arguments(SETTINGS[command], config)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -172,6 +173,7 @@ class ControlSettings:
     export_real: Literal["double", "float"]
     settled_after: NonNegativeFloat
     trajectory: NonNegativeInt
+    animate: bool
     threads: PositiveInt
     trust: Names | None = None
     controllers: Mapping[str, Law | Mapping[str, Any]]
@@ -235,3 +237,9 @@ SETTINGS: dict[str, type] = {
     "gather": GatherSettings,
     "excite": ExciteSettings,
 }
+
+
+def annotation(command: str, key: str) -> Any:
+    """Return the annotation of a key of a command; imports no class of other annotations."""
+    alone = SimpleNamespace(__annotations__={key: SETTINGS[command].__annotations__[key]})
+    return get_type_hints(alone, globals(), TYPES, include_extras=True)[key]
