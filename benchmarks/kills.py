@@ -73,7 +73,7 @@ FIT = [  # one step of the trainer that is a whole fit
     ),
     *("data.steps=2", "~callbacks.figures"),
 ]
-ONCE = ["reference.q=[0.05,0.05,0.2]", "duration=0.02", "settled_after=0.01"]
+ONCE = ["reference.q=[0.05,0.05,0.2]", "duration=0.02", "settled_after=0.01", "animate=false"]
 
 Result = dict[str, np.ndarray]
 

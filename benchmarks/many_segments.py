@@ -65,7 +65,7 @@ def control(segments: int) -> list[str]:
         *("checkpoint=last", "controllers=regulation", "reference=set_point"),
         f"reference.q={listed((0.05, 0.03, 0.03), segments)}",
         *("gains.position=1", "gains.velocity=0.005", "rate=1000"),
-        *("duration=0.6", "settled_after=0.4"),
+        *("duration=0.6", "settled_after=0.4", "animate=false"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Write tables, figures and reports of control.py."""
+"""Write tables, figures, animation and reports of control.py."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from pinn_dyn.data import DataSource
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import (
     ControlResult,
+    animate,
     closed_loop_figure,
     controller_comparison_figure,
     save,
@@ -34,7 +35,7 @@ from pinn_dyn.evaluation.report import Origin, control_report
 from pinn_dyn.evaluation.report.control_page import shown_columns
 from pinn_dyn.evaluation.tables import to_text, write_table
 from pinn_dyn.mechanics import MechanicalSystem
-from pinn_dyn.systems import HasTip
+from pinn_dyn.systems import Drawable, HasTip
 
 _ERRORS = (1e-2, 1e-3, 1e-4)  # in the units of q
 
@@ -49,7 +50,7 @@ def write_results(
     folder: Path,
     origin: Origin,
 ) -> float:
-    """Write tables, figures and report; return the RMS error of the first law."""
+    """Write tables, figures, animation and report; return the RMS error of the first law."""
     records, summary = result.records, result.table
     first = next(iter(records))
     result.save(folder)
@@ -62,6 +63,11 @@ def write_results(
             figures["steady_state"] = steady_state_figure(*bounds, title=title, label=label)
     for name, figure in figures.items():
         save(figure, folder / f"{name}.png")
+    animation: Path | None = None
+    if config["animate"] and isinstance(robot, Drawable):
+        animation = folder / f"animation_{first}.gif"
+        animate(records[first], config["trajectory"], robot, animation)
+
     runs = len(records[first].stopped)
     print(f"\n{source.name}: {runs} run{'s' if runs > 1 else ''} of {config['duration']:g} s")
     print(to_text(summary, shown_columns(summary)))
@@ -70,6 +76,7 @@ def write_results(
         result=result,
         figures=figures,
         labels=source.labels,
+        animation=animation,
         stability=stability,
         origin=origin,
     )

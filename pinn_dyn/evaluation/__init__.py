@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from pinn_dyn.evaluation.animation import animate
 from pinn_dyn.evaluation.baselines import build_baselines
 from pinn_dyn.evaluation.calibration import Calibration, calibration
 from pinn_dyn.evaluation.closed_loops import ControlResult, close_loop, close_loops
@@ -37,6 +38,7 @@ __all__ = [
     "RolloutValidator",
     "TermComparison",
     "TorqueError",
+    "animate",
     "build_baselines",
     "calibration",
     "cleaning_figure",

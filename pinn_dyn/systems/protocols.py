@@ -49,3 +49,13 @@ class Stepped(Protocol):
 
     def step(self, torque: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
         """Return q and v, ``(N,)`` each, after ``step`` s under an input ``(M,)``."""
+
+
+@runtime_checkable
+class Drawable(Protocol):
+    """A robot that is drawn as lines, from its base to its tip."""
+
+    z_is_down: bool
+
+    def lines(self, q: Tensor) -> Tensor:
+        """Return S lines of P points, ``(*batch, S, P, 3)``, m; the last point is the tip."""

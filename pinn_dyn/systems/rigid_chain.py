@@ -78,6 +78,7 @@ class RigidChain(MechanicalSystem):
         FileNotFoundError, ImportError, ValueError: as :func:`~pinn_dyn.systems.urdf.read_urdf`.
     """
 
+    z_is_down = False
     inertia: Tensor
     _gravity: Tensor
     _placements: Tensor
@@ -347,6 +348,14 @@ class RigidChain(MechanicalSystem):
         if self._tip_body < 0:
             return origin[:3].expand(*q.shape[:-1], 3)
         return self.kinematics(q).poses[..., self._tip_body, :3, :] @ origin
+
+    def lines(self, q: Tensor) -> Tensor:
+        """Return a line from each joint to the next, and to the tip, ``(*batch, B + 1, 2, 3)``."""
+        origins = self.kinematics(q).poses[..., :3, 3]
+        base = torch.zeros_like(origins[..., :1, :])
+        points = torch.cat([base, origins, self.tip_position(q).unsqueeze(-2)], dim=-2)
+        starts = [parent + 1 for parent in (*self.parents, self._tip_body)]
+        return torch.stack([points[..., starts, :], points[..., 1:, :]], dim=-2)
 
     def mass_matrix(self, q: Tensor, inertia: Tensor | None = None) -> Tensor:
         """M(q), ``(*batch, N, N)``, with the bodies ``inertia``, the URDF's if None."""

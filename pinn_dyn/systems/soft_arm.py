@@ -58,6 +58,7 @@ class SoftArm(MechanicalSystem):
         nodes: Gauss-Legendre nodes per segment; 10 are exact to 1e-12 for theta <= 3.
     """
 
+    z_is_down = True
     mass: Tensor
     stiffness: Tensor
     damping: Tensor
@@ -134,6 +135,10 @@ class SoftArm(MechanicalSystem):
     def tip_position(self, q: Tensor) -> Tensor:
         """Return the world position of the arm's tip, ``(*batch, 3)``, m."""
         return self.backbone(q, q.new_ones(1))[..., -1, 0, :]
+
+    def lines(self, q: Tensor) -> Tensor:
+        """Return the backbone, a line of 21 points per segment, ``(*batch, n, 21, 3)``, m."""
+        return self.backbone(q, torch.linspace(0, 1, 21, dtype=q.dtype, device=q.device))
 
     def backbone(self, q: Tensor, s: Tensor) -> Tensor:
         """Return points at the fractions s ``(S,)`` of all segments, ``(*batch, n, S, 3)``, m."""

@@ -29,6 +29,7 @@ SET_POINTS = [
     "settled_after=0.03",
     "gains.position=5",
     "gains.velocity=0.5",
+    "animate=false",
 ]
 
 TINY_DATA = [

@@ -24,7 +24,7 @@ KNOWN += ["model=known", "model/structure=urdf", f"model.structure.urdf={PENDULU
 FIT = ["train.py", *KNOWN, "dataset.u.unit=Nm", "optimizer=least_squares"]
 SHORT = ["steps=2", "duration=3"]
 ROBOT = f"model.structure.urdf={PENDULUM}"
-STEP = ["duration=0.05", "settled_after=0.03", "rate=200"]
+STEP = ["duration=0.05", "settled_after=0.03", "animate=false", "rate=200"]
 LOOP = ["run={lnn}", *SET_POINTS, "~controllers.truth", "~controllers.pd", "runs=1"]
 CONTINUOUS = [*LOOP, "rate=null", "controllers.learned.terms=truth"]
 COMMANDS = {

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from PIL import Image
 
 import pinn_dyn
 from pinn_dyn.app.config import CONF
@@ -47,9 +48,9 @@ def elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory, lnn_run):
-    """Three runs at 200 Hz."""
+    """Three runs at 200 Hz with an animation."""
     folder = tmp_path_factory.mktemp("control")
-    return control(folder, lnn_run, "rate=200", "guard.threshold=1.0")
+    return control(folder, lnn_run, "rate=200", "animate=true", "guard.threshold=1.0")
 
 
 def test_the_table_has_a_row_for_each_controller(results):
@@ -62,9 +63,11 @@ def test_the_table_has_a_row_for_each_controller(results):
     assert coordinates.groupby("controller").size().to_dict() == {"learned": 3, "truth": 3, "pd": 3}
 
 
-def test_figures_record_page_and_provenance_are_written(results, lnn_run):
+def test_figures_animation_record_page_and_provenance_are_written(results, lnn_run):
     for name in ("closed_loop", "comparison"):
         assert (results / f"{name}.png").stat().st_size > 10_000
+    with Image.open(results / "animation_learned.gif") as animation:
+        assert animation.is_animated
     summary = pd.read_csv(results / "summary.csv")
     with np.load(results / "record_learned.npz") as record:
         assert {"input_condition", "distance", "outside"} <= set(record)
@@ -262,6 +265,7 @@ def test_the_panda_is_controlled_without_pybullet(request, tmp_path, experiment,
         f"experiment={experiment}",
         f"run={panda_run}",
         "duration=0.05",
+        "animate=false",
         f"hydra.run.dir={folder}",
     )
     summary = pd.read_csv(folder / "summary.csv").set_index("controller")

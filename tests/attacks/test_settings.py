@@ -223,6 +223,7 @@ MISTAKES = {
         export=3
         settled_after=-1
         trajectory=x
+        animate=1
         ruun=x
     """,
     "gather": """

@@ -29,7 +29,7 @@ SMALL = {
     "train.py": [*TINY_TRAINING, NO_FIGURES],
     "evaluate.py": ["horizon=0.1", "windows=[0.1]"],
     "control.py": [
-        *("runs=2", "rate=200", "duration=0.05", "settled_after=0.02"),
+        *("runs=2", "rate=200", "duration=0.05", "settled_after=0.02", "animate=false"),
         *("gains.position=5", "gains.velocity=0.5"),  # soft gains for an untrained model
     ],
 }

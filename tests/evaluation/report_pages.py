@@ -164,7 +164,7 @@ def records(names=("learned", "pd"), runs=4):
     return laws
 
 
-def control_page(names=("learned", "pd"), title="a loop"):
+def control_page(names=("learned", "pd"), title="a loop", animation=None):
     """Return the page, and the summary that it was made of."""
     laws = records(names)
     metrics = {name: closed_loop_metrics(item, settled_after=1.0) for name, item in laws.items()}
@@ -177,6 +177,7 @@ def control_page(names=("learned", "pd"), title="a loop"):
             "closed_loop": closed_loop_figure(laws, 2, title=title, labels=LABELS),
         },
         labels=LABELS,
+        animation=animation,
         stability="# Stability\n\n| a | b |\n|---|---|\n| A_L | 2 |\n",
         origin=origin(names),
     )

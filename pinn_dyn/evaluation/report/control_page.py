@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import pandas as pd
 from markupsafe import Markup
@@ -18,6 +19,7 @@ from pinn_dyn.evaluation.report.page import (
     from_markdown,
     page,
     paragraph,
+    picture,
     table,
 )
 
@@ -40,14 +42,21 @@ def control_report(
     result: ControlResult,
     figures: Mapping[str, Figure],
     labels: Sequence[str],
+    animation: Path | None,
     stability: str | None,
     origin: Origin,
 ) -> str:
-    """Return the page as HTML text; ``stability`` is a report in Markdown, or None."""
+    """Return the page as HTML text.
+
+    ``animation`` is a GIF of the first law, ``stability`` a report in Markdown, or None.
+    """
     sections = [
         Section("Summary", _summary(result, labels)),
         Section("Figures", [drawing(figure, name) for name, figure in figures.items()]),
     ]
+    if animation is not None:
+        gif = picture(animation.read_bytes(), "gif", "animation of the first law in real time")
+        sections.append(Section("Animation", [gif]))
     if stability is not None:
         sections.append(Section("Stability", [from_markdown(stability)]))
     record = next(iter(result.records.values()))

@@ -101,13 +101,19 @@ def from_markdown(text: str) -> Markup:
     return Markup('<div class="document">{}</div>').format(Markup(content))
 
 
+def picture(content: bytes, kind: str, text: str, width: float | None = None) -> Markup:
+    """Return an embedded image of the kind ``gif`` or ``png`` with its description."""
+    data = base64.b64encode(content).decode()
+    style = "" if width is None else f"width: {width:.0f}px"
+    image = Markup('<img src="data:image/{};base64,{}" alt="{}" style="{}">')
+    return Markup('<div class="figure">{}</div>').format(image.format(kind, data, text, style))
+
+
 def drawing(figure: Figure, text: str) -> Markup:
     """Return a matplotlib figure, embedded as PNG."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=140)
-    data, width = base64.b64encode(file.getvalue()).decode(), 96 * figure.get_figwidth()
-    image = Markup('<img src="data:image/png;base64,{}" alt="{}" style="width: {:.0f}px">')
-    return Markup('<div class="figure">{}</div>').format(image.format(data, text, width))
+    return picture(file.getvalue(), "png", text, width=96 * figure.get_figwidth())
 
 
 def interactive(figure: graph_objects.Figure, name: str) -> Markup:
