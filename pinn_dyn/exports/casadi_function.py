@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Elementwise operations with another name in CasADi, and with the same name.
 _NAMES = {"add": "plus", "sub": "minus", "mul": "times", "div": "rdivide", "pow": "power"}
-_NAMES |= {"abs": "fabs", "maximum": "fmax", "minimum": "fmin", "where": "if_else"}
+_NAMES |= {"abs": "fabs", "where": "if_else"}
 _NAMES |= {"logical_not": "logic_not", "logical_and": "logic_and", "logical_or": "logic_or"}
 _NAMES |= {"bitwise_not": "logic_not", "bitwise_and": "logic_and", "bitwise_or": "logic_or"}
 _SAME = "sqrt exp expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh erf sign floor"
@@ -109,7 +109,8 @@ class _Writer:
             columns = self.ca.reshape(numbers, -1, shape.numel())
             if name in ("sum", "mean"):
                 return self.ca.sum1(columns).T / (columns.size1() if name == "mean" else 1)
-            return functools.reduce(getattr(self.ca, f"f{name[1:]}"), self.ca.vertsplit(columns)).T
+            larger = self._larger if name == "amax" else self._smaller
+            return functools.reduce(larger, self.ca.vertsplit(columns)).T
         return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
 
     def matrix(self, node: fx.Node) -> Any:
@@ -142,6 +143,14 @@ class _Writer:
             return self.values[argument]
         return self.values[argument][_flat(_positions(argument).expand(shape))]
 
+    def _larger(self, x: Any, y: Any) -> Any:
+        """Return the larger number, and NaN if one is NaN, which ``fmax`` ignores."""
+        if_else = self.ca.if_else
+        return if_else(x > y, x, if_else(x <= y, y, x + y))
+
+    def _smaller(self, x: Any, y: Any) -> Any:
+        return -self._larger(-x, -y)
+
     def _elementwise(self, node: fx.Node, name: str, x: list[Any]) -> Any:
         ca, options = self.ca, node.kwargs
         if options.get("alpha", 1) != 1:
@@ -158,14 +167,18 @@ class _Writer:
             case "sigmoid":
                 return 1 / (1 + ca.exp(-x[0]))
             case "relu":
-                return ca.fmax(x[0], 0)
+                return self._larger(x[0], 0)
+            case "maximum":
+                return self._larger(*x)
+            case "minimum":
+                return self._smaller(*x)
             case "remainder":
                 return x[0] - x[1] * ca.floor(x[0] / x[1])
             case "clamp":
                 low, high = [*x[1:], None, None][:2]
                 low, high = options.get("min", low), options.get("max", high)
-                value = x[0] if low is None else ca.fmax(x[0], low)
-                return value if high is None else ca.fmin(value, high)
+                value = x[0] if low is None else self._larger(x[0], low)
+                return value if high is None else self._smaller(value, high)
         raise unsupported(node, "CasADi")
 
 

@@ -29,3 +29,17 @@ def test_an_operation_without_counterpart_is_named():
     program = trace(lambda q: torch.special.bessel_j0(q), {"q": torch.ones(2).double()}, ["y"])
     with pytest.raises(TypeError, match="bessel_j0"):
         casadi_function(program, "f")
+
+
+def test_numbers_that_are_not_finite_pass_limits_and_extremes():
+    pytest.importorskip("casadi")
+
+    def function(x, y):
+        columns = torch.stack([x, y])
+        limited = x.clamp(-1, 1), torch.relu(x), x.maximum(y), x.minimum(y)
+        return torch.cat([*limited, columns.amax(0), columns.amin(0)])
+
+    values = torch.tensor([torch.nan, -torch.inf, torch.inf, -2.0, 2.0]).double()
+    x, y = torch.cartesian_prod(values, values).T.contiguous()
+    exported = casadi_function(trace(function, {"x": x, "y": y}, ["z"]), "f")
+    np.testing.assert_array_equal(np.array(exported(x.numpy(), y.numpy()))[:, 0], function(x, y))
