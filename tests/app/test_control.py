@@ -274,6 +274,22 @@ def test_the_panda_is_controlled_without_pybullet(request, tmp_path, experiment,
     assert (folder / "tip_path.png").is_file() == (experiment == "panda/helix")
 
 
+def test_the_panda_is_planned_within_its_limits(tmp_path, panda_run, undrawn):
+    pytest.importorskip("casadi")
+    words = ["duration=0.1", "runs=2", "controllers.learned.terms=truth", "~controllers.truth"]
+    folder = f"hydra.run.dir={tmp_path}"
+    run_script("control.py", "experiment=panda/mpc", f"run={panda_run}", *words, folder)
+    summary = pd.read_csv(tmp_path / "summary.csv").set_index("controller")
+    assert summary.loc["learned", "solver_failures"] == 0
+    limits = np.repeat([87.0, 12.0], [4, 3])
+    with np.load(tmp_path / "record_learned.npz") as planned:
+        shares = np.abs(planned["u_wanted"][:, :-1]) / limits
+        assert 0.9 < shares.max() <= 1
+        assert np.abs(planned["v"] / np.repeat([2.175, 2.61], [4, 3])).max() < 1.02
+    with np.load(tmp_path / "record_clipped.npz") as clipped:
+        assert np.abs(clipped["u_wanted"][:, 0] / limits).max() > 2
+
+
 @pytest.fixture(scope="module")
 def panda_run(tmp_path_factory):
     """A run of a process that cannot import PyBullet, until the last test of this module."""
