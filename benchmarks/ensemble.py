@@ -60,6 +60,7 @@ def make_windows() -> Windows:
         dv=5 * STEP * draw(PAIRS, 1, N),
         dp=0.2 * STEP * draw(PAIRS, 1, N),
         input=Signal(torch.tensor([0.0, STEP]), 0.5 * draw(PAIRS, 2, N)),
+        past_q=torch.zeros(PAIRS, 0, N),
     )
 
 

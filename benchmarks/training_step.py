@@ -100,6 +100,7 @@ def make_windows(size: int, batch: int, dtype: torch.dtype) -> Windows:
         dv=STEP * normal(batch, 1, size),
         dp=empty[:, None],
         input=Signal(t, normal(batch, 2, size)),
+        past_q=torch.zeros(batch, 0, size, dtype=torch.float64),
     )
     return windows.to(torch.device("cpu"), dtype)
 

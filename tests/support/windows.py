@@ -27,6 +27,7 @@ def make_windows(count, size=1, interpolation="linear", seed=0):
         dv=STEP * normal(count, 1, size),
         dp=STEP * normal(count, 1, size),
         input=Signal(t, normal(count, 3, size), interpolation),
+        past_q=torch.zeros(count, 0, size, dtype=torch.float64),
     )
 
 
