@@ -1,21 +1,24 @@
-"""Long roll-outs of a learned model: compiled steps against the eager loop, side by side.
+"""Long roll-outs: the loop in C, the loop in Python, and MuJoCo on the same robot, in one run.
 
-    python benchmarks/long_rollout.py                 # the table in benchmarks/README.md
-    python benchmarks/long_rollout.py --quick         # a smoke run
+    python benchmarks/long_rollout.py                              # the Panda of the package
+    python benchmarks/long_rollout.py --urdf $PINN_DYN_LOGS/ur10e/ur10e.urdf --locked
+    python benchmarks/long_rollout.py --quick                      # a smoke run
 
-float64, as evaluate.py; the one-segment soft arm's sizes (N = 3), steps of 0.0002 s for one
-trajectory and 0.002 s for many. The networks have the sizes of conf/model and their initial
-weights: what they have learned changes no time. The eager loop, torchdiffeq's fixed-step RK4, runs
-for a part of the steps and is scaled up; its states are compared with those of the compiled one.
+Steps of RK4 per second of processor time on one core, float64, under sampled torques. `known` has
+the bodies of the URDF and Coulomb friction, `lnn` has the joints of the robot and heads of 2 x 64
+units. Neither is trained, since the weights do not change the time. The loop in Python runs for a
+part of the steps, and the states of both are compared there. MuJoCo runs `mj_step` with its RK4,
+without contacts, limits and friction, under constant torques.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import os
+import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -23,10 +26,12 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.app.provenance import provenance
-from pinn_dyn.mechanics import RK4, MechanicalSystem, Signal
-from pinn_dyn.mechanics.compilation import CompiledLoop, integrated_by
+from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.exports import c_loop
+from pinn_dyn.mechanics import ContinuousPredictor, Signal, double_copy
 from pinn_dyn.models import (
-    HamiltonianNetwork,
+    CoulombFriction,
+    KnownMechanics,
     LagrangianNetwork,
     NetworkCholesky,
     NetworkInput,
@@ -34,123 +39,127 @@ from pinn_dyn.models import (
     Positive,
     Statistics,
 )
+from pinn_dyn.systems import MujocoArm, RigidChain
 
 HERE = Path(__file__).parent
-N = 3
+PANDA = "franka_panda/panda.urdf"
+FINGERS = ["panda_finger_joint1", "panda_finger_joint2"]
+STEP = 1e-3
 
 
-@dataclass(frozen=True)
-class Case:
-    """Trajectories of so many steps, and how many of the steps the eager loop is timed over."""
-
-    trajectories: int
-    steps: int
-    step: float
-    eager_steps: int
-
-
-def make_model(kind: str) -> MechanicalSystem:
-    """A network with the head sizes of conf/model and the scales of the one-segment arm."""
+def models_of(chain: RigidChain) -> dict[str, ContinuousPredictor]:
+    """Return known mechanics and a Lagrangian network with the joints of a robot."""
+    one, scales = torch.ones(chain.num_coordinates), torch.ones(1, 2 * chain.num_coordinates)
+    statistics = Statistics(0 * one, one, -one, one, one, one, 0 * one, one, scales, scales, STEP)
     torch.manual_seed(0)
-    one = torch.ones(N, dtype=torch.float64)
-    increment = torch.cat([2e-3 * one, 1e-2 * one])[None]
-    scales = Statistics(
-        q_mean=0 * one,
-        q_std=0.5 * one,
-        q_low=-2 * one,
-        q_high=2 * one,
-        v_std=one,
-        p_std=0.05 * one,
-        u_mean=0 * one,
-        u_std=0.5 * one,
-        qv_increment_std=increment,
-        qp_increment_std=0.1 * increment,
-        step=2e-3,
+    hidden = [64, 64]
+    network = LagrangianNetwork(
+        statistics,
+        partial(NetworkCholesky, hidden=hidden),
+        potential=partial(NetworkPotential, hidden=hidden),
+        damping=partial(NetworkCholesky, hidden=hidden, positivity=Positive(floor=0.0)),
+        input=partial(NetworkInput, hidden=hidden),
     )
-    mass = partial(NetworkCholesky, hidden=[32, 32, 32])
-    heads = {
-        "potential": partial(NetworkPotential, hidden=[32, 32]),
-        "damping": partial(NetworkCholesky, hidden=[16, 16], positivity=Positive(floor=0.0)),
-        "input": partial(NetworkInput, hidden=[16, 16]),
-    }
-    network = {"lnn": LagrangianNetwork, "hnn": HamiltonianNetwork}[kind]
-    return network(scales, mass, **heads).double().eval()
+    known = KnownMechanics(statistics, chain, start="prior", friction=CoulombFriction)
+    return {"known": double_copy(known), "lnn": double_copy(network)}
 
 
-def timed(work: Callable[[], Tensor], clock: Callable[[], float]) -> tuple[float, Tensor]:
+def timed(work: Callable[[], Tensor]) -> tuple[float, Tensor]:
+    """Return processor time in s, with that of compilers, and the result."""
+
+    def clock() -> float:
+        return time.process_time() + sum(os.times()[2:4])
+
     start = clock()
     result = work()
     return clock() - start, result
 
 
-def measure(kind: str, case: Case, clock: Callable[[], float]) -> dict[str, object]:
-    """Seconds of both for one case.
+def measure(model: ContinuousPredictor, trajectories: int, steps: int, timed_steps: int) -> dict:
+    """Return steps per second of both loops, and the processor time to build the loop.
 
     Raises:
         RuntimeError: if the states of both differ by more than 1e-9.
     """
-    model = make_model(kind)
-    generator = torch.Generator().manual_seed(1)
-    batch = () if case.trajectories == 1 else (case.trajectories,)
-    x0 = 0.1 * torch.randn(*batch, 2 * N, generator=generator, dtype=torch.float64)
-    t = case.step * torch.arange(case.steps + 1, dtype=torch.float64)
-    phase = torch.rand(*batch, 1, N, generator=generator, dtype=torch.float64)
-    u = 0.3 * torch.sin(2 * t[:, None] + 6 * phase)
+    n = model.num_coordinates
+    x0 = 0.1 * torch.randn(trajectories, 2 * n, generator=torch.Generator().manual_seed(1)).double()
+    t = STEP * torch.arange(steps + 1).double()
+    u = 0.3 * torch.sin(2 * t[:, None] + torch.arange(n)).expand(trajectories, -1, -1)
 
-    def roll_out(steps: int, compiled: bool) -> Tensor:
-        integrator = CompiledLoop(RK4()) if compiled else RK4()
-        with torch.no_grad(), integrated_by(model, integrator):
-            return model.predict(x0, t[: steps + 1], Signal(t[: steps + 1], u[..., : steps + 1, :]))
+    @torch.no_grad()
+    def roll_out(predictor: ContinuousPredictor, count: int) -> Tensor:
+        times = t[: count + 1]
+        return predictor.predict(x0, times, Signal(times, u[:, : count + 1]))
 
-    compile_s, _ = timed(lambda: roll_out(2, compiled=True), time.perf_counter)
-    warm_s, _ = timed(lambda: roll_out(2, compiled=True), clock)
-    total_s, states = timed(lambda: roll_out(case.steps, compiled=True), clock)
-    eager_s, expected = timed(lambda: roll_out(case.eager_steps, compiled=False), clock)
-    difference = float((states[..., : case.eager_steps + 1, :] - expected).abs().max())
+    fast = model_for_roll_outs(model)
+    first = max(c_loop.STEPS, timed_steps)
+    build, _ = timed(lambda: roll_out(fast, first))
+    c_loop._LOOPS.clear()  # as in the next process
+    cached, _ = timed(lambda: roll_out(fast, first))
+    seconds, states = timed(lambda: roll_out(fast, steps))
+    eager, expected = timed(lambda: roll_out(model, timed_steps))
+    difference = float((states[:, : timed_steps + 1] - expected).abs().max())
     if not difference <= 1e-9:
-        raise RuntimeError(f"{kind}: the states of both differ by {difference:.2g}")
+        raise RuntimeError(f"the states of both loops differ by {difference:.2g}")
     return {
-        "model": kind,
-        "trajectories": case.trajectories,
-        "steps": case.steps,
-        "compiled_s": round(total_s - warm_s, 2),
-        "with_warm_compile_s": round(total_s, 2),
-        "first_compile_s": round(compile_s, 1),
-        "eager_s": round(eager_s * case.steps / case.eager_steps, 1),
-        "eager_timed_steps": case.eager_steps,
+        "steps_per_second": round(trajectories * steps / seconds),
+        "eager_steps_per_second": round(trajectories * timed_steps / eager),
+        "build_s": round(build, 1),
+        "cached_build_s": round(cached, 1),
         "largest_difference": f"{difference:.1e}",
     }
 
 
+def mujoco_steps_per_second(arm: MujocoArm, steps: int) -> int:
+    """Return the steps of ``mj_step`` with RK4 per second."""
+    import mujoco
+
+    spec = mujoco.MjSpec.from_string(arm.text)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    spec.option.timestep = STEP
+    spec.compiler.balanceinertia = True
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qfrc_applied[:] = 0.3
+    start = time.process_time()
+    mujoco.mj_step(model, data, steps)
+    return round(steps / (time.process_time() - start))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--threads", type=int, default=2, help="torch threads (default 2)")
-    parser.add_argument("--models", nargs="+", default=["lnn", "hnn"])
-    parser.add_argument("--cpu-time", action="store_true", help="processor time, on a busy machine")
+    parser.add_argument("--urdf", default=PANDA)
+    parser.add_argument("--locked", nargs="*", default=None, help="locked joints; Panda: fingers")
     parser.add_argument("--quick", action="store_true", help="smoke run: few steps, no file")
     parser.add_argument("--output", type=Path, default=HERE / "results" / "long_rollout.csv")
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    cases = [Case(1, 50_000, 2e-4, 500), Case(1000, 5_000, 2e-3, 50)]
-    if arguments.quick:
-        cases = [Case(1, 200, 2e-4, 50)]
-    clock = time.process_time if arguments.cpu_time else time.perf_counter
-    environment = {
-        "clock": "processor" if arguments.cpu_time else "wall",
-        "threads": arguments.threads,
-        **provenance(),
-    }
+    locked = FINGERS if arguments.locked is None and arguments.urdf == PANDA else arguments.locked
+    torch.set_num_threads(1)
+    chain = RigidChain(arguments.urdf, locked_joints=locked or [])
+    cases = [(1, 600, 20)] if arguments.quick else [(1, 50_000, 300), (1000, 500, 20)]
+    about = {"robot": Path(arguments.urdf).stem, "joints": chain.num_coordinates}
     rows = []
-    for kind in arguments.models:
-        for case in cases:
-            rows.append({**measure(kind, case, clock), **environment})
-            print(rows[-1], flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["PINN_DYN_CACHE"] = folder
+        for name, model in models_of(chain).items():
+            for trajectories, steps, timed_steps in cases:
+                c_loop._LOOPS.clear()
+                row = {**about, "model": name, "trajectories": trajectories, "steps": steps}
+                rows.append({**row, **measure(model, trajectories, steps, timed_steps)})
+                print(rows[-1], flush=True)
+    arm, steps = MujocoArm(arguments.urdf, locked_joints=locked or []), cases[0][1]
+    row = {**about, "model": "MuJoCo", "trajectories": 1, "steps": steps}
+    rows.append({**row, "steps_per_second": mujoco_steps_per_second(arm, steps)})
+    print(rows[-1], flush=True)
     if not arguments.quick:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        with arguments.output.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        exists = arguments.output.exists()
+        with arguments.output.open("a" if arguments.locked is not None and exists else "w") as file:
+            record = {key: provenance()[key] for key in ("hardware", "torch", "commit")}
+            writer = csv.DictWriter(file, [*rows[0], *record])
+            if file.mode == "w":
+                writer.writeheader()
+            writer.writerows({**row, **record} for row in rows)
         print(f"wrote {arguments.output}")
 
 

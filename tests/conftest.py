@@ -49,7 +49,6 @@ def traced(monkeypatch):
 
     Each kind of program is built by one test.
     """
-    monkeypatch.setattr("pinn_dyn.mechanics.compilation._compile", lambda function, _: function)
     monkeypatch.setattr("torch._inductor.compile", lambda graph, *_: graph)
 
 

@@ -23,6 +23,7 @@ from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.payload import identify_payload
+from pinn_dyn.evaluation.prediction import model_for_roll_outs
 from pinn_dyn.exports.exported import Real
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
@@ -210,8 +211,9 @@ class Run:
     ) -> pd.DataFrame | np.ndarray:
         """Predict the motion from a start under an input, or along a data frame.
 
-        ``predict(start, u, t)`` returns the states x(t_k), ``(*batch, T, 2N)``. The input between
-        its samples is interpolated as in the training data.
+        ``predict(start, u, t)`` simulates the model, and returns the states x(t_k), ``(*batch, T,
+        2N)``. The input between its samples is interpolated as in the training data. Long motions
+        run as a loop in C if there is a C compiler.
 
         ``predict(frame)`` returns q and v in the columns, units and index of a log, whose columns
         the frame needs. It is cleaned by the same steps. Every run starts from its first row.
@@ -229,9 +231,11 @@ class Run:
         if isinstance(start, pd.DataFrame):
             if self.log is None:
                 raise ValueError("the training data have no columns of a log: give start, u and t")
-            return predict_frame(self.model, self.log, start)
+            with torch.no_grad():
+                return predict_frame(model_for_roll_outs(self.model), self.log, start)
         x0, times, signal = self._motion(start, u, t)
-        return self.model.predict(x0, times, signal).numpy()
+        with torch.no_grad():
+            return model_for_roll_outs(self.model).predict(x0, times, signal).numpy()
 
     def predict_interval(
         self,
@@ -260,8 +264,8 @@ class Run:
             raise TypeError("a single network has no spread: train an ensemble (ensemble=5)")
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
-            paths = double_copy(ensemble).member_increments(x0, times, signal)
-            mean = self.model.predict(x0, times, signal)
+            paths = model_for_roll_outs(ensemble).member_increments(x0, times, signal)
+            mean = model_for_roll_outs(self.model).predict(x0, times, signal)
         width = float(half_widths(len(paths), level)) * (1 + 1 / len(paths)) ** 0.5
         reach = factor * width * paths.std(dim=0)
         return (mean - reach).numpy(), (mean + reach).numpy()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from pinn_dyn.data.simulation import has_cpp_compiler
 from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
     MechanicalSystem,
@@ -21,7 +21,9 @@ from pinn_dyn.mechanics import (
     double_copy,
     samples_of,
 )
-from pinn_dyn.mechanics.compilation import WORK_FOR_LOOP, CompiledLoop, RecordedSteps
+from pinn_dyn.mechanics.compilation import RecordedSteps
+
+Model = TypeVar("Model", bound=Predictor)
 
 WINDOWS = (0.1, 0.5, 1.0)
 """Default windows, s."""
@@ -90,7 +92,7 @@ def predict_trajectories(
         ValueError: if the step is no multiple of the sample time.
     """
     stride = 1 if step is None else samples_of("step", step, truth.t)
-    copy = model_for_roll_outs(model, truth.q.device, truth.t.shape[0] // stride, truth.q.shape[0])
+    copy = model_for_roll_outs(model, truth.q.device)
     x0 = truth.states(model.state, slice(1), model.past_steps, stride)[:, 0].double()
     input = truth.since(model.input_history).input.to(truth.q.device, torch.float64)
     states = _roll_out(copy, x0, truth.t[::stride], input)
@@ -137,7 +139,7 @@ def predict_windows(
     size = past + samples + 1  # neighbors share the sample between them, and their past
     pieces = input.mapped(lambda u: u.unfold(1, size, samples).movedim(-1, -2).flatten(0, 1))
     pieces = replace(pieces, t=input.t[:size])
-    copy = model_for_roll_outs(model, truth.q.device, samples // stride, x0.shape[:2].numel())
+    copy = model_for_roll_outs(model, truth.q.device)
     states = _roll_out(copy, x0.flatten(0, 1), pieces.t[past::stride], pieces)
     ends = states[..., 1:, : model.num_coordinates]
     q = truth.q[:, : last + 1 : stride].double()
@@ -147,18 +149,14 @@ def predict_windows(
     return Prediction(truth.t[: last + 1 : stride].double(), paths.mean(0), q, members)
 
 
-def model_for_roll_outs(
-    model: Predictor, device: torch.device, steps: int, batch: int
-) -> Predictor:
-    """Copy the model in float64, with compiled (on a GPU recorded) steps for long rollouts."""
+def model_for_roll_outs(model: Model, device: torch.device | str = "cpu") -> Model:
+    """Copy the model in float64, with loops in C (on a GPU recorded steps) for long rollouts."""
     copy = double_copy(model, device)
-    members, inner = (copy.size, copy.stack) if isinstance(copy, Ensemble) else (1, copy)
-    if isinstance(inner, ContinuousPredictor) and device.type == "cuda":
+    members, inner = (1, copy.stack) if isinstance(copy, Ensemble) else (0, copy)
+    if isinstance(inner, ContinuousPredictor) and torch.device(device).type == "cuda":
         inner.integrator = RecordedSteps(inner.integrator)
-    elif isinstance(inner, ContinuousPredictor) and device.type == "cpu":
-        work = steps * inner.integrator.substeps * (members * batch + 300)
-        if work >= WORK_FOR_LOOP and has_cpp_compiler():
-            inner.integrator = CompiledLoop(inner.integrator)
+    elif isinstance(inner, ContinuousPredictor):
+        inner.integrator = CLoop(inner.integrator, members)
     return copy
 
 

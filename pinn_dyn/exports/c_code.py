@@ -68,14 +68,14 @@ class Constants:
 
     def __init__(self, real: str):
         self.real = real
-        self._names: dict[tuple[str, int, str], str] = {}
+        self._arrays: dict[tuple[str, bytes], tuple[str, Tensor]] = {}
 
     def name(self, values: Tensor) -> str:
         """Return the name of the array with these values."""
+        values = values.flatten()
         kind = self.real if values.dtype.is_floating_point else "int"
-        numbers = ", ".join(self.number(x) for x in values.flatten().tolist())
-        key = kind, values.numel(), numbers
-        return self._names.setdefault(key, f"c{len(self._names)}")
+        key = kind, values.numpy().tobytes()
+        return self._arrays.setdefault(key, (f"c{len(self._arrays)}", values))[0]
 
     def number(self, value: Any) -> str:
         """Return a number as an operand."""
@@ -90,9 +90,13 @@ class Constants:
     def definitions(self) -> list[str]:
         """Return the lines that define the arrays."""
         return [
-            f"static const {kind} {name}[{size}] = {{{numbers}}};"
-            for (kind, size, numbers), name in self._names.items()
+            self._definition(kind, name, values)
+            for (kind, _), (name, values) in self._arrays.items()
         ]
+
+    def _definition(self, kind: str, name: str, values: Tensor) -> str:
+        numbers = ", ".join(self.number(x) for x in values.tolist())
+        return f"static const {kind} {name}[{len(values)}] = {{{numbers}}};"
 
 
 class _Buffers:
@@ -175,18 +179,18 @@ class CFunction:
         same = operation(user) in _ELEMENTWISE
         return same and user.meta["val"].numel() == node.meta["val"].numel()
 
-    def _reads(self, node: fx.Node) -> set[int]:
+    def _reads(self, node: fx.Node) -> list[int]:
         """Return the arrays of a node: its result and what its loop reads."""
         value = node.meta["val"]
-        pointers = set()
+        pointers = []
         if isinstance(value, Tensor) and node not in self._inlined:
-            pointers.add(_storage(value))
+            pointers.append(_storage(value))
         if node.op == "call_function" and operation(node) != "getitem":
             for operand in node.all_input_nodes:
                 if operand in self._inlined:
-                    pointers |= self._reads(operand)
+                    pointers += self._reads(operand)
                 elif isinstance(operand.meta["val"], Tensor):
-                    pointers.add(_storage(operand.meta["val"]))
+                    pointers.append(_storage(operand.meta["val"]))
         return pointers
 
     # Operands and expressions.
@@ -213,8 +217,10 @@ class CFunction:
         index = index[len(index) - value.ndim :]
         index = ["0" if size == 1 else i for i, size in zip(index, value.shape, strict=True)]
         constant = operand.op == "get_attr"
-        if constant and bool((value == value.flatten()[0]).all()):
-            return self.constants.number(value.flatten()[0].item())
+        first = value.flatten()[0] if constant else value
+        # Integers, such as zeros, follow from the structure. Other numbers may be learned.
+        if constant and float(first).is_integer() and bool((value == first).all()):
+            return self.constants.number(first.item())
         if operand in self._inlined:
             return f"({self._expression(operand, index)})"
         return self._element(value, index, constant)
@@ -317,6 +323,12 @@ class CFunction:
                     f"{row} {{ {' '.join(copies)} }}",
                 ]
                 self._loops({"b": len(block)}, body)
+
+    def _state_derivative(self, node: fx.Node, *sources: fx.Node) -> None:
+        """Write a call of the function with this name."""
+        values = [*(source.meta["val"] for source in sources), self._declare(node)]
+        pointers = [f"&{self._element(value, ['0'])}" for value in values]
+        self.lines.append(f"state_derivative(values, {', '.join(pointers)});")
 
     def _reduction(self, node: fx.Node, source: fx.Node, dims: Any = None, keep: bool = False):
         start, step = _REDUCTIONS[operation(node)]

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, fx
 from torch._decomp import core_aten_decompositions, get_decompositions
+from torch._guards import TracingContext, tracing
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.exports.decompositions import DECOMPOSITIONS
@@ -75,6 +77,7 @@ def trace(
     function: Callable[..., Tensor | tuple[Tensor, ...]],
     inputs: Mapping[str, Tensor],
     outputs: Sequence[str],
+    lines: bool = True,
 ) -> Program:
     """Record a function at example inputs, without a batch dimension, in float64.
 
@@ -82,6 +85,7 @@ def trace(
         function: takes the inputs by position, and returns a tensor for each output.
         inputs: example value of each input by its name.
         outputs: names of the outputs.
+        lines: record the lines of code, for messages.
     """
 
     def run(*arguments: Tensor) -> tuple[Tensor, ...]:
@@ -92,7 +96,9 @@ def trace(
     softmax = get_decompositions([torch.ops.aten._softmax])
     table = {**core_aten_decompositions(), **softmax, **DECOMPOSITIONS}
     values = tuple(value.clone() for value in inputs.values())  # make_fx merges equal tensors
-    module = make_fx(torch.func.functionalize(run), table, record_stack_traces=True)(*values)
+    with tracing(TracingContext(FakeTensorMode())):  # else make_fx creates a mode for every node
+        traced = make_fx(torch.func.functionalize(run), table, record_stack_traces=lines)
+        module = traced(*values)
     _fold_constants(module, values)
     results = module(*values)
     shapes = {name: value.shape for name, value in zip(outputs, results, strict=True)}

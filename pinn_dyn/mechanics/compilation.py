@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import types
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,13 +9,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
-from pinn_dyn.mechanics.integrators.integrator import BLOCK
 from pinn_dyn.mechanics.predictor import ContinuousPredictor
 from pinn_dyn.mechanics.signal import Signal
 
@@ -33,14 +30,8 @@ MOST_EVALUATIONS = 4
 CHUNK = 256
 """Number of windows with MOST_EVALUATIONS that are computed at once, so that the values for the
 gradient stay in the cache. Batches of less than twice this number are not split."""
-WORK_FOR_LOOP = 4_500_000
-"""Steps times (batch + 300) from which a compiled loop pays off in a roll-out: 2 ms per step and
-7 us per trajectory for 20 s."""
-
 _SHORT = 8
 """Largest number of terms for which the compiler can fuse a product as a sum."""
-_WORTH_THREADS = 1024
-"""Smallest number of values for which a loop runs in several threads."""
 
 
 @contextmanager
@@ -53,7 +44,9 @@ def integrated_by(model: ContinuousPredictor, integrator: Integrator) -> Iterato
         model.integrator = original
 
 
-class _Wrapped(Integrator):
+class Wrapped(Integrator):
+    """Integrator with the steps of another, for another way to run them."""
+
     def __init__(self, inner: Integrator):
         super().__init__(inner.substeps)
         self.inner = inner
@@ -65,11 +58,11 @@ class _Wrapped(Integrator):
         return self.inner.step(dynamics, increment, start, inputs, h)
 
 
-class Unrolled(_Wrapped):
+class Unrolled(Wrapped):
     """Integrator whose paths are the traceable loop over single steps."""
 
 
-class CompiledDynamics(_Wrapped):
+class CompiledDynamics(Wrapped):
     """Integrator of dynamics whose derivative or step is compiled, with gradients."""
 
     def __init__(self, inner: Integrator, dynamics: Dynamics):
@@ -85,24 +78,7 @@ class CompiledDynamics(_Wrapped):
         return self.inner.path(self._compiled, start, grid, signal)
 
 
-class CompiledLoop(_Wrapped):
-    """Integrator that runs a path as one compiled loop, without gradients, for long roll-outs."""
-
-    def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        u = signal.u[..., 0, :].expand(BLOCK, len(self.nodes), *signal.batch, signal.num_inputs)
-        arguments = (u.contiguous(), start.new_zeros(BLOCK))
-        loop = compile_loop(dynamics.integration_step, torch.zeros_like(start), start, arguments)
-        blocks = [torch.zeros_like(start)[None]]
-        for inputs, lengths in self.blocks(grid, signal):
-            # The last block is padded with steps of length zero.
-            missing = BLOCK - lengths.shape[0]
-            padded = torch.cat([inputs, inputs[-1:].expand(missing, *inputs.shape[1:])])
-            path = loop(blocks[-1][-1], start, padded, F.pad(lengths, (0, missing)))
-            blocks.append(path[: lengths.shape[0]])
-        return torch.cat(blocks)
-
-
-class RecordedSteps(_Wrapped):
+class RecordedSteps(Wrapped):
     """Integrator that replays steps from a CUDA graph on a GPU, without gradients.
 
     Dynamics that wait for the GPU cannot be recorded; they use the inner integrator.
@@ -205,38 +181,6 @@ class _Recorded:
         return [value.clone() for value in self._results]
 
 
-def compile_loop(
-    step: Callable[..., Tensor], state: Tensor, constant: Tensor, inputs: tuple[Tensor, ...]
-) -> Callable[..., Tensor]:
-    """Compile the loop x_{k+1} = step(x_k, c, *inputs_k) into one program without gradients.
-
-    The program is for arguments of fixed shapes and types. Each of the ``inputs`` is ``(T, ...)``,
-    and the program returns x_1 to x_T, ``(T, ...)``.
-    """
-    from torch._dynamo import config as dynamo_config  # the import takes a second
-    from torch._higher_order_ops.scan import scan
-
-    # make_fx does not support bound methods.
-    graph = make_fx(lambda *arguments: step(*arguments), _DECOMPOSITIONS)(
-        state, constant, *[values[0] for values in inputs]
-    )
-
-    def loop(state: Tensor, constant: Tensor, *inputs: Tensor) -> Tensor:
-        def body(state: Tensor, now: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-            following = graph(state, constant, *now)
-            return following, following.clone()
-
-        return scan(body, state, inputs)[1]
-
-    # The compiler stores programs by the code of a function, which all loops share.
-    copied = types.FunctionType(loop.__code__.replace(), loop.__globals__, closure=loop.__closure__)
-    program = _compile(copied, {"cpp.threads": 1} if state.numel() < _WORTH_THREADS else {})
-    # The compiler must treat the counter of the loop as symbolic.
-    with dynamo_config.patch(capture_scalar_outputs=True), torch.no_grad():
-        program(state, constant, *inputs)
-    return program
-
-
 def _keep_rows() -> None:
     """Make the compiler pass matrices to triangular solves in row-major order, without copies."""
     from torch._inductor import lowering  # the import takes a second
@@ -246,12 +190,6 @@ def _keep_rows() -> None:
 
 
 _OPTIONS = {"cpp_wrapper": True, "post_grad_fusion_options": {"decompose_mm_pass": {}}}
-
-
-def _compile(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
-    _keep_rows()
-    options = {**options, **_OPTIONS, "guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
-    return torch.compile(function, dynamic=False, options=options)
 
 
 def _mm(a: Tensor, b: Tensor) -> Tensor:

@@ -11,9 +11,7 @@ from pinn_dyn.evaluation import (
     rollout_metrics,
 )
 from pinn_dyn.evaluation.metrics import left_data, member_metrics, state_squared_error
-from pinn_dyn.evaluation.prediction import model_for_roll_outs
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, Trajectory
-from pinn_dyn.mechanics.compilation import CompiledLoop
 from pinn_dyn.systems import SoftArm
 
 
@@ -265,22 +263,3 @@ def test_a_truth_that_is_like_a_member_is_calibrated_and_a_common_error_is_not()
     # The error's mean square is 9 + 1/5 in place of 1 + 1/5 for each coordinate.
     expected = math.sqrt(1.2 / 9.2)
     assert figures(3 * q)["spread_over_error"] == pytest.approx(expected, rel=0.03)
-
-
-# Which roll-outs are compiled.
-
-
-@pytest.mark.parametrize(
-    ("steps", "batch", "expected"),
-    [(2_500, 10, False), (50_000, 1, True), (5_000, 1000, True), (50, 500, False)],
-)
-def test_only_long_roll_outs_take_compiled_steps(monkeypatch, steps, batch, expected):
-    device = torch.device("cpu")
-    monkeypatch.setattr("pinn_dyn.evaluation.prediction.has_cpp_compiler", lambda: True)
-    model = PointMass()
-    copy = model_for_roll_outs(model, device, steps, batch)
-    assert isinstance(copy.integrator, CompiledLoop) is expected
-    assert not isinstance(model.integrator, CompiledLoop)
-    monkeypatch.setattr("pinn_dyn.evaluation.prediction.has_cpp_compiler", lambda: False)
-    copy = model_for_roll_outs(model, device, steps, batch)
-    assert not isinstance(copy.integrator, CompiledLoop)

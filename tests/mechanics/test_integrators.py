@@ -9,14 +9,13 @@ from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
 from pinn_dyn.mechanics.compilation import (
     CompiledDynamics,
-    CompiledLoop,
     Unrolled,
     integrated_by,
 )
 from pinn_dyn.mechanics.rollout import path_between
-from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkCholesky, NetworkPotential
+from pinn_dyn.models import ConstantCholesky, ConstantInput, NetworkPotential
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
-from tests.models.builders import make_model, make_structured, perturb
+from tests.models.builders import make_structured, perturb
 
 
 def samples(batch, count, size, seed=0):
@@ -24,13 +23,6 @@ def samples(batch, count, size, seed=0):
     return torch.randn(*batch, count, size, generator=generator, dtype=torch.float64)
 
 
-@pytest.fixture
-def uncompiled(monkeypatch):
-    """The same loop, with the step left as it is."""
-    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
-
-
-@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
 @pytest.mark.parametrize(("batch", "substeps"), [((2, 3), 1), ((), 3)])
 def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
@@ -41,13 +33,12 @@ def test_the_loop_gives_what_torchdiffeq_gives(interpolation, batch, substeps):
     u = samples(batch, count, 1)
     x0 = samples(batch, 1, 4, seed=1).squeeze(-2)
     signal, plain = Signal(t_input, u, interpolation), RK4(substeps)
-    expected, unrolled, looped = (
+    expected, unrolled = (
         path_between(system, integrator, x0, t_input[::2], signal)
-        for integrator in (plain, Unrolled(plain), CompiledLoop(plain))
+        for integrator in (plain, Unrolled(plain))
     )
     assert expected.shape == (*batch, 140 // substeps // 2 + 1, 4)
     torch.testing.assert_close(unrolled, expected, rtol=0, atol=1e-12)
-    torch.testing.assert_close(looped, expected, rtol=0, atol=1e-12)
 
 
 # The Rosenbrock method.
@@ -109,14 +100,10 @@ def test_an_ensemble_integrates_as_its_members_do(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("batch", [(4,), ()])
-def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
-    monkeypatch, batch, traced
-):
-    """In training the step is compiled for gradients; in a long roll-out without them."""
+def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(monkeypatch):
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
     t = 0.02 * torch.arange(4, dtype=torch.float64)
-    u, x0 = samples(batch, 4, 1), 0.3 * samples(batch, 1, 2, seed=1).squeeze(-2)
+    u, x0 = samples((4,), 4, 1), 0.3 * samples((4,), 1, 2, seed=1).squeeze(-2)
     constant = dict(mass=ConstantCholesky, damping=ConstantCholesky, input=ConstantInput)
     potential = partial(NetworkPotential, hidden=[3])
     model = make_structured("lnn", 1, 1, **constant, potential=potential, integrator=Rosenbrock())
@@ -128,43 +115,10 @@ def test_a_compiled_rosenbrock_step_has_the_same_increments_and_gradients(
         if name != "potential.network.layers.1.bias"
     ]
     gradients = torch.autograd.grad(expected.square().sum(), parameters)
-    if batch:
-        with integrated_by(model, CompiledDynamics(model.integrator, model)):
-            found = model.increments(x0, t, Signal(t, u))
-        for one, other in zip(
-            torch.autograd.grad(found.square().sum(), parameters), gradients, strict=True
-        ):
-            torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
-    else:
-        with torch.no_grad(), integrated_by(model, CompiledLoop(model.integrator)):
-            found = model.increments(x0, t, Signal(t, u))
+    with integrated_by(model, CompiledDynamics(model.integrator, model)):
+        found = model.increments(x0, t, Signal(t, u))
+    for one, other in zip(
+        torch.autograd.grad(found.square().sum(), parameters), gradients, strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "size"), [("acceleration", 1), ("hnn", 2)])
-def test_a_compiled_roll_out_of_a_network_is_that_of_torchdiffeq(request, kind, size):
-    """Two models of one shape in turn: neither may be taken for the other. A block and a part."""
-    if kind != "acceleration":  # whose program is built in a third of the time
-        request.getfixturevalue("traced")
-    t = 0.005 * torch.arange(81, dtype=torch.float64)
-    u, x0 = samples((), 81, size), 0.3 * samples((), 1, 2 * size, seed=1).squeeze(0)
-    heads = dict(  # small ones: compiling is what takes the time here
-        mass=partial(NetworkCholesky, hidden=[4]),
-        potential=partial(NetworkPotential, hidden=[4]),
-        damping=ConstantCholesky,
-        input=ConstantInput,
-    )
-    if kind == "acceleration":
-        model, other = (make_model(kind, size, size).eval() for _ in range(2))
-    else:
-        model, other = (make_structured(kind, size, size, **heads).eval() for _ in range(2))
-    with torch.no_grad():
-        for parameter in other.parameters():
-            parameter *= 0.9
-        for item in (model, other):
-            expected = item.predict(x0, t, Signal(t, u))
-            item.integrator = CompiledLoop(item.integrator)
-            found = item.predict(x0, t, Signal(t, u))
-            torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
-            assert (expected[-1] - x0).abs().max() > 0.01

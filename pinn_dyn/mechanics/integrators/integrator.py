@@ -82,13 +82,15 @@ class Integrator(abc.ABC):
             blocks.append(torch.stack(steps))
         return torch.cat(blocks)
 
-    def blocks(self, grid: Tensor, signal: Signal) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield inputs ``(n, stages, *batch, M)`` and lengths ``(n,)`` of blocks of n steps."""
+    def blocks(
+        self, grid: Tensor, signal: Signal, size: int = BLOCK
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield inputs ``(n, stages, *batch, M)`` and lengths ``(n,)`` of n <= ``size`` steps."""
         lengths = grid.diff()
         means = signal.means(grid) if self.mean_input else None
-        for begin in range(0, grid.shape[0] - 1, BLOCK):
-            block = slice(begin, begin + BLOCK)
-            inputs = signal.stages(grid[begin : begin + BLOCK + 1], self.nodes)
+        for begin in range(0, grid.shape[0] - 1, size):
+            block = slice(begin, begin + size)
+            inputs = signal.stages(grid[begin : begin + size + 1], self.nodes)
             if means is not None:
                 inputs = inputs + (means[block] - inputs.mean(1)).unsqueeze(1)
             yield inputs, lengths[block]

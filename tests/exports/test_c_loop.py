@@ -1,0 +1,156 @@
+"""Roll-outs as loops in C, beside the loop in Python."""
+
+import logging
+from functools import partial
+
+import pytest
+import torch
+
+from pinn_dyn.ensembles import Ensemble
+from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.exports import c_library, c_loop
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
+from pinn_dyn.models import AccelerationMLP, LearnedDelay, Servo
+from pinn_dyn.testing import LinearSystem
+from tests.models.builders import VARIANTS, make_model, make_statistics, make_structured, perturb
+from tests.support.known import elastic_model, known_model
+
+NETWORK = VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]
+
+
+@pytest.fixture(autouse=True)
+def cached(monkeypatch, tmp_path):
+    """Loops for paths of any length, compiled quickly, in a cache folder of the test."""
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
+    monkeypatch.setattr(c_loop, "STEPS", 1)
+    monkeypatch.setattr(c_library, "_FLAGS", [x.replace("-O3", "-O1") for x in c_library._FLAGS])
+    c_library._target.cache_clear()
+    monkeypatch.setattr(c_loop, "_LOOPS", {})
+    return tmp_path
+
+
+def make_ensemble(kind):
+    return Ensemble([perturb(make_structured(kind, **NETWORK), k, 0.1) for k in range(3)])
+
+
+MODELS = {
+    "known": known_model,
+    "elastic": elastic_model,
+    "servo": partial(known_model, input=partial(Servo, limit="learned")),
+    "rosenbrock": partial(known_model, integrator=Rosenbrock(2)),
+    "substeps": partial(make_structured, "lnn", integrator=RK4(3), **NETWORK),
+    "momentum": partial(make_structured, "hnn", **NETWORK),
+    "delay": lambda: perturb(
+        AccelerationMLP(make_statistics(2, 2), hidden=[6], delay=LearnedDelay(0.1, 0.03))
+    ),
+    "acceleration": partial(make_model, "acceleration"),
+    "ensemble": partial(make_ensemble, "lnn"),
+}
+
+
+def rolled_out(model, batch=(), count=80, interpolation="linear", scale=1.0):
+    """The states of the loop, and those of the loop in Python."""
+    model = model.double().eval().requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    n, m = model.num_coordinates, model.num_inputs
+    x0 = 0.3 * scale * torch.randn(*batch, 2 * n, generator=generator).double()
+    u = scale * torch.randn(*batch, count + 5, m, generator=generator).double()
+    t = 0.004 * torch.arange(count + 5).double()
+    signal = Signal(t, u, interpolation)
+    with torch.no_grad():
+        found = model_for_roll_outs(model).predict(x0, t[5:], signal)
+        return found, model.predict(x0, t[5:], signal)
+
+
+@pytest.mark.parametrize(
+    ("kind", "batch"), [*((kind, (2, 3)) for kind in MODELS), ("momentum", ()), ("ensemble", ())]
+)
+def test_the_loop_gives_the_states_of_the_model(kind, batch):
+    interpolation = {"known": "hold", "rosenbrock": "cubic"}.get(kind, "linear")
+    found, expected = rolled_out(MODELS[kind](), batch, interpolation=interpolation)
+    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop._Loop]
+    assert (expected[..., -1, :] - expected[..., 0, :]).abs().max() > 1e-3
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+
+
+def test_long_paths_are_computed_in_blocks_and_end_where_one_diverges(monkeypatch):
+    monkeypatch.setattr(c_loop, "NUMBERS", 100)
+    unstable = LinearSystem([[1.0]], [[-1e9]], [[0.0]], [[1.0]])
+    found, expected = rolled_out(unstable, (2,), scale=1e300)
+    assert not expected[:, -1].isfinite().any()
+    same = found.isfinite() == expected.isfinite()
+    assert same.all()
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=0, equal_nan=True)
+
+
+def test_models_of_one_kind_share_the_compiled_code_but_not_its_numbers(cached):
+    """Neither a change of the numbers nor an earlier program leaves a loop of old ones."""
+    model = make_structured("lnn", **NETWORK)
+    before, _ = rolled_out(model)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.data.mul_(1.1)
+    found, expected = rolled_out(model)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    assert (found - before).abs().max() > 1e-4
+    assert len(c_loop._LOOPS) == 2
+    assert len([*cached.glob("compiled/*.so")]) == 1
+    assert len([*cached.glob("compiled/*")]) == 1
+
+
+def test_a_compiled_loop_serves_the_next_process(monkeypatch, cached):
+    rolled_out(MODELS["momentum"]())
+    c_loop._LOOPS.clear()
+    monkeypatch.setattr(c_library, "compile_c", None)
+    rolled_out(MODELS["momentum"]())
+    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop._Loop]
+    c_library._target.cache_clear()  # as for another processor
+    monkeypatch.setattr(c_library, "_FLAGS", [*c_library._FLAGS, "-mtune=generic"])
+    c_loop._LOOPS.clear()
+    rolled_out(MODELS["momentum"]())
+    assert [*c_loop._LOOPS.values()] == [None]
+
+
+class Bessel(LinearSystem):
+    """A potential without C code."""
+
+    def _potential_force(self, q):
+        return super()._potential_force(q) + torch.special.bessel_j1(q)
+
+
+class Branching(LinearSystem):
+    """A force that Python selects by the state."""
+
+    def _potential_force(self, q):
+        return super()._potential_force(q) * (2.0 if float(q.sum()) > 0 else 1.0)
+
+
+@pytest.mark.parametrize("cause", ["compiler", "operation", "branch", "folder", "wrong"])
+def test_without_a_loop_the_states_are_those_of_the_model(monkeypatch, cached, caplog, cause):
+    kind = {"operation": Bessel, "branch": Branching}.get(cause, LinearSystem)
+    model = kind([[1.0]], [[2.0]], [[0.1]], [[1.0]])
+    if cause == "compiler":
+        monkeypatch.setenv("CC", "/nonexistent")
+    if cause == "folder":
+        (cached / "compiled").write_text("a file")
+    if cause == "wrong":
+        monkeypatch.setitem(c_loop.CFunction.__init__.__globals__["_ELEMENTWISE"], "add", "{0}")
+    with caplog.at_level(logging.INFO):
+        found, expected = rolled_out(model)
+    assert torch.equal(found, expected)
+    assert not any(c_loop._LOOPS.values())
+    assert not caplog.text
+
+
+def test_short_paths_and_gradients_do_not_build_a_loop(monkeypatch):
+    monkeypatch.setattr(c_loop, "STEPS", 100)
+    model = make_structured("lnn", **NETWORK)
+    rolled_out(model)
+    assert not c_loop._LOOPS
+    rolled_out(model, count=102)
+    assert len(c_loop._LOOPS) == 1
+    copy = model_for_roll_outs(model)
+    x0 = torch.full((6,), 0.1).double().requires_grad_()
+    t = 0.01 * torch.arange(200).double()
+    path = copy.predict(x0, t, Signal(t, torch.zeros(200, 3).double()))
+    assert path.requires_grad
