@@ -21,8 +21,8 @@ from pinn_dyn.mechanics.signal import Signal
 
 log = logging.getLogger(__name__)
 
-STEPS = 1000
-"""Number of steps from which building a loop pays off: 4 ms per step for 1 to 3 s, measured by
+STEPS = 2000
+"""Number of steps from which building a loop pays off: 4 to 6 ms per step for 1 to 4 s, measured by
 benchmarks/long_rollout.py for one trajectory."""
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
