@@ -17,15 +17,8 @@ from pinn_dyn.mechanics import Signal, State, Trajectory
 from pinn_dyn.mechanics.signal import stacked
 from pinn_dyn.models.statistics import Statistics
 
-_ROWS = (
-    "q",
-    "v",
-    "p",
-    "dq",
-    "dv",
-    "dp",
-    "past_q",
-)  # have one row for each window, as the input has
+_ROWS = ("q", "v", "p", "dq", "dv", "dp", "past_q")
+"""Fields with a row for each window, as the input has."""
 
 
 @dataclass(frozen=True)
