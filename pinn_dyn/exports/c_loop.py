@@ -54,9 +54,9 @@ class CLoop(Wrapped):
         self.members = members
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        own, batch = start.shape[: self.members], start.shape[self.members : -1]
-        x = start.reshape(*own, -1, start.shape[-1]).movedim(self.members, 0).contiguous()
-        u = signal.u[..., 0, :].reshape(*own, len(x), -1)[..., 0, :]
+        leading, batch = start.shape[: self.members], start.shape[self.members : -1]
+        x = start.reshape(*leading, -1, start.shape[-1]).movedim(self.members, 0).contiguous()
+        u = signal.u[..., 0, :].reshape(*leading, len(x), -1)[..., 0, :]
         u = u.expand(len(self.nodes), *u.shape).contiguous()
         fits = start.dtype == torch.float64 and start.is_cpu and not torch.is_grad_enabled()
         loop = _loop_of(dynamics, self, x[0], u, grid) if fits else None
@@ -68,7 +68,7 @@ class CLoop(Wrapped):
             rows = rows.movedim(2 + self.members, 0)
             blocks.append(loop(blocks[-1][:, -1], x, rows, lengths))
         path = torch.cat(blocks, dim=1).movedim(0, 1 + self.members)
-        return path.reshape(-1, *own, *batch, start.shape[-1])
+        return path.reshape(-1, *leading, *batch, start.shape[-1])
 
 
 class _Loop:
@@ -102,8 +102,8 @@ class _Loop:
         path = start.new_empty(len(start), len(lengths) + 1, *start.shape[1:])
         path[:, 0] = increment
         arrays = [self._values, start, inputs.contiguous(), lengths.contiguous(), path]
-        values, *others = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
-        self._function(values, ctypes.c_long(len(start)), ctypes.c_long(len(lengths)), *others)
+        values, *pointers = [ctypes.c_void_p(array.data_ptr()) for array in arrays]
+        self._function(values, ctypes.c_long(len(start)), ctypes.c_long(len(lengths)), *pointers)
         return path[:, 1:]
 
 
