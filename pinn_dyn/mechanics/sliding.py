@@ -40,7 +40,7 @@ class Sliding:
     Args:
         system: the system, with the state (q, v).
         x: state at the start of the step, ``(*batch, 2N)``.
-        u: input at the start of the step, ``(*batch, M)``.
+        inputs: input at the nodes of the step, ``(stages, *batch, M)``. Its mean decides the stops.
         h: length of the step, ``()``, s.
         implicit: true for a step that may be longer than motions with damping last.
 
@@ -54,13 +54,15 @@ class Sliding:
     """
 
     def __init__(
-        self, system: MechanicalSystem, x: Tensor, u: Tensor, h: Tensor, implicit: bool = False
+        self, system: MechanicalSystem, x: Tensor, inputs: Tensor, h: Tensor, implicit: bool = False
     ):
         self.system, self.h = system, h
         q, v = x.chunk(2, dim=-1)
         self._v = v
-        inertia, force = self._mass_and_force(q, v, u)
+        inertia, force = self._mass_and_force(q, v, inputs[0])
         self._first: tuple[Tensor, Tensor] | None = (inertia, force)
+        mean, first = (system._applied_force(q, v, u) for u in (inputs.mean(0), inputs[0]))
+        force = force + mean - first
         resistance = torch.zeros_like(inertia)
         if implicit:
             resistance = system._resistance(q, h)

@@ -305,9 +305,9 @@ class MechanicalSystem(ContinuousPredictor):
         return damping if stiffness is None else damping + step * stiffness
 
     @final
-    def sliding(self, x: Tensor, u: Tensor, h: Tensor, implicit: bool) -> Sliding:
+    def sliding(self, x: Tensor, inputs: Tensor, h: Tensor, implicit: bool) -> Sliding:
         """Return the dynamics of a step of h s from x with sticking friction."""
-        return Sliding(self, x, u, h, implicit)
+        return Sliding(self, x, inputs, h, implicit)
 
     @final
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:

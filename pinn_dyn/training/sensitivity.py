@@ -64,8 +64,8 @@ class _Sensitivity:
     def implicit_solver(self, x: Tensor, step: Tensor) -> Callable[[Tensor], Tensor]:
         raise NotImplementedError("sensitivities are integrated by RK4")
 
-    def sliding(self, y: Tensor, u: Tensor, h: Tensor, implicit: bool) -> _SlidingSensitivity:
-        return _SlidingSensitivity(self, y, u, h)
+    def sliding(self, y: Tensor, inputs: Tensor, h: Tensor, implicit: bool) -> _SlidingSensitivity:
+        return _SlidingSensitivity(self, y, inputs, h)
 
     def change(self, sensitivity: Tensor, *at: Tensor) -> Tensor:
         """Return de/dx S + de/dz, ``(*batch, N, P)``."""
@@ -87,13 +87,15 @@ class _SlidingSensitivity:
 
     """
 
-    def __init__(self, dynamics: _Sensitivity, y: Tensor, u: Tensor, h: Tensor):
+    def __init__(self, dynamics: _Sensitivity, y: Tensor, inputs: Tensor, h: Tensor):
         self.dynamics, self.h = dynamics, h
         x, sensitivity = dynamics.split(y)
         q, v = x.chunk(2, dim=-1)
-        motion = self.motion = Sliding(dynamics.model, x, u, h)
+        motion = self.motion = Sliding(dynamics.model, x, inputs, h)
         self.v, self.start = v.unsqueeze(-1), sensitivity.chunk(2, dim=-2)[1]
-        change = dynamics.change(sensitivity, q, v, motion.rate, u, motion.forward.to(v))
+        change = dynamics.change(
+            sensitivity, q, v, motion.rate, inputs.mean(0), motion.forward.to(v)
+        )
         slope = dynamics.solve(q, change, v == 0, 0 * change)
         self.tau = motion.stop.unsqueeze(-1)
         stopping = -(self.start + self.tau * slope) / motion.rate.unsqueeze(-1)

@@ -13,8 +13,9 @@ from pinn_dyn.mechanics.integrators.rk4 import RK4
 class Sticking(Integrator):
     """A step of another method, after :class:`~.sliding.Sliding` has found what sticks.
 
-    The order is that of the inner method while no coordinate stops or starts, and otherwise 2. A
-    coordinate at rest under a load below its friction level does not move at all.
+    The order is that of the inner method while no coordinate stops or starts, otherwise 2, and 1
+    for coordinates that start because of the stop of another. A coordinate at rest under a load
+    below its friction level does not move at all.
 
     Args:
         inner: the method while coordinates slide.
@@ -29,7 +30,7 @@ class Sticking(Integrator):
     def step(
         self, dynamics: Any, increment: Tensor, start: Tensor, inputs: Tensor, h: Tensor
     ) -> Tensor:
-        sliding = dynamics.sliding(start + increment, inputs[0], h, self.implicit)
+        sliding = dynamics.sliding(start + increment, inputs, h, self.implicit)
         after = self.inner.step(sliding, increment, start, inputs, h)
         return sliding.ended(start, increment, after)
 
