@@ -11,8 +11,10 @@ import torch
 from scipy.integrate import solve_ivp
 
 from pinn_dyn.app.export import export
+from pinn_dyn.exports import c_loop
+from pinn_dyn.exports.c_loop import CLoop
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
-from pinn_dyn.mechanics.compilation import CompiledLoop, Unrolled, integrated_by
+from pinn_dyn.mechanics.compilation import Unrolled, integrated_by
 from pinn_dyn.mechanics.integrators import Sticking
 from pinn_dyn.models import CoulombFriction
 from pinn_dyn.testing import LinearSystem, assert_near, partial_derivatives
@@ -174,14 +176,10 @@ def test_friction_never_adds_energy(elastic):
     assert ((energy.diff(dim=1) / scale) < 1e-9).all()
 
 
-@pytest.fixture
-def uncompiled(monkeypatch):
-    """The loop of the compiler, with its traced step left as it is."""
-    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
-
-
-@pytest.mark.usefixtures("uncompiled")
-def test_loops_and_batches_equal_single_steps():
+def test_loops_and_batches_equal_single_steps(monkeypatch, tmp_path):
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
+    monkeypatch.setattr(c_loop, "STEPS", 1)
+    monkeypatch.setattr(c_loop, "_LOOPS", {})
     system = two_links()
     t = torch.linspace(0, 3, 20, dtype=torch.float64)
     x0 = torch.tensor([[0.0, 0.0, 0.7, -0.4], [0.1, 0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -193,11 +191,11 @@ def test_loops_and_batches_equal_single_steps():
         for k, sign in enumerate((1, -1)):
             alone = system.predict(x0[k], t, Signal(t, sign * u))
             torch.testing.assert_close(alone, expected[k], rtol=0, atol=1e-12)
-        for wrapper in (Unrolled, CompiledLoop):
+        for wrapper in (Unrolled, CLoop):
             with integrated_by(system, wrapper(system.integrator)):
-                torch.testing.assert_close(
-                    system.predict(x0, t, both), expected, rtol=0, atol=1e-12
-                )
+                path = system.predict(x0, t, both)
+            torch.testing.assert_close(path, expected, rtol=0, atol=1e-12)
+    assert [type(loop) for loop in c_loop._LOOPS.values()] == [c_loop._Loop]
 
 
 @pytest.mark.parametrize("method", METHODS)
