@@ -88,7 +88,7 @@ class Sliding:
                 reaction = torch.where(stuck, force - matvec(inertia, rate), friction)
                 tendency = reaction + scale * rate
                 stuck = can_stick & (tendency > lower) & (tendency < upper)
-                ahead = torch.where(can_stick, tendency >= upper, self.forward)
+                ahead = (can_stick & (tendency >= upper)) | (~can_stick & self.forward)
         self.stuck, self.ahead = stuck, ahead
         before = self.stop / h
         self.share = before * self.forward + (1 - before) * ahead
