@@ -23,7 +23,7 @@ from pinn_dyn.evaluation import (
 from pinn_dyn.mechanics import Predictor, stack_until
 
 LINEAR_STEP = 0.01  # smallest step of the linear baselines, s; smaller steps give larger errors
-# Horizon, step of the roll-outs and windows of each data set, s.
+# Horizon, step of the rollouts and windows of each data set, s.
 SETS = {
     "soft_arm_1": (5.0, 0.002, (0.1, 1.0)),
     "soft_arm_1_wide": (5.0, 0.002, (0.1, 1.0)),

@@ -1,4 +1,4 @@
-"""Long roll-outs: the loop in C, the loop in Python, and MuJoCo on the same robot, in one run.
+"""Long rollouts: the loop in C, the loop in Python, and MuJoCo on the same robot, in one run.
 
     python benchmarks/long_rollout.py                              # the Panda of the package
     python benchmarks/long_rollout.py --urdf $PINN_DYN_LOGS/ur10e/ur10e.urdf --locked
@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.app.provenance import provenance
-from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import c_loop
 from pinn_dyn.mechanics import ContinuousPredictor, Signal, double_copy
 from pinn_dyn.models import (
@@ -91,7 +91,7 @@ def measure(model: ContinuousPredictor, trajectories: int, steps: int, timed_ste
         times = t[: count + 1]
         return predictor.predict(x0, times, Signal(times, u[:, : count + 1]))
 
-    fast = model_for_roll_outs(model)
+    fast = model_for_rollouts(model)
     build, _ = timed(lambda: roll_out(fast, timed_steps))
     c_loop._LOOPS.clear()  # as in the next process
     cached, _ = timed(lambda: roll_out(fast, timed_steps))

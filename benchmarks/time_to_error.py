@@ -3,7 +3,7 @@
 Both learn from 8,000 pairs of the same simulated trajectories in memory. They stop once the mean
 error of q over 5 s open loop on the validation trajectories is at most the error of the paper:
 0.022 with a Hamiltonian network, 0.171 with a Lagrangian network. The clock includes compiling and
-training, but not the roll-outs that measure the error. One core.
+training, but not the rollouts that measure the error. One core.
 
     ours    experiment=soft_arm_1 model=hnn (or lnn) optimizer=soap trainer.steps=2000
             trainer.validations=2 compile=false, through the Lightning trainer

@@ -50,7 +50,7 @@ def task(robot: str, prefix: str = "") -> pd.DataFrame:
 
 
 def diverged(runs: pd.DataFrame, metric: str = "error_mean") -> str:
-    """Return the number of diverged roll-outs behind an error, or nothing."""
+    """Return the number of diverged rollouts behind an error, or nothing."""
     prefix = metric.partition("error")[0]
     count = runs.get(f"{prefix}diverged", pd.Series([0.0])).sum()
     total = runs.get(f"{prefix}trajectories", runs.get("trajectories"))
@@ -72,7 +72,7 @@ def grid(data: pd.DataFrame, columns: Sequence[str], digits: int = 2, mark=MODEL
 
 
 def best_baseline(robot: str) -> tuple[str, float]:
-    """Return the baseline with the smallest error among those without diverged roll-outs."""
+    """Return the baseline with the smallest error among those without diverged rollouts."""
     errors = task(robot).query("model in @BASELINES and diverged == 0")["error_mean"]
     return errors.idxmin()[0], errors.min()
 

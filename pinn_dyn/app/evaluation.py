@@ -133,7 +133,7 @@ def _is_rolled_out(run: Run) -> bool:
 
 
 def _identified(run: Run, source: DataSource) -> Predictor:
-    """Repeat the first stage of a fit: identification by inverse dynamics, without roll-outs."""
+    """Repeat the first stage of a fit: identification by inverse dynamics, without rollouts."""
     model = model_builder(run.config)(statistics=run.statistics)
     solver = build_part("optimizer", {**run.config["optimizer"], "rollouts": False})
     solver.fit(model, source.load().train)

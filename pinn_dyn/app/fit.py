@@ -25,7 +25,7 @@ STEPS = 1000
 _PAIRS, _BATCH = 10_000, 128  # at most
 _WINDOW, _STEP = 2, 0.02  # steps of a training window, and their length in s
 _FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs and steps for least squares
-_HORIZON = 2.0  # s, at most, of the roll-outs that choose the best checkpoint
+_HORIZON = 2.0  # s, at most, of the rollouts that choose the best checkpoint
 _SI = {"time": "s", "v": "1/s", "q": "1", "u": "1"}
 
 

@@ -23,7 +23,7 @@ from pinn_dyn.data import DataSource, LogSource, RobotSource, store
 from pinn_dyn.ensembles import Ensemble, posterior_draws
 from pinn_dyn.evaluation.calibration import half_widths
 from pinn_dyn.evaluation.payload import identify_payload
-from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports.exported import Real
 from pinn_dyn.mechanics import (
     ContinuousPredictor,
@@ -38,7 +38,7 @@ from pinn_dyn.models import KnownMechanics, Statistics
 VALIDATION_ERROR = "val/error_mean"
 """Metric that summarizes a training; sweeps minimize it."""
 BEST_BY = "val/error_windowed"
-"""Metric that chooses the best checkpoint. A long roll-out may err least before it learns."""
+"""Metric that chooses the best checkpoint. A long rollout may err least before it learns."""
 TRAJECTORIES = "trajectories.pt"
 """File in a run folder: the data of a source that was made in Python."""
 
@@ -232,10 +232,10 @@ class Run:
             if self.log is None:
                 raise ValueError("the training data have no columns of a log: give start, u and t")
             with torch.no_grad():
-                return predict_frame(model_for_roll_outs(self.model), self.log, start)
+                return predict_frame(model_for_rollouts(self.model), self.log, start)
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
-            return model_for_roll_outs(self.model).predict(x0, times, signal).numpy()
+            return model_for_rollouts(self.model).predict(x0, times, signal).numpy()
 
     def predict_interval(
         self,
@@ -264,8 +264,8 @@ class Run:
             raise TypeError("a single network has no spread: train an ensemble (ensemble=5)")
         x0, times, signal = self._motion(start, u, t)
         with torch.no_grad():
-            paths = model_for_roll_outs(ensemble).member_increments(x0, times, signal)
-            mean = model_for_roll_outs(self.model).predict(x0, times, signal)
+            paths = model_for_rollouts(ensemble).member_increments(x0, times, signal)
+            mean = model_for_rollouts(self.model).predict(x0, times, signal)
         width = float(half_widths(len(paths), level)) * (1 + 1 / len(paths)) ** 0.5
         reach = factor * width * paths.std(dim=0)
         return (mean - reach).numpy(), (mean + reach).numpy()

@@ -139,7 +139,7 @@ def train(
         compile: compile the dynamics; ``"auto"`` does in long trainings if there is a compiler.
         threads: CPU threads; small networks are fastest with one.
         trainer: arguments of :class:`lightning.Trainer`.
-        callbacks: callbacks; None draws figures of roll-outs if there is a folder.
+        callbacks: callbacks; None draws figures of rollouts if there is a folder.
         loggers: loggers; None writes a TensorBoard log to the folder.
         start_from: a run whose weights the training starts from.
         folder: the run folder; None uses a temporary one, see :meth:`Run.save`.

@@ -92,7 +92,7 @@ def predict_trajectories(
         ValueError: if the step is no multiple of the sample time.
     """
     stride = 1 if step is None else samples_of("step", step, truth.t)
-    copy = model_for_roll_outs(model, truth.q.device)
+    copy = model_for_rollouts(model, truth.q.device)
     x0 = truth.states(model.state, slice(1), model.past_steps, stride)[:, 0].double()
     input = truth.since(model.input_history).input.to(truth.q.device, torch.float64)
     states = _roll_out(copy, x0, truth.t[::stride], input)
@@ -139,7 +139,7 @@ def predict_windows(
     size = past + samples + 1  # neighbors share the sample between them, and their past
     pieces = input.mapped(lambda u: u.unfold(1, size, samples).movedim(-1, -2).flatten(0, 1))
     pieces = replace(pieces, t=input.t[:size])
-    copy = model_for_roll_outs(model, truth.q.device)
+    copy = model_for_rollouts(model, truth.q.device)
     states = _roll_out(copy, x0.flatten(0, 1), pieces.t[past::stride], pieces)
     ends = states[..., 1:, : model.num_coordinates]
     q = truth.q[:, : last + 1 : stride].double()
@@ -149,7 +149,7 @@ def predict_windows(
     return Prediction(truth.t[: last + 1 : stride].double(), paths.mean(0), q, members)
 
 
-def model_for_roll_outs(model: Model, device: torch.device | str = "cpu") -> Model:
+def model_for_rollouts(model: Model, device: torch.device | str = "cpu") -> Model:
     """Copy the model in float64, with loops in C (on a GPU recorded steps) for long rollouts."""
     copy = double_copy(model, device)
     members, inner = (1, copy.stack) if isinstance(copy, Ensemble) else (0, copy)

@@ -1,4 +1,4 @@
-"""Roll-outs as a loop in C, which models that differ in their numbers alone share."""
+"""Rollouts as a loop in C, which models that differ in their numbers alone share."""
 
 from __future__ import annotations
 

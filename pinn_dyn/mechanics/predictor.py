@@ -98,7 +98,7 @@ class ContinuousPredictor(Predictor):
     """Predictor that integrates a state derivative dx/dt = f(x, u).
 
     The integrated state ``(*batch, S)`` begins with (q, v) or (q, p). :meth:`initial_state` adds
-    more states. ``learns_initial_state`` is true if roll-outs start at a learned state.
+    more states. ``learns_initial_state`` is true if rollouts start at a learned state.
     """
 
     integrator: Integrator = RK4()
@@ -157,7 +157,7 @@ class ContinuousPredictor(Predictor):
         return lambda rate: rate
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
-        """Return the initial state ``(*batch, S)`` of a roll-out from measured x0 and input u0."""
+        """Return the initial state ``(*batch, S)`` of a rollout from measured x0 and input u0."""
         return x0
 
     def integration_step(

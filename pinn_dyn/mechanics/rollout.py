@@ -1,4 +1,4 @@
-"""Roll-outs: integrate a state derivative under a sampled input."""
+"""Rollouts: integrate a state derivative under a sampled input."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def require_start(x0: Tensor, t: Tensor, input: Signal) -> None:
 def path_between(
     dynamics: Dynamics, integrator: Integrator, x0: Tensor, t: Tensor, input: Signal
 ) -> Tensor:
-    """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks of a roll-out."""
+    """Return increments x(t_k) - x(t_0), ``(*batch, T, S)``, without the checks of a rollout."""
     # Times are relative before they are cast, so that those of solver and input compare exactly.
     input = input.since(t[0])
     grid = step_grid(t - t[0], input.t.detach(), integrator.substeps).to(x0.dtype)

@@ -43,7 +43,7 @@ class MechanicalSystem(ContinuousPredictor):
         dq/dt = dH/dp,   dp/dt = -dH/dq - D(q) v - F(v) + A(q) u + r,  v = dH/dp
 
     F(v) is dry friction, with v^T F(v) >= 0. With ``sticking`` friction, coordinates stick
-    in roll-outs (:class:`~.integrators.Sticking`). r(q, v, u) is a residual force for effects that
+    in rollouts (:class:`~.integrators.Sticking`). r(q, v, u) is a residual force for effects that
     are not mechanical (``has_residual``). Both are zero by default, as in the paper.
 
     Symbols: q configuration ``(*batch, N)``, v velocity ``(*batch, N)``, a acceleration

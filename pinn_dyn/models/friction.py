@@ -18,7 +18,7 @@ _SMALLEST_WIDTH = 0.01
 class Friction(nn.Module, abc.ABC):
     """A dissipative force F(v) ``(*batch, N)`` in addition to D(q) v, with v^T F(v) >= 0.
 
-    With ``sticking``, roll-outs use :meth:`sliding` instead of F.
+    With ``sticking``, rollouts use :meth:`sliding` instead of F.
     """
 
     sticking: bool = False
@@ -61,7 +61,7 @@ class CoulombFriction(Friction):
 
     c_i is the friction level of coordinate i (N or Nm), of which the force has reached 76 % at the
     speed w_i (m/s or rad/s). A ``sticking`` law is smooth for control laws, torques and the
-    identification only. Its roll-outs use the limit of w = 0, in which a coordinate at rest under a
+    identification only. Its rollouts use the limit of w = 0, in which a coordinate at rest under a
     load below c_i does not move (:class:`~pinn_dyn.mechanics.sliding.Sliding`). Source:
     Armstrong-Helouvry, Dupont and Canudas de Wit (1994), "A survey of models, analysis tools and
     compensation methods for the control of machines with friction".
@@ -72,7 +72,7 @@ class CoulombFriction(Friction):
         width: initial w in units of the typical speeds, without the added minimum of 0.01. The
             default is 0.1 for a network, and 0.03 for known mechanics.
         spread: prior standard deviation of log c and log w, for known mechanics only.
-        sticking: true for roll-outs with sticking. The default is true for known mechanics only.
+        sticking: true for rollouts with sticking. The default is true for known mechanics only.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The head for a learned initial velocity of a roll-out."""
+"""The head for a learned initial velocity of a rollout."""
 
 from __future__ import annotations
 

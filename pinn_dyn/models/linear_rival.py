@@ -14,7 +14,7 @@ from pinn_dyn.mechanics import Predictor, Signal, Trajectory, samples_of, stack_
 
 _ROWS = 10_000  # largest number of windows in a fit
 _FEATURES = 300  # largest number of features
-_STEPS = 500  # length of the roll-outs that select the lags
+_STEPS = 500  # length of the rollouts that select the lags
 _LAGS = {1: (1, 2, 4, 8), 2: (1, 2)}  # candidates by degree
 _RIDGES = (1e-12, 1e-7, 1e-3)  # candidates, relative to the variance of the features
 
@@ -28,7 +28,7 @@ class LinearRival(Predictor):
     L is the number of lags. phi(s) is s for degree 1, and s with all products of two entries for
     degree 2. u_{k+1} is the left value of the input at the end of the step.
 
-    The state history before the start of a roll-out is estimated from (x_0, u_0) by a linear map
+    The state history before the start of a rollout is estimated from (x_0, u_0) by a linear map
     fitted on the training windows, so the baseline uses the same measurements as a network.
 
     Sources: Ljung (1999), "System Identification", section 4.2 (ARX); Korda and Mezic (2018),

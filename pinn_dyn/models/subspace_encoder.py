@@ -97,7 +97,7 @@ class SubspaceEncoder(Predictor):
         self.encoder = LinearAndMLP(len(self.mean), latent, hidden, activation)
         self.transition = LinearAndMLP(latent + 2 * inputs, latent, hidden, activation)
         self.output = LinearAndMLP(latent, 2 * size, hidden, activation)
-        with torch.no_grad():  # decay, so that the first roll-outs over many steps do not diverge
+        with torch.no_grad():  # decay, so that the first rollouts over many steps do not diverge
             self.transition.first.weight[:latent, :latent] -= 0.5 * torch.eye(latent)
         self.fade = nn.Parameter(torch.zeros(2 * size))
 

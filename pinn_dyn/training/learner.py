@@ -40,7 +40,7 @@ Validator = Callable[[Predictor, Trajectory], dict[str, float]]
 
 
 class DynamicsLearner(L.LightningModule):
-    """LightningModule that trains a predictor on windows and validates it by roll-outs.
+    """LightningModule that trains a predictor on windows and validates it by rollouts.
 
     A training step of Lightning comprises many optimizer steps. It ends if Lightning may have
     something to do: around each ``log_every_n_steps`` steps, at a validation, and after half a

@@ -1,4 +1,4 @@
-"""Least-squares fits of models with few parameters, by inverse dynamics and by roll-outs."""
+"""Least-squares fits of models with few parameters, by inverse dynamics and by rollouts."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ AtLeastTwo = Annotated[int, Field(ge=2)]
 REST = 0.05
 """Share of the typical speed of a joint below which it is considered at rest."""
 _CHUNK = 500  # windows whose derivatives are rolled out at once, to limit the memory
-_CHEAP = 8  # evaluations of the inverse dynamics in the time of one roll-out
+_CHEAP = 8  # evaluations of the inverse dynamics in the time of one rollout
 _PASSES = 3  # fits of a stage, to estimate the noise
 _BLOCKS = 30  # blocks of the motion, and neighborhoods of windows
 _SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _SCALE = 100.0  # root of the prior precision of the last mass of a robot without inputs
-_DIVERGED = 1e4  # residual of a diverged roll-out
+_DIVERGED = 1e4  # residual of a diverged rollout
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
 
@@ -68,8 +68,8 @@ class LeastSquares:
        at rest are excluded, since dry friction may then have any value up to its level. Without
        inputs r is the error of the acceleration, which no common factor of the forces changes:
        the mass of the last body stays that of the prior.
-    2. Roll-outs: r = predicted minus measured increments of the windows, in units of their spread,
-       as in the increment loss. The first roll-outs use a quarter of the steps of the windows.
+    2. Rollouts: r = predicted minus measured increments of the windows, in units of their spread,
+       as in the increment loss. The first rollouts use a quarter of the steps of the windows.
 
     The stage with the smallest validation error is kept, or the last stage without validation.
 
@@ -83,7 +83,7 @@ class LeastSquares:
         rollouts: true for both stages, false for the identification only.
         samples: number of samples of the inverse dynamics.
         evaluations: largest number of evaluations of the residuals in a stage.
-        velocity_weight: weight of the velocity half in the roll-outs, as in the loss.
+        velocity_weight: weight of the velocity half in the rollouts, as in the loss.
         changed: bodies, such as ``tip`` in ``mass of tip``, that are fitted anew.
     """
 
@@ -115,7 +115,7 @@ class LeastSquares:
         Args:
             model: the model to fit.
             trajectories: training trajectories for the inverse dynamics.
-            windows: training windows for the roll-outs; not needed if ``rollouts`` is false.
+            windows: training windows for the rollouts; not needed if ``rollouts`` is false.
             covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
             stopped: interrupted result of this fit, to continue from the present z.
             validate: validation error of a model, to compare the stages.
@@ -144,7 +144,7 @@ class LeastSquares:
             enough = size * _informative_blocks(short) * short >= count
             for length in [short, steps] if enough and short < steps else [steps]:
                 part = windows.first(length)
-                name = f"roll-outs of {float(part.t[-1]):.3g} s"
+                name = f"rollouts of {float(part.t[-1]):.3g} s"
                 stages[name] = partial(self._roll_out, name, model, prior, part)
         best, number = stopped, (stopped.stopped_in or 0) if stopped else 0
         errors = [f"{best.stage} {best.error:.4g}"] if best and best.stage else []
@@ -337,7 +337,7 @@ class LeastSquares:
 def _evaluate(
     model: LearnedConstants, z: np.ndarray, residuals: Residuals, derivative: bool
 ) -> np.ndarray:
-    """Return the residuals at z, flattened. A diverged roll-out has large residuals."""
+    """Return the residuals at z, flattened. A diverged rollout has large residuals."""
     with torch.no_grad():
         vector_to_parameters(torch.from_numpy(z), model.parameters())
         result = residuals(derivative)

@@ -142,16 +142,14 @@ def test_a_fit_has_intervals_of_its_predictions(tmp_path, fitted):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_fit_with_roll_outs_has_its_identification_beside_it(tmp_path):
+def test_a_fit_with_rollouts_has_its_identification_beside_it(tmp_path):
     words = ["model/friction=coulomb", "data.steps=5", "validator.horizon=0.5"]
     words += ["optimizer.samples=500", "optimizer.evaluations=8"]
     for name, stages in {"rolled": [], "alone": ["optimizer.rollouts=false"]}.items():
         run_script(
             "train.py", *KNOWN, *WINDOWS, *words, *stages, f"hydra.run.dir={tmp_path / name}"
         )
-    assert (
-        json.loads((tmp_path / "rolled" / "metrics.json").read_text())["stage"][:9] == "roll-outs"
-    )
+    assert json.loads((tmp_path / "rolled" / "metrics.json").read_text())["stage"][:8] == "rollouts"
     table = pd.read_csv(tmp_path / "rolled" / "constants.csv")
     assert table.name.str.match(r"Coulomb friction.* of (shoulder|elbow)").sum() == 2
     folders = ",".join(str(tmp_path / name) for name in ("rolled", "alone"))

@@ -100,7 +100,7 @@ def panda_states(panda):
     return q0, torch.from_numpy(rng.uniform(-1, 1, (2, 7))), rng.uniform(-5, 5, (6, 2, 7))
 
 
-def test_copies_move_as_in_a_roll_out_of_the_simulator(panda):
+def test_copies_move_as_in_a_rollout_of_the_simulator(panda):
     q0, v0, inputs = panda_states(panda)
     states = run(SimulatorPlant(panda, step=0.001), q0, v0, torch.from_numpy(inputs), 0.003)
     for k in range(2):

@@ -25,7 +25,7 @@ def test_every_result_comes_from_an_entry_and_every_entry_has_results():
     assert entries == set(read_entries())
 
 
-def test_bold_is_the_smallest_error_without_diverged_roll_outs():
+def test_bold_is_the_smallest_error_without_diverged_rollouts():
     index = pd.MultiIndex.from_product([["lnn", "mlp", "ARX"], [0, 1]], names=["model", "seed"])
     data = pd.DataFrame({"error_mean": [1.0, 3.0, 2.0, 2.5, 9.0, 9.0]}, index=index)
     data["trajectories"], data["diverged"] = 10, 0

@@ -51,7 +51,7 @@ def test_two_members_have_the_quantiles_of_cauchy():
     assert half_widths(2, 0.9) == pytest.approx(math.tan(0.45 * math.pi))
 
 
-def test_a_roll_out_that_broke_down_lies_in_no_interval():
+def test_a_rollout_that_broke_down_lies_in_no_interval():
     item = prediction(0)
     item.q_hat[:10, 30:] = math.nan
     errors = standardized_errors(item)

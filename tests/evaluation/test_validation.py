@@ -10,7 +10,7 @@ T = 0.25 * torch.arange(17, dtype=torch.float64)
 
 
 class Drift(ContinuousPredictor):
-    """dq/dt = v + rate: a roll-out errs by the time since its start, times the rate."""
+    """dq/dt = v + rate: a rollout errs by the time since its start, times the rate."""
 
     def __init__(self, rate=1.0):
         super().__init__(1, 1)

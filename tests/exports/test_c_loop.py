@@ -1,4 +1,4 @@
-"""Roll-outs as loops in C, beside the loop in Python."""
+"""Rollouts as loops in C, beside the loop in Python."""
 
 import logging
 from functools import partial
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import c_library, c_loop
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
 from pinn_dyn.models import AccelerationMLP, LearnedDelay, Servo
@@ -58,7 +58,7 @@ def rolled_out(model, batch=(), count=80, interpolation="linear", scale=1.0):
     t = 0.004 * torch.arange(count + 5).double()
     signal = Signal(t, u, interpolation)
     with torch.no_grad():
-        found = model_for_roll_outs(model).predict(x0, t[5:], signal)
+        found = model_for_rollouts(model).predict(x0, t[5:], signal)
         return found, model.predict(x0, t[5:], signal)
 
 
@@ -149,7 +149,7 @@ def test_short_paths_and_gradients_do_not_build_a_loop(monkeypatch):
     assert not c_loop._LOOPS
     rolled_out(model, count=102)
     assert len(c_loop._LOOPS) == 1
-    copy = model_for_roll_outs(model)
+    copy = model_for_rollouts(model)
     x0 = torch.full((6,), 0.1).double().requires_grad_()
     t = 0.01 * torch.arange(200).double()
     path = copy.predict(x0, t, Signal(t, torch.zeros(200, 3).double()))

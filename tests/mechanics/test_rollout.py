@@ -1,4 +1,4 @@
-"""Roll-outs against exact solutions: order, input interpolation, precision, gradients."""
+"""Rollouts against exact solutions: order, input interpolation, precision, gradients."""
 
 import copy
 import itertools

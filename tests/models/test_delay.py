@@ -179,7 +179,7 @@ def test_windows_of_held_inputs_are_refused_by_name():
         pendulum_trajectory(interpolation="hold").input.delayed(torch.tensor(0.01))
 
 
-def test_roll_outs_see_the_input_before_their_start():
+def test_rollouts_see_the_input_before_their_start():
     whole = pendulum_trajectory()
     model = set_delay(pendulum_model(make_scales(), LearnedDelay(0.1)), 0.05)
     cut = {name: getattr(whole, name)[None, 300:421] for name in ("q", "v")}

@@ -48,7 +48,7 @@ class HandBuilt(MechanicalSystem):
 
 
 def paths(lagrangian, hamiltonian, t=T, count=4):
-    """(q, v) and (q, p) along a roll-out from one start under one input, by each network."""
+    """(q, v) and (q, p) along a rollout from one start under one input, by each network."""
     q, v, _, u = random_batch(lagrangian.num_coordinates, lagrangian.num_inputs, count)
     u = u[:, None] * torch.cos(4 * t)[:, None]
     with torch.no_grad():

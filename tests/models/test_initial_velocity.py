@@ -1,4 +1,4 @@
-"""A learned initial velocity: where roll-outs start, how it is trained, and what refuses it."""
+"""A learned initial velocity: where rollouts start, how it is trained, and what refuses it."""
 
 from functools import partial
 
@@ -56,7 +56,7 @@ def untrained(model):
     return model
 
 
-def test_before_training_roll_outs_start_at_the_measured_velocity():
+def test_before_training_rollouts_start_at_the_measured_velocity():
     head = LearnedVelocity(make_scales(2, 2, [1.0, 1.0]))
     x0, _, u = (value.float() for value in motion())
     q, v = x0.chunk(2, -1)
@@ -64,7 +64,7 @@ def test_before_training_roll_outs_start_at_the_measured_velocity():
 
 
 @pytest.mark.parametrize("kind", ["rk4", "rosenbrock", "acceleration"])
-def test_a_roll_out_starts_there_and_counts_from_the_measured_state(kind):
+def test_a_rollout_starts_there_and_counts_from_the_measured_state(kind):
     model, plain = started(kind), untrained(started(kind))
     plain.load_state_dict(
         {k: v for k, v in model.state_dict().items() if "initial_velocity" not in k}, strict=False
@@ -118,7 +118,7 @@ def test_one_step_windows_teach_it_by_their_configuration():
     assert IncrementLoss(statistics, make_structured("lnn", 1, 1)).exact_coordinates == 1
 
 
-def test_a_loss_without_a_roll_out_refuses_it():
+def test_a_loss_without_a_rollout_refuses_it():
     model = make_structured("lnn", 2, 2, initial_velocity=LEARNED)
-    with pytest.raises(ValueError, match=r"has no roll-out.*~model/initial_velocity"):
+    with pytest.raises(ValueError, match=r"has no rollout.*~model/initial_velocity"):
         MidpointLoss(make_statistics(2, 2), model)

@@ -56,7 +56,7 @@ def motion(samples, stride=1, seed=0):
 
 
 def test_evaluation_and_training_hand_over_the_past(model):
-    """Roll-outs from a piece, from windows of it, and training windows equal the equations."""
+    """Rollouts from a piece, from windows of it, and training windows equal the equations."""
     stride = 3
     whole = motion(61, stride)
     q, v, u = (getattr(whole, key)[::stride].numpy() for key in "qvu")

@@ -19,7 +19,7 @@ class OutsideTheDataContract:
     largest = 4.0
     """Of the eigenvalues of M anywhere, in units of the largest on the data."""
     duration = 20.0
-    """Of a roll-out without input, s."""
+    """Of a rollout without input, s."""
     tolerance = 1e-5
     """Of the integrator, relative."""
 
@@ -71,7 +71,7 @@ class OutsideTheDataContract:
             assert float(found.max()) < self.largest * float(shown.max()), times
 
     def test_without_input_energy_is_only_lost(self, system, ranges):
-        """Along roll-outs from far outside, by an adaptive integrator: E never grows."""
+        """Along rollouts from far outside, by an adaptive integrator: E never grows."""
         n, count = system.num_coordinates, 1
         x0 = self.states(ranges, self.times, count, seed=1)
         u = torch.zeros(count, system.num_inputs, dtype=torch.float64)

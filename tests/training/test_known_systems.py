@@ -83,7 +83,7 @@ def test_constants_that_are_not_linear_are_found_with_fewer_inputs_than_coordina
 @pytest.mark.parametrize(
     ("rollouts", "fits", "unlikely"),
     [(False, 4, 5), pytest.param(True, 2, 4, marks=pytest.mark.slow)],
-    ids=["identification", "roll-outs"],
+    ids=["identification", "rollouts"],
 )
 def test_the_truth_lies_in_the_intervals(arm_runs, rollouts, fits, unlikely):
     """Of a fit's 7 constants from noisy motions 95 % should; 5 of 28, 4 of 14 outside are not."""

@@ -64,8 +64,8 @@ def held_out_error(model, truth, run):
     return float((a - expected).norm() / expected.norm())
 
 
-def test_roll_outs_fit_friction_that_sticks():
-    """A load below the friction level holds; only roll-outs that stick fit such windows."""
+def test_rollouts_fit_friction_that_sticks():
+    """A load below the friction level holds; only rollouts that stick fit such windows."""
     truth = robot_model("prior", seed=1, sticking=True)
     with torch.no_grad():
         truth.friction.level.z += 1.5
@@ -79,7 +79,7 @@ def test_roll_outs_fit_friction_that_sticks():
     assert float(ratio.log().abs().max()) < 0.05  # 0.6 with the smooth law
 
 
-@pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "roll-outs"])
+@pytest.mark.parametrize("rollouts", [False, True], ids=["identification", "rollouts"])
 def test_the_dynamics_are_found_from_a_generic_start(truth, runs, unseen, rollouts):
     windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
     model = robot_model("generic")
@@ -234,7 +234,7 @@ def test_data_that_do_not_fit_the_filter_are_refused(runs):
 
 @pytest.fixture
 def solved(monkeypatch):
-    """The stages that were begun: the identification, then short and long roll-outs."""
+    """The stages that were begun: the identification, then short and long rollouts."""
     begun, solve = [], LeastSquares._solve
 
     def recorded(self, stage, *arguments, **settings):
@@ -279,7 +279,7 @@ def test_a_stopped_fit_keeps_the_best_constants_and_goes_on(
 
 @pytest.mark.parametrize("at", [0, 3], ids=["at once", "interrupted"])
 def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
-    """Windows that start at wrong velocities spoil the roll-outs, not the identification."""
+    """Windows that start at wrong velocities spoil the rollouts, not the identification."""
     windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)
     noise = torch.randn(windows.v.shape, generator=torch.Generator().manual_seed(0)).double()
     windows = dataclasses.replace(windows, v=windows.v + 0.5 * noise)
@@ -306,13 +306,13 @@ def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
     torch.testing.assert_close(result.covariance, expected.covariance)
 
 
-def test_roll_outs_that_validate_better_are_kept(truth, runs, unseen):
+def test_rollouts_that_validate_better_are_kept(truth, runs, unseen):
     windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
     model = robot_model("generic")
     result = LeastSquares(cutoff=20.0).fit(
         model, runs, windows, validate=lambda model: held_out_error(model, truth, unseen)
     )
-    assert result.stage == "roll-outs of 0.04 s"
+    assert result.stage == "rollouts of 0.04 s"
     assert held_out_error(model, truth, unseen) < 0.01
 
 

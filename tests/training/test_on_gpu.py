@@ -7,7 +7,7 @@ import torch
 
 from pinn_dyn.ensembles import Ensemble, EnsembleData, EnsembleLearner
 from pinn_dyn.ensembles.gradients import CompiledMembers
-from pinn_dyn.evaluation.prediction import model_for_roll_outs
+from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.mechanics import Signal, double_copy
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 from pinn_dyn.training import (
@@ -118,9 +118,9 @@ def assert_rolls_out_the_same(on_gpu, model):
 
 
 @pytest.mark.parametrize("kind", ["lnn", "hnn"])
-def test_a_roll_out_by_recorded_steps_is_that_of_a_cpu(kind):
+def test_a_rollout_by_recorded_steps_is_that_of_a_cpu(kind):
     model = perturb(make_model(kind))
-    on_gpu = model_for_roll_outs(model, GPU)
+    on_gpu = model_for_rollouts(model, GPU)
     on_gpu.integrator.inner.path = None  # what would be called, were a step not recorded
     assert_rolls_out_the_same(on_gpu, model)
 
@@ -134,7 +134,7 @@ def test_dynamics_that_wait_for_the_gpu_are_integrated_without_a_record(monkeypa
         return derivative(self, x, u)
 
     monkeypatch.setattr(type(model), "state_derivative", waiting)
-    assert_rolls_out_the_same(model_for_roll_outs(model, GPU), model)
+    assert_rolls_out_the_same(model_for_rollouts(model, GPU), model)
 
 
 def test_a_loss_that_is_not_a_number_is_found_though_the_steps_run_ahead(tmp_path):

@@ -98,7 +98,7 @@ def test_fixed_gains_do_not_depend_on_the_parameters():
 
 
 @pytest.mark.parametrize("substeps", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_roll_outs_by_the_parameters(model, substeps):
+def test_rollouts_by_the_parameters(model, substeps):
     windows = windows_of(model, count=3, steps=4 - substeps)
     model.integrator = RK4(substeps)
     increments = partial(model.increments, windows.start("qv"), windows.t, windows.input)
@@ -107,7 +107,7 @@ def test_roll_outs_by_the_parameters(model, substeps):
     assert_close(rollout_slopes(model, windows) @ directions.T, expected)
 
 
-def test_roll_outs_with_stops_by_the_parameters():
+def test_rollouts_with_stops_by_the_parameters():
     """Joints stop, turn and stick within the windows."""
     model = known_model(friction=Stribeck)
     windows = draw_windows([motion(model, seconds=1.0)], count=20, steps=6, stride=2, seed=0)

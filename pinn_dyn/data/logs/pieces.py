@@ -48,14 +48,14 @@ def one_sample_time(items: Sequence[Recording]) -> float:
 def pieces_of(
     name: str, part: Part, stretches: Sequence[Recording], step: float
 ) -> tuple[list[Recording], str]:
-    """Cut the cleaned stretches of a split into roll-outs; return them and a note.
+    """Cut the cleaned stretches of a split into rollouts; return them and a note.
 
     Raises:
         LogError: if a piece is no multiple of the sample time, or longer than every stretch.
     """
     if part.piece == "whole":
         pieces = list(stretches)
-        return pieces, f"{summary(pieces, step)}, each one roll-out"
+        return pieces, f"{summary(pieces, step)}, each one rollout"
     span = round(part.piece / step)
     if span < 1 or abs(span * step - part.piece) > 1e-3 * part.piece:
         raise LogError(f"{name}.piece is {part.piece} s, expected a multiple of {step:g} s")
@@ -70,7 +70,7 @@ def pieces_of(
     if not pieces:
         raise LogError(f"{name}: no stretch is as long as a piece of {part.piece} s")
     unused = max(sum(item.duration for item in stretches) - len(pieces) * span * step, 0)
-    return pieces, f"{summary(pieces, step)}, each one roll-out; {unused:.4g} s are dropped"
+    return pieces, f"{summary(pieces, step)}, each one rollout; {unused:.4g} s are dropped"
 
 
 def _starts(samples: int, span: int) -> list[int]:

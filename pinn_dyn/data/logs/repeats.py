@@ -16,7 +16,7 @@ _SAME = 0.05  # distance of a repeated motion, as a share of its spread
 def check_repeats(
     earlier: list[Recording], pieces: list[Recording], name: str
 ) -> list[Measurement]:
-    """Count the roll-outs of the split ``name`` that repeat a motion of the splits before it.
+    """Count the rollouts of the split ``name`` that repeat a motion of the splits before it.
 
     At a shift s, the mean of ‖q(t) - q_earlier(t + s)‖² is below 0.05² times the variance of q.
     """

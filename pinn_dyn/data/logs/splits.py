@@ -27,7 +27,7 @@ class Part:
     """Validation or test data: whole runs, or seconds of the other runs.
 
     Args:
-        piece: length of the roll-outs, s; ``"whole"``: each stretch is one roll-out.
+        piece: length of the rollouts, s; ``"whole"``: each stretch is one rollout.
         runs: number of runs, drawn by the seed, or the names of the runs.
         seconds: duration at the end of every other run, s; either this or ``runs``.
     """

@@ -1,4 +1,4 @@
-"""Loss on the increments of roll-outs."""
+"""Loss on the increments of rollouts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class IncrementLoss(WindowLoss):
     deviation over the training windows. With one step this is the normalized loss of the paper.
 
     The weight w of the configuration half is 1, as in the Hamiltonian loss of the paper. It is 0
-    for windows of one step if dq/dt = v holds by construction and the roll-out starts at the
+    for windows of one step if dq/dt = v holds by construction and the rollout starts at the
     measured v, as in the Lagrangian loss of the paper.
 
     With ``huber`` = d the mean r^2 over the components of each window and step is replaced by::

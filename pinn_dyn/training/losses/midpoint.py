@@ -58,7 +58,7 @@ class MidpointLoss(WindowLoss):
             )
         if model.learns_initial_state:
             raise ValueError(
-                "this loss has no roll-out whose initial velocity could be learned: use "
+                "this loss has no rollout whose initial velocity could be learned: use "
                 "loss=increment, or ~model/initial_velocity"
             )
         scale = statistics.increment_std(model.state)
