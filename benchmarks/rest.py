@@ -27,11 +27,11 @@ def main(folders: list[str]) -> None:
         count = (len(prediction.t) - 1) // steps
         fast = truth.v.abs().amax(-1)
         pieces = [fast[:, k * samples : (k + 1) * samples + 1].amax(1) for k in range(count)]
-        rest = torch.stack(pieces, dim=1) < SLOW
+        at_rest = torch.stack(pieces, dim=1) < SLOW
         error = prediction.error()[:, steps::steps][:, :count]
         print(
-            f"{folder}: {int(rest.sum())} of {rest.numel()} windows at rest, error after 1 s "
-            f"{float(error[rest].mean()):.2g}, in motion {float(error[~rest].mean()):.2g}"
+            f"{folder}: {int(at_rest.sum())} of {at_rest.numel()} windows at rest, error after 1 s "
+            f"{float(error[at_rest].mean()):.2g}, in motion {float(error[~at_rest].mean()):.2g}"
         )
 
 

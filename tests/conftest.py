@@ -54,7 +54,7 @@ def traced(monkeypatch):
 
 @pytest.fixture
 def few_states(monkeypatch):
-    """Compare an export with its original at ten states of 200."""
+    """Compare an export with its original at ten states instead of 200."""
     monkeypatch.setattr("pinn_dyn.exports.exported.STATES", 10)
 
 

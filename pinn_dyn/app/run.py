@@ -252,7 +252,8 @@ class Run:
         s is the spread of E predictions: those of the members of an ensemble, or of draws of the
         constants that least squares fitted. c is the quantile of Student's t with E - 1 degrees of
         freedom. Measurement noise and errors that all members share are not included; evaluate.py
-        reports the ``factor`` that validation motions needed, in ``summary.csv``.
+        reports the ``factor`` that validation motions needed, in ``summary.csv``. The width is zero
+        where a joint sticks in all predictions.
 
         Returns:
             The lower and the upper ends, ``(*batch, T, 2N)`` each.

@@ -140,7 +140,7 @@ class ShootingProblem:
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """Return da/dz, ``(K, N, 2N + M)``, at K states and inputs, by forward differences.
 
-        They take less time than exact derivatives of networks.
+        Forward differences take less time than exact derivatives of networks.
         """
         moved = z + _DIFFERENCE * np.maximum(1, np.abs(z))
         points = np.where(np.eye(z.shape[-1], dtype=bool), moved[:, None], z[:, None])

@@ -1,4 +1,4 @@
-"""Rollouts as a loop in C, which models that differ in their numbers alone share."""
+"""Rollouts as a loop in C. Models that differ only in their numbers share the compiled code."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from pinn_dyn.mechanics.signal import Signal
 log = logging.getLogger(__name__)
 
 STEPS = 2000
-"""Number of steps from which building a loop pays off: 4 to 6 ms per step for 1 to 4 s, measured by
-benchmarks/long_rollout.py for one trajectory."""
+"""Number of steps from which a loop pays off. A step in Python takes 4 to 10 ms. Building a loop
+takes 1 to 4 s from the cache folder, and up to 23 s before (benchmarks/long_rollout.py)."""
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
 _LOOP = """
@@ -46,7 +46,7 @@ class CLoop(Wrapped):
 
     Args:
         inner: the method.
-        members: number of leading dimensions of the state of an ensemble, which has one, or 0.
+        members: number of leading dimensions of the state for members: 1 for an ensemble, or 0.
     """
 
     def __init__(self, inner: Integrator, members: int = 0):
@@ -72,7 +72,7 @@ class CLoop(Wrapped):
 
 
 class _Loop:
-    """The compiled loop of a model, for trajectories in turn."""
+    """Compiled loop of a model over the steps of one trajectory after another."""
 
     def __init__(self, dynamics: Any, x: Tensor, inputs: Tensor, h: Tensor):
         step = {"increment": torch.zeros_like(x), "start": x, "inputs": inputs, "h": h}
@@ -129,7 +129,7 @@ class _Values(Constants):
 
 
 class _Content(pickle.Pickler):
-    """Pickle in which a tensor is its numbers."""
+    """Pickler that writes a tensor as its type, shape and numbers."""
 
     def persistent_id(self, value: Any) -> Any:
         if isinstance(value, Tensor):

@@ -82,6 +82,6 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
     else:
         raise TypeError(
             f"a {type(model).__name__} has no function of a state (q, v) to export: export a model "
-            "without a memory; of an ensemble a single model, such as run.members[0]"
+            "without a memory, or a single member of an ensemble, such as run.members[0]"
         )
     return [exported(*function) for function in functions]

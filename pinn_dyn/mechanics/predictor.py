@@ -27,8 +27,8 @@ class Predictor(nn.Module, abc.ABC):
         fixed_step: step of a discrete-time model in s, or None if any step is possible.
         penalized: true if training adds :meth:`penalty` to the loss.
         input_history: time before the start in which the model uses the input, s.
-        past_steps: number n of earlier q that the model uses, a step apart, the latest first. They
-            follow the state in x0 ``(*batch, 2N + nN)``; without them the robot was at rest.
+        past_steps: number n of earlier q that the model uses, a step apart, the latest first. x0
+            ``(*batch, 2N + nN)`` holds them after the state; without them the robot was at rest.
     """
 
     fixed_step: float | None = None

@@ -20,19 +20,20 @@ _PASSES = 4
 class Sliding:
     """Dynamics of a step of h seconds, in which coordinates slide or come to rest::
 
-        M a + C v + G + D v + F(v, s) = A u + r        of coordinates that slide
+        M a + C v + G + D v + F(v, s) = A u + r        rows of coordinates that slide
         v_i(t) = v_i(0) (1 - t/h)                      of coordinates that come to rest
 
-    F(v, s) is the sliding friction, forward with s = 1 and backward with s = 0. A coordinate at
-    rest sticks as long as a force between F(0, 0) and F(0, 1) holds it (Coulomb's law). The others
-    stop at most once in a step, at the time tau. After the stops, the accelerations minimize::
+    F(v, s) is the sliding friction, and s is the mean direction over the step, from 0 (backward)
+    to 1 (forward). A coordinate at rest sticks as long as a force between F(0, 0) and F(0, 1)
+    holds it (Coulomb's law). A coordinate in motion stops at most once in a step, at the time tau.
+    After the stops, the accelerations minimize::
 
         (a - a_free)^T M (a - a_free)/2 + sum over coordinates at rest of F_i(0, a_i > 0) a_i
 
-    where a_free is the acceleration without friction at rest. An ``implicit`` method has
-    M + h D + h^2 K instead of M, with the stiffness K of servos and elastic joints. s is the mean
-    over the step. An active-set method finds the coordinates that
-    stick, with a fixed number of passes. Gradients are those of the step for the resulting set.
+    where a_free is the acceleration without friction at rest. For an ``implicit`` method, M is
+    replaced by M + h D + h^2 K, with the stiffness K of servos and elastic joints. An active-set
+    method with a fixed number of passes finds the coordinates that stick. Gradients are those of
+    the step for the resulting set.
     Source: Moreau (1988), "Unilateral contact and dry friction in finite freedom dynamics";
     Hintermueller, Ito and Kunisch (2002), "The primal-dual active set strategy as a semismooth
     Newton method".
@@ -42,7 +43,7 @@ class Sliding:
         x: state at the start of the step, ``(*batch, 2N)``.
         inputs: input at the nodes of the step, ``(stages, *batch, M)``. Its mean decides the stops.
         h: length of the step, ``()``, s.
-        implicit: true for a step that may be longer than motions with damping last.
+        implicit: true for a method that is stable where damping outweighs inertia.
 
     Attributes:
         rate: acceleration before the stops, ``(*batch, N)``.

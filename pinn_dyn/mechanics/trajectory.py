@@ -68,7 +68,8 @@ class Trajectory:
     def since(self, history: float) -> Trajectory:
         """Return the motion from ``history`` s before the start on.
 
-        Unknown samples of q and u are the earliest, so the robot rests before. v does not count.
+        Unknown samples of q and u repeat the earliest sample: the robot was at rest. v before the
+        start repeats the first sample and has no meaning.
         """
         step = self.t[1] - self.t[0]
         count = math.ceil(history / float(step) - 1e-6)
@@ -88,7 +89,8 @@ class Trajectory:
     ) -> Tensor:
         """Return states (q, v) or (q, p) at the chosen samples, ``(*batch, T, 2N)``.
 
-        With ``past`` = n each is followed by n earlier q, ``stride`` samples apart, ``(nN,)``.
+        With ``past`` = n, each state is followed by n earlier q that are ``stride`` samples apart,
+        the latest first, ``(*batch, T, 2N + nN)``.
 
         Raises:
             ValueError: if momenta are needed and M is unknown.

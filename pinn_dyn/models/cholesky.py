@@ -17,7 +17,7 @@ from pinn_dyn.models.triangular import UNROLLED, square
 
 _DIAGONAL_MARGIN = 0.2
 """Margin of the outputs beyond the data: a factor of at least exp(-0.2) = 0.82 for a softplus."""
-_CACHED = 1024  # configurations that are evaluated at once, in the cache
+_CACHED = 1024  # configurations in a block whose values stay in the cache
 _MARGIN = 0.1
 """Margin of all other outputs, in units of their range on the data."""
 

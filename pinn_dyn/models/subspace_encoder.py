@@ -1,4 +1,4 @@
-"""Black box with a memory: a latent state that an encoder reads from the past."""
+"""Black box with a memory: a latent state that an encoder computes from the past."""
 
 from __future__ import annotations
 
@@ -48,20 +48,20 @@ class LinearAndMLP(nn.Module):
 
 
 class SubspaceEncoder(Predictor):
-    """State-space network whose latent state z an encoder reads from the past (SUBNET)::
+    """State-space network with a latent state z that an encoder computes from the past (SUBNET)::
 
         z_0     = encoder(q_0, v_0, q_-1, ... q_-n, u_0, ... u_-n)
         z_{k+1} = z_k + transition(z_k, u_k, u_{k+1})
         y_k     = output(z_k) + fade^k (y_0 - output(z_0)),      y = (q, v)
 
-    y, q and u are normalized by their means and standard deviations. Each network is the sum of a
-    linear map and an MLP. The last term starts the prediction at the measured y_0; fade, between 0
-    and 1 for each entry, is learned. Training on windows of many steps is the truncated simulation
-    loss.
+    Symbols: latent state z ``(*batch, latent)``, state y of the robot ``(*batch, 2N)``, fade
+    ``(2N,)``. y, q and u are normalized by their means and standard deviations. Each network is the
+    sum of a linear map and an MLP. The last term starts the prediction at the measured y_0. fade is
+    learned, between 0 and 1. Training on windows of many steps is the truncated simulation loss.
 
-    z may hold states that are not measured, such as those of actuators. Where q and u before the
-    start are unknown, they are constant: the robot was at rest. There is no state of the robot for
-    a control law, and no function of a state to export.
+    z may hold states that are not measured, such as those of actuators. Unknown q and u before the
+    start repeat the first sample: the robot was at rest. The model has no function of (q, v) for
+    control laws and exports.
 
     Source: Beintema, Schoukens and Toth (2023), "Deep subspace encoders for nonlinear system
     identification". The fading term is not part of it.
@@ -107,7 +107,11 @@ class SubspaceEncoder(Predictor):
         return float(self.step)
 
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
-        """Apply the network step by step, of which ``t`` must have the length."""
+        """Apply the network step by step.
+
+        Raises:
+            ValueError: if the spacing of ``t`` is not the step of the training windows.
+        """
         self._require_step(t)
         size, n = self.num_coordinates, self.past_steps
         before = t[0] - self.step.to(t) * torch.arange(n + 1, device=t.device)

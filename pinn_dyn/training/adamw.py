@@ -28,8 +28,12 @@ class CompiledAdamW:
 
     Parameters and moments are those of the optimizer, and change in place::
 
-        m <- b1 m + (1 - b1) g      s <- b2 s + (1 - b2) g^2      g: the clipped gradient
+        m <- b1 m + (1 - b1) g      s <- b2 s + (1 - b2) g^2
         w <- (1 - lr d) w - lr / (1 - b1^k) m / (sqrt(s / (1 - b2^k)) + eps)
+
+    w: parameters, g: clipped gradient, m and s: moments, ``(*members, P)`` each; k: number of the
+    step, b1 and b2: decay of the moments, d: weight decay. Source: Loshchilov and Hutter (2019),
+    "Decoupled weight decay regularization".
 
     Args:
         optimizer: the optimizer of the vector. A step of length zero creates its state.

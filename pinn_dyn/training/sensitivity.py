@@ -81,10 +81,9 @@ class _Sensitivity:
 
 
 class _SlidingSensitivity:
-    """Dynamics of y in a step with sticking friction, see :class:`Sliding`::
+    """Dynamics of y in a step with the symbols of :class:`Sliding`::
 
     dtau/dz = -(S_v + tau drate/dz) / rate,    ds/dz = (forward - ahead) dtau/dz / h
-
     """
 
     def __init__(self, dynamics: _Sensitivity, y: Tensor, inputs: Tensor, h: Tensor):

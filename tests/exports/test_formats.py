@@ -1,4 +1,4 @@
-"""Each kind of head in each format: C, ONNX and CasADi, from one trace of each function."""
+"""Files in C, ONNX and CasADi for all kinds of heads, from one trace of each function."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What all five models share: batch shapes, precision, saving, copying, compiling."""
+"""Properties of all five models: batch shapes, precision, saving, copying, compiling."""
 
 import copy
 import io

@@ -1,4 +1,4 @@
-"""The black box with a memory: its equations, and the past that evaluation and training give."""
+"""Black box with a memory: equations, and the past in evaluation and training."""
 
 import numpy as np
 import pytest
@@ -101,7 +101,7 @@ def test_without_a_past_the_robot_was_at_rest(model):
         model.predict(torch.cat([q, v, q], -1), T, signal)
 
 
-def test_what_needs_a_state_of_the_robot_refuses_a_memory(model):
+def test_exports_refuse_a_model_with_a_memory(model):
     with pytest.raises(TypeError, match="export a model without a memory"):
         model_functions(model)
 

@@ -48,7 +48,7 @@ def test_the_trained_models_are_small_and_hold_no_path_of_a_machine():
         assert not re.search(rb"/(home|root|tmp|Users|work)/", file.read_bytes()), file
 
 
-# Lengths of trainings and loops; the committed outputs are of the whole ones.
+# Shorter trainings and loops. The committed outputs have the full lengths.
 SHORT = (
     (r"\bsteps=\d{3,}", "steps=20"),
     (r"duration=3\.0", "duration=0.2"),

@@ -1,4 +1,4 @@
-"""A method for dry friction, which lets coordinates stick."""
+"""Integration method for dry friction, with coordinates that stick."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pinn_dyn.mechanics.integrators.rk4 import RK4
 
 
 class Sticking(Integrator):
-    """A step of another method, after :class:`~.sliding.Sliding` has found what sticks.
+    """Method whose steps integrate the dynamics of :class:`~.sliding.Sliding`.
 
-    The order is that of the inner method while no coordinate stops or starts, otherwise 2, and 1
-    for coordinates that start because of the stop of another. A coordinate at rest under a load
-    below its friction level does not move at all.
+    The order is that of the inner method while no coordinate stops or starts, and otherwise 2. It
+    is 1 if a coordinate starts because of the stop of another coordinate. A coordinate at rest
+    under a load below its friction level does not move at all.
 
     Args:
-        inner: the method while coordinates slide.
+        inner: the method that integrates these dynamics.
     """
 
     def __init__(self, inner: Integrator):
@@ -36,6 +36,6 @@ class Sticking(Integrator):
 
 
 def with_friction(integrator: Integrator | None, sticking: bool) -> Integrator:
-    """Return an integrator of a system, whose dry friction may be sticking; the default is RK4."""
+    """Return the integrator of a system with or without sticking friction; the default is RK4."""
     integrator = integrator or RK4()
     return Sticking(integrator) if sticking else integrator
