@@ -24,7 +24,8 @@ STEPS = 1000
 """Default steps of the optimizer."""
 _PAIRS, _BATCH = 10_000, 128  # at most
 _WINDOW, _STEP = 2, 0.02  # steps of a training window, and their length in s
-_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs and steps for least squares
+_FEW_PAIRS, _LONG_WINDOW = 150, 10  # pairs for least squares, and steps for it and subnet
+_HISTORY = 0.5  # s of the past, for subnet
 _HORIZON = 2.0  # s, at most, of the rollouts that choose the best checkpoint
 _SI = {"time": "s", "v": "1/s", "q": "1", "u": "1"}
 
@@ -84,6 +85,8 @@ def fit(
         DynamicsData, pairs=pairs, steps=window, stride=stride, batch_size=min(_BATCH, pairs)
     )
     horizon = min(_HORIZON, *(item.duration for item in splits.validation))
+    if model == "subnet":
+        windows = partial(windows, history=_HISTORY, steps=_LONG_WINDOW)
     if model == "hnn":  # a log has no momenta
         options = {"model_name": "hnn", **options}
         model = partial(MODELS["hnn"], state="qv")

@@ -64,6 +64,7 @@ from pinn_dyn.models import (
     LagrangianNetwork,
     NextStateMLP,
     Statistics,
+    SubspaceEncoder,
 )
 from pinn_dyn.models.output_limits import set_output_limits
 from pinn_dyn.training import (
@@ -80,6 +81,7 @@ MODELS: dict[str, ModelBuilder] = {
     "hnn": HamiltonianNetwork,
     "acceleration": AccelerationMLP,
     "mlp": partial(NextStateMLP, activation="silu"),
+    "subnet": SubspaceEncoder,
 }
 """Models by their names in conf/model."""
 ADAMW = partial(AdamW, lr=0.005, weight_decay=1e-5, fused=True)
@@ -125,8 +127,8 @@ def train(
 
     Args:
         source: the data.
-        model: builder, called with ``statistics=``; or ``"lnn"``, ``"hnn"``, ``"acceleration"`` or
-            ``"mlp"``; or a built predictor.
+        model: builder, called with ``statistics=``; or ``"lnn"``, ``"hnn"``, ``"acceleration"``,
+            ``"mlp"`` or ``"subnet"``; or a built predictor.
         loss: builder, called with ``statistics=`` and ``model=``.
         optimizer: builder, called with the parameters; or a least-squares fit.
         scheduler: builder, called with the optimizer and ``total_steps=``.

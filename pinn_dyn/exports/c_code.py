@@ -333,6 +333,9 @@ class CFunction:
     def _reduction(self, node: fx.Node, source: fx.Node, dims: Any = None, keep: bool = False):
         start, step = _REDUCTIONS[operation(node)]
         value, shape = self._declare(node), source.meta["val"].shape
+        if not shape.numel():  # such as the force of no inputs
+            self._assign(value, float(start))
+            return
         dims = [d % len(shape) for d in dims] if dims else [*range(len(shape))]
         index, sizes = self._indices(value)
         free = iter(index if not keep else [i for d, i in enumerate(index) if d not in dims])

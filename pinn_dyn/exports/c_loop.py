@@ -63,7 +63,8 @@ class CLoop(Wrapped):
         if loop is None:
             return self.inner.path(dynamics, start, grid, signal)
         blocks = [torch.zeros_like(x)[:, None]]
-        for inputs, lengths in self.blocks(grid, signal, max(1, NUMBERS // (u.numel() * len(x)))):
+        steps = max(1, NUMBERS // max(1, u.numel() * len(x)))
+        for inputs, lengths in self.blocks(grid, signal, steps):
             rows = inputs.reshape(*inputs.shape[: 2 + self.members], len(x), -1)
             rows = rows.movedim(2 + self.members, 0)
             blocks.append(loop(blocks[-1][:, -1], x, rows, lengths))

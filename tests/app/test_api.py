@@ -344,3 +344,9 @@ def test_a_folder_of_another_training_is_refused(tmp_path):
     pinn_dyn.train(Still(), "acceleration", folder=tmp_path, **SHORT)
     with pytest.raises(ValueError, match=r"another configuration: seed=1 \(there 0\)"):
         pinn_dyn.train(Still(), "acceleration", folder=tmp_path, seed=1, **SHORT)
+
+
+def test_a_model_with_a_memory_trains_on_windows_with_a_past():
+    run = fit(model="subnet", steps=2)
+    assert run.model.past_steps > 1
+    assert run.config["model_name"] == "subnet"

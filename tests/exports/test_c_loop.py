@@ -44,6 +44,7 @@ MODELS = {
         AccelerationMLP(make_statistics(2, 2), hidden=[6], delay=LearnedDelay(0.1, 0.03))
     ),
     "acceleration": partial(make_model, "acceleration"),
+    "passive": partial(LinearSystem, [[1.0]], [[2.0]], [[0.1]], torch.zeros(1, 0).tolist()),
     "ensemble": partial(make_ensemble, "lnn"),
 }
 
