@@ -90,8 +90,8 @@ class Windows:
 
     def start(self, state: State, past: int = 0) -> Tensor:
         """Return (q, v) or (q, p) at the start and n = ``past`` earlier q, ``(B, 2N + nN)``."""
-        earlier = self.past_q[..., :past, :].flatten(-2)
-        return torch.cat([self.q, self.v if state == "qv" else self.p, earlier], dim=-1)
+        earlier = [self.past_q[..., :past, :].flatten(-2)] if past else []
+        return torch.cat([self.q, self.v if state == "qv" else self.p, *earlier], dim=-1)
 
     def increments(self, state: State) -> Tensor:
         """Return the increments of (q, v) or (q, p) to each step, ``(B, H, 2N)``."""
