@@ -78,7 +78,7 @@ def test_the_package_imports_nothing_until_it_is_asked():
     ("command", "argument", "absent"),
     [
         ("train", "modle=lnn", "torch"),
-        ("train", "trainer.stepps=3", "lightning"),
+        ("train", "trainer.stepps=3", "torch"),
         ("train", "dataset.smaple=3", "lightning"),
         ("check", "longest_delay=none", "lightning"),
     ],

@@ -125,10 +125,10 @@ def test_all_mistakes_are_reported_at_once():
         "data.pairs is 'many', expected a valid integer or 'all'",
     ]
     with pytest.raises(ConfigError) as caught:  # without an import of Lightning
-        composed("train", ["trainer.steps=many", "loss.hubber=1"])
+        composed("train", ["dataset.seed=many", "loss.hubber=1"])
     assert str(caught.value).splitlines() == [
-        "trainer.steps is 'many', expected a valid integer",
         "the configuration has no key 'loss.hubber': did you mean loss.huber?",
+        "dataset.seed is 'many', expected a valid integer",
     ]
 
 
