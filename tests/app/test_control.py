@@ -232,7 +232,7 @@ def test_a_black_box_has_no_terms_to_control_by(capsys, mlp_run):
 
 @pytest.mark.slow
 def test_the_law_on_a_model_of_measured_data_is_exported(tmp_path, capsys):
-    """Without a reference and an experiment, as by the command of docs/your_log.md."""
+    """Hold the first measured pose where no reference is set, as in docs/your_log.md."""
     (tmp_path / "examples").symlink_to(CONF.parent / "examples")
     run = tmp_path / "arm" / "lnn"
     words = [*TINY_TRAINING, NO_FIGURES, "compile=false", f"hydra.run.dir={run}"]

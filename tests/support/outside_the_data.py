@@ -19,7 +19,7 @@ class OutsideTheDataContract:
     largest = 4.0
     """Of the eigenvalues of M anywhere, in units of the largest on the data."""
     duration = 20.0
-    """Of a rollout without input, s."""
+    """Duration of a rollout without input, s."""
     tolerance = 1e-5
     """Of the integrator, relative."""
 
