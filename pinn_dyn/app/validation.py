@@ -80,7 +80,8 @@ def _reported(value: Any, path: str = "") -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        lines = [_line(mistake, value, path) for mistake in error.errors(include_url=False)]
+        root = {path: value} if path else value
+        lines = [_line(mistake, root, path) for mistake in error.errors(include_url=False)]
         raise ConfigError("\n".join(dict.fromkeys(lines))) from error
 
 
