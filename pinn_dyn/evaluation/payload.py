@@ -64,7 +64,8 @@ def identify_payload(
     with torch.no_grad():
         parameters = joint.load()
     jacobian = torch.func.jacrev(_central)(parameters)
-    variance, open_variance = ((jacobian @ x @ jacobian.T).diagonal() for x in (covariance, prior))
+    variance = (jacobian @ covariance @ jacobian.T).diagonal()
+    open_variance = jacobian.diagonal() ** 2 * prior.diagonal()  # without that of the center
     width = 1.96 * variance.sqrt()
     values = _central(parameters)
     determined = variance < OPEN * open_variance
