@@ -113,6 +113,18 @@ def test_it_respects_the_limits_and_beats_the_clipped_law():
     assert planned.diagnostics["solver_failed"].sum() == 0
 
 
+def test_limits_hold_on_both_sides_and_at_a_rate_above_that_of_the_plan():
+    actuator = Actuator(-6.0, 6.0, rate=60.0)
+    settings = {"velocity_weight": 0.01, "q_low": -0.8, "v_max": 2.0, "actuator": actuator}
+    law = PredictiveControl(Pendulum(), 0.6, STEP, **settings)
+    start = double([[0.0]]), double([[0.0]])
+    loop = {"duration": 1.0, "rate": 2 / STEP}
+    record = close_loop(SystemPlant(Pendulum()), law, SetPoint([-1.0]), *start, **loop)
+    assert record.u.diff(dim=1).abs().max() <= 60.0 * STEP / 2 + 1e-6
+    assert -2.05 < record.v.min() < -1.8
+    assert -0.81 < record.q.min() < -0.79
+
+
 def test_a_new_run_forgets_the_previous_run(law):
     first, second = run(law, duration=0.5), run(law, duration=0.5)
     torch.testing.assert_close(first.u, second.u, rtol=0, atol=0)
@@ -128,12 +140,13 @@ def test_it_sees_the_reference_ahead_of_time(law):
 
 
 def test_the_observer_removes_the_steady_error_of_a_wrong_model(law):
-    wrong = run(law, mass=1.2, duration=2.0)
+    wrong, exact = run(law, mass=1.2, duration=2.0), run(law)
     observed = PredictiveControl(
         Pendulum(), 0.6, STEP, input_weight=1e-2, velocity_weight=0.01, observer_bandwidth=10.0
     )
     corrected = run(observed, mass=1.2, duration=2.0)
     assert (corrected.q - 1)[0, -1].abs() < 1e-3 < 0.02 < (wrong.q - 1)[0, -1].abs()
+    assert (run(observed).q - exact.q).abs().max() < 5e-3
 
 
 def test_a_failed_solver_holds_the_last_input_and_stops_after_a_horizon(law, monkeypatch):
@@ -163,6 +176,10 @@ def test_a_start_without_a_feasible_plan_names_the_limit(caplog):
     run(law, SetPoint([0.2]), duration=2 * STEP)
     assert not caplog.text
     run(law, SetPoint([0.2]), q0=0.3, v0=6.0, duration=2 * STEP)
+    assert "leaves the limits of q[0]" in caplog.text
+    caplog.clear()
+    law = PredictiveControl(Pendulum(), 0.6, STEP, q_low=-0.5, actuator=Actuator(-6.0, 6.0))
+    run(law, SetPoint([-0.2]), q0=-0.3, v0=-6.0, duration=2 * STEP)
     assert "leaves the limits of q[0]" in caplog.text
 
 

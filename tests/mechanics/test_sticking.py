@@ -137,6 +137,88 @@ def test_order_against_an_event_driven_solution(build, order, method):
     assert float(fine.square().mean().sqrt()) < 1e-3
 
 
+def pushed(damping, method, h, u, v0=0.0, friction=None, stride=1):
+    """States of a mass of 1 kg with a friction level of 1 N, at each ``stride``-th input."""
+    system = Rubbing([1.0], [1.0], [[1.0]], [[0.0]], [[damping]], [[1.0]]).requires_grad_(False)
+    system._sliding_force = friction or system._sliding_force
+    system.integrator = Sticking(method())
+    t = h * torch.arange(len(u), dtype=torch.float64)
+    signal = Signal(t, torch.tensor(u, dtype=torch.float64)[:, None])
+    return system.predict(torch.tensor([0.0, v0], dtype=torch.float64), t[::stride], signal)
+
+
+def test_a_strongly_damped_mass_comes_to_rest_and_stays_there():
+    """An implicit step is longer than the time constant M/D of 20 ms."""
+    q, v = pushed(50.0, Rosenbrock, 0.02, [0.0] * 12, v0=10.0).unbind(-1)
+    stop = np.log(1 + 10.0 * 50) / 50
+    assert float(q[-1]) == pytest.approx(10.0 / 50 - stop / 50, rel=0.02)
+    assert (v[:6] > 0).all()
+    assert not v[8:].any()
+    assert q.diff().min() > -1e-5  # a step may end beyond the stop
+    assert not pushed(50.0, Rosenbrock, 0.1, [0.0] * 3, v0=0.09)[1:, 1].any()
+
+
+def test_a_stopped_mass_is_held_by_the_friction_at_rest():
+    """The load of 1.5 N is above the sliding friction of 1 N, and below the stiction of 2 N."""
+
+    def stribeck(v, share):
+        return (2 * share - 1) * (1 + torch.exp(-((v / 0.01) ** 2)))
+
+    q, v = pushed(0.0, RK4, 0.05, [-1.5] * 5, v0=0.05, friction=stribeck).unbind(-1)
+    assert not v[1:].any()
+    assert float(q[-1]) == pytest.approx(0.05**2 / (2 * 2.5), rel=0.3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_load_that_grows_beyond_the_friction_within_a_step_moves_the_mass(method):
+    start = (1.0 - 0.9) / 6.0  # 6 N/s
+    v = pushed(0.0, method, 0.1, [0.9, 1.5])[-1, 1]
+    assert float(v) == pytest.approx(3 * (0.1 - start) ** 2, rel=0.1)
+    assert not pushed(0.0, method, 0.1, [1.1, 0.5])[-1].any()
+
+
+def test_a_push_between_the_ends_of_a_step_moves_the_mass():
+    """The mean input is 1.2 N."""
+    v = pushed(0.0, Rosenbrock, 0.02, [0.0, 0.0, 3.0, 3.0, 0.0, 0.0], stride=5)[-1, 1]
+    assert float(v) == pytest.approx(0.02)
+
+
+def test_coordinates_that_start_from_rest_obey_the_law_of_coulomb():
+    """Loads on four coupled inertias: each holds below its level, or moves against it."""
+    inertia = torch.tensor([[4.0, 1.5, 0.6, 0.2], [1.5, 2.0, 0.7, 0.3], [0.6, 0.7, 0.9, 0.3]])
+    mass = torch.cat([inertia, torch.tensor([[0.2, 0.3, 0.3, 0.4]])])
+    level = [1.0, 0.8, 0.5, 0.2]
+    system = Rubbing(level, level, mass, *2 * [torch.zeros(4, 4)], torch.eye(4))
+    system.integrator = Sticking(RK4())
+    generator = torch.Generator().manual_seed(0)
+    force = 1.5 * torch.randn(500, 4, generator=generator).double() * system.forward_level
+    t = torch.tensor([0.0, 0.01], dtype=torch.float64)
+    signal = Signal(t, force[:, None].expand(500, 2, 4))
+    with torch.no_grad():
+        end = system.predict(torch.zeros(500, 8).double(), t, signal)
+    a = end[:, 1, 4:] / 0.01
+    friction = force - a @ system.mass
+    assert 0.2 < float((a == 0).double().mean()) < 0.8
+    assert (friction.abs() <= system.forward_level * (1 + 1e-9)).all()
+    moving = a.sign() * system.forward_level
+    torch.testing.assert_close(friction[a != 0], moving[a != 0])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_without_friction_a_step_is_that_of_the_inner_method(method):
+    """Stiff springs and dampers, in states whose velocities keep their signs."""
+    system = two_links()
+    system.forward_level, system.backward_level = torch.zeros(2, 2, dtype=torch.float64)
+    system._stiffness_matrix = lambda q: system.stiffness
+    x0 = torch.tensor([[0.01, -0.02, 3.0, 2.0], [0.0, 0.01, -2.0, 4.0]], dtype=torch.float64)
+    t = torch.tensor([0.0, 0.3], dtype=torch.float64)
+    signal = Signal(t, torch.tensor([[1.0, 0.3], [0.5, 0.8]]).double().expand(2, 2, 2))
+    ends = []
+    for system.integrator in (Sticking(method()), method()):
+        ends.append(system.predict(x0, t, signal)[:, 1])
+    torch.testing.assert_close(*ends, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("method", METHODS)
 def test_rest_is_exact(method, dtype):
