@@ -24,34 +24,24 @@ static inline real sigmoid(real x) { return 1 / (1 + exp(-x)); }
 
 _FUNCTIONS = "sqrt exp expm1 log log1p sin cos tan asin acos atan sinh cosh tanh erf floor sigmoid"
 _OPERATORS = {"mul": "*", "div": "/", "add": "+", "sub": "-", "gt": ">", "ge": ">=", "lt": "<"}
-_OPERATORS |= {"le": "<=", "eq": "==", "ne": "!="}
-_OPERATORS |= {
-    f"{kind}_{name}": sign
-    for kind in ("logical", "bitwise")
-    for name, sign in (("and", "&&"), ("or", "||"))
-}
+_OPERATORS |= {"le": "<=", "eq": "==", "logical_and": "&&", "logical_or": "||"}
 _ELEMENTWISE = {
     **{name: f"{name}({{0}})" for name in [*_FUNCTIONS.split(), "sign"]},
     **{name: f"{{0}} {sign} {{1}}" for name, sign in _OPERATORS.items()},
     **{name: f"{name}({{0}}, {{1}})" for name in ("atan2", "pow", "fmod")},
     "neg": "-{0}",
     "reciprocal": "1 / {0}",
-    "rsqrt": "1 / sqrt({0})",
     "abs": "fabs({0})",
-    "relu": "larger({0}, 0)",
     "logical_not": "!{0}",
-    "bitwise_not": "!{0}",
     "clone": "{0}",
     "copy": "{1}",
     "_to_copy": "{0}",
     "maximum": "larger({0}, {1})",
     "minimum": "smaller({0}, {1})",
     "where": "{0} ? {1} : {2}",
-    "clamp": "",  # by the limits that are present
 }
 _REDUCTIONS = {
     "sum": ("0", "{0} + {1}"),
-    "mean": ("0", "{0} + {1}"),
     "amin": ("INFINITY", "smaller({0}, {1})"),
     "amax": ("-INFINITY", "larger({0}, {1})"),
 }
@@ -230,18 +220,8 @@ class CFunction:
         operands = [
             self._operand(x, index) for x in arguments if isinstance(x, fx.Node | int | float)
         ]
-        if name == "clamp":
-            low, high = (*arguments[1:], None, None)[:2]
-            text = operands[0]
-            if (low := node.kwargs.get("min", low)) is not None:
-                text = f"larger({text}, {self._operand(low, index)})"
-            if (high := node.kwargs.get("max", high)) is not None:
-                text = f"smaller({text}, {self._operand(high, index)})"
-            return text
         if name == "pow" and arguments[1] in (2, 0.5):
             return f"{'square' if arguments[1] == 2 else 'sqrt'}({operands[0]})"
-        if (alpha := node.kwargs.get("alpha", 1)) != 1:
-            operands[1] = f"({self.constants.number(alpha)} * {operands[1]})"
         return _ELEMENTWISE[name].format(*operands)
 
     # Statements.
@@ -342,15 +322,13 @@ class CFunction:
         full = [f"j{d}" if d in dims else next(free) for d in range(len(shape))]
         inner = {f"j{d}": shape[d] for d in dims if shape[d] > 1}
         target, operand = self._element(value, index), self._operand(source, full)
-        count = math.prod(inner.values()) if operation(node) == "mean" else 1
         if value.numel() < 8:
             loops = " ".join(f"for (int {i} = 0; {i} < {n}; {i}++)" for i, n in inner.items())
             add = f"{loops} s = {step.format('s', operand)};"
-            self._loops(sizes, [f"real s = {start};", add, f"{target} = s / {count};"])
+            self._loops(sizes, [f"real s = {start};", add, f"{target} = s;"])
         else:  # entries side by side do not wait for each other
             self._loops(sizes, [f"{target} = {start};"])
             self._loops({**inner, **sizes}, [f"{target} = {step.format(target, operand)};"])
-            self._loops(sizes if count > 1 else {}, [f"{target} /= {count};"][: count > 1])
 
     def _cat(self, node: fx.Node, sources: Sequence[fx.Node], dim: int = 0) -> None:
         value, start = self._declare(node), 0
@@ -359,16 +337,6 @@ class CFunction:
                 size = source.meta["val"].shape[dim]
                 self._assign(value.narrow(dim, start, size), source)
                 start += size
-
-    def _constant_pad_nd(
-        self, node: fx.Node, source: fx.Node, pads: Sequence[int], fill: float = 0
-    ) -> None:
-        value = self._declare(node)
-        self._assign(value, fill)
-        for k, before in enumerate(pads[::2]):
-            dim = node.meta["val"].ndim - 1 - k
-            value = value.narrow(dim, before, source.meta["val"].shape[dim])
-        self._assign(value, source)
 
     def _move(self, node: fx.Node, source: fx.Node, *arguments: Any) -> None:
         """Write a loop over a table of the positions of entries, by the operation itself."""

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, fx
 
-from pinn_dyn.exports.program import MOVES, Program, operation, unsupported
+from pinn_dyn.exports.program import MOVES, Program, moved, operation, unsupported
 
 if TYPE_CHECKING:
     import casadi
@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 _NAMES = {"add": "plus", "sub": "minus", "mul": "times", "div": "rdivide", "pow": "power"}
 _NAMES |= {"abs": "fabs", "where": "if_else"}
 _NAMES |= {"logical_not": "logic_not", "logical_and": "logic_and", "logical_or": "logic_or"}
-_NAMES |= {"bitwise_not": "logic_not", "bitwise_and": "logic_and", "bitwise_or": "logic_or"}
 _SAME = "sqrt exp expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh erf sign floor"
-_NAMES |= {name: name for name in f"{_SAME} lt le gt ge eq ne".split()}
+_NAMES |= {name: name for name in f"{_SAME} lt le gt ge eq".split()}
 
 
 def casadi_function(program: Program, name: str) -> casadi.Function:
@@ -86,29 +85,27 @@ class _Writer:
 
     def evaluate(self, node: fx.Node) -> Any:
         """Return the numbers of an operation; a list for an operation with several results."""
-        target: Any = node.target
         arguments: list[Any] = list(node.args)
-        if target is operator.getitem:
+        if node.target is operator.getitem:
             return self.values[arguments[0]][arguments[1]]
         name = operation(node)
         if name in MOVES.split() or name in ("clone", "_to_copy"):
-            return self._moved(target, arguments, node.kwargs)
+            sources, index = moved(node)
+            numbers = self.ca.vertcat(*(self.values[source] for source in sources))
+            is_single = isinstance(index, Tensor)
+            return numbers[_flat(index)] if is_single else [numbers[_flat(x)] for x in index]
         shape = node.meta["val"].shape
-        if name == "constant_pad_nd":
-            source, pads, *fill = arguments
-            index = torch.constant_pad_nd(_positions(source) + 1, pads, 0)
-            return self.ca.vertcat(*(fill or [0.0]), self.values[source])[_flat(index)]
         if name == "mm":
             return self.ca.vec(self.ca.mtimes(*map(self.matrix, reversed(arguments))))
-        if name in ("sum", "mean", "amin", "amax"):
+        if name in ("sum", "amin", "amax"):
             source, dims, *_ = (*arguments, None)
             positions = _positions(source)
             axes = [d % positions.ndim for d in dims or range(positions.ndim)]
             order = [*(d for d in range(positions.ndim) if d not in axes), *axes]
             numbers = self.values[source][_flat(positions.permute(order))]
             columns = self.ca.reshape(numbers, -1, shape.numel())
-            if name in ("sum", "mean"):
-                return self.ca.sum1(columns).T / (columns.size1() if name == "mean" else 1)
+            if name == "sum":
+                return self.ca.sum1(columns).T
             larger = self._larger if name == "amax" else self._smaller
             return functools.reduce(larger, self.ca.vertsplit(columns)).T
         return self._elementwise(node, name, [self._operand(x, shape) for x in arguments])
@@ -116,24 +113,6 @@ class _Writer:
     def matrix(self, node: fx.Node) -> Any:
         """Return the transpose of a matrix: CasADi stores columns."""
         return self.ca.reshape(self.values[node], node.meta["val"].shape[1], -1)
-
-    def _moved(self, target: Any, arguments: list[Any], options: Mapping[str, Any]) -> Any:
-        """Return the numbers at the positions to which the operation puts their indices."""
-        sources: list[Any] = []
-
-        def positions(node: fx.Node) -> Tensor:
-            if node.meta["val"].dtype == torch.int64:
-                return node.meta["val"]
-            start = sum(x.numel() for x in sources)
-            sources.append(self.values[node])
-            return _positions(node, start)
-
-        options = {key: x for key, x in options.items() if key != "dtype"}
-        index = target(*fx.map_arg(arguments, positions), **options)
-        numbers = self.ca.vertcat(*sources)
-        if isinstance(index, Tensor):
-            return numbers[_flat(index)]
-        return [numbers[_flat(part)] for part in index]
 
     def _operand(self, argument: Any, shape: torch.Size) -> Any:
         if not isinstance(argument, fx.Node):
@@ -152,39 +131,25 @@ class _Writer:
         return -self._larger(-x, -y)
 
     def _elementwise(self, node: fx.Node, name: str, x: list[Any]) -> Any:
-        ca, options = self.ca, node.kwargs
-        if options.get("alpha", 1) != 1:
-            x[1] = options["alpha"] * x[1]
         if name in _NAMES:
-            return getattr(ca, _NAMES[name])(*x)
+            return getattr(self.ca, _NAMES[name])(*x)
         match name:
             case "neg":
                 return -x[0]
             case "reciprocal":
                 return 1 / x[0]
-            case "rsqrt":
-                return 1 / ca.sqrt(x[0])
             case "sigmoid":
-                return 1 / (1 + ca.exp(-x[0]))
-            case "relu":
-                return self._larger(x[0], 0)
+                return 1 / (1 + self.ca.exp(-x[0]))
             case "maximum":
                 return self._larger(*x)
             case "minimum":
                 return self._smaller(*x)
-            case "remainder":
-                return x[0] - x[1] * ca.floor(x[0] / x[1])
-            case "clamp":
-                low, high = [*x[1:], None, None][:2]
-                low, high = options.get("min", low), options.get("max", high)
-                value = x[0] if low is None else self._larger(x[0], low)
-                return value if high is None else self._smaller(value, high)
         raise unsupported(node, "CasADi")
 
 
-def _positions(node: Any, start: int = 0) -> Tensor:
+def _positions(node: Any) -> Tensor:
     shape = node.meta["val"].shape
-    return torch.arange(start, start + shape.numel()).reshape(shape)
+    return torch.arange(shape.numel()).reshape(shape)
 
 
 def _flat(index: Tensor) -> list[int]:

@@ -1,8 +1,8 @@
-"""Matrix factorizations as elementary operations, for matrices of a few rows."""
+"""Operations as those that all exports have; factorizations for matrices of a few rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -88,6 +88,35 @@ def _solve_triangular(
     return solve_triangular(A, B, upper)
 
 
+def _clamp(x: Tensor, low: Any = None, high: Any = None) -> Tensor:
+    for limit, limited in ((low, torch.maximum), (high, torch.minimum)):
+        if limit is not None:
+            number = not isinstance(limit, Tensor)
+            x = limited(x, torch.full((), limit, dtype=x.dtype) if number else limit)
+    return x
+
+
+def _mean(x: Tensor, dims: Any = None, keep: bool = False, *, dtype: Any = None) -> Tensor:
+    total = x.sum(dims or tuple(range(x.ndim)), keep)
+    return total / (x.numel() // max(total.numel(), 1))
+
+
+def _padded(x: Tensor, pads: Sequence[int], fill: float = 0.0) -> Tensor:
+    for dim, *counts in zip(range(x.ndim - 1, -1, -1), pads[::2], pads[1::2], strict=False):
+        shapes = ((*x.shape[:dim], count, *x.shape[dim + 1 :]) for count in counts)
+        before, after = ([torch.full(shape, fill, dtype=x.dtype)] for shape in shapes)
+        x = torch.cat([*before * (counts[0] > 0), x, *after * (counts[1] > 0)], dim)
+    return x
+
+
+def _remainder(x: Tensor, y: Any) -> Any:
+    return x - y * (x / y).floor() if x.is_floating_point() else NotImplemented
+
+
+def _scaled(operation: Callable[[Tensor, Any], Tensor]) -> Callable[..., Any]:
+    return lambda x, y, alpha=1: NotImplemented if alpha == 1 else operation(x, alpha * y)
+
+
 _aten = torch.ops.aten
 DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.linalg_cholesky_ex.default: _cholesky_ex,
@@ -98,4 +127,16 @@ DECOMPOSITIONS: dict[Any, Callable[..., Any]] = {
     _aten.linalg_inv_ex.default: _inverse_ex,
     _aten.linalg_qr.default: lambda A, mode="reduced": qr(A),
     _aten.linalg_solve_triangular.default: _solve_triangular,
+    _aten.add.Tensor: _scaled(torch.add),
+    _aten.sub.Tensor: _scaled(torch.sub),
+    _aten.bitwise_and.Tensor: torch.logical_and,
+    _aten.bitwise_not.default: torch.logical_not,
+    _aten.bitwise_or.Tensor: torch.logical_or,
+    _aten.constant_pad_nd.default: _padded,
+    _aten.relu.default: lambda x: _clamp(x, 0.0),
+    _aten.rsqrt.default: lambda x: x.sqrt().reciprocal(),
+    **dict.fromkeys((_aten.clamp.default, _aten.clamp.Tensor), _clamp),
+    **dict.fromkeys((_aten.mean.default, _aten.mean.dim), _mean),
+    **dict.fromkeys((_aten.ne.Scalar, _aten.ne.Tensor), lambda x, y: torch.logical_not(x == y)),
+    **dict.fromkeys((_aten.remainder.Scalar, _aten.remainder.Tensor), _remainder),
 }

@@ -13,24 +13,22 @@ import torch
 from torch import Tensor, fx
 
 from pinn_dyn.exports.exported import Calls, ExportedFunction, Real
-from pinn_dyn.exports.program import MOVES, operation, unsupported
+from pinn_dyn.exports.program import MOVES, moved, operation, unsupported
 
 OPSET = 18
 _SAME = "sqrt exp log sin cos tan asin acos atan sinh cosh tanh erf floor sign sigmoid"
-_SAME += " neg reciprocal abs relu add sub mul div pow"
+_SAME += " neg reciprocal abs add sub mul div pow"
 _ELEMENTWISE = {
     **{name: name.capitalize() for name in _SAME.split()},
     **{"maximum": "Max", "minimum": "Min", "where": "Where", "logical_not": "Not"},
     **{"gt": "Greater", "ge": "GreaterOrEqual", "lt": "Less", "le": "LessOrEqual", "eq": "Equal"},
-    **{"bitwise_not": "Not", "logical_and": "And", "bitwise_and": "And"},
-    **{"logical_or": "Or", "bitwise_or": "Or", "mm": "MatMul", "clone": "Identity"},
+    **{"logical_and": "And", "logical_or": "Or", "mm": "MatMul", "clone": "Identity"},
 }
 _COMPOSED: dict[str, Callable[..., str]] = {
     "log1p": lambda node, x, unit: node("Log", [node("Add", [x, unit])]),
-    "rsqrt": lambda node, x, unit: node("Reciprocal", [node("Sqrt", [x])]),
     "expm1": lambda node, x, unit: node("Sub", [node("Exp", [x]), unit]),
 }
-_REDUCTIONS = {"sum": "ReduceSum", "mean": "ReduceMean", "amin": "ReduceMin", "amax": "ReduceMax"}
+_REDUCTIONS = {"sum": "ReduceSum", "amin": "ReduceMin", "amax": "ReduceMax"}
 
 
 def write_onnx(functions: Sequence[ExportedFunction], path: Path, info: str, real: Real) -> Calls:
@@ -141,7 +139,9 @@ class _Writer:
 
     def _write(self, node: fx.Node) -> Any:
         name, arguments = operation(node), cast(tuple[Any, ...], node.args)
-        if name in MOVES.split() or name in ("constant_pad_nd", "getitem"):
+        if name == "getitem":
+            return self.names[arguments[0]][arguments[1]]
+        if name in MOVES.split():
             return self._move(node)
         if name in _COMPOSED:
             return _COMPOSED[name](self.node, self.real(arguments[0]), self.operand(1.0))
@@ -149,8 +149,9 @@ class _Writer:
             x, dims, keep, *_ = (*arguments, None, False)
             axes = [self.constant(list(dims), np.int64)] if dims else []
             return self.node(_REDUCTIONS[name], [self.real(x), *axes], keepdims=int(bool(keep)))
-        if name in ("clamp", "ne", "_to_copy"):
-            return getattr(self, f"_{name.strip('_')}")(node, *node.args)
+        if name == "_to_copy":
+            is_real = node.meta["val"].is_floating_point()
+            return self.real(arguments[0]) if is_real else self.operand(arguments[0])
         if name not in _ELEMENTWISE:
             raise unsupported(node, "ONNX")
         kind = _ELEMENTWISE[name]
@@ -158,49 +159,14 @@ class _Writer:
         operands = [
             self.operand(x) if k < logical else self.real(x) for k, x in enumerate(node.args)
         ]
-        if (alpha := node.kwargs.get("alpha", 1)) != 1:
-            operands[1] = self.node("Mul", [operands[1], self.operand(alpha)])
         return self.node(kind, operands)
 
-    def _ne(self, node: fx.Node, x: Any, y: Any) -> str:
-        return self.node("Not", [self.node("Equal", [self.real(x), self.real(y)])])
-
-    def _clamp(self, node: fx.Node, x: fx.Node, low: Any = None, high: Any = None) -> str:
-        name = self.real(x)
-        limits = ("Max", node.kwargs.get("min", low)), ("Min", node.kwargs.get("max", high))
-        for kind, limit in limits:
-            name = name if limit is None else self.node(kind, [name, self.operand(limit)])
-        return name
-
-    def _to_copy(self, node: fx.Node, x: fx.Node) -> str:
-        return self.real(x) if node.meta["val"].is_floating_point() else self.operand(x)
-
     def _move(self, node: fx.Node) -> Any:
-        """Gather the numbers of a result from those of its operands.
-
-        The operation itself is applied to the positions of the numbers.
-        """
-        flat: list[str] = []
-        count = 0
-
-        def positions(x: fx.Node) -> Tensor:
-            nonlocal count
-            value = x.meta["val"]
-            if isinstance(value, list | tuple) or value.dtype == torch.int64:
-                return value  # of a getitem, or indices
-            flat.append(self.node("Reshape", [self.operand(x), self.constant([-1], np.int64)]))
-            count += value.numel()
-            return torch.arange(count - value.numel(), count).reshape(value.shape)
-
-        if operation(node) == "getitem":
-            results, position = cast(tuple[Any, ...], node.args)
-            return self.names[results][position]
-        arguments: Any = fx.node.map_arg(node.args, positions)
-        if operation(node) == "constant_pad_nd":
-            flat.append(self.constant([float(cast(Any, (*node.args, 0.0)[2]))]))
-            arguments = (*arguments[:2], count)
+        """Gather the numbers of a result from those of its sources."""
+        sources, index = moved(node)
+        shape = self.constant([-1], np.int64)
+        flat = [self.node("Reshape", [self.operand(x), shape]) for x in sources]
         source = self.node("Concat", flat, axis=0) if len(flat) > 1 else flat[0]
-        result = node.target(*arguments, **node.kwargs)  # type: ignore[operator]
-        if isinstance(result, Tensor):
-            return self.node("Gather", [source, self.constant(result)])
-        return [self.node("Gather", [source, self.constant(x)]) for x in result]
+        if isinstance(index, Tensor):
+            return self.node("Gather", [source, self.constant(index)])
+        return [self.node("Gather", [source, self.constant(x)]) for x in index]

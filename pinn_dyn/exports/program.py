@@ -64,6 +64,27 @@ def operation(node: fx.Node) -> str:
     return getattr(target, "__name__", str(target))
 
 
+def moved(node: fx.Node) -> tuple[list[fx.Node], Any]:
+    """Return the sources of an operation that moves numbers, and the positions that it reads.
+
+    The positions have the shape of the result and count the numbers of all sources in turn. They
+    are a list for an operation with several results.
+    """
+    sources: list[fx.Node] = []
+
+    def positions(source: fx.Node) -> Tensor:
+        value = source.meta["val"]
+        if value.dtype == torch.int64:  # indices
+            return value
+        start = sum(x.meta["val"].numel() for x in sources)
+        sources.append(source)
+        return torch.arange(start, start + value.numel()).reshape(value.shape)
+
+    options = {key: x for key, x in node.kwargs.items() if key != "dtype"}
+    target: Any = node.target
+    return sources, target(*fx.map_arg(node.args, positions), **options)
+
+
 def unsupported(node: fx.Node, form: str) -> TypeError:
     """Return the error for an operation that an export does not have, with its line of code."""
     trace = (node.meta.get("stack_trace") or "").strip().split("\n")[0]
