@@ -17,7 +17,6 @@ from pinn_dyn.app.config import composed
 from pinn_dyn.evaluation import (
     build_baselines,
     predict_trajectories,
-    predict_windows,
     rollout_metrics,
 )
 from pinn_dyn.mechanics import Predictor, stack_until
@@ -51,7 +50,7 @@ def errors(name: str) -> pd.DataFrame:
     for label, (model, model_step) in models.items():
         parts = {"": predict_trajectories(model, truth, step=model_step)}
         for window in windows:
-            parts[f"window_{window:g}s_"] = predict_windows(
+            parts[f"window_{window:g}s_"] = predict_trajectories(
                 model, truth, window=window, step=model_step
             )
         for prefix, part in parts.items():

@@ -5,7 +5,7 @@ import sys
 import torch
 
 import pinn_dyn
-from pinn_dyn.evaluation.prediction import predict_windows
+from pinn_dyn.evaluation.prediction import predict_trajectories
 from pinn_dyn.mechanics import samples_of, stack_until
 
 WINDOW, HORIZON = 1.0, 2.0  # s
@@ -22,7 +22,7 @@ def main(folders: list[str]) -> None:
         run = pinn_dyn.load(folder)
         truth = stack_until(run.source.load().test, HORIZON)
         step = run.statistics.step
-        prediction = predict_windows(run.model, truth, window=WINDOW, step=step)
+        prediction = predict_trajectories(run.model, truth, window=WINDOW, step=step)
         samples, steps = (samples_of("window", WINDOW, t) for t in (truth.t, prediction.t))
         count = (len(prediction.t) - 1) // steps
         fast = truth.v.abs().amax(-1)

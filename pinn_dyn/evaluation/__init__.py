@@ -19,7 +19,7 @@ from pinn_dyn.evaluation.learned_terms import TermComparison, compare_terms
 from pinn_dyn.evaluation.log_figures import cleaning_figure
 from pinn_dyn.evaluation.metrics import RolloutMetrics, rollout_metrics
 from pinn_dyn.evaluation.plots import save
-from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
+from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
 from pinn_dyn.evaluation.torque import TorqueError, torque_error
 from pinn_dyn.lazy import lazy_attributes
 
@@ -51,7 +51,6 @@ __all__ = [
     "error_figure",
     "evaluate_models",
     "predict_trajectories",
-    "predict_windows",
     "rollout_metrics",
     "save",
     "steady_state_figure",

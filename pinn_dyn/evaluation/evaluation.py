@@ -24,7 +24,7 @@ from pinn_dyn.evaluation.metrics import (
     state_squared_error,
 )
 from pinn_dyn.evaluation.plots import save, with_unit
-from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, predict_windows
+from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories
 from pinn_dyn.evaluation.tables import (
     SEEDS_COLUMNS,
     over_seeds,
@@ -271,10 +271,7 @@ def _predict(
     entry: Entry, truth: Trajectory, stride: int, window: float | None = None
 ) -> Prediction:
     def rollout(model: Predictor) -> Prediction:
-        if window is None:
-            prediction = predict_trajectories(model, truth, step=entry.step)
-        else:
-            prediction = predict_windows(model, truth, window=window, step=entry.step)
+        prediction = predict_trajectories(model, truth, window=window, step=entry.step)
         return prediction.every(stride // samples_of("step", entry.step, truth.t))
 
     prediction = rollout(entry.model)

@@ -76,61 +76,33 @@ class Prediction:
 
 
 def predict_trajectories(
-    model: Predictor, truth: Trajectory, *, step: float | None = None
+    model: Predictor,
+    truth: Trajectory,
+    *,
+    window: float | None = None,
+    step: float | None = None,
 ) -> Prediction:
     """Roll out a model in float64 from each true initial state under the true input.
 
     If a trajectory breaks down (mass matrix not positive definite), its q_hat is NaN from there on.
-
-    Args:
-        model: predictor with N coordinates and M inputs.
-        truth: K test trajectories stacked, q ``(K, T, N)``.
-        step: step of the rollout in s, an integer multiple of the sample time; None takes the
-            sample times of the data.
-
-    Raises:
-        ValueError: if the step is no multiple of the sample time.
-    """
-    stride = 1 if step is None else samples_of("step", step, truth.t)
-    copy = model_for_rollouts(model, truth.q.device)
-    x0 = truth.states(model.state, slice(1), model.past_steps, stride)[:, 0].double()
-    input = truth.since(model.input_history).input.to(truth.q.device, torch.float64)
-    states = _roll_out(copy, x0, truth.t[::stride], input)
-    paths = states[..., : model.num_coordinates]
-    v_hat = _velocities(copy, states)
-    return Prediction(
-        truth.t[::stride].double(),
-        paths.mean(0),
-        truth.q[:, ::stride].double(),
-        paths if len(paths) > 1 else None,
-        v_hat,
-        None if v_hat is None else truth.v[:, ::stride].double(),
-    )
-
-
-def predict_windows(
-    model: Predictor, truth: Trajectory, *, window: float, step: float | None = None
-) -> Prediction:
-    """Roll out a model as :func:`predict_trajectories` does, with resets to the true state.
-
-    At a reset the prediction is the end of the window before. An incomplete window is left out.
+    With a window, the state is reset to the true state after each. At a reset the prediction is the
+    end of the window before. An incomplete window is left out.
 
     Args:
         model: predictor with N coordinates and M inputs.
         truth: K test trajectories stacked, q ``(K, T, N)``, with a constant sample time.
-        window: time between two resets in s, an integer multiple of the step.
-        step: step of the rollout in s, an integer multiple of the sample time, or None.
+        window: time between two resets in s, an integer multiple of the step; None for no reset.
+        step: step of the rollout in s, an integer multiple of the sample time; None takes the
+            sample times of the data.
 
     Raises:
         ValueError: if step, window and sample time do not fit, or the trajectory is too short.
     """
     stride, samples = samples_of_window(window, step, truth.t)
-    windows = (truth.t.shape[0] - 1) // samples
-    if windows < 1:
-        raise ValueError(
-            f"window is {window} s, but the trajectories last only {truth.duration:g} s"
-        )
-    last = windows * samples
+    last = (truth.t.shape[0] - 1) // samples * samples
+    if last == 0:
+        span = f"step is {step}" if window is None else f"window is {window}"
+        raise ValueError(f"{span} s, but the trajectories last only {truth.duration:g} s")
     starts = slice(0, last, samples)
     x0 = truth.states(model.state, starts, model.past_steps, stride).double()
     input = truth.since(model.input_history).input
@@ -141,12 +113,13 @@ def predict_windows(
     pieces = replace(pieces, t=input.t[:size])
     copy = model_for_rollouts(model, truth.q.device)
     states = _roll_out(copy, x0.flatten(0, 1), pieces.t[past::stride], pieces)
-    ends = states[..., 1:, : model.num_coordinates]
-    q = truth.q[:, : last + 1 : stride].double()
-    start = q[:, :1].expand(ends.shape[0], -1, -1, -1)
-    paths = torch.cat([start, ends.reshape(ends.shape[0], q.shape[0], -1, q.shape[-1])], dim=2)
+    q, v = (x[:, : last + 1 : stride].double() for x in (truth.q, truth.v))
+    ends = states[..., 1:, : model.num_coordinates].reshape(len(states), len(q), -1, q.shape[-1])
+    paths = torch.cat([q[:, :1].expand(len(states), -1, -1, -1), ends], dim=2)
     members = paths if len(paths) > 1 else None
-    return Prediction(truth.t[: last + 1 : stride].double(), paths.mean(0), q, members)
+    v_hat = _velocities(copy, states) if window is None else None
+    t, v_true = truth.t[: last + 1 : stride].double(), None if v_hat is None else v
+    return Prediction(t, paths.mean(0), q, members, v_hat, v_true)
 
 
 def model_for_rollouts(model: Model, device: torch.device | str = "cpu") -> Model:
@@ -181,9 +154,11 @@ def _velocities(model: Predictor, states: Tensor) -> Tensor | None:
     return torch.cat([model.velocity(*piece) for piece in pieces]).reshape(q.shape)
 
 
-def samples_of_window(window: float, step: float | None, t: Tensor) -> tuple[int, int]:
-    """Return the number of sample times in a step and in a window."""
+def samples_of_window(window: float | None, step: float | None, t: Tensor) -> tuple[int, int]:
+    """Return the number of sample times in a step and in a window; None is the whole of t."""
     stride = 1 if step is None else samples_of("step", step, t)
+    if window is None:
+        return stride, stride * max((len(t) - 1) // stride, 1)
     samples = samples_of("window", window, t)
     if samples % stride:
         raise ValueError(f"window is {window} s and step is {step} s: expected a multiple of it")

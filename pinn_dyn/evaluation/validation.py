@@ -16,13 +16,7 @@ from pinn_dyn.evaluation.baselines import HoldPosition
 from pinn_dyn.evaluation.figures import error_figure, terms_figure, trajectory_figure
 from pinn_dyn.evaluation.learned_terms import compare_with_source
 from pinn_dyn.evaluation.metrics import member_metrics, rollout_metrics
-from pinn_dyn.evaluation.prediction import (
-    Prediction,
-    predict_trajectories,
-    predict_windows,
-    samples_of,
-    samples_of_window,
-)
+from pinn_dyn.evaluation.prediction import Prediction, predict_trajectories, samples_of_window
 from pinn_dyn.evaluation.torque import residual_share
 from pinn_dyn.mechanics import MechanicalSystem, Predictor, Trajectory
 
@@ -81,19 +75,13 @@ class RolloutValidator:
     def check(self, truth: Trajectory, training: Sequence[Trajectory] = ()) -> None:
         """Raise ValueError for data that do not fit horizon, window and step; keep the training."""
         self._training = training
-        t = truth.until(self.horizon).t
-        if self.window is None:
-            samples_of("step", self.step, t)
-        else:
-            samples_of_window(self.window, self.step, t)
+        samples_of_window(self.window, self.step, truth.until(self.horizon).t)
 
     def predict(self, model: Predictor, truth: Trajectory) -> Prediction:
         """Roll out the model along the first ``horizon`` seconds of the truth."""
         step = model.fixed_step or self.step
         truth = truth.until(self.horizon)
-        if self.window is None:
-            return predict_trajectories(model, truth, step=step)
-        return predict_windows(model, truth, window=self.window, step=step)
+        return predict_trajectories(model, truth, window=self.window, step=step)
 
     def __call__(self, model: Predictor, truth: Trajectory) -> dict[str, float]:
         """Return mean, median, worst and windowed error, and the diverged count.
@@ -121,8 +109,11 @@ class RolloutValidator:
         still = HoldPosition(model.num_coordinates, model.num_inputs)
         trials = [(span, longest, self.predict(still, truth))]
         for n in steps:
-            both = [predict_windows(x, truth, window=n * step, step=step) for x in (model, still)]
-            trials.append((n * step, both[0], both[1]))
+            window = n * step
+            both = [
+                predict_trajectories(x, truth, window=window, step=step) for x in (model, still)
+            ]
+            trials.append((window, both[0], both[1]))
         ratios = [
             item.error().mean(dim=1) / max(float(held.error().mean()), self._motion(window))
             for window, item, held in trials

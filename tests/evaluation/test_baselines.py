@@ -5,7 +5,7 @@ import logging
 import pytest
 import torch
 
-from pinn_dyn.evaluation import build_baselines, predict_trajectories, predict_windows
+from pinn_dyn.evaluation import build_baselines, predict_trajectories
 from pinn_dyn.evaluation.prediction import common_stride, default_windows
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 
@@ -44,7 +44,7 @@ def test_baselines_predict_what_their_names_say(baselines):
 
 def test_windowed_baselines_restart_from_the_measured_state(baselines):
     truth = stack(swings(1, seed=2))
-    found = predict_windows(baselines["constant velocity"], truth, window=1.0, step=0.1)
+    found = predict_trajectories(baselines["constant velocity"], truth, window=1.0, step=0.1)
     samples = torch.arange(81)
     start = ((samples - 1).clamp(min=0) // 20) * 20
     expected = truth.q[0, start] + truth.v[0, start] * (T - T[start])[:, None]

@@ -7,7 +7,6 @@ from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import (
     Prediction,
     predict_trajectories,
-    predict_windows,
     rollout_metrics,
 )
 from pinn_dyn.evaluation.metrics import left_data, member_metrics, state_squared_error
@@ -126,7 +125,7 @@ def test_the_squared_error_of_the_state_adds_that_of_the_velocity():
     assert found["state_squared_error_mean"] == pytest.approx(float(square[:, ::2].mean()))
     variance = float(square[:, ::2].var(correction=0))
     assert found["state_squared_error_variance"] == pytest.approx(variance)
-    assert state_squared_error(predict_windows(PointMass(), truth, window=1.0)) == {}
+    assert state_squared_error(predict_trajectories(PointMass(), truth, window=1.0)) == {}
 
 
 def test_the_velocity_of_a_model_of_momenta_is_its_momentum_over_its_mass():
@@ -171,7 +170,7 @@ def test_the_model_of_the_caller_is_left_alone():
 def test_windows_are_set_back_to_the_true_state():
     truth = ramps()  # 12 intervals of 0.25 s
     model = PointMass(gain=2.0)
-    prediction = predict_windows(model, truth, window=1.0)
+    prediction = predict_trajectories(model, truth, window=1.0)
     assert torch.equal(prediction.t, truth.t)
     # By hand: a window from t0 doubles the acceleration c t, so it errs by c times the
     # integral of (s - r) r over r in (t0, s), (s - t0)^2 (s + 2 t0) / 6.
@@ -187,7 +186,7 @@ def test_a_momentum_model_starts_from_the_momentum():
     model = PointMass(state="qp")
     for prediction in (
         predict_trajectories(model, truth),
-        predict_windows(model, truth, window=1.0),
+        predict_trajectories(model, truth, window=1.0),
     ):
         torch.testing.assert_close(prediction.q_hat, prediction.q)
 
@@ -210,9 +209,9 @@ def test_errors_name_what_does_not_fit():
     with pytest.raises(ValueError, match=r"step is 0\.1 s and the sample time .* 0\.25 s"):
         predict_trajectories(model, truth, step=0.1)
     with pytest.raises(ValueError, match=r"window is 0\.75 s and step is 0\.5 s"):
-        predict_windows(model, truth, window=0.75, step=0.5)
+        predict_trajectories(model, truth, window=0.75, step=0.5)
     with pytest.raises(ValueError, match=r"window is 4\.0 s, but .* last only 3 s"):
-        predict_windows(model, truth, window=4.0)
+        predict_trajectories(model, truth, window=4.0)
     uneven = Trajectory(truth.q, truth.v, Signal(truth.t**2, truth.u))
     with pytest.raises(ValueError, match="sample time varies"):
         predict_trajectories(model, uneven, step=0.25)
@@ -228,9 +227,7 @@ def test_an_ensemble_is_predicted_with_its_members(windowed):
     truth = ramps()
 
     def predict(model):
-        if windowed:
-            return predict_windows(model, truth, window=1.0, step=0.5)
-        return predict_trajectories(model, truth, step=0.5)
+        return predict_trajectories(model, truth, window=1.0 if windowed else None, step=0.5)
 
     found = predict(Ensemble([PointMass(gain).eval() for gain in gains]))
     assert found.members.shape == (3, *found.q.shape)

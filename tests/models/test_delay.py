@@ -8,7 +8,7 @@ import torch
 from pinn_dyn.data.logs import SavitzkyGolayVelocity
 from pinn_dyn.data.windows import draw_windows
 from pinn_dyn.ensembles import Ensemble
-from pinn_dyn.evaluation import predict_trajectories, predict_windows
+from pinn_dyn.evaluation import predict_trajectories
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Sum, Trajectory
 from pinn_dyn.models import (
     AccelerationMLP,
@@ -188,7 +188,7 @@ def test_rollouts_see_the_input_before_their_start():
     assert_near(known.since(0.1).input.u, whole.u[None, 290:421], 0)
     seen = predict_trajectories(model, known).q_hat
     # The same piece as a window of the whole, and one whose past is not known.
-    again = predict_windows(
+    again = predict_trajectories(
         model,
         Trajectory(
             whole.q[None, :1201], whole.v[None, :1201], whole.input.mapped(lambda u: u[None])

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pinn_dyn.data.windows import draw_windows
-from pinn_dyn.evaluation.prediction import predict_trajectories, predict_windows
+from pinn_dyn.evaluation.prediction import predict_trajectories
 from pinn_dyn.exports.model_functions import model_functions
 from pinn_dyn.mechanics import Signal, Trajectory, stack
 from pinn_dyn.models import NextStateMLP, SubspaceEncoder
@@ -74,7 +74,7 @@ def test_evaluation_and_training_hand_over_the_past(model):
     expected = by_hand(model, q, v, u, 10, 10)
     assert_near(path.q_hat[0], torch.from_numpy(expected[:, :2]), 1e-6)
     assert_near(path.v_hat[0], torch.from_numpy(expected[:, 2:]), 1e-6)
-    found = predict_windows(model, piece, window=5 * STEP, step=STEP).q_hat[0]
+    found = predict_trajectories(model, piece, window=5 * STEP, step=STEP).q_hat[0]
     for k in (10, 15):  # resets to a measured state
         expected = by_hand(model, q, v, u, k, 5)
         assert_near(found[k - 9 : k - 4], torch.from_numpy(expected[1:, :2]), 1e-6)
@@ -136,6 +136,6 @@ def test_the_memory_finds_an_actuator_state_that_is_not_measured():
             optimizer.zero_grad()
             loss(model, windows[torch.arange(100) + 100 * (step % 20)]).backward()
             optimizer.step()
-        prediction = predict_windows(model, stack([test]), window=1.0, step=0.1)
+        prediction = predict_trajectories(model, stack([test]), window=1.0, step=0.1)
         errors[kind] = float(prediction.error().mean())
     assert errors[SubspaceEncoder] < 0.5 * errors[NextStateMLP]
