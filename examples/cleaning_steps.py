@@ -5,7 +5,7 @@ A data set names them as ``{_target_: examples.cleaning_steps.SubtractStart, sam
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -141,10 +141,7 @@ class RowClock(Step):
 
     longest: PositiveFloat
     rate: PositiveFloat
-
-    @property
-    def repairs(self) -> Collection[str]:
-        return ("bursts", "gaps", "repeated times")
+    repairs = ("bursts", "gaps", "repeated times")
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         rows, t, step = np.arange(len(recording)), recording.t - recording.t[0], 1 / self.rate

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +23,7 @@ class Deduplicate(Step):
     """
 
     longest: PositiveInt = 5
-
-    @property
-    def repairs(self) -> Collection[str]:
-        return ("repeated times",)
+    repairs = ("repeated times",)
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         values = recording.values()
@@ -52,10 +49,7 @@ class SplitGaps(Step):
     """
 
     longest: PositiveFloat
-
-    @property
-    def repairs(self) -> Collection[str]:
-        return ("gaps",)
+    repairs = ("gaps",)
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         spacing = np.diff(recording.t)
@@ -78,10 +72,7 @@ class Resample(Step):
 
     rate: PositiveFloat
     max_gap: PositiveFloat
-
-    @property
-    def repairs(self) -> Collection[str]:
-        return ("gaps",)
+    repairs = ("gaps",)
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
         t = recording.t

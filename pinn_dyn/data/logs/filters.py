@@ -90,7 +90,7 @@ class RemoveJumps(Step):
     signals: Signals = ("q",)
 
     @property
-    def repairs(self) -> Collection[str]:
+    def repairs(self) -> Collection[str]:  # type: ignore[override]
         return [f"jumps of {signal}" for signal in self.signals]
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:

@@ -17,15 +17,14 @@ Signals = Sequence[Literal["q", "v", "u"]]
 
 
 class Step(abc.ABC):
-    """One step of the cleaning: maps a recording to recordings and a note for the report."""
+    """One step of the cleaning: maps a recording to recordings and a note for the report.
 
-    @property
-    def repairs(self) -> Collection[str]:
-        """Faults that the step repairs, and that are then no errors.
+    Attributes:
+        repairs: faults that the step repairs, and that are then no errors: ``"gaps"``,
+            ``"repeated times"``, ``"bursts"``, ``"jumps of q"``.
+    """
 
-        ``"gaps"``, ``"repeated times"``, ``"bursts"``, ``"jumps of q"``.
-        """
-        return ()
+    repairs: Collection[str] = ()
 
     @abc.abstractmethod
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
