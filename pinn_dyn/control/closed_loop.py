@@ -27,7 +27,6 @@ def close_loop(
     actuator: Actuator | None = None,
     sensor: Sensor | None = None,
     delay: int = 0,
-    q_bound: float = 1e3,
     progress: str | None = None,
 ) -> ClosedLoopRecord:
     """Run a sampled closed loop, K copies at once, with the input held between instants::
@@ -35,7 +34,7 @@ def close_loop(
         u_wanted(t_k) = law(t_k, q + noise, v + noise, reference(t_k))
         u(t_k) = actuator(u_wanted(t_k-d)),    t_k = k / rate,  k = 0 ... duration * rate
 
-    A copy is stopped if its state, measurement or input is not finite, q leaves its bound, or the
+    A copy is stopped if its state, measurement or input is not finite, |q| exceeds 1000, or the
     controller reports a fault. The other copies go on. Ctrl-C returns the record up to then.
 
     Args:
@@ -48,14 +47,13 @@ def close_loop(
         actuator: limits of the input.
         sensor: noise of the measurement.
         delay: dead time of the input in control instants, with zero input before.
-        q_bound: a copy with |q| beyond this bound has diverged, in the units of q.
         progress: name of the task in lines of progress; None logs none.
 
     Raises:
         ValueError: on sizes that do not agree, or a duration that is no multiple of 1 / rate.
     """
     q0, v0 = q0.double(), v0.double()
-    run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator, q_bound)
+    run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator)
     queue = deque([q0.new_zeros(len(q0), plant.num_inputs)] * delay)
     if sensor is not None:
         sensor.reset()
@@ -84,7 +82,12 @@ def close_loop(
 
 
 class LoopRun:
-    """The state of a run: the copies that still run, the law's measurements, and the record."""
+    """The state of a run: the copies that still run, the law's measurements, and the record.
+
+    A copy with |q| beyond ``q_bound`` has diverged, in the units of q.
+    """
+
+    q_bound = 1e3
 
     def __init__(
         self,
@@ -96,7 +99,6 @@ class LoopRun:
         duration: float,
         rate: float,
         actuator: Actuator | None,
-        q_bound: float,
     ):
         n, m = plant.num_coordinates, plant.num_inputs
         for name, sizes, expected in (
@@ -116,7 +118,7 @@ class LoopRun:
         self.running = torch.ones(len(q0), dtype=torch.bool, device=q0.device)
         self._shape_of_u = (len(q0), m)
         self._controller, self._actuator = controller, actuator
-        self._interval, self._q_bound = 1 / rate, q_bound
+        self._interval = 1 / rate
         self._measured = q0.clone(), v0.clone()
         self._motions = [motion_of_copies(reference, float(t), q0) for t in self.t]
         samples = (len(q0), len(self.t))
@@ -142,8 +144,8 @@ class LoopRun:
         self.stop(~finite, time, "the plant diverged: its state is not finite")
         self._q[self.running, k] = q[self.running]
         self._v[self.running, k] = v[self.running]
-        beyond = (q.abs() > self._q_bound).any(-1)
-        self.stop(beyond, time, f"the plant diverged: |q| is beyond {self._q_bound:g}")
+        beyond = (q.abs() > self.q_bound).any(-1)
+        self.stop(beyond, time, f"the plant diverged: |q| is beyond {self.q_bound:g}")
 
     def measure(self, k: int, q: Tensor, v: Tensor) -> None:
         """Store the measurement at instant k; stop the copies where it is not finite."""

@@ -15,6 +15,8 @@ from pinn_dyn.control.record import ClosedLoopRecord
 from pinn_dyn.mechanics import MechanicalSystem
 from pinn_dyn.progress import Progress
 
+_RTOL, _ATOL = 1e-6, 1e-8  # tolerances of the solver, relative and in the units of q and v
+
 
 def close_loop_continuous(
     system: MechanicalSystem,
@@ -26,9 +28,6 @@ def close_loop_continuous(
     duration: float,
     samples_rate: float,
     actuator: Actuator | None = None,
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
-    q_bound: float = 1e3,
     progress: str | None = None,
 ) -> ClosedLoopRecord:
     """Run a closed loop whose law acts in continuous time, K copies at once::
@@ -41,15 +40,14 @@ def close_loop_continuous(
     Args:
         system: the system that is controlled.
         controller: the law; it must have no memory.
-        reference, q0, v0, duration, q_bound, progress: as for :func:`close_loop`.
+        reference, q0, v0, duration, progress: as for :func:`close_loop`.
         samples_rate: samples of the record per second, 1/s.
         actuator: limits of the input, without a rate.
-        rtol, atol: tolerances of the solver, relative and in the units of q and v.
     """
     if actuator is not None and actuator.rate is not None:
         raise ValueError("actuator.rate needs control instants: leave it out, or give a rate")
     q0, v0 = q0.double(), v0.double()
-    run = LoopRun(system, controller, reference, q0, v0, duration, samples_rate, actuator, q_bound)
+    run = LoopRun(system, controller, reference, q0, v0, duration, samples_rate, actuator)
     states = q0.new_full((len(q0), len(run.t), 2 * q0.shape[1]), torch.nan)
     states[:, 0] = torch.cat([q0, v0], -1)
 
@@ -79,8 +77,8 @@ def close_loop_continuous(
             0.0,
             states[copies, 0].numpy().ravel(),
             float(run.t[-1]),
-            rtol=share * rtol,
-            atol=share * atol,
+            rtol=share * _RTOL,
+            atol=share * _ATOL,
             jac_sparsity=block_diag([np.ones((size, size))] * count),
             vectorized=True,
         )
@@ -98,8 +96,8 @@ def close_loop_continuous(
                     x = torch.from_numpy(solver.dense_output()(run.t[now].numpy()))
                     states[copies[:, None], now] = x.unflatten(0, (count, -1)).transpose(1, 2)
                 lines.update(float(solver.t))
-                if np.abs(solver.y.reshape(count, 2, -1)[:, 0]).max() > q_bound:
-                    return float(solver.t), f"the plant diverged: |q| is beyond {q_bound:g}"
+                if np.abs(solver.y.reshape(count, 2, -1)[:, 0]).max() > run.q_bound:
+                    return float(solver.t), f"the plant diverged: |q| is beyond {run.q_bound:g}"
         return np.inf, ""
 
     with torch.no_grad():

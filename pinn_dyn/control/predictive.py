@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 
 _FIRST_ITERATIONS = 20  # times as many iterations at the first instant, without a previous plan
 _LARGEST_GAP = 0.1  # largest gap of a plan that counts as a solution
+_LIMIT_WEIGHT = 1e3  # rho of a violated limit of the state
 _Values = float | Sequence[float] | None
 _Weight = NonNegativeFloat | Sequence[NonNegativeFloat]
 
@@ -58,7 +59,6 @@ class PredictiveControl(Controller):
             end of the reference.
         actuator: hard limits of the input and of its rate.
         q_low, q_high, v_max: soft limits of the state, one number or N; None for no limit.
-        limit_weight: rho, weight of a violated limit of the state.
         iterations: quadratic programs per instant; the first instant may take 20 times as many.
         observer_bandwidth: K_O in 1/s of an observer of the acceleration d that the model does not
             explain, d_k+1 = d_k + (1 - exp(-K_O T)) (measured - d_k); None for d = 0.
@@ -86,7 +86,6 @@ class PredictiveControl(Controller):
         q_low: _Values = None,
         q_high: _Values = None,
         v_max: _Values = None,
-        limit_weight: PositiveFloat = 1e3,
         iterations: PositiveInt = 2,
         observer_bandwidth: PositiveFloat | None = None,
     ):
@@ -113,7 +112,7 @@ class PredictiveControl(Controller):
             np.concatenate(x_weight),
             _row("input_weight", input_weight, m),
             _row("rate_weight", rate_weight, m),
-            limit_weight,
+            _LIMIT_WEIGHT,
         )
         self.problem = ShootingProblem(model, self.step, steps, self.weights, self.limits)
         self._terminal, self._iterations = terminal_weight, iterations

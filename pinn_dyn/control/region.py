@@ -38,7 +38,6 @@ class DataRegion:
         q, v: configurations and velocities of the training trajectories, ``(T_k, N)`` each.
         angles: indices of the coordinates that are angles of unlimited joints.
         samples: S, largest number of states that are drawn.
-        seed: seed of the draw.
 
     Raises:
         ValueError: if the trajectories hold the same states.
@@ -51,7 +50,6 @@ class DataRegion:
         *,
         angles: Sequence[NonNegativeInt] = (),
         samples: PositiveInt = 5000,
-        seed: NonNegativeInt = 0,
     ):
         self.num_coordinates = int(q[0].shape[-1])
         self.angles = sorted(angles)
@@ -67,7 +65,7 @@ class DataRegion:
             trajectory = np.repeat(np.arange(len(q)), [len(x) for x in q])
 
         count = min(samples, len(states))
-        drawn = np.random.default_rng(seed).choice(len(states), count, replace=False)
+        drawn = np.random.default_rng(0).choice(len(states), count, replace=False)
         states, trajectory = states[drawn] / self._scale, trajectory[drawn]
         self._tree = cKDTree(states)
         distances = [

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from pinn_dyn.control.closed_loop import LoopRun
 from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.effects import Sensor
 from pinn_dyn.control.plants import SystemPlant
@@ -81,9 +82,10 @@ def test_a_plant_that_diverges_stops_its_copy_even_while_its_input_is_delayed():
     torch.testing.assert_close(record.q[[0, 2]], others.q, rtol=0, atol=1e-6)
 
 
-def test_a_copy_beyond_its_bound_is_stopped(undisturbed):
+def test_a_copy_beyond_its_bound_is_stopped(undisturbed, monkeypatch):
     bound = 1.02 * float(Q0[1].abs().max())
-    runs = {"sampled": sampled(q_bound=bound, controller=PD(k_p=-300.0, k_d=0.0))}
+    monkeypatch.setattr(LoopRun, "q_bound", bound)
+    runs = {"sampled": sampled(controller=PD(k_p=-300.0, k_d=0.0))}
     runs["continuous"] = close_loop_continuous(
         spring(),
         PD(k_p=-300.0, k_d=0.0),
@@ -92,7 +94,6 @@ def test_a_copy_beyond_its_bound_is_stopped(undisturbed):
         V0,
         duration=0.4,
         samples_rate=50.0,
-        q_bound=bound,
     )
     for record in runs.values():
         assert all("|q| is beyond 1.02 at t = " in reason for reason in record.stopped)
@@ -103,13 +104,14 @@ def test_a_copy_beyond_its_bound_is_stopped(undisturbed):
 
 
 @pytest.mark.slow
-def test_a_copy_that_a_continuous_loop_loses_leaves_the_others_unharmed():
+def test_a_copy_that_a_continuous_loop_loses_leaves_the_others_unharmed(monkeypatch):
+    monkeypatch.setattr(LoopRun, "q_bound", 50.0)
     still, law = Wave(double([0.0])), PD(size=1, k_p=1e-9, k_d=1e-9)
     q0, v0 = double([[0.0], [0.0], [0.1], [0.2], [0.3]]), double([[0.1], [3.0], [0], [-1], [0.4]])
 
     def run(q0, v0):
         return close_loop_continuous(
-            Vanishing(), law, still, q0, v0, duration=0.4, samples_rate=50.0, q_bound=50.0
+            Vanishing(), law, still, q0, v0, duration=0.4, samples_rate=50.0
         )
 
     record, rest = run(q0, v0), [0, 2, 3, 4]
