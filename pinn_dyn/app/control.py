@@ -88,7 +88,7 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         robot,
         q0=q0,
         v0=v0,
-        plant=None if config["rate"] is None else build_part("plant", config["plant"], robot),
+        plant=build_part("plant", config["plant"], robot) if config["plant"] else None,
         actuator=build_part("actuator", config["actuator"]),
         sensor=sensor if noisy else None,
         progress=True,

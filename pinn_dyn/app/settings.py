@@ -178,7 +178,7 @@ class ControlSettings:
     trust: Names | None = None
     controllers: Mapping[str, Law | Mapping[str, Any]]
     reference: Reference | Callable[..., Reference]
-    plant: Plant | Callable[..., Plant]
+    plant: Plant | Callable[..., Plant] | None
 
 
 @dataclass(kw_only=True)

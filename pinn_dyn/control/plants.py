@@ -89,7 +89,7 @@ class SimulatorPlant(Plant):
 
     def __init__(self, arm: Stepped, *, step: PositiveFloat = 0.001):
         if not isinstance(arm, Stepped):
-            raise TypeError(f"{type(arm).__name__} has no simulator: use plant=simulated")
+            raise TypeError(f"{type(arm).__name__} has no simulator")
         self.num_coordinates = arm.num_coordinates
         self.num_inputs = arm.num_inputs
         self._arm, self._step = arm, step
@@ -103,7 +103,7 @@ class SimulatorPlant(Plant):
         if steps < 1 or abs(duration / self._step - steps) > 1e-6:
             raise ValueError(
                 f"duration is {duration:g} s, expected an integer multiple of the simulator's step "
-                f"of {self._step:g} s: change the rate or plant.step"
+                f"of {self._step:g} s: change the rate or the step"
             )
         for k, torque in enumerate(u.double().numpy()):
             state = self._x[k].numpy()

@@ -19,6 +19,7 @@ from pinn_dyn.control import (
     Plant,
     Reference,
     Sensor,
+    SimulatorPlant,
     SystemPlant,
     close_loop_continuous,
 )
@@ -28,7 +29,7 @@ from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
 from pinn_dyn.evaluation.tables import write_table
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
-from pinn_dyn.systems import HasDomain, HasLimits
+from pinn_dyn.systems import HasDomain, HasLimits, Stepped
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,8 @@ def close_loops(
         rate: control instants per second, 1/s; None for a law in continuous time.
         samples_rate: samples per second of a continuous-time record, 1/s.
         q0, v0: initial states, ``(K, N)`` each; None starts on the reference.
-        plant: the simulation of the robot at control instants; None solves its equation of motion.
+        plant: the simulation of the robot at control instants; None takes the simulator of a
+            :class:`~pinn_dyn.systems.Stepped` robot, and solves the equation of motion of others.
         actuator: limits of the input.
         sensor: noise of the measurement.
         delay: dead time of the input, control instants.
@@ -139,6 +141,8 @@ def close_loops(
     _check_reference(reference, robot, q0, duration)
     if rate is None and (delay or sensor is not None):
         raise ValueError("a law in continuous time has no delay and no sensor noise: give a rate")
+    if plant is None:
+        plant = SimulatorPlant(robot) if isinstance(robot, Stepped) else SystemPlant(robot)
     records, metrics = {}, {}
     for name, law in laws.items():
         common: dict[str, Any] = {"duration": duration, "actuator": actuator}
@@ -148,7 +152,6 @@ def close_loops(
                 robot, law, reference, q0, v0, samples_rate=samples_rate, **common
             )
         else:
-            plant = SystemPlant(robot) if plant is None else plant
             records[name] = close_sampled_loop(
                 plant, law, reference, q0, v0, rate=rate, sensor=sensor, delay=delay, **common
             )

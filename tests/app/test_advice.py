@@ -75,7 +75,6 @@ COMMANDS = {
         "+controllers.learned.observer={_target_: pinn_dyn.control.DisturbanceObserver, "
         "_partial_: true, bandwidth: 20}",
     ],
-    "plant without a simulator": ["control.py", *LOOP, "rate=200", "plant=simulator"],
     "gains that let the loop diverge": [
         *("control.py", *LOOP, "rate=100"),
         *("gains.position=2e4", "gains.velocity=300", "controllers.learned.terms=truth"),

@@ -211,7 +211,6 @@ def test_the_law_of_an_experiment_goes_to_the_kind_of_its_file(
         (["rate=null", "actuator.rate=1.0"], ["rate"]),
         (["rate=null", "delay=1"], ["delay", "rate"]),
         (["rate=null", "sensor.v_noise=0.1"], ["sensor", "rate"]),
-        (["plant=simulator", "rate=200"], ["plant"]),
         (["trajectory=3"], ["trajectory is 3", "0 to 2"]),
         (["member=1"], ["member is 1", "a single model"]),
         (["checkpoint=first"], ["first", "'best' or 'last'"]),
