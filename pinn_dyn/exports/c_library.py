@@ -7,7 +7,7 @@ import hashlib
 import logging
 import os
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,8 +21,11 @@ from pinn_dyn.exports.program import trace
 
 log = logging.getLogger(__name__)
 
-_FLAGS = ["-std=gnu99", "-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared"]
+_FLAGS = ["-std=gnu99", "-march=native", "-fno-math-errno", "-fPIC", "-shared"]
 _FLAGS += ["-D__FAST_MATH__"]  # makes glibc declare exp, tanh and so on of vectors, nothing else
+QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
+"""Optimization that takes a third of the time of ``-O3`` for a rigid chain with sticking joints.
+The code has 0.8 of its speed (benchmarks/long_rollout.py)."""
 
 
 def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[Tensor], Tensor]:
@@ -61,8 +64,10 @@ def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[
         return function
 
 
-def load_code(code: str) -> ctypes.CDLL:
+def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     """Compile C code for this processor, unless the cache folder has the library, and load it.
+
+    ``optimization`` is a list of flags of the compiler.
 
     Raises:
         FileNotFoundError: without a C compiler.
@@ -71,7 +76,8 @@ def load_code(code: str) -> ctypes.CDLL:
     compiler = find_compiler()
     if compiler is None:
         raise FileNotFoundError("no C compiler is installed: set CC to one")
-    digest = hashlib.sha256((code + _target(*compiler)).encode()).hexdigest()
+    flags = [*_FLAGS, *optimization]
+    digest = hashlib.sha256((code + _target(*compiler, *flags)).encode()).hexdigest()
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
     library = folder / f"{digest}.so"
     if not library.exists():
@@ -79,12 +85,12 @@ def load_code(code: str) -> ctypes.CDLL:
         with TemporaryDirectory(dir=folder) as name:
             source = Path(name) / "code.c"
             source.write_text(code)
-            os.replace(compile_c(compiler, _FLAGS, source), library)
+            os.replace(compile_c(compiler, flags, source), library)
     return ctypes.CDLL(str(library))
 
 
 @cache
 def _target(*compiler: str) -> str:
-    """Return the version of a compiler and its flags for this processor."""
-    command = [*compiler, *_FLAGS, "-###", "-E", "-x", "c", "-"]
+    """Return the version of a compiler with flags, and all its flags for this processor."""
+    command = [*compiler, "-###", "-E", "-x", "c", "-"]
     return subprocess.run(command, capture_output=True, text=True, check=True).stderr

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pinn_dyn.exports.c_code import PRELUDE, CFunction, Constants
 from pinn_dyn.exports.c_file import find_compiler
-from pinn_dyn.exports.c_library import load_code
+from pinn_dyn.exports.c_library import QUICK, load_code
 from pinn_dyn.exports.program import trace
 from pinn_dyn.mechanics.compilation import Wrapped
 from pinn_dyn.mechanics.integrators import Dynamics, Integrator
@@ -21,9 +21,10 @@ from pinn_dyn.mechanics.signal import Signal
 
 log = logging.getLogger(__name__)
 
-STEPS = 2000
-"""Number of steps from which a loop pays off. A step in Python takes 4 to 10 ms. Building a loop
-takes 1 to 4 s from the cache folder, and up to 23 s before (benchmarks/long_rollout.py)."""
+STEPS = 3000
+"""Number of steps from which a loop pays off at its first use. A step in Python takes 4 to 10 ms.
+Building a loop takes up to 12 s, and 1 to 4 s from the cache folder (benchmarks/long_rollout.py).
+"""
 NUMBERS = 2**21
 """Number of inputs that are computed at once, to limit the memory of large batches."""
 _LOOP = """
@@ -95,7 +96,7 @@ class _Loop:
             code += [f"static void {name}({text})", "{", *lines, "}"]
         definitions = ["typedef double real;", PRELUDE, *constants.definitions()]
         loop = _LOOP.format(size=x.numel(), stages=inputs.numel())
-        self._function = load_code("\n".join([*definitions, *code, loop])).roll_out
+        self._function = load_code("\n".join([*definitions, *code, loop]), QUICK).roll_out
         self._values = torch.cat([*constants.values, x.new_zeros(1)])
 
     def __call__(self, increment: Tensor, start: Tensor, inputs: Tensor, lengths: Tensor) -> Tensor:

@@ -23,8 +23,7 @@ def cached(monkeypatch, tmp_path):
     """Loops for paths of any length, compiled quickly, in a cache folder of the test."""
     monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path))
     monkeypatch.setattr(c_loop, "STEPS", 1)
-    monkeypatch.setattr(c_library, "_FLAGS", [x.replace("-O3", "-O1") for x in c_library._FLAGS])
-    c_library._target.cache_clear()
+    monkeypatch.setattr(c_loop, "QUICK", ("-O1",))
     monkeypatch.setattr(c_loop, "_LOOPS", {})
     return tmp_path
 
