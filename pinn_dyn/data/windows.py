@@ -53,7 +53,9 @@ class Windows:
 
     def __getitem__(self, index: Tensor) -> Windows:
         """Return the windows at the positions ``index``."""
-        return self._map(lambda value: value[index])
+        rows, shape = index.flatten(), index.shape
+        # Several times faster than value[index].
+        return self._map(lambda x: x.index_select(0, rows).view(*shape, *x.shape[1:]))
 
     def unbind(self) -> Iterator[Windows]:
         """Iterate over the first of several leading dimensions, by views."""
@@ -292,8 +294,7 @@ class BatchSampler(Sampler[Tensor]):
     def __iter__(self) -> Iterator[Tensor]:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
         per_pass = max(self.size // self.batch_size, 1)
-        for number in range(self.batches):
-            if number % per_pass == 0:
-                order = torch.randperm(self.size, generator=generator)
-            first = (number % per_pass) * self.batch_size
-            yield order[first : first + self.batch_size][self.rank :: self.processes]
+        for first in range(0, self.batches, per_pass):
+            order = torch.randperm(self.size, generator=generator)[: per_pass * self.batch_size]
+            rows = order.view(per_pass, -1)[:, self.rank :: self.processes]
+            yield from rows[: self.batches - first].unbind()

@@ -37,7 +37,7 @@ class CompiledMembers:
             return losses.detach(), self.vector.gradient_of(losses.sum())
         if windows.q.is_cuda:
             return self._program(windows, len(windows))
-        batches = [windows[index] for index in torch.arange(len(windows))]
+        batches = list(windows.unbind())
         results = self._program.in_parallel(self.vector.values.detach().unbind(), batches)
         losses, gradients = map(torch.stack, zip(*results, strict=True))
         return losses, gradients
