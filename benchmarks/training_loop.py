@@ -51,6 +51,8 @@ from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM
 RESULTS = Path(__file__).parent / "results"
 STEP = 2e-3
 PAIRS = 16_384
+EPOCH = trainer.LONGEST_EPOCH
+"""Steps between two checkpoints of train.py."""
 CHECKED = 20
 """Steps after which the weights of both sides are compared."""
 CELL = ("coordinates", "batch", "loss", "optimizer", "members")
@@ -167,11 +169,10 @@ def run_cell(
     steps: int | None = None,
     compiled: bool = True,
 ) -> Row:
-    """The row of a cell: ``rounds`` epochs of ``steps`` steps, by default some 10 s of them."""
+    """The row of a cell: ``rounds`` epochs of ``steps`` steps."""
     torch._dynamo.reset()
-    if steps is None:  # an epoch has half of the usual steps; of large batches fewer will do
-        most = min(max(200_000 // batch, 40), 500)
-        steps = next(n for n in range(most, 0, -1) if STEPS_FOR_PROGRAM % n == 0)
+    if steps is None:  # of an epoch, which ends with a checkpoint; fewer will do of large batches
+        steps = EPOCH if batch <= 1024 else 40
     trainer.LONGEST_EPOCH = steps
     config = configuration(size, batch, loss, optimizer, members, device, compiled)
     L.seed_everything(0, verbose=False)
