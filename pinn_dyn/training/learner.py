@@ -7,6 +7,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import islice
 from typing import Any, Literal
 
@@ -89,6 +90,7 @@ class DynamicsLearner(L.LightningModule):
         self._clipping = gradient_clip_val, gradient_clip_algorithm == "value"
         self._compiled: CompiledAdamW | None = None
         self._losses: list[Tensor] = []  # losses of this epoch
+        self._pace = math.inf  # time of a step, s
 
     def gradients(self, vector: ParameterVector, steps: int) -> Engine:
         """Return the engine that computes loss and gradient in a training of ``steps`` steps."""
@@ -104,16 +106,23 @@ class DynamicsLearner(L.LightningModule):
             self._losses.clear()  # of an interrupted epoch
         # Without the hooks of Lightning around a step, which take as long as AdamW.
         optimizer, schedule = self.optimizers(use_pl_optimizer=False), self.lr_schedulers()
-        step, until, count = self.global_step, time.monotonic() + BLOCK_SECONDS, len(self._losses)
-        done = 0
+        step, count = self.global_step, len(self._losses)
+        fetched = islice(dataloader_iter, self._steps_until_due(before))
+        # All batches are prepared first: Python between two steps evicts the program's data.
+        steps = [
+            self._prepared_step(batch, step + k, optimizer)  # type: ignore[arg-type]
+            for k, (batch, _, _) in enumerate(fetched)
+        ]
+        if self._vector.parameters[0].grad is None:  # the trainer clears them at first
+            self._vector.show_gradients()
+        done, start = 0, time.monotonic()
         try:
-            for batch, _, _ in islice(dataloader_iter, self._steps_until_due(before)):
-                self._take_step(optimizer, batch, step + done)  # type: ignore[arg-type]
+            for take in steps:
+                self._losses.append(take())
                 schedule.step()  # type: ignore[union-attr]
                 done += 1
-                if time.monotonic() > until:
-                    break
         finally:
+            self._pace = (time.monotonic() - start) / max(done, 1)
             self._count_steps(done)
             if new := self._losses[count:]:
                 self._refuse_non_finite(torch.stack(new), step)
@@ -134,18 +143,16 @@ class DynamicsLearner(L.LightningModule):
         loop.batch_progress.increment_by(done - 1)
         loop._batches_that_stepped += done - 1
 
-    def _take_step(self, optimizer: Optimizer, batch: Windows, step: int) -> None:
-        """Take an optimizer step on a batch, by one program if possible."""
+    def _prepared_step(
+        self, batch: Windows, step: int, optimizer: Optimizer
+    ) -> Callable[[], Tensor]:
+        """Return a function that takes an optimizer step on a batch, by one program if possible."""
         # The step is restored from a checkpoint, so a resumed training has the same progress.
         windows = self.loss.selected(batch, step / self._steps)
-        losses: Any = None
+        take: Any = None
         if self._compiled is not None:
-            losses = self._gradients.step(windows, self._compiled)  # type: ignore[attr-defined]
-        if losses is None:
-            losses = optimizer.step(self._closure(windows))  # type: ignore[arg-type]
-        if self._vector.parameters[0].grad is None:  # the trainer clears them at first
-            self._vector.show_gradients()
-        self._losses.append(losses)
+            take = self._gradients.step(windows, self._compiled)  # type: ignore[attr-defined]
+        return take or partial(optimizer.step, self._closure(windows))
 
     def _steps_until_due(self, before: int) -> int:
         """Return the number of steps until Lightning may have something to do."""
@@ -154,7 +161,7 @@ class DynamicsLearner(L.LightningModule):
         if trainer.world_size > 1 or averaged:
             return 1
         steps = self.global_step
-        due = [int(trainer.num_training_batches) - before]
+        due = [int(trainer.num_training_batches) - before, int(BLOCK_SECONDS / self._pace)]
         if period := trainer.log_every_n_steps:  # type: ignore[attr-defined]
             due += [period - steps % period, period - (steps + 1) % period]
         if isinstance(period := trainer.val_check_batch, int):

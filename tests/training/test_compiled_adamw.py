@@ -32,7 +32,7 @@ def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
     for k in steps:
         batch = make_windows(8, size=2, seed=k)
         if compiled:
-            assert engine.step(batch, program) is not None
+            engine.step(batch, program)()
         else:
             _, gradient = Eager(loss, model, vector)(batch)
             vector.gradient.copy_(clipped(gradient, *clipping))

@@ -189,8 +189,9 @@ def trained(tmp_path, data, monkeypatch, seconds, **options):
 def test_many_steps_in_one_are_the_same_training(tmp_path, data, monkeypatch):
     """They end where a log is due or an epoch ends, or each by itself when time is short."""
     together, ends, trainer = trained(tmp_path, data, monkeypatch, 100.0)
-    assert ends.steps == [19, 20, 30, 39, 40, 59, 60]
-    assert ends.batches == [19, 20, 30, 9, 10, 29, 30]
+    # The first step tells how many fit into the time.
+    assert ends.steps == [1, 19, 20, 30, 39, 40, 59, 60]
+    assert ends.batches == [1, 19, 20, 30, 9, 10, 29, 30]
     alone, each, other = trained(tmp_path, data, monkeypatch, 0.0)
     assert each.steps == list(range(1, 61))
     assert trainer.global_step == other.global_step == 60

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -37,8 +39,8 @@ class Compiled:
         self._program = LossProgram(loss, model, vector)
         self.evaluations = EvaluationCount(loss, model)
 
-    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Tensor | None:
-        """Take a step on a batch and return the loss, or None if this is not worth a program."""
+    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], Tensor] | None:
+        """Return a function that takes a step on a batch, or None if a program does not pay off."""
         part = self._part(windows)
         if part is None or len(windows) >= 2 * part or windows.q.is_cuda:
             return None

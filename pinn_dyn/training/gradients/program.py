@@ -56,8 +56,8 @@ class LossProgram:
         programs = [self._program(self._traced(batch), batch, rows) for batch, rows in pairs]
         return self._run(programs, arguments)
 
-    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Tensor:
-        """Take a step of the optimizer on a batch on the CPU, and return the loss."""
+    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], Tensor]:
+        """Return a function that takes a step on a batch on the CPU, and returns the loss."""
         evaluate = self._traced(windows)
 
         def step(*arguments: Tensor) -> list[Tensor]:
@@ -66,9 +66,14 @@ class LossProgram:
             optimizer.step(gradient, *moved)
             return [loss]
 
-        arguments = (*optimizer.arguments(), *self._rows(windows))
-        ((loss,),) = self._run([self._program(step, windows, arguments)], [arguments])
-        return loss
+        rows = self._rows(windows)
+        program = self._program(step, windows, (*optimizer.arguments(), *rows))
+
+        def take() -> Tensor:
+            ((loss,),) = self._run([program], [(*optimizer.arguments(), *rows)])
+            return loss
+
+        return take
 
     def _rows(self, windows: Windows) -> list[Tensor]:
         rows = [getattr(windows, name) for name in _ROWS[self._loss.model.state]]
