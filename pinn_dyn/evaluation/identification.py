@@ -105,11 +105,20 @@ def undetermined(model: LearnedConstants, fit: Fit) -> list[str]:
     """Describe the directions of the parameters that only the prior determines.
 
     They span the eigenvectors of the covariance whose variance is more than half of the prior's.
+    Widths of friction that a fit with sticking does not use are left out.
     """
+    widths = {x for item in model.physical_constants() if item.upper_limit for x in item.names}
+    unused = {
+        name
+        for name, row in zip(model.parameter_names(), fit.information, strict=True)
+        if name in widths and not row.any()
+    }
     variances, vectors = torch.linalg.eigh(fit.covariance)
     space = vectors[:, variances > OPEN].T.numpy()
     lines = []
     for item in reversed(named_directions(space, model.parameter_names())):
+        if item.text in unused:
+            continue
         variance = item.direction @ fit.covariance.numpy() @ item.direction
         lines.append(f"{item.text}: held by the prior ({variance:.0%} of its variance is left)")
     return lines

@@ -53,6 +53,19 @@ def test_undetermined_parameters_are_named_one_by_one(model):
     assert {text.split(":")[0] for text in lines} == set(undetermined_names)
 
 
+def test_widths_that_rollouts_with_sticking_do_not_use_are_not_undetermined():
+    model = known_model(friction=AsymmetricCoulomb)
+    names = model.parameter_names()
+    variances = torch.full((len(names),), 0.01).double()
+    variances[[name.startswith("friction width of") for name in names]] = 1.0
+    assert not undetermined(model, fit_with(model, variances))
+    variances[names.index("friction width of slide")] = 0.9  # an identification uses the widths
+    variances[names.index("mass of slider")] = 1.0
+    lines = undetermined(model, fit_with(model, variances))
+    named = {text.split(":")[0] for text in lines}
+    assert named == {"friction width of slide", "mass of slider"}
+
+
 def test_what_no_data_determine_keeps_the_width_of_the_prior(model):
     """Though its slope has become small on the way from the start."""
     names = model.parameter_names()
