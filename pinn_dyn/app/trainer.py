@@ -67,7 +67,8 @@ def build_learner(
     )
     with naming("optimizer"):
         if isinstance(optimizer, LeastSquares):
-            return LeastSquaresLearner(model, solver=optimizer, **common)  # type: ignore[arg-type]
+            common |= dict(solver=optimizer, part_errors=validator.part_errors)
+            return LeastSquaresLearner(model, **common)  # type: ignore[arg-type]
         learner = EnsembleLearner if isinstance(model, Ensemble) else DynamicsLearner
         common |= dict(optimizer=optimizer, scheduler=scheduler, compile=compile)
         return learner(model, **common, **clipping)

@@ -97,11 +97,20 @@ class RolloutValidator:
             errors |= {name: of_members[name] for name in ("member_error_mean", "spread_mean")}
         if isinstance(model, MechanicalSystem) and model.has_residual:
             errors["residual_share"] = residual_share(model, truth.until(self.horizon))
-        errors["error_windowed"] = self._windowed(model, truth, prediction)
+        errors["error_windowed"] = float(self._windowed(model, truth, prediction).mean())
         return errors
 
-    def _windowed(self, model: Predictor, truth: Trajectory, longest: Prediction) -> float:
-        """Return ``error_windowed``, with ``longest`` for the longest window."""
+    def part_errors(self, model: Predictor, truth: Trajectory) -> Tensor:
+        """Return ``error_windowed`` of the quarters of K trajectories, ``(4 K,)``."""
+        return self._windowed(model, truth, self.predict(model, truth), parts=4).flatten()
+
+    def _windowed(
+        self, model: Predictor, truth: Trajectory, longest: Prediction, parts: int = 1
+    ) -> Tensor:
+        """Return ``error_windowed`` of parts in time of each trajectory, ``(K, parts)``.
+
+        The prediction ``longest`` is that of the longest window.
+        """
         step = model.fixed_step or self.step
         truth = truth.until(self.horizon)
         span = self.window or self.horizon
@@ -114,13 +123,15 @@ class RolloutValidator:
                 predict_trajectories(x, truth, window=window, step=step) for x in (model, still)
             ]
             trials.append((window, both[0], both[1]))
+        parts = min(parts, *(len(item.t) for _, item, _ in trials))
         ratios = [
-            item.error().mean(dim=1) / max(float(held.error().mean()), self._motion(window))
+            torch.stack([x.mean(dim=1) for x in item.error().tensor_split(parts, dim=1)], dim=1)
+            / max(float(held.error().mean()), self._motion(window))
             for window, item, held in trials
         ]
         ratio, largest = torch.stack(ratios).nan_to_num(torch.inf), _LARGEST_RATIO
         limited = torch.where(ratio > largest / 2, largest - largest**2 / (4 * ratio), ratio)
-        return float(limited.mean())
+        return limited.mean(dim=0)
 
     def _motion(self, window: float) -> float:
         """Return the mean distance in the training from the start of windows in s."""

@@ -14,6 +14,8 @@ _UNEXPLAINED = 0.9
 """Share of the inputs from which the fit of the median joint explains nothing."""
 _LARGEST_SHARE = 0.9
 """Largest corrected share of a block of residuals in the information on a direction."""
+UNKNOWN = torch.tensor(math.nan)
+"""Validation error without validation."""
 
 
 class Prior(NamedTuple):
@@ -35,7 +37,7 @@ class Fit:
         iterations: number of Gauss-Newton steps.
         z: the fitted z, ``(P,)``.
         stage: stage of the fit that found z.
-        error: validation error of z, or NaN.
+        errors: smallest validation errors of the stages, ``(V,)``, or NaN.
         stopped_in: stage in which the fit was interrupted, or None if it is finished.
         scores: covariance of the data's gradient, see :func:`block_scores`; None: the information.
     """
@@ -47,7 +49,7 @@ class Fit:
     iterations: int
     z: Tensor | None = None
     stage: str = ""
-    error: float = math.nan
+    errors: Tensor = UNKNOWN
     stopped_in: int | None = None
     scores: Tensor | None = None
 
@@ -63,6 +65,7 @@ class Fit:
         if getattr(values.get("covariance"), "shape", None) != (count, count):
             raise ValueError(f"the checkpoint has no fit of the model's {count} constants")
         prior = Prior(values.pop("mean"), values.pop("root"))
+        values.pop("error", None)  # of earlier versions
         return cls(prior=prior, **values)
 
 

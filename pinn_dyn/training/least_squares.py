@@ -20,6 +20,7 @@ from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.progress import Progress
 from pinn_dyn.training.constants_fit import (
+    UNKNOWN,
     Fit,
     Prior,
     StoppedFit,
@@ -45,6 +46,8 @@ _SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _SCALE = 100.0  # root of the prior precision of the last mass of a robot without inputs
+_LEVEL = 0.95  # one-sided, at which a stage is worse than an earlier one
+_NOISE = 0.2  # largest share of a validation error that is attributed to noise
 _DIVERGED = 1e4  # residual of a diverged rollout
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
@@ -71,7 +74,9 @@ class LeastSquares:
     2. Rollouts: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first rollouts use a quarter of the steps of the windows.
 
-    The stage with the smallest validation error is kept, or the last stage without validation.
+    Later stages fit what is predicted. So the kept stage is the last one whose validation error is
+    the smallest, or larger by less than a fifth and not significantly, by a paired t-test over V
+    parts of the validation motions (95 %, one-sided). Without validation it is the last stage.
 
     s^2 is the mean square of the residuals times the number of correlated residuals that count as
     one, estimated by repeating each stage. The covariance of z, and this number, follow from sums
@@ -108,7 +113,7 @@ class LeastSquares:
         windows: Windows | None = None,
         covariance: Tensor | None = None,
         stopped: Fit | None = None,
-        validate: Callable[[LearnedConstants], float] | None = None,
+        validate: Callable[[LearnedConstants], Tensor] | None = None,
     ) -> Fit:
         """Fit the model in place. Its precision does not change.
 
@@ -118,7 +123,7 @@ class LeastSquares:
             windows: training windows for the rollouts; not needed if ``rollouts`` is false.
             covariance: covariance of the initial z from an earlier fit, ``(P, P)``, if any.
             stopped: interrupted result of this fit, to continue from the present z.
-            validate: validation error of a model, to compare the stages.
+            validate: validation errors ``(V,)`` of a model, to compare the stages.
 
         Raises:
             ValueError: if trajectories are too short for the filter, there are fewer residuals than
@@ -147,14 +152,16 @@ class LeastSquares:
                 name = f"rollouts of {float(part.t[-1]):.3g} s"
                 stages[name] = partial(self._roll_out, name, model, prior, part)
         best, number = stopped, (stopped.stopped_in or 0) if stopped else 0
-        errors = [f"{best.stage} {best.error:.4g}"] if best and best.stage else []
+        lowest = best.errors if best else UNKNOWN
+        texts = [f"{best.stage} {lowest.mean():.4g}"] if best and best.stage else []
         try:
             for stage, solve in list(stages.items())[number:]:
                 result = solve()
-                error = float("nan") if validate is None else validate(model)
-                errors.append(f"{stage} {error:.4g}")
-                if best is None or not best.error <= error:
-                    best = replace(result, stage=stage, error=error)
+                errors = UNKNOWN if validate is None else validate(model)
+                texts.append(f"{stage} {errors.mean():.4g}")
+                kept = best if best and _clearly_larger(errors, lowest) else result
+                lowest = lowest if lowest.mean() <= errors.mean() else errors
+                best = replace(kept, stage=kept.stage or stage, errors=lowest)
                 number += 1
         except KeyboardInterrupt as interrupt:
             zero = torch.zeros_like(prior.root)
@@ -167,7 +174,7 @@ class LeastSquares:
         assert best.z is not None
         vector_to_parameters(best.z.to(precision), model.parameters())
         if validate is not None and len(stages) > 1:
-            log.info("least squares keeps %s: validation errors %s", best.stage, ", ".join(errors))
+            log.info("least squares keeps %s: validation errors %s", best.stage, ", ".join(texts))
         return replace(best, stopped_in=None)
 
     def _prior(self, model: LearnedConstants, covariance: Tensor | None) -> Prior:
@@ -344,6 +351,14 @@ def _evaluate(
     bad = 0.0 if derivative else _DIVERGED
     values = np.nan_to_num(result.flatten().numpy(), nan=bad, posinf=bad, neginf=-bad)
     return values if derivative else values.clip(-_DIVERGED, _DIVERGED)
+
+
+def _clearly_larger(errors: Tensor, lowest: Tensor) -> bool:
+    excess = errors - lowest
+    freedom = max(excess.numel() - 1, 1)
+    noise = scipy.stats.t.ppf(_LEVEL, freedom) * excess.std(correction=0) / freedom**0.5
+    # A single diverged part has a mean of one standard error, which is not significant.
+    return bool(excess.mean() > min(noise, _NOISE * lowest.mean()))
 
 
 def _speeds(v: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.optim import SGD
 
 from pinn_dyn.data.windows import Windows
+from pinn_dyn.mechanics import Predictor, Trajectory
 from pinn_dyn.models.learned_constants import LearnedConstants
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.training.constants_fit import Fit, StoppedFit
@@ -35,6 +36,8 @@ class LeastSquaresLearner(DynamicsLearner):
 
     Args:
         model, solver: the model to fit, and the least-squares solver.
+        part_errors: function from a model and true trajectories to the errors of parts of the
+            motions, ``(V,)``, to compare the stages of the fit.
         covariance: covariance of the initial constants from an earlier fit, if any.
         loss, validator, config, statistics: see :class:`DynamicsLearner`.
 
@@ -52,6 +55,7 @@ class LeastSquaresLearner(DynamicsLearner):
         model: LearnedConstants,
         *,
         solver: LeastSquares,
+        part_errors: Callable[[Predictor, Trajectory], Tensor],
         covariance: Tensor | None = None,
         loss: WindowLoss,
         validator: Validator,
@@ -73,7 +77,7 @@ class LeastSquaresLearner(DynamicsLearner):
             statistics=statistics,
             compile=False,
         )
-        self.solver, self.covariance = solver, covariance
+        self.solver, self.part_errors, self.covariance = solver, part_errors, covariance
 
     def training_step(self, batch: Windows, batch_idx: int) -> None:  # type: ignore[override]
         """Fit the model on all training trajectories and windows, in double precision."""
@@ -88,7 +92,7 @@ class LeastSquaresLearner(DynamicsLearner):
                         data.windows,
                         self.covariance,
                         self.result,
-                        self._validation_error,
+                        self._validation_errors,
                     )
             except StoppedFit as stopped:
                 self.result = stopped.fit
@@ -98,10 +102,10 @@ class LeastSquaresLearner(DynamicsLearner):
         self.log_losses(torch.tensor(self.result.residual**2))
         self.optimizers().step()  # type: ignore[union-attr]  # only counts the step
 
-    def _validation_error(self, model: LearnedConstants) -> float:
+    def _validation_errors(self, model: LearnedConstants) -> Tensor:
         (truth,) = self.trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]
         with torch.no_grad():
-            return self.validator(model, truth)["error_windowed"]
+            return self.part_errors(model, truth)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the fit, and its covariance for later fits."""

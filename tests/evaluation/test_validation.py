@@ -80,6 +80,17 @@ def test_a_diverged_trajectory_counts_as_ten_times_standing_still():
     assert figures["error_mean"] == float("inf")
 
 
+def test_quarters_of_each_trajectory_have_errors_of_their_own():
+    """The errors at 0, 0.5, ..., 3 s are the times since the last reset of each window."""
+    since = {3.0: [0, 0.5, 1, 1.5, 2, 2.5, 3], 1.0: [0, 0.5, 1, 0.5, 1, 0.5, 1]}
+    since[0.5] = [0, *6 * [0.5]]
+    times = torch.tensor(list(since.values()))
+    quarters = torch.stack([times[:, k : k + 2].mean(1) for k in (0, 2, 4, 6)], dim=1)
+    expected = (quarters / (0.75 * times.mean(1, keepdim=True))).mean(0)
+    errors = validator(None).part_errors(Drift(), truth())
+    torch.testing.assert_close(errors, expected.double().repeat(2), rtol=1e-6, atol=0)
+
+
 def still(offset=0.0):
     q = torch.full((2, 17, 1), offset, dtype=torch.float64)
     return Trajectory(q, 0 * q, Signal(T, 0 * q))

@@ -17,7 +17,7 @@ from pinn_dyn.evaluation.identification import constants_table
 from pinn_dyn.mechanics import MechanicalSystem, Signal, Trajectory
 from pinn_dyn.models import CoulombFriction, KnownSystem
 from pinn_dyn.training import LeastSquares, StoppedFit, least_squares
-from pinn_dyn.training.constants_fit import Fit
+from pinn_dyn.training.constants_fit import Fit, Prior
 from pinn_dyn.training.filtered_motion import filtered_motion
 from tests.support.known import known_model, motion, motions, statistics
 from tests.support.rigid_chains import joint, link, robot
@@ -289,7 +289,7 @@ def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
         errors.append(held_out_error(model, truth, unseen))
         if len(errors) == at:
             raise KeyboardInterrupt
-        return errors[-1]
+        return torch.tensor([errors[-1]])
 
     model, alone, solver = robot_model("generic"), robot_model("generic"), LeastSquares(cutoff=20.0)
     expected = LeastSquares(cutoff=20.0, rollouts=False).fit(alone, runs)
@@ -306,11 +306,42 @@ def test_the_stage_that_validates_best_is_kept(truth, runs, unseen, at):
     torch.testing.assert_close(result.covariance, expected.covariance)
 
 
+@pytest.mark.parametrize(
+    ("changes", "stage"),
+    [
+        ([[0.1, -0.2, 0.3, -0.1], [0.1, -0.2, 0.2, 0.1]], 2),  # larger by less than the noise
+        ([[0.1, 0.1, 0.1, 0.12], [0.3, 0.3, 0.3, 0.3]], 0),  # larger in each part
+        ([[-0.3] * 4, [-0.2, -0.2, -0.2, -0.3]], 1),  # better than the first, not the second
+        ([[-0.1, 9.0, -0.1, -0.1], [0.1, -0.1, 0.0, 0.1]], 2),  # a part diverged in the second
+        ([[0.1, 0.0, -0.1, 0.1], [0.2, -0.2, 0.0, 9.0]], 1),
+    ],
+)
+def test_a_later_stage_is_kept_unless_it_is_clearly_worse(runs, monkeypatch, changes, stage):
+    windows = draw_windows(runs, count=20, steps=4, stride=1, seed=0)
+    number = itertools.count()
+
+    def solved(self, name, model, *others):
+        with torch.no_grad():
+            next(model.parameters()).fill_(next(number))
+        z = parameters_to_vector(model.parameters()).detach()
+        eye = torch.eye(len(z)).to(z)
+        return Fit(eye, eye, Prior(0 * z, eye), 0.1, 1, z.clone())
+
+    monkeypatch.setattr(LeastSquares, "_solve", solved)
+    errors = iter([torch.ones(4), *(1 + torch.tensor(x) for x in changes)])
+    model = robot_model("prior")
+    LeastSquares(cutoff=20.0).fit(model, runs, windows, validate=lambda _: next(errors))
+    assert float(next(model.parameters()).detach().flatten()[0]) == stage
+
+
 def test_rollouts_that_validate_better_are_kept(truth, runs, unseen):
     windows = draw_windows(runs, count=40, steps=2, stride=2, seed=0)
     model = robot_model("generic")
     result = LeastSquares(cutoff=20.0).fit(
-        model, runs, windows, validate=lambda model: held_out_error(model, truth, unseen)
+        model,
+        runs,
+        windows,
+        validate=lambda model: torch.tensor([held_out_error(model, truth, unseen)]),
     )
     assert result.stage == "rollouts of 0.04 s"
     assert held_out_error(model, truth, unseen) < 0.01
