@@ -1,5 +1,7 @@
 """Black box with a memory: equations, and the past in evaluation and training."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -99,6 +101,11 @@ def test_without_a_past_the_robot_was_at_rest(model):
     assert torch.equal(model.predict(torch.cat([q, v], -1), T, signal), expected)
     with pytest.raises(ValueError, match="x0"):
         model.predict(torch.cat([q, v, q], -1), T, signal)
+
+
+def test_the_history_has_all_steps_that_fit():
+    statistics = dataclasses.replace(make_statistics(2, 2), step=0.1)
+    assert SubspaceEncoder(statistics, history=0.3).past_steps == 3  # 0.3 / 0.1 is below 3
 
 
 def test_exports_refuse_a_model_with_a_memory(model):

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from torch.optim import AdamW
+from torch.optim import Adam, AdamW
 
 from pinn_dyn.mechanics.compilation import STEPS_FOR_PROGRAM, compile_graph
 from pinn_dyn.training import MidpointLoss, ParameterVector, one_cycle
@@ -21,7 +21,8 @@ def trained(model, clipping, compiled, state=None, steps=range(STEPS)):
     """The weights and the state of the optimizer after steps of either way."""
     vector = ParameterVector(model.parameters())
     loss = MidpointLoss(one_step(size=2), model).double()
-    optimizer = AdamW([vector.values], lr=0.05, weight_decay=0.1, fused=True)
+    options = {"lr": 0.05, "betas": (0.8, 0.97), "eps": 1e-6, "weight_decay": 0.1}
+    optimizer = AdamW([vector.values], **options, fused=True)
     scheduler = one_cycle(optimizer, total_steps=STEPS, warm_up=0.5)
     if compiled:
         engine = Compiled(loss, model, vector, STEPS_FOR_PROGRAM)
@@ -71,6 +72,13 @@ def test_steps_go_on_from_a_saved_state_of_the_optimizer(traced):
     _, _, state = trained(model, (0.3, False), compiled=True, steps=range(3))
     resumed, _, _ = trained(model, (0.3, False), True, state, range(3, STEPS))
     assert torch.equal(resumed, whole)
+
+
+def test_optimizers_with_another_formula_are_not_compiled():
+    weights = [torch.nn.Parameter(torch.ones(2))]
+    assert CompiledAdamW.supports(AdamW(weights, weight_decay=0.1))
+    variants = AdamW(weights, amsgrad=True), AdamW(weights, maximize=True), Adam(weights)
+    assert not any(map(CompiledAdamW.supports, variants))
 
 
 def test_a_program_has_equal_constants_once(traced):
