@@ -43,8 +43,8 @@ class PredictiveControl(Controller):
     With a C compiler, the model is compiled first, which takes some seconds.
 
     At each instant, the law plans a motion over the horizon by :class:`ShootingProblem`, starting
-    from the previous plan, and applies the first input of the plan. The plan follows the future
-    reference if the loop calls :meth:`follow`, as :func:`close_loop` does.
+    from the previous plan, and applies its first input. The plan follows the future reference,
+    within limits of the state, if the loop calls :meth:`follow`, as :func:`close_loop` does.
 
     u_ref is A^+ times the inverse dynamics of the reference, within the limits. It is zero for a
     force that is not linear in the input. If the solver fails, the law holds the last input.
@@ -200,7 +200,9 @@ class PredictiveControl(Controller):
             torch.stack([x.double().cpu().expand(count, n) for x in values], -2)
             for values in zip(*motions, strict=True)
         )
-        x = torch.cat([q, v], -1).numpy()
+        # Beyond a limit, the weight of the goal would exceed that of the limit.
+        states = torch.cat([q, v], -1).clip(*map(torch.from_numpy, self.limits[:2]))
+        (q, v), x = states.split(n, -1), states.numpy()
         x_ref = x[:, 1:].transpose(0, 2, 1)
         last = self._references
         if last is not None and np.array_equal(last[0], x_ref):
