@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pinn_dyn.lazy import lazy_attributes
+from pinn_dyn.lazy import LazyNames, lazy_attributes
 
 if TYPE_CHECKING:
     from pinn_dyn.app.build import dataset as dataset
@@ -31,23 +31,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.4.0"
 
-_NAMES = {
-    "pinn_dyn.app.build": "dataset",
-    "pinn_dyn.app.evaluation": "evaluate",
-    "pinn_dyn.app.fit": "fit",
-    "pinn_dyn.app.run": "Run",
-    "pinn_dyn.app.run_folder": "load",
-    "pinn_dyn.app.training": "train",
-    "pinn_dyn.data": "DataSource LogSource Splits",
-    "pinn_dyn.evaluation.closed_loops": "close_loop",
-    "pinn_dyn.evaluation.excitation_design": "design_excitation",
-    "pinn_dyn.evaluation.log_check": "check",
-    "pinn_dyn.mechanics": "MechanicalSystem Signal Terms Trajectory",
-    "pinn_dyn.systems": "SoftArm",
-}
-
-__all__ = " ".join(_NAMES.values()).split()
-__getattr__ = lazy_attributes(__name__, _NAMES)
+__getattr__ = lazy_attributes(__name__)
+__all__ = list(LazyNames(__name__).paths)
 
 
 def __dir__() -> list[str]:

@@ -19,7 +19,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from pinn_dyn.app.settings import SETTINGS, annotation
+from pinn_dyn.app.settings import SETTINGS
 from pinn_dyn.app.validation import ConfigError, check_arguments, check_keys, check_value
 from pinn_dyn.spelling import did_you_mean
 
@@ -27,8 +27,6 @@ from pinn_dyn.spelling import did_you_mean
 _INSTALLED = Path(__file__).resolve().parents[1] / "conf"
 CONFIG = "config.yaml"  # in the folder of a run
 CONF = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "conf"
-_QUICK = (("trainer",), ("model",), ("optimizer", "scheduler", "loss", "dataset"))
-"""Keys that are checked first, by what the check imports: nothing, PyTorch, and pandas."""
 
 
 # The name of an experiment, or else the last two folders of the path of a run.
@@ -73,18 +71,8 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     """
     config = cfg if isinstance(cfg, dict) else plain(cfg)
     check_keys(SETTINGS[command], config)
-    for keys in _QUICK:
-        mistakes = []
-        for key in keys:
-            if not isinstance(part := config.get(key), dict) or "_target_" not in part:
-                continue
-            is_trainer = part["_target_"] == "lightning.Trainer"
-            try:
-                check_value(key, part, object if is_trainer else annotation(command, key))
-            except ConfigError as error:
-                mistakes.append(str(error))
-        if mistakes:
-            raise ConfigError("\n".join(mistakes))
+    if command == "train" and isinstance(config.get("trainer"), dict):
+        check_value("trainer", config["trainer"])  # before the import of Lightning
     check_arguments(SETTINGS[command], config)
     return config
 

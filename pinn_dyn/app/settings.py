@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pinn_dyn.app.validation import STAND_INS, Seed
-from pinn_dyn.lazy import LazyNames
+from pinn_dyn.app.signatures import STAND_INS
+from pinn_dyn.app.validation import Seed
 
 if TYPE_CHECKING:
     from lightning import Callback, Trainer
@@ -26,24 +25,6 @@ if TYPE_CHECKING:
     from pinn_dyn.models.known import Structure
     from pinn_dyn.systems import RigidChain
     from pinn_dyn.training import LeastSquares, WindowLoss
-
-TYPES = LazyNames(
-    {
-        "lightning": "Callback Trainer",
-        "lightning.pytorch.loggers": "Logger",
-        "torch.optim": "Optimizer",
-        "torch.optim.lr_scheduler": "LRScheduler",
-        "pinn_dyn.control": "Actuator Controller Plant Reference Sensor",
-        "pinn_dyn.data": "DataSource DynamicsData InitialStates",
-        "pinn_dyn.evaluation": "RolloutValidator",
-        "pinn_dyn.evaluation.motion_limits": "JointValues MotionLimits",
-        "pinn_dyn.mechanics": "Predictor",
-        "pinn_dyn.models.known": "Structure",
-        "pinn_dyn.systems": "RigidChain",
-        "pinn_dyn.training": "LeastSquares WindowLoss",
-    }
-)
-"""Names in the annotations below, which are imported when a configuration is checked."""
 
 Names = str | Sequence[str]
 
@@ -237,9 +218,3 @@ SETTINGS: dict[str, type] = {
     "gather": GatherSettings,
     "excite": ExciteSettings,
 }
-
-
-def annotation(command: str, key: str) -> Any:
-    """Return the annotation of a key of a command; imports no class of other annotations."""
-    alone = SimpleNamespace(__annotations__={key: SETTINGS[command].__annotations__[key]})
-    return get_type_hints(alone, globals(), TYPES, include_extras=True)[key]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import collections.abc
 import contextlib
-import dataclasses
 import difflib
 import functools
 import inspect
 import pkgutil
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
@@ -18,6 +16,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import pydantic
 from pydantic import Field, NonNegativeFloat, PositiveFloat, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
+
+from pinn_dyn.app.signatures import STAND_INS, unknown_keys
+from pinn_dyn.lazy import LazyNames
 
 _CONFIG = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 _LISTS = (
@@ -32,11 +33,10 @@ _PLAIN = (bool, int, float, str, type(None), Any)  # The optimizers of PyTorch s
 _OPTIMIZER = {"lr": PositiveFloat, "weight_decay": NonNegativeFloat, "eps": PositiveFloat}
 
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
-STAND_INS: dict[Any, type] = {}
-"""Names of classes of other packages, and dataclasses with the arguments to accept for them."""
 SET_BY_PROGRAM = {
-    *("data.batches_per_epoch", "data.source", "plant.system", "optimizer.maximize"),
-    *("optimizer.params", "scheduler.optimizer", "scheduler.total_steps"),
+    *("data.batches_per_epoch", "data.source", "loss.model", "loss.statistics"),
+    *("model.statistics", "optimizer.maximize", "optimizer.params", "plant.system"),
+    *("scheduler.optimizer", "scheduler.total_steps", "validator.training_step"),
 }
 """Keys of arguments that the program sets itself."""
 
@@ -57,13 +57,11 @@ def check_arguments(target: Callable[..., Any], values: Mapping[str, Any]) -> No
             raise ConfigError(_line({"type": "missing", "loc": [path], "input": value}, values, ""))
 
 
-def check_keys(target: Any, values: Mapping[str, Any]) -> None:
-    """Check that keys are fields of a dataclass, without importing the types of its fields."""
-    fields = dict.fromkeys(field.name for field in dataclasses.fields(target))
+def check_keys(target: type, values: Mapping[str, Any]) -> None:
+    """Check keys against the source of classes, without imports; report all mistakes."""
     lines = [
-        _line({"type": "unknown_key", "loc": [key], "ctx": fields, "input": None}, values, "")
-        for key in values
-        if key not in fields
+        _line({"type": "unknown_key", "loc": [path], "ctx": keys, "input": None}, values, "")
+        for path, keys in unknown_keys(values, f"{target.__module__}.{target.__qualname__}")
     ]
     if lines:
         raise ConfigError("\n".join(lines))
@@ -103,10 +101,12 @@ def _line(mistake: Mapping[str, Any], root: Any, path: str) -> str:
 def _closest(path: str, keys: Mapping[str, Any], root: Any) -> str:
     """Return the keys beside an unknown key that resemble it, or else those anywhere."""
     parent, dot, name = path.rpartition(".")
-    close = [f"{parent}{dot}{key}" for key in difflib.get_close_matches(name, keys)]
+    names = [key for key in keys if f"{parent}{dot}{key}" not in SET_BY_PROGRAM]
+    close = [f"{parent}{dot}{key}" for key in difflib.get_close_matches(name, names)]
     paths = [key for key, _ in places(root) if key != path and "[" not in key]
-    close = close or difflib.get_close_matches(path, paths)
-    return f": did you mean {' or '.join(close)}?" if close else f", expected {', '.join(keys)}"
+    paths = [key for key in paths if difflib.get_close_matches(name, [key.rpartition(".")[2]])]
+    close = close or difflib.get_close_matches(path, paths, cutoff=0)
+    return f": did you mean {' or '.join(close)}?" if close else f", expected {', '.join(names)}"
 
 
 def places(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -147,8 +147,8 @@ def arguments_model(target: Any, required: bool = False) -> type[pydantic.BaseMo
 
 def _hints(target: Any) -> dict[str, Any]:
     try:
-        types = getattr(sys.modules.get(target.__module__), "TYPES", None)
-        return get_type_hints(target, localns=types, include_extras=True)
+        names = LazyNames(target.__module__)
+        return get_type_hints(target, localns=names, include_extras=True)
     except Exception:  # names that other packages import for type checkers only
         return {}
 

@@ -49,4 +49,4 @@ __all__ = [
     "store",
 ]
 
-__getattr__ = lazy_attributes(__name__, {"pinn_dyn.data.datamodule": "DynamicsData"})
+__getattr__ = lazy_attributes(__name__)

@@ -11,10 +11,4 @@ if TYPE_CHECKING:
     from pinn_dyn.ensembles.learner import EnsembleLearner
 
 __all__ = ["Ensemble", "EnsembleData", "EnsembleLearner", "posterior_draws"]
-__getattr__ = lazy_attributes(
-    __name__,
-    {
-        "pinn_dyn.ensembles.data": "EnsembleData",
-        "pinn_dyn.ensembles.learner": "EnsembleLearner",
-    },
-)
+__getattr__ = lazy_attributes(__name__)

@@ -61,5 +61,4 @@ __all__ = [
     "trajectory_figure",
 ]
 
-_NAMES = {"pinn_dyn.evaluation.validation": "RolloutFigures RolloutValidator"}
-__getattr__ = lazy_attributes(__name__, _NAMES)
+__getattr__ = lazy_attributes(__name__)

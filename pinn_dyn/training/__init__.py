@@ -35,11 +35,4 @@ __all__ = [
     "one_cycle",
 ]
 
-__getattr__ = lazy_attributes(
-    __name__,
-    {
-        "pinn_dyn.training.checkpoints": "WholeCheckpoints",
-        "pinn_dyn.training.learner": "DynamicsLearner",
-        "pinn_dyn.training.least_squares_learner": "COVARIANCE LeastSquaresLearner",
-    },
-)
+__getattr__ = lazy_attributes(__name__)

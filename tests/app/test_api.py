@@ -79,13 +79,15 @@ def test_the_package_imports_nothing_until_it_is_asked():
     [
         ("train", "modle=lnn", "torch"),
         ("train", "trainer.stepps=3", "torch"),
-        ("train", "dataset.smaple=3", "lightning"),
+        ("train", "dataset.smaple=3", "torch"),
+        ("train", "dataset=example_log dataset.test.peice=3", "torch"),
+        ("train", "optimizer.x=3", "torch"),
         ("check", "longest_delay=none", "lightning"),
     ],
 )
 def test_a_typo_is_answered_without_slow_imports(command, argument, absent):
     code = (
-        f"import sys, pinn_dyn.app.command as c; sys.argv[1:] = [{argument!r}]\n"
+        f"import sys, pinn_dyn.app.command as c; sys.argv[1:] = {argument.split()}\n"
         f"try: c.main({command!r})\n"
         f"except SystemExit as e: sys.exit({absent!r} in sys.modules or 'Error' not in str(e))"
     )

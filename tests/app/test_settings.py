@@ -124,12 +124,26 @@ def test_all_mistakes_are_reported_at_once():
         "seed is 'x', expected a valid integer",
         "data.pairs is 'many', expected a valid integer or 'all'",
     ]
-    with pytest.raises(ConfigError) as caught:  # without an import of Lightning
-        composed("train", ["dataset.seed=many", "loss.hubber=1"])
-    assert str(caught.value).splitlines() == [
+    with pytest.raises(ConfigError) as caught:
+        composed("train", ["loss.hubber=1", "trainer.stpes=1"])
+    assert set(str(caught.value).splitlines()) == {
         "the configuration has no key 'loss.hubber': did you mean loss.huber?",
-        "dataset.seed is 'many', expected a valid integer",
-    ]
+        "the configuration has no key 'trainer.stpes': did you mean trainer.steps?",
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "listed", "hidden"),
+    [
+        ("optimizer", "lr", "params"),
+        ("loss", "huber", "statistics"),
+        ("model", "input", "statistics"),
+    ],
+)
+def test_an_unknown_key_lists_only_what_a_user_sets(key, listed, hidden):
+    with pytest.raises(ConfigError, match=f"expected .*{listed}") as caught:
+        composed("train", [f"{key}.zzz=1"])
+    assert hidden not in str(caught.value)
 
 
 # --- annotations ----------------------------------------------------------------------------------

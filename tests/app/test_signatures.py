@@ -1,0 +1,67 @@
+"""Arguments read from source code, beside the signatures of the imported classes."""
+
+import inspect
+import pkgutil
+import re
+
+import pytest
+
+from pinn_dyn.app.config import CONF
+from pinn_dyn.app.signatures import unknown_keys
+
+TEXT = "".join(file.read_text("utf-8") for file in CONF.rglob("*.yaml"))
+TARGETS = sorted(set(re.findall(r"_target_: *([\w.]+)", TEXT)) - {"lightning.Trainer"})
+
+ARM = """
+import abc, torch
+from dataclasses import dataclass
+
+@dataclass
+class Link(abc.ABC):
+    length: float
+
+@dataclass
+class Arm(Link):
+    mass: float = 1.0
+
+class Loaded(Arm):
+    pass
+
+class Head(torch.nn.Module):
+    pass
+
+class Free:
+    def __init__(self, **options): ...
+
+Alias = Arm
+"""
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_arguments_in_the_source_are_those_of_the_class(target):
+    parameters = inspect.signature(pkgutil.resolve_name(target)).parameters.values()
+    names = {"_target_": target, **{x.name: None for x in parameters}}
+    assert not list(unknown_keys(names, path="part"))
+    if all(x.kind != x.VAR_KEYWORD for x in parameters):
+        assert [path for path, _ in unknown_keys({**names, "typo": 1}, path="part")] == [
+            "part.typo"
+        ]
+
+
+@pytest.mark.parametrize(
+    ("name", "paths"),
+    [
+        ("Arm", ["mas"]),
+        ("Loaded", ["mas"]),
+        ("Head", []),  # arguments of torch.nn.Module are not in its source
+        ("Free", []),
+        ("Alias", []),
+        ("Missing", []),
+    ],
+)
+def test_a_users_class_is_read_with_its_bases(tmp_path, monkeypatch, name, paths):
+    module = f"arm_of_{name.lower()}"
+    (tmp_path / f"{module}.py").write_text(ARM)
+    monkeypatch.syspath_prepend(tmp_path)
+    part = {"_target_": f"{module}.{name}", "length": 1.0, "mas": 2.0}
+    assert [path for path, _ in unknown_keys(part)] == paths
