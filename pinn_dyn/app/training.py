@@ -67,6 +67,7 @@ from pinn_dyn.models import (
     SubspaceEncoder,
 )
 from pinn_dyn.models.output_limits import set_output_limits
+from pinn_dyn.spelling import did_you_mean
 from pinn_dyn.training import (
     DynamicsLearner,
     IncrementLoss,
@@ -163,6 +164,9 @@ def train(
         trainer = {key: value for key, value in trainer.items() if key not in CLIPPING}
     validations = validations or even_validations(steps, 4)
     if isinstance(model, str):
+        if model not in MODELS:
+            names = f", expected {', '.join(MODELS)} or a builder like partial(KnownMechanics, ...)"
+            raise ValueError(f"model is {model!r}{did_you_mean(model, MODELS) or names}")
         model_name, model = model_name or model, MODELS[model]
     made_in_python = config is None
     model, changes = match_model(model, source)

@@ -55,6 +55,8 @@ class CLoop(Wrapped):
         self.members = members
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
+        if not start.numel():
+            return self.inner.path(dynamics, start, grid, signal)
         leading, batch = start.shape[: self.members], start.shape[self.members : -1]
         x = start.reshape(*leading, -1, start.shape[-1]).movedim(self.members, 0).contiguous()
         u = signal.u[..., 0, :].reshape(*leading, len(x), -1)[..., 0, :]

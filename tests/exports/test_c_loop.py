@@ -73,6 +73,13 @@ def test_the_loop_gives_the_states_of_the_model(kind, batch):
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", ["momentum", "ensemble", "passive"])
+def test_no_trajectories_give_no_states(kind):
+    found, expected = rolled_out(MODELS[kind](), (0,))
+    assert found.shape == expected.shape
+    assert not found.numel()
+
+
 def test_long_paths_are_computed_in_blocks_and_end_where_one_diverges(monkeypatch):
     monkeypatch.setattr(c_loop, "NUMBERS", 100)
     unstable = LinearSystem([[1.0]], [[-1e9]], [[0.0]], [[1.0]])
