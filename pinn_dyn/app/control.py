@@ -25,8 +25,6 @@ from pinn_dyn.control import (
     DataRegion,
     DisturbanceObserver,
     Guarded,
-    ModelBasedLaw,
-    PredictiveControl,
     export_law,
     term_conditions,
 )
@@ -73,10 +71,6 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
         raise ConfigError(f"trajectory is {config['trajectory']}, expected 0 to {count - 1}")
     laws = {name: build_law(config, name, learned, source.system) for name in config["controllers"]}
     if config["guard"].get("threshold") is not None:
-        if not isinstance(laws["learned"], ModelBasedLaw | PredictiveControl):
-            raise ConfigError(
-                "a guard takes no observer: leave out guard.threshold or the observer"
-            )
         laws["learned"] = _guarded(laws["learned"], config, source)
     if config["export"]:
         _export(laws[config["exported_law"]], run, config)

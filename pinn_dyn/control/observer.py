@@ -125,6 +125,11 @@ class DisturbanceObserver(Controller):
         self._memory = _Memory(t, momentum, force, A, u)
         return u
 
+    def replace_input(self, u: Tensor) -> None:
+        """Set the input that acts in place of that of the latest call, ``(*batch, M)``."""
+        if self._memory is not None:
+            self._memory = self._memory._replace(u=u)
+
     def diagnostics(self) -> dict[str, Tensor]:
         """Return the law's diagnostics and ``compensation``, |A^+ r| in the units of u."""
         if self._size is None:

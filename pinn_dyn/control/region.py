@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion, Reference
 from pinn_dyn.control.laws import ComputedTorque, ModelBasedLaw, Regulation
+from pinn_dyn.control.observer import DisturbanceObserver
 from pinn_dyn.mechanics.arrays import require_last_dim
 
 log = logging.getLogger(__name__)
@@ -126,6 +127,8 @@ class Guarded(Controller):
     ):
         super().__init__(law.num_coordinates, law.num_inputs)
         self.law, self.region, self.threshold, self.fallback = law, region, threshold, fallback
+        self._observer = law if isinstance(law, DisturbanceObserver) else None
+        law = self._observer.law if self._observer else law
         if fallback == "regulation":
             if not isinstance(law, ModelBasedLaw) or isinstance(law, ComputedTorque):
                 raise ValueError(
@@ -158,6 +161,8 @@ class Guarded(Controller):
         if self.fallback:
             last = torch.zeros_like(u) if self._last is None else self._last
             u = torch.where(outside.unsqueeze(-1), self.fall_back(q, v, reference, u, last), u)
+            if self._observer:
+                self._observer.replace_input(u)
         self._last = u
         return u
 

@@ -70,11 +70,6 @@ COMMANDS = {
     "rate of an actuator": ["control.py", *CONTINUOUS, "actuator.rate=1.0"],
     "delay in continuous time": ["control.py", *CONTINUOUS, "delay=1"],
     "noise in continuous time": ["control.py", *CONTINUOUS, "sensor.v_noise=0.1"],
-    "guard of an observer": [
-        *("control.py", *LOOP, "guard.threshold=1.0", "rate=200"),
-        "+controllers.learned.observer={_target_: pinn_dyn.control.DisturbanceObserver, "
-        "_partial_: true, bandwidth: 20}",
-    ],
     "gains that let the loop diverge": [
         *("control.py", *LOOP, "rate=100"),
         *("gains.position=2e4", "gains.velocity=300", "controllers.learned.terms=truth"),
@@ -96,9 +91,6 @@ VALUES = {
     "a run of model=lnn or model=hnn": "run={lnn} or run={hnn}",
     "reference.q=[...]": "reference.q=[0,0,0.2]",
     "leave it out": "~actuator.rate",
-    "leave out guard.threshold or the observer": (
-        "~guard.threshold or ~controllers.learned.observer"
-    ),
     "give a rate": "rate=200",
     "change the rate": "rate=200",
     "reduce optimizer.lr": "optimizer.lr=0.001",

@@ -166,11 +166,12 @@ def test_the_guard_of_a_known_robot_counts_whole_turns_as_the_same_angle():
     assert region.distance(q[0, 0] + 2 * torch.pi, train[0].v[0]) < 1e-6
 
 
-def test_the_guard_is_exported_with_the_observer(tmp_path, lnn_run, undrawn, few_states):
+def test_the_guard_acts_and_is_exported_with_the_observer(tmp_path, lnn_run, undrawn, few_states):
     """Also if the exported law is not the learned law of the loop."""
     path = tmp_path / "law.c"
     words = ["rate=200", f"export={path}", "controllers=tracking", "exported_law=learned_observer"]
     words += ["duration=0.1", "settled_after=0", "guard.threshold=2", "guard.fallback=hold"]
+    words += ["controllers.learned.observer=${controllers.learned_observer.observer}"]
     control(tmp_path / "out", lnn_run, *words)
     size = pinn_dyn.load(lnn_run).model.num_coordinates
     far = np.full(size, 50.0)

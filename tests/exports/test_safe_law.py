@@ -148,6 +148,22 @@ def test_a_held_input_does_not_spoil_the_memory_of_the_observer(law, tmp_path):
     assert np.isfinite(call(*good, after)[1]).all()
 
 
+@pytest.mark.parametrize("fallback", [None, "hold", "regulation"])
+def test_a_guard_over_an_observer_acts_in_the_loop_as_in_the_file(law, tmp_path, fallback):
+    """The observer of the loop counts the input of the guard."""
+    x = motion(100)
+    region = DataRegion(x[0].split(50), x[1].split(50), samples=77)
+    guarded = Guarded(DisturbanceObserver(law, 20.0), region, threshold=1.5, fallback=fallback)
+    call = function_of(export_law(guarded, tmp_path / "law.c", period=PERIOD), "law_control")
+    memory = np.zeros(13)
+    for k, state in enumerate(zip(*motion(12), strict=True)):
+        q = state[0] + 6.0 * (k in (5, 6))
+        expected = guarded(k * PERIOD, q, state[1], Motion(*state[2:]))
+        u, memory, status = call(q.numpy(), *(x.numpy() for x in state[1:]), memory)
+        np.testing.assert_allclose(u, expected, rtol=1e-9, atol=1e-12)
+        assert status == 2 * (k in (5, 6))
+
+
 def test_the_first_input_is_limited_from_zero(law, tmp_path):
     control = control_of(tmp_path / "law.c", law, actuator=Actuator(rate=10.0))
     u, status = control(*[10 * np.ones(3), *[np.zeros(3)] * 4])
