@@ -100,8 +100,10 @@ def _source(module: str) -> tuple[ast.Module, dict[str, str]]:
 @functools.cache
 def _spec(module: str) -> ModuleSpec | None:
     """Return the place of a module, without the import of its packages by ``find_spec``."""
-    package = module.rpartition(".")[0]
-    if not package:
-        return find_spec(module) if module not in ("", "__main__") else None
-    folders = getattr(_spec(package), "submodule_search_locations", None)
-    return PathFinder.find_spec(module, folders) if folders else None
+    if package := module.rpartition(".")[0]:
+        folders = getattr(_spec(package), "submodule_search_locations", None)
+        return PathFinder.find_spec(module, folders) if folders else None
+    try:
+        return None if module == "__main__" else find_spec(module)
+    except ValueError:  # a module that was made in Python
+        return None

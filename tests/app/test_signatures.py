@@ -3,6 +3,8 @@
 import inspect
 import pkgutil
 import re
+import sys
+import types
 
 import pytest
 
@@ -65,3 +67,9 @@ def test_a_users_class_is_read_with_its_bases(tmp_path, monkeypatch, name, paths
     monkeypatch.syspath_prepend(tmp_path)
     part = {"_target_": f"{module}.{name}", "length": 1.0, "mas": 2.0}
     assert [path for path, _ in unknown_keys(part)] == paths
+
+
+def test_a_class_of_a_module_without_a_file_is_not_read(monkeypatch):
+    monkeypatch.setitem(sys.modules, "arm_of_a_notebook", types.ModuleType("arm_of_a_notebook"))
+    for module in ("arm_of_a_notebook", "__main__"):
+        assert not list(unknown_keys({"_target_": f"{module}.Arm", "mas": 2.0}))
