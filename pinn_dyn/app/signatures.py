@@ -33,11 +33,11 @@ def unknown_keys(
         return
     arguments = _arguments(str(value.get("_target_", target)))
     for key, item in value.items():
-        place = f"{path}.{key}" if path else str(key)
+        inner = f"{path}.{key}" if path else str(key)
         if arguments is None or key in arguments:
-            yield from unknown_keys(item, (arguments or {}).get(key), place)
+            yield from unknown_keys(item, (arguments or {}).get(key), inner)
         elif key not in ("_target_", "_partial_"):
-            yield place, arguments
+            yield inner, arguments
 
 
 @functools.cache

@@ -177,6 +177,8 @@ def build_trainer(
     ``settings`` are arguments of :class:`lightning.Trainer`, ``length`` is that of :func:`epochs`.
     A strategy that starts the program again on each device is refused.
     """
+    if "64" in str(precision := settings.get("precision")):
+        raise ValueError(f"trainer.precision is {precision!r}, expected '32-true' or 'bf16-mixed'")
     # A resumed training finds its checkpoints by these names.
     files: dict[str, Any] = {"dirpath": str(folder / CHECKPOINTS), "enable_version_counter": False}
     count, batches, interval = length

@@ -335,6 +335,10 @@ def test_a_built_model_is_trained_and_loaded_by_a_builder(tmp_path):
         ({"data": partial(DynamicsData, pairs=8, batch_size=9, stride=1)}, "data: batch_size is 9"),
         ({"validator": partial(RolloutValidator, horizon=5.0)}, "validator: horizon is 5.0 s"),
         ({"steps": 10, "validations": 3}, "trainer.steps is 10, .* set trainer.steps=9"),
+        (
+            {"trainer": {"precision": "64-true"}},
+            "trainer.precision is .64-true., expected .32-true",
+        ),
         ({"model": "known"}, "model is .known., expected lnn, .* or a builder"),
         ({"model": "subent"}, "model is .subent.: did you mean subnet"),
     ],
