@@ -25,7 +25,7 @@ _FLAGS = ["-std=gnu99", "-march=native", "-fno-math-errno", "-fPIC", "-shared"]
 _FLAGS += ["-D__FAST_MATH__"]  # makes glibc declare exp, tanh and so on of vectors, nothing else
 QUICK = ("-O2", "-ftree-vectorize", "-fvect-cost-model")
 """Optimization that takes a third of the time of ``-O3`` for a rigid chain with sticking joints.
-The code has 0.8 of its speed (benchmarks/long_rollout.py)."""
+The code has 0.7 to 0.8 of its speed (benchmarks/long_rollout.py)."""
 
 
 def compiled_rows(function: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[Tensor], Tensor]:
