@@ -41,16 +41,22 @@ def main(command: str) -> None:
             composed(command, flags.overrides, flags.config_dir)
         folder = str(config_folder(command))
         run = partial(_run, command)
-        with redirect_stdout(help_text) if flags.help and installed else nullcontext():
-            hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
+        try:
+            with redirect_stdout(help_text) if flags.help and installed else nullcontext():
+                hydra.main(version_base="1.3", config_path=folder, config_name=command)(run)()
+        finally:
+            text = re.sub(r"python (\w+)\.py", r"pinn-dyn-\1", help_text.getvalue())
+            print(text, end="", flush=True)
+    except BrokenPipeError:
+        if not shows:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # --help | head
     except KeyboardInterrupt:
         raise SystemExit("interrupted") from None
     except (HydraException, OmegaConfBaseException) as error:
         raise SystemExit(f"Error: {explained(error)}") from error
     except ConfigError as error:
         raise SystemExit(f"Error: {error}") from error
-    finally:
-        print(re.sub(r"python (\w+)\.py", r"pinn-dyn-\1", help_text.getvalue()), end="")
 
 
 def _run(command: str, cfg: DictConfig) -> object:

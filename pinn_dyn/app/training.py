@@ -313,7 +313,7 @@ def build_predictor(
 
 
 def _check_windows(model: Predictor, windows: DynamicsData) -> None:
-    """Refuse windows without the momenta or the past that the model needs."""
+    """Refuse windows without the momenta or the past that the model needs; warn of short ones."""
     if model.state == "qp" and windows.windows.p.shape[-1] == 0:
         raise ValueError(
             f"{windows.source.name} has no momenta p: set model.state=qv, or use model=lnn"
@@ -323,6 +323,11 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
         raise ValueError(
             f"the model uses {model.input_history} s before its start, but data.history is "
             f"{windows.history} s: set data.history={model.input_history}"
+        )
+    if model.past_steps > 20 * windows.steps:
+        log.warning(
+            f"the model sees {model.past_steps} steps of {windows.step:g} s before windows of "
+            f"{windows.steps} steps: increase data.stride or data.steps, or reduce model.history"
         )
 
 

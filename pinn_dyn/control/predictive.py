@@ -68,7 +68,8 @@ class PredictiveControl(Controller):
 
     Raises:
         ImportError: without CasADi.
-        ValueError: on values that do not fit N or M, or a horizon below two steps.
+        ValueError: on values that do not fit N or M, q_low above q_high, or a horizon below two
+            steps.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class PredictiveControl(Controller):
         actuator: Actuator | None = None,
         q_low: _Values = None,
         q_high: _Values = None,
-        v_max: _Values = None,
+        v_max: PositiveFloat | Sequence[PositiveFloat] | None = None,
         iterations: PositiveInt = 2,
         observer_bandwidth: PositiveFloat | None = None,
     ):
@@ -101,9 +102,13 @@ class PredictiveControl(Controller):
             _row("velocity_weight", velocity_weight, n),
         ]
         v_high = _row("v_max", v_max, n, np.inf)
+        low, high = _row("q_low", q_low, n, -np.inf), _row("q_high", q_high, n, np.inf)
+        if (low > high).any():
+            i = int((low > high).argmax())
+            raise ValueError(f"q_low[{i}] is {low[i]:g}, which exceeds q_high[{i}], {high[i]:g}")
         self.limits = Limits(
-            np.concatenate([_row("q_low", q_low, n, -np.inf), -v_high]),
-            np.concatenate([_row("q_high", q_high, n, np.inf), v_high]),
+            np.concatenate([low, -v_high]),
+            np.concatenate([high, v_high]),
             _row("actuator.low", actuator.low, m, -np.inf),
             _row("actuator.high", actuator.high, m, np.inf),
             _row("actuator.rate", actuator.rate, m, np.inf),

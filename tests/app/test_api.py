@@ -354,7 +354,11 @@ def test_a_folder_of_another_training_is_refused(tmp_path):
         pinn_dyn.train(Still(), "acceleration", folder=tmp_path, seed=1, **SHORT)
 
 
-def test_a_model_with_a_memory_trains_on_windows_with_a_past():
+def test_a_model_with_a_memory_trains_on_windows_with_a_past(caplog):
     run = fit(model="subnet", steps=2)
     assert run.model.past_steps > 1
     assert run.config["model_name"] == "subnet"
+    assert "the model sees" not in caplog.text
+    short = partial(DynamicsData, pairs=8, batch_size=8, steps=1, stride=1, history=0.5)
+    fit(model="subnet", data=short)
+    assert "sees 25 steps of 0.02 s before windows of 1 steps: increase data.str" in caplog.text

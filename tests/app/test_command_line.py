@@ -1,7 +1,9 @@
 """Mistakes on the command line: what is said, and that nothing is left behind."""
 
 import re
+import sys
 from datetime import datetime
+from subprocess import PIPE, Popen
 
 import pytest
 import torch
@@ -115,6 +117,14 @@ def test_help_of_an_installed_command_names_the_command(capsys, monkeypatch, com
     text = capsys.readouterr().out
     assert f"  pinn-dyn-{command} " in text
     assert f"{command}.py" not in text
+
+
+@pytest.mark.parametrize("name", ["train.py", "pinn-dyn-train"])
+def test_help_ends_quietly_in_a_pipe_that_closes(name):
+    code = f"import sys; sys.argv = [{name!r}, '--help']; from pinn_dyn.app.command import train"
+    with Popen([sys.executable, "-c", f"{code}; train()"], stdout=PIPE, stderr=PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
 
 
 @pytest.mark.parametrize(
