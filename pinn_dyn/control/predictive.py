@@ -68,8 +68,7 @@ class PredictiveControl(Controller):
 
     Raises:
         ImportError: without CasADi.
-        ValueError: on values that do not fit N or M, q_low above q_high, or a horizon below two
-            steps.
+        ValueError: on values that do not fit N or M, crossed limits, or a horizon below two steps.
     """
 
     def __init__(

@@ -8,6 +8,7 @@ import logging
 import os
 import subprocess
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -81,11 +82,16 @@ def load_code(code: str, optimization: Sequence[str] = ("-O3",)) -> ctypes.CDLL:
     folder = Path(os.environ.get("PINN_DYN_CACHE", "~/.cache/pinn_dyn")).expanduser() / "compiled"
     library = folder / f"{digest}.so"
     if not library.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder) as name:
+        with suppress(OSError):  # a read-only folder: the library serves this process alone
+            folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder if os.access(folder, os.W_OK) else None) as name:
             source = Path(name) / "code.c"
             source.write_text(code)
-            os.replace(compile_c(compiler, flags, source), library)
+            compiled = compile_c(compiler, flags, source)
+            loaded = ctypes.CDLL(str(compiled))
+            with suppress(OSError):
+                os.replace(compiled, library)
+        return loaded
     return ctypes.CDLL(str(library))
 
 

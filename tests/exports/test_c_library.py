@@ -28,6 +28,15 @@ def test_rows_are_those_of_the_function_also_where_they_are_not_finite():
         torch.testing.assert_close(rows(columns), rows(x), rtol=0, atol=0, equal_nan=True)
 
 
+def test_a_cache_folder_that_cannot_be_made_does_not_prevent_compiling(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("PINN_DYN_CACHE", str(tmp_path / "file"))
+    x = torch.rand(3, dtype=torch.float64)
+    rows = compiled_rows(torch.sin, x)
+    assert rows is not torch.sin
+    torch.testing.assert_close(rows(x), x.sin(), rtol=1e-12, atol=0)
+
+
 def test_without_a_compiler_or_c_code_the_function_remains(monkeypatch):
     x = torch.rand(3, dtype=torch.float64)
     sorted_rows = lambda x: x.sort(-1).values  # noqa: E731
