@@ -105,27 +105,34 @@ class DynamicsLearner(L.LightningModule):
         if before == 0:
             self._losses.clear()  # of an interrupted epoch
         # Without the hooks of Lightning around a step, which take as long as AdamW.
-        optimizer, schedule = self.optimizers(use_pl_optimizer=False), self.lr_schedulers()
+        optimizer: Any = self.optimizers(use_pl_optimizer=False)
+        schedule: Any = self.lr_schedulers()
+        options, state = [{**group} for group in optimizer.param_groups], schedule.state_dict()
         step, count = self.global_step, len(self._losses)
         fetched = islice(dataloader_iter, self._steps_until_due(before))
-        # All batches are prepared first: Python between two steps evicts the program's data.
-        steps = [
-            self._prepared_step(batch, step + k, optimizer)  # type: ignore[arg-type]
-            for k, (batch, _, _) in enumerate(fetched)
-        ]
-        if self._vector.parameters[0].grad is None:  # the trainer clears them at first
-            self._vector.show_gradients()
-        done, start = 0, time.monotonic()
+        start = time.monotonic()
         try:
+            # Python between two steps evicts the data of the program from the cache: the schedule
+            # also runs ahead.
+            steps = list(self._prepared_steps(fetched, optimizer, schedule))
+            if self._vector.parameters[0].grad is None:  # the trainer clears them at first
+                self._vector.show_gradients()
+            record, start = self._losses.extend, time.monotonic()
             for take in steps:
-                self._losses.append(take())
-                schedule.step()  # type: ignore[union-attr]
-                done += 1
+                record(take())
+        except BaseException:
+            for group, before_block in zip(optimizer.param_groups, options, strict=True):
+                group.update(before_block)
+            schedule.load_state_dict(state)
+            for _ in self._losses[count:]:
+                schedule.step()
+            raise
         finally:
+            done = len(self._losses) - count
             self._pace = (time.monotonic() - start) / max(done, 1)
             self._count_steps(done)
-            if new := self._losses[count:]:
-                self._refuse_non_finite(torch.stack(new), step)
+            if done:
+                self._refuse_non_finite(torch.stack(self._losses[count:]), step)
         period = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if period and self.global_step % period == 0:
             losses = torch.stack(self._losses[-period:]).mean(0)
@@ -143,16 +150,23 @@ class DynamicsLearner(L.LightningModule):
         loop.batch_progress.increment_by(done - 1)
         loop._batches_that_stepped += done - 1
 
-    def _prepared_step(
-        self, batch: Windows, step: int, optimizer: Optimizer
-    ) -> Callable[[], Tensor]:
-        """Return a function that takes an optimizer step on a batch, by one program if possible."""
-        # The step is restored from a checkpoint, so a resumed training has the same progress.
-        windows = self.loss.selected(batch, step / self._steps)
-        take: Any = None
-        if self._compiled is not None:
-            take = self._gradients.step(windows, self._compiled)  # type: ignore[attr-defined]
-        return take or partial(optimizer.step, self._closure(windows))
+    def _prepared_steps(
+        self, batches: Iterator[tuple[Windows, int, int]], optimizer: Any, schedule: Any
+    ) -> Iterator[Callable[[], list[Tensor]]]:
+        """Yield a function for each batch that takes a step, by one program if possible."""
+        program = self._compiled
+        for step, (batch, _, _) in enumerate(batches, self.global_step):
+            # The step is restored from a checkpoint, so a resumed training has the same progress.
+            windows = self.loss.selected(batch, step / self._steps)
+            take: Any = None
+            if program is not None:
+                take = self._gradients.step(windows, program)  # type: ignore[attr-defined]
+            if take is None:
+                program = None  # the schedule of later steps waits for this one
+                yield partial(self._step, windows, optimizer, schedule)
+            else:
+                schedule.step()  # the function has the rate of this step
+                yield take
 
     def _steps_until_due(self, before: int) -> int:
         """Return the number of steps until Lightning may have something to do."""
@@ -170,8 +184,8 @@ class DynamicsLearner(L.LightningModule):
             due.append(trainer.max_steps - self.global_step)
         return max(1, min(due))
 
-    def _closure(self, windows: Windows) -> Callable[[], Tensor]:
-        """Return a function that sets the gradient of a batch and returns the losses."""
+    def _step(self, windows: Windows, optimizer: Any, schedule: Any) -> list[Tensor]:
+        """Take a step of the optimizer and the schedule on a batch, and return the losses."""
 
         def closure() -> Tensor:
             losses, gradient = self._gradients(windows)
@@ -179,7 +193,9 @@ class DynamicsLearner(L.LightningModule):
             self._vector.gradient.copy_(clipped(gradient, *self._clipping))
             return losses
 
-        return closure
+        losses = optimizer.step(closure)
+        schedule.step()
+        return [losses]
 
     def _refuse_non_finite(self, losses: Tensor, first: int) -> None:
         for step, loss in enumerate(losses.reshape(len(losses), -1).sum(1).tolist(), first):

@@ -1,5 +1,7 @@
 """The LightningModule: a training lowers the loss, and stops at one that is not a number."""
 
+import contextlib
+import itertools
 from functools import partial
 
 import numpy as np
@@ -13,8 +15,15 @@ from torch.optim.lr_scheduler import OneCycleLR
 
 from pinn_dyn.data import DynamicsData
 from pinn_dyn.models import AccelerationMLP
-from pinn_dyn.training import SOAP, DynamicsLearner, IncrementLoss, NonFiniteLossError
+from pinn_dyn.training import (
+    SOAP,
+    DynamicsLearner,
+    IncrementLoss,
+    MidpointLoss,
+    NonFiniteLossError,
+)
 from pinn_dyn.training.adamw import clipped
+from pinn_dyn.training.gradients import Compiled
 from tests.support.training import MODELS, Oscillators, make_splits, make_trainer
 
 
@@ -37,17 +46,23 @@ def data(splits):
 
 
 def make_learner(
-    model, data, validator=lambda model, truth: {"error_mean": 1.0}, lr=0.01, optimizer=AdamW
+    model,
+    data,
+    validator=lambda model, truth: {"error_mean": 1.0},
+    lr=0.01,
+    optimizer=AdamW,
+    loss=IncrementLoss,
+    compile=False,
 ):
     return DynamicsLearner(
         model,
-        loss=IncrementLoss(data.statistics, model),
+        loss=loss(data.statistics, model),
         optimizer=partial(optimizer, lr=lr),
         scheduler=partial(OneCycleLR, max_lr=lr),
         validator=validator,
         config={"seed": 0},
         statistics=data.statistics,
-        compile=False,
+        compile=compile,
     )
 
 
@@ -198,6 +213,63 @@ def test_many_steps_in_one_are_the_same_training(tmp_path, data, monkeypatch):
     assert trainer.callback_metrics["train/loss"] == other.callback_metrics["train/loss"]
     for one, two in zip(together, alone, strict=True):
         assert torch.equal(one, two)
+
+
+def taught(tmp_path, data, compile, interrupted=None):
+    """A learner, and where its schedule and optimizer are after a training, or an interrupt.
+
+    The schedule moves the rate and the momentum.
+    """
+    torch.manual_seed(0)
+    model = AccelerationMLP(data.statistics, [8])
+    learner = make_learner(model, data, loss=MidpointLoss, compile=compile)
+    prepared = learner._prepared_steps
+
+    def stopped(*arguments):
+        for step, take in enumerate(prepared(*arguments), learner.global_step):
+            yield take if step != interrupted else partial(interrupt, learner)
+
+    learner._prepared_steps = stopped
+    trainer = make_trainer(tmp_path, max_epochs=2, enable_checkpointing=False)
+    with contextlib.suppress(SystemExit, KeyboardInterrupt):
+        trainer.fit(learner, data)
+    (group,) = learner.optimizers(use_pl_optimizer=False).param_groups
+    return learner, learner.lr_schedulers().last_epoch, group["lr"], group["betas"][0]
+
+
+def interrupt(learner):
+    raise KeyboardInterrupt
+
+
+def test_a_program_takes_each_step_with_its_rate_and_momentum(tmp_path, data, traced, monkeypatch):
+    """Some batches are not for the program."""
+    monkeypatch.setattr("pinn_dyn.training.learner.BLOCK_SECONDS", 100.0)
+    step, calls = Compiled.step, itertools.count()
+
+    def sometimes(*arguments):
+        return step(*arguments) if next(calls) % 15 < 12 else None
+
+    monkeypatch.setattr(Compiled, "step", sometimes)
+    (program, *ours), (eager, *theirs) = (taught(tmp_path, data, x) for x in (True, False))
+    assert ours == theirs
+    assert next(calls) > 20
+    for one, two in zip(program.model.parameters(), eager.model.parameters(), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("compile", [True, False])
+def test_the_schedule_of_interrupted_steps_is_that_of_the_steps_done(
+    tmp_path, data, traced, monkeypatch, compile
+):
+    monkeypatch.setattr("pinn_dyn.training.learner.BLOCK_SECONDS", 100.0)
+    learner, *state = taught(tmp_path, data, compile, interrupted=41)
+    optimizer = AdamW([torch.nn.Parameter(torch.ones(1))])
+    schedule = OneCycleLR(optimizer, max_lr=0.01, total_steps=60)
+    for _ in range(41):
+        optimizer.step()
+        schedule.step()
+    (group,) = optimizer.param_groups
+    assert (learner.global_step, *state) == (41, 41, group["lr"], group["betas"][0])
 
 
 def test_steps_end_where_the_trainer_validates_or_stops(tmp_path, data, monkeypatch):

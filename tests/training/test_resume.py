@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from functools import partial
 
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -23,11 +24,10 @@ LONG = [
 ]
 
 
-def killed_within(self, batch, step, optimizer, prepared=DynamicsLearner._prepared_step):
+def killed_within(self, *arguments, prepared=DynamicsLearner._prepared_steps):
     """In the place of what a step does: one of them is never done."""
-    if step == KILLED:
-        return lambda: os.kill(os.getpid(), signal.SIGKILL)
-    return prepared(self, batch, step, optimizer)
+    for step, take in enumerate(prepared(self, *arguments), self.global_step):
+        yield take if step != KILLED else partial(os.kill, os.getpid(), signal.SIGKILL)
 
 
 def validations(log):
@@ -43,7 +43,7 @@ def test_a_killed_and_resumed_training_ends_with_the_same_weights(tmp_path, monk
     with log.open("w") as output:
         at = dict(folder=tmp_path, output=output)
         with monkeypatch.context() as patch:
-            patch.setattr(DynamicsLearner, "_prepared_step", killed_within)
+            patch.setattr(DynamicsLearner, "_prepared_steps", killed_within)
             process = fork_script("train.py", *LONG, f"hydra.run.dir={killed}", **at)
         process.join(600)
         process.kill()

@@ -39,7 +39,7 @@ class Compiled:
         self._program = LossProgram(loss, model, vector)
         self.evaluations = EvaluationCount(loss, model)
 
-    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], Tensor] | None:
+    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], list[Tensor]] | None:
         """Return a function that takes a step on a batch, or None if a program does not pay off."""
         part = self._part(windows)
         if part is None or len(windows) >= 2 * part or windows.q.is_cuda:

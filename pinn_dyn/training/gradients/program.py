@@ -56,8 +56,11 @@ class LossProgram:
         programs = [self._program(self._traced(batch), batch, rows) for batch, rows in pairs]
         return self._run(programs, arguments)
 
-    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], Tensor]:
-        """Return a function that takes a step on a batch on the CPU, and returns the loss."""
+    def step(self, windows: Windows, optimizer: CompiledAdamW) -> Callable[[], list[Tensor]]:
+        """Return a function that takes a step on a batch on the CPU, and returns the loss.
+
+        The step has the learning rate that the optimizer has now.
+        """
         evaluate = self._traced(windows)
 
         def step(*arguments: Tensor) -> list[Tensor]:
@@ -66,14 +69,10 @@ class LossProgram:
             optimizer.step(gradient, *moved)
             return [loss]
 
-        rows = self._rows(windows)
-        program = self._program(step, windows, (*optimizer.arguments(), *rows))
-
-        def take() -> Tensor:
-            ((loss,),) = self._run([program], [(*optimizer.arguments(), *rows)])
-            return loss
-
-        return take
+        arguments = *optimizer.arguments(), *self._rows(windows)
+        program = self._program(step, windows, arguments)
+        call = functools.partial(_call, program, arguments)
+        return call if self._alone else lambda: _pool(torch.get_num_threads()).submit(call).result()
 
     def _rows(self, windows: Windows) -> list[Tensor]:
         rows = [getattr(windows, name) for name in _ROWS[self._loss.model.state]]
@@ -83,11 +82,13 @@ class LossProgram:
     def _run(
         self, programs: list[Program], arguments: list[tuple[Tensor, ...]]
     ) -> Iterable[list[Tensor]]:
-        # A single batch also runs in the pool, since small products are faster with one thread.
-        threads = torch.get_num_threads()
-        alone = threads == 1 or self._vector.values.is_cuda
-        run = map if alone else _pool(threads).map
+        run = map if self._alone else _pool(torch.get_num_threads()).map
         return run(_call, programs, arguments)
+
+    @property
+    def _alone(self) -> bool:
+        # A single batch also runs in the pool, since small products are faster with one thread.
+        return torch.get_num_threads() == 1 or self._vector.values.is_cuda
 
     def _program(
         self, function: Program, windows: Windows, arguments: tuple[Tensor, ...]
