@@ -49,6 +49,9 @@ def _arguments(path: str) -> Arguments | None:
     fields: list[ast.AnnAssign | ast.arg] = []
     arguments: Arguments = {}
     if isinstance(node, ast.ClassDef):
+        decorators = {ast.unparse(x).partition("(")[0] for x in node.decorator_list}
+        if node.keywords or not decorators <= {"dataclass", "dataclasses.dataclass"}:
+            return None
         functions = {x.name: x for x in node.body if isinstance(x, ast.FunctionDef)}
         if "__init__" not in functions:
             for base in reversed(node.bases):

@@ -32,6 +32,10 @@ class Loaded(Arm):
 class Head(torch.nn.Module):
     pass
 
+@torch.jit.script  # any decorator may add arguments
+class Wrapped:
+    def __init__(self, length): ...
+
 class Free:
     def __init__(self, **options): ...
 
@@ -56,6 +60,7 @@ def test_arguments_in_the_source_are_those_of_the_class(target):
         ("Arm", ["mas"]),
         ("Loaded", ["mas"]),
         ("Head", []),  # arguments of torch.nn.Module are not in its source
+        ("Wrapped", []),
         ("Free", []),
         ("Alias", []),
         ("Missing", []),
