@@ -363,7 +363,7 @@ def _fit(
             trainer.validate(learner, data, verbose=False)
     except SystemExit as stop:  # Lightning's end of an interrupted training
         if solver and solver.result is not None:
-            trainer.save_checkpoint(last)
+            trainer.save_checkpoint(last, weights_only=False)
         raise KeyboardInterrupt from stop
     if solver and solver.result is not None:
         recorder.facts["stage"] = solver.result.stage
