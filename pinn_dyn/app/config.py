@@ -71,8 +71,9 @@ def checked(command: str, cfg: DictConfig | dict[str, Any]) -> dict[str, Any]:
     """
     config = cfg if isinstance(cfg, dict) else plain(cfg)
     check_keys(SETTINGS[command], config)
-    if command == "train" and isinstance(config.get("trainer"), dict):
-        check_value("trainer", config["trainer"])  # before the import of Lightning
+    trainer = config.get("trainer")
+    if isinstance(trainer, dict) and trainer.get("_target_") == "lightning.Trainer":
+        check_value("trainer", trainer)  # before the import of Lightning
     check_arguments(SETTINGS[command], config)
     return config
 

@@ -6,6 +6,7 @@ import ast
 import functools
 import re
 from collections.abc import Iterator
+from difflib import get_close_matches
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from typing import Any
@@ -32,11 +33,16 @@ def unknown_keys(
     if not isinstance(value, dict):
         return
     arguments = _arguments(str(value.get("_target_", target)))
+    keys = value.keys() - {"_target_", "_partial_"}
+    if arguments and keys.isdisjoint(arguments):
+        single = len(keys) == 1 and get_close_matches(str(*keys), arguments)
+        # Otherwise it is probably the wrong class, which the full check names.
+        arguments = arguments if single else None
     for key, item in value.items():
         inner = f"{path}.{key}" if path else str(key)
         if arguments is None or key in arguments:
             yield from unknown_keys(item, (arguments or {}).get(key), inner)
-        elif key not in ("_target_", "_partial_"):
+        elif key in keys:
             yield inner, arguments
 
 
