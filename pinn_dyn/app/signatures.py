@@ -7,6 +7,7 @@ import functools
 import re
 from collections.abc import Iterator
 from difflib import get_close_matches
+from importlib.abc import InspectLoader
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from typing import Any
@@ -101,7 +102,8 @@ def _definition(path: str) -> tuple[str, ast.AST | None]:
 def _source(module: str) -> tuple[ast.Module, dict[str, str]]:
     """Return the syntax tree of a module, and the paths of the names that it imports."""
     spec = _spec(module)
-    text = getattr(spec and spec.loader, "get_source", lambda _: "")(module)
+    has_source = spec is not None and isinstance(spec.loader, InspectLoader)
+    text = spec.loader.get_source(module) if has_source else None  # type: ignore[union-attr]
     tree = ast.parse(text or "")  # no text of a module in C
     return tree, imported_names(tree, spec.parent or "" if spec else "")
 

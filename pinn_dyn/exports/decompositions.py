@@ -1,4 +1,4 @@
-"""Operations as those that all exports have; factorizations for matrices of a few rows."""
+"""Operations in terms of those that all exports have, and factorizations of small matrices."""
 
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ _SPEEDS = 16  # blocks of the speeds of a joint
 _FIRST_NOISE = 0.1  # largest assumed noise of the normalized residuals before the first fit
 _CHANGED = 5.0  # prior standard deviation of a changed body, which may be a heavy payload
 _SCALE = 100.0  # root of the prior precision of the last mass of a robot without inputs
-_LEVEL = 0.95  # one-sided, at which a stage is worse than an earlier one
-_NOISE = 0.2  # largest share of a validation error that is attributed to noise
+_LEVEL = 0.95  # level of the one-sided test for a larger validation error
+_NOISE = 0.2  # largest relative difference of validation errors that may be noise
 _DIVERGED = 1e4  # residual of a diverged rollout
 IDENTIFICATION = "inverse dynamics"
 """Name of the first stage."""
@@ -74,9 +74,10 @@ class LeastSquares:
     2. Rollouts: r = predicted minus measured increments of the windows, in units of their spread,
        as in the increment loss. The first rollouts use a quarter of the steps of the windows.
 
-    Later stages fit what is predicted. So the kept stage is the last one whose validation error is
-    the smallest, or larger by less than a fifth and not significantly, by a paired t-test over V
-    parts of the validation motions (95 %, one-sided). Without validation it is the last stage.
+    The kept stage is the last one whose validation error is not clearly larger than the smallest,
+    since later stages fit what is predicted. An error is clearly larger if it is 20 % larger, or if
+    a paired t-test over V parts of the validation motions is significant (95 %, one-sided). Without
+    validation, the last stage is kept.
 
     s^2 is the mean square of the residuals times the number of correlated residuals that count as
     one, estimated by repeating each stage. The covariance of z, and this number, follow from sums

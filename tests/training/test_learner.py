@@ -242,7 +242,7 @@ def interrupt(learner):
 
 
 def test_a_program_takes_each_step_with_its_rate_and_momentum(tmp_path, data, traced, monkeypatch):
-    """Some batches are not for the program."""
+    """Mix batches for the program and batches for the optimizer."""
     monkeypatch.setattr("pinn_dyn.training.learner.BLOCK_SECONDS", 100.0)
     step, calls = Compiled.step, itertools.count()
 
