@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,16 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
 from pydantic import PositiveFloat
 
 from pinn_dyn.data import logs
+from pinn_dyn.data.logs.averages import Averages, white_noise
 from pinn_dyn.data.logs.delay import INTERVAL
-from pinn_dyn.data.logs.delay_regression import white_noise
+from pinn_dyn.data.logs.input_faults import input_faults
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.whole import write_whole
 from pinn_dyn.evaluation import log_numbers as numbers
 from pinn_dyn.evaluation.rigid_excitation import MOST, RigidExcitation, rigid_excitation
+from pinn_dyn.evaluation.structure_check import compare_structure, regressor
 from pinn_dyn.mechanics import Trajectory
 from pinn_dyn.models.known import Structure
 
@@ -51,6 +53,8 @@ class LogCheck:
         options: options of a training: heads for dry friction or servos, if needed; none if an
             angle turns too far in a sample for a step.
         rigid: excitation of the base parameters of a rigid robot; None without a structure.
+        motion: averages of the motion, or None if it is too short for an equation of motion.
+        equations: equations of motion of the log.
     """
 
     source: logs.LogSource
@@ -62,6 +66,8 @@ class LogCheck:
     steps: list[str]
     options: list[str]
     rigid: RigidExcitation | None = None
+    motion: Averages | None = None
+    equations: Sequence[logs.Equation] = ()
 
     @property
     def problems(self) -> list[str]:
@@ -87,30 +93,47 @@ class LogCheck:
         frame.insert(0, "verdict", frame.pop("verdict"))
         return frame.sort_values("verdict", key=lambda x: x.map(_RANK), kind="stable")
 
+    @property
+    def verdict(self) -> str:
+        """The verdict in one line."""
+        count = len(self.findings())
+        if self.problems:
+            return f"a training makes no sense: {'; '.join(self.problems)}"
+        notes = f"{count} warning{'s' * (count != 1)}" if count else "no warnings"
+        return f"a training makes sense, {notes}"
+
+    def findings(self) -> list[str]:
+        """Return what is not ok, stops first. Equal quantities of several places are one text."""
+        groups: dict[tuple[str, str], list[Measurement]] = {}
+        bad = sorted(self.measurements, key=lambda x: _RANK[x.verdict])
+        for item in (x for x in bad if x.verdict != "ok"):
+            groups.setdefault((item.name, _cause(item.text)), []).append(item)
+        texts = []
+        for items in groups.values():
+            first = items[0]
+            more = ", ".join(x.place for x in items[1:] if x.place) or f"{len(items) - 1} more"
+            also = f" The same: {more}." if len(items) > 1 else ""
+            texts.append(f"{first.verdict}: {first.text}.{also} ({first.section})")
+        return texts
+
     def __str__(self) -> str:
-        tables = {
-            "Runs": self.runs,
-            "Coordinates": self.coordinates,
-            "Inputs": self.inputs,
-            "Measurements": self.table()[["verdict", "measurement", "of", "value", "expected"]],
-        }
+        lines = [f"{self.source.name}: {self.verdict}", *(f"\n{x}" for x in self.findings())]
+        tables = {"Coordinates": self.coordinates, "Inputs": self.inputs}
         if self.rigid is not None:
             tables[f"Rigid bodies, not determined: {self.rigid.undetermined}"] = self.rigid.joints
-        lines = [f"{self.source.name}: check of the log"]
         for title, frame in ((k, x) for k, x in tables.items() if len(x)):
             text = frame.to_string(
                 index=False, na_rep="", float_format="{:.3g}".format, max_rows=_ROWS
             )
             lines += ["", title, text]
-        bad = [x for x in self.measurements if x.verdict != "ok"]
-        lines += [f"\n{x.verdict}: {x.text} ({x.section})" for x in bad]
+        ok = sum(x.verdict == "ok" for x in self.measurements)
+        lines += ["", f"{ok} of {len(self.measurements)} measurements are ok; the page lists them."]
         if self.steps:
             place = "steps" if self.source.steps else "the data set"
             lines += ["", f"Append to {place}:", "", self.block]
         if self.options:
             lines += ["", f"Options of a training: model=lnn {' '.join(self.options)}"]
-        verdict = "no sense" if self.problems else "sense"
-        return "\n".join([*lines, "", f"Verdict: a training makes {verdict}"])
+        return "\n".join(lines)
 
     def save(self, folder: str | Path, command: str = "") -> Path:
         """Write ``check.html``, ``measurements.csv`` and ``log_report.md``; return the page."""
@@ -145,12 +168,27 @@ def check(
     training = [item for x in source.cleaned if x.split == "train" for item in x.clean]
     training = [replace(item, u=item.u[:, :inputs]) for item in training]  # no rates of inputs
     step = float(np.median(np.diff(training[0].t)))
-    rigid = None if structure is None else partial(_regressor, structure)
+    square = structure is not None and structure.num_coordinates == inputs
+    rigid = regressor(structure) if structure is not None and square else None
     delays = logs.input_delays(training, longest=longest_delay, rigid=rigid)
+    faults, delays = input_faults(training, delays, source.u, step, rigid)
     coordinates = _coordinates(source, training, splits.test)
     noise = coordinates["noise of q"].to_numpy()
     highest = numbers.bandwidth(training, step, noise)
-    measurements = [*source.measurements, *_limited(coordinates)]
+    everything = [item for x in source.cleaned for item in x.clean]
+    columns = source.q, source.u
+    motion, equations = logs.equations_of_motion(
+        everything, *columns, step, curves=delays, rigid=rigid
+    )
+    after = logs.check_runs(everything, *columns, step, curves=delays, rigid=rigid)
+    # A fault of an input explains runs that differ, and signs.
+    if any(x.verdict != "ok" for x in faults):
+        after = []
+    names = {logs.RESIDUAL, logs.INERTIA}
+    before = [x for x in source.measurements if x.name not in names]
+    measurements = [*before, *after, *faults, *_limited(coordinates)]
+    if structure is not None:
+        measurements += compare_structure(structure, training, delays, source.u, step)
     if inputs:
         share = numbers.explained_share(training, delays, step)
         text = (
@@ -216,7 +254,14 @@ def check(
         else ["model/input=servo", "model/integrator=rosenbrock"] * servo
         + ["model/friction=coulomb"] * dry,
         excitation,
+        motion,
+        equations,
     )
+
+
+def _cause(text: str) -> str:
+    """Return the part of a text that names a cause, without names and numbers of its place."""
+    return re.sub(r"[\d.]+|\S*[/\\']\S*", "", text.rpartition(": ")[2])
 
 
 def _run(part: logs.Cleaned) -> dict[str, object]:
@@ -252,10 +297,6 @@ def _coordinates(
         "test outside": ((tested < low) | (tested > high)).mean(axis=0),
     }
     return pd.DataFrame(table)
-
-
-def _regressor(structure: Structure, *motion: np.ndarray) -> np.ndarray:
-    return structure.regressor(*map(torch.from_numpy, motion)).numpy()
 
 
 def _limited(coordinates: pd.DataFrame) -> list[Measurement]:

@@ -8,11 +8,13 @@ import numpy as np
 import scipy
 
 from pinn_dyn.data.logs import DelayCurve, Recording
-from pinn_dyn.data.logs.delay_regression import CUT, averages
+from pinn_dyn.data.logs.averages import Averages
+from pinn_dyn.data.logs.equation import EquationOfMotionRegression
+from pinn_dyn.data.logs.input_faults import delayed
 
 _LAGS = 30  # of a target that are tried
 _STILL = 0.01  # variance of a coordinate at rest as a share of the largest
-_SMOOTH = 0.03  # width of the kernel before a derivative, s
+_INDEPENDENT = 3.5  # widths at which the averages of two rows are independent
 
 
 def explained_share(
@@ -22,26 +24,27 @@ def explained_share(
 
     The result is 1 where the rows are too few to tell.
     """
-    width = max(_SMOOTH / step, 1.5)
-    edge = int(CUT * width) + 1
-    lags = [round((curve.delay or 0.0) / step) for curve in delays]
-    parts = []
-    for item in training:
-        # At this distance the averages of two rows are independent.
-        rows = np.arange(edge + max(lags), len(item) - edge, max(1, int(3.5 * width)))
-        smooth = averages(item.u, width)
-        acting = np.column_stack([smooth[rows - lag, i] for i, lag in enumerate(lags)])
-        motion = [averages(item.q, width, order=k)[rows] for k in range(3)]
-        parts.append([*motion, acting])
-    q, v, a, u = map(np.vstack, zip(*parts, strict=True))
-    if len(q) < 6 * (3 * q.shape[1] + len(lags)):
+    parts = delayed(training, [curve.delay or 0.0 for curve in delays])
+    data = Averages.of(parts, step, spacing=_INDEPENDENT)
+    if data is None or len(data.t) < 6 * (3 * data.q.shape[1] + len(delays)):
         return 1.0
-    basis = np.hstack([np.ones((len(q), 1)), q, np.sin(q), np.cos(q)])
+    u = data.u[:, 0]
+    columns = {"one": np.ones((len(u), 1)), "u": u - u.mean(axis=0), "q": data.q}
+    columns |= {"sin": np.sin(data.q), "cos": np.cos(data.q)}
+    columns |= {"v": data.v - data.v.mean(axis=0), "a": data.a - data.a.mean(axis=0)}
+    regression = EquationOfMotionRegression(columns, np.zeros(len(u), dtype=int))
+
+    def unexplained(y: str, *x: str) -> float:
+        """Return the share of the variance of y that x leaves, per degree of freedom."""
+        names = ["one", "q", "sin", "cos", *x]
+        count = sum(columns[name].shape[1] for name in names)
+        return float(regression.fit(y, names).shares()[0].mean()) * len(u) / (len(u) - count)
+
     return max(
-        _unexplained(v, basis) - _unexplained(v, np.hstack([basis, u])),
-        _unexplained(a, np.hstack([basis, v])) - _unexplained(a, np.hstack([basis, v, u])),
+        unexplained("v") - unexplained("v", "u"),
+        unexplained("a", "v") - unexplained("a", "v", "u"),
         # The acceleration of a controlled robot may follow from q and v; its torque then does too.
-        1 - _unexplained(u, np.hstack([basis, v, a])),
+        1 - unexplained("u", "v", "a"),
     )
 
 
@@ -62,18 +65,6 @@ def target_distance(training: Sequence[Recording], step: float, longest: float) 
         parts = [item.q[lag:] - item.u[: len(item) - lag, :size] for item in training]
         shares.append(np.vstack(parts).var(axis=0) / spread)
     return float(np.min(shares, axis=0).max())
-
-
-def _unexplained(y: np.ndarray, x: np.ndarray) -> float:
-    """Return the share of the variance of y that x leaves, per degree of freedom."""
-    spread = y.std(axis=0)
-    moving = spread > 1e-12 * np.abs(y).max(axis=0)  # a constant has the spread of rounding
-    if not moving.any():
-        return 1.0
-    y = (y[:, moving] - y[:, moving].mean(axis=0)) / spread[moving]
-    x = x / np.abs(x).max(axis=0).clip(min=1e-300)
-    remainder = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-    return float((remainder**2).mean()) * len(x) / (len(x) - x.shape[1])
 
 
 def bandwidth(training: Sequence[Recording], step: float, noise: np.ndarray) -> float:

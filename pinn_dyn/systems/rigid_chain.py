@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -159,8 +159,15 @@ class RigidChain(MechanicalSystem):
 
     def with_joints(self, joints: Sequence[str]) -> RigidChain:
         """Return the same robot with other coordinates; see ``joints``."""
+        return self._with("joints", list(joints))
+
+    def with_gravity(self, gravity: Sequence[float]) -> RigidChain:
+        """Return the same robot with another gravitational acceleration, m/s^2, 3 numbers."""
+        return self._with("gravity", list(gravity))
+
+    def _with(self, name: str, value: Any) -> RigidChain:
         names = inspect.signature(type(self)).parameters
-        return type(self)(**{**{x: getattr(self, x) for x in names}, "joints": list(joints)})
+        return type(self)(**{**{x: getattr(self, x) for x in names}, name: value})
 
     def check_domain(self, q_low: np.ndarray, q_high: np.ndarray) -> None:
         """Check that the bodies of the file have a positive mass matrix at q = 0.

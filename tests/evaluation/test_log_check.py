@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data.logs import Butterworth, LogSource, Recording
-from pinn_dyn.data.logs.delay_regression import white_noise
+from pinn_dyn.data.logs.averages import white_noise
 from pinn_dyn.evaluation.log_check import check
 from pinn_dyn.evaluation.log_numbers import bandwidth
 from tests.support.delayed_robots import resting

@@ -15,6 +15,7 @@ from pinn_dyn.data.logs.measurement import Measurement
 from pinn_dyn.data.logs.pieces import Cleaned
 from pinn_dyn.data.logs.readers import READERS
 from pinn_dyn.data.logs.recording import Recording
+from pinn_dyn.data.logs.runs import INERTIA, RESIDUAL, Equation, check_runs, equations_of_motion
 from pinn_dyn.data.logs.source import LogSource
 from pinn_dyn.data.logs.splits import Part
 from pinn_dyn.data.logs.stamps import Clock
@@ -22,7 +23,9 @@ from pinn_dyn.data.logs.step import Step, window_samples
 from pinn_dyn.data.logs.table import Request, Table
 
 __all__ = [
+    "INERTIA",
     "READERS",
+    "RESIDUAL",
     "UNITS",
     "Butterworth",
     "Cleaned",
@@ -30,6 +33,7 @@ __all__ = [
     "Columns",
     "Deduplicate",
     "DelayCurve",
+    "Equation",
     "InputDelay",
     "InputRates",
     "LogError",
@@ -45,7 +49,9 @@ __all__ = [
     "SplitGaps",
     "Step",
     "Table",
+    "check_runs",
     "clear_delays",
+    "equations_of_motion",
     "input_delays",
     "window_samples",
 ]

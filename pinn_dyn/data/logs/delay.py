@@ -3,13 +3,13 @@
 A candidate d is judged by the share that an equation of motion leaves unexplained:
 
     inverse dynamics    u_i(t - d_i) = f_i(q, v, a),    with at most as many inputs as q
-    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if f has no answer
+    rigid bodies        u_i(t - d_i) = Y_i(q, v, a) pi + friction,    if there is a structure
     increments          v = f(q) + B(u(t - d)),         overdamped robots with more inputs
     acceleration        a = f(q, v) + B(u(t - d)),      robots with more inputs
 
-f and B are linear in their parameters (least squares). All signals are averaged by one Gaussian
-kernel g, whose slopes give the derivatives: g * a = g'' * q. The form and width count whose
-estimate varies least when tenths of the data are left out in turn (jackknife).
+f and B are linear in their parameters (least squares). Noise of the acceleration makes inertias too
+small, and a delay would make up for it: kernels that leave too much noise are not used. The form
+and width count whose estimate varies least when parts of the data are left out in turn (jackknife).
 """
 
 from __future__ import annotations
@@ -19,22 +19,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pinn_dyn.data.logs.delay_regression import (
-    BLOCKS,
-    Regressor,
-    Smoothed,
-    input_shares,
-    motion_shares,
-    terms,
-)
+from pinn_dyn.data.logs.averages import Averages, with_products
+from pinn_dyn.data.logs.equation import EquationOfMotionRegression, Regressor, terms
 from pinn_dyn.data.logs.recording import Recording
 
 _WIDTHS = (0.005, 0.01, 0.02, 0.04, 0.08)  # of the kernel, s
 _CANDIDATES = 60  # at most: a parabola finds what is between them
-_DEPTH = 0.9  # largest residual as a share of its median
+_NOISE = 0.01  # largest part of the variance of the acceleration that is noise
+_DEPTH = 0.8  # largest residual as a share of its median
 _SPREAD = 0.6  # largest spread of an estimate as a share of a sample, or of 10 ms
 _UNEXPLAINED = 0.4  # largest residual
 _WORSE = 2.0  # residual over that of the best equation of motion, beyond which it is left out
+_GROUPS = 10  # of the data that the jackknife leaves out in turn
+_FEWEST = 20 * _GROUPS  # rows
 _AFTER = "the input is logged after the motion: a filtered measurement, or another clock"
 _INVERSE, _RIGID = "inverse dynamics", "rigid bodies"
 _ONE_LINE = 0.995  # of the power of a signal
@@ -87,21 +84,23 @@ def input_delays(
         LogError: if a clock is not uniform.
     """
     step = recordings[0].sample_time("a delay")
-    inputs = recordings[0].u.shape[1]
+    inputs, size = recordings[0].u.shape[1], recordings[0].q.shape[1]
     if not inputs:
         return []
     stride = max(1, round(longest / step / _CANDIDATES))
     lags = stride * np.arange(-2, max(round(longest / step / stride), 3) + 1)
-    forms: dict[str, list[list[DelayCurve]]] = {}
-    for width in sorted({max(width, 1.5 * step) for width in _WIDTHS}):
-        data = Smoothed.average(recordings, step, width, lags)
-        for form, shares in _shares(data, inputs, rigid).items() if data else ():
-            parts = np.moveaxis(shares, -1, 0)
-            curves = [_curve(lags * step, share, force, form) for share, force in parts]
-            forms.setdefault(form, []).append(curves * (inputs // len(curves)))
-    if not forms:
+    parts = [with_products(x) for x in recordings] if inputs > size else recordings
+    widths = sorted({max(width, 1.5 * step) for width in _WIDTHS})
+    trials = [Averages.of(parts, step, width, lags) for width in widths]
+    enough = [data for data in trials if data is not None and len(data.t) >= _FEWEST]
+    if not enough:
         short = "the stretches are too short"
         return [DelayCurve(lags * step, np.ones(len(lags)), None, np.inf, "none", short)] * inputs
+    forms: dict[str, list[list[DelayCurve]]] = {}
+    smooth = [data for data in enough if data.noise.max() < _NOISE] or enough[-1:]
+    for data in smooth:
+        for form, curves in _curves(data, inputs, rigid, lags * step).items():
+            forms.setdefault(form, []).append(curves * (inputs // len(curves)))
     best = {
         form: [_best(curves) for curves in zip(*trials, strict=True)]
         for form, trials in forms.items()
@@ -110,7 +109,7 @@ def input_delays(
     curves = _agreed(list(best.values()), step)
     if bodies is not None:
         curves = [
-            of_bodies if curve.reason and not of_bodies.reason else curve
+            of_bodies if not of_bodies.reason else curve
             for curve, of_bodies in zip(curves, bodies, strict=True)
         ]
     reason = "the input is a single sine, whose delay looks like damping"
@@ -122,22 +121,21 @@ def input_delays(
 
 
 def clear_delays(curves: Sequence[DelayCurve], step: float) -> list[float]:
-    """Return the delay of each input in s, or 0 where the data agree with no delay.
+    """Return the delay of each input in s, or 0 where the data agree with no delay or do not tell.
 
     A delay is clear from one sample on, if its 95 % interval excludes half a sample: the hold of a
     sampled input is no delay. Delays that agree within their intervals are one delay.
     """
     values = np.array([np.nan if x.delay is None else x.delay for x in curves])
-    if np.isnan(values).all():
+    usable = np.isfinite(values)
+    if not usable.any():
         return [0.0] * len(curves)
     # The shape of the input between samples is worth a quarter of a sample.
     widths = INTERVAL * np.hypot([x.spread for x in curves], step / 4)
-    usable = np.isfinite(values)
     weights = usable / widths**2
     mean = float(np.nansum(weights * values) / weights.sum())
     if (np.abs(values - mean) <= widths)[usable].all():
-        logged_late = np.array([x.reason == _AFTER for x in curves])
-        values = np.where(logged_late, np.nan, mean)
+        values = np.where(usable, mean, np.nan)
         widths = np.full(len(curves), widths[usable].min())
     clear = (values >= step) & (values - widths > step / 2)
     return np.where(clear, values, 0.0).tolist()
@@ -178,18 +176,81 @@ def _is_sine(x: np.ndarray) -> bool:
     return bool(power[max(peak - 2, 0) : peak + 3].sum() >= _ONE_LINE * power.sum())
 
 
-def _shares(data: Smoothed, inputs: int, rigid: Regressor | None) -> dict[str, np.ndarray]:
-    """Return unexplained shares and friction by form, ``(2, B + 1, D, M)``; of all inputs M = 1."""
-    if inputs > data.q.shape[1]:
-        shares = {
-            "increments": motion_shares(terms(data, "increments"), data, data.v),
-            "acceleration": motion_shares(terms(data, "acceleration"), data, data.a),
+def _curves(
+    data: Averages, inputs: int, rigid: Regressor | None, candidates: np.ndarray
+) -> dict[str, list[DelayCurve]]:
+    """Return a curve of each input in each form of the equation; or one for all inputs."""
+    size = data.q.shape[1]
+    if inputs > size:
+        return {
+            form: [_motion_curve(data, form, motion, candidates)]
+            for form, motion in (("increments", data.v), ("acceleration", data.a))
         }
-        return {form: np.stack([x, np.full_like(x, np.nan)]) for form, x in shares.items()}
-    shares = {_INVERSE: input_shares(data, inputs)}
-    if rigid is not None and inputs == data.q.shape[1]:
-        shares[_RIGID] = input_shares(data, inputs, rigid)
-    return shares
+    forms = {_INVERSE: [_input_curve(data, i, inputs, None, candidates) for i in range(inputs)]}
+    if rigid is not None and inputs == size:
+        forms[_RIGID] = [_input_curve(data, i, inputs, rigid, candidates) for i in range(inputs)]
+    return forms
+
+
+def _input_curve(
+    data: Averages, i: int, inputs: int, rigid: Regressor | None, candidates: np.ndarray
+) -> DelayCurve:
+    """Return the curve of input i by inverse dynamics, generic or of rigid bodies."""
+    moving = data.moving_rows(i, inputs)
+    form = _INVERSE if rigid is None else _RIGID
+    if moving.sum() < _FEWEST:
+        ones = np.ones(len(candidates))
+        return DelayCurve(candidates, ones, None, np.inf, form, "the joint hardly moves")
+    data = data.rows(moving)
+    columns = force_columns(data, i, rigid)
+    u = data.u[:, :, i] - data.u[:, :, i].mean(axis=0)
+    regression = EquationOfMotionRegression({**columns, "u": u}, _tenths(data))
+    weights = regression.jackknife()
+    shares = regression.fit("u", list(columns), weights).shares()
+    # The level of the friction is that without its rise at low speed.
+    level = regression.fit("u", ["terms", "sign"], weights).theta[:, columns["terms"].shape[1] :]
+    own = i if columns["sign"].shape[1] > 1 else 0
+    friction = level[:, own] / u.std(axis=0) if inputs == data.q.shape[1] else np.nan * shares
+    return _curve(candidates, shares, friction, form)
+
+
+def force_columns(data: Averages, i: int, rigid: Regressor | None) -> dict[str, np.ndarray]:
+    """Return the columns that explain input i: terms, sign of v, and sign of slow v.
+
+    Without a structure, the signs of all joints count.
+    """
+    if rigid is None:
+        return {
+            "terms": terms(data, "inverse dynamics"),
+            "sign": data.sign,
+            "slow": data.slow_sign,
+        }
+    bodies = rigid(data.q, data.v, data.a)[:, i]
+    drive = [data.a[:, i], data.v[:, i], np.ones(len(bodies))]
+    size = data.q.shape[1]
+    return {
+        "terms": np.column_stack([bodies, *drive]),
+        "sign": data.sign[:, [i]],
+        "slow": data.slow_sign[:, [i, size + i]],
+    }
+
+
+def _motion_curve(
+    data: Averages, form: str, motion: np.ndarray, candidates: np.ndarray
+) -> DelayCurve:
+    """Return the curve of all inputs by v or a ``(R, N)``."""
+    spread = motion.std(axis=0).clip(min=1e-300)
+    columns = {"terms": terms(data, form), "motion": (motion - motion.mean(axis=0)) / spread}
+    columns |= {f"u{k}": data.u[:, k] for k in range(len(candidates))}
+    regression = EquationOfMotionRegression(columns, _tenths(data))
+    weights = regression.jackknife()
+    fits = [regression.fit("motion", ["terms", f"u{k}"], weights) for k in range(len(candidates))]
+    shares = np.stack([fit.shares().mean(axis=1) for fit in fits], axis=1)
+    return _curve(candidates, shares, np.full_like(shares, np.nan), form)
+
+
+def _tenths(data: Averages) -> np.ndarray:
+    return np.arange(len(data.t)) * _GROUPS // len(data.t)
 
 
 def _curve(
@@ -199,7 +260,7 @@ def _curve(
     gap = candidates[1] - candidates[0]
     residual, best = shares[0], int(shares[0].argmin())
     minima = np.array([_minimum(candidates, share) for share in shares[1:]])
-    spread = float(np.sqrt((BLOCKS - 1) * minima.var()))
+    spread = float(np.sqrt((len(minima) - 1) * minima.var()))
     reason = ""
     if residual[best] > _UNEXPLAINED:
         reason = f"the equation leaves {100 * residual[best]:.0f} % unexplained at any delay"
@@ -213,7 +274,7 @@ def _curve(
         reason = _AFTER
     delay = max(_minimum(candidates, residual), 0.0)
     level, parts = friction[0, best], friction[1:, best]
-    level_spread = float(np.sqrt((BLOCKS - 1) * parts.var()))
+    level_spread = float(np.sqrt((len(parts) - 1) * parts.var()))
     return DelayCurve(
         candidates, residual, None if reason else delay, spread, form, reason, level, level_spread
     )

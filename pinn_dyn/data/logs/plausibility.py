@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy
-from scipy.ndimage import gaussian_filter1d
 
+from pinn_dyn.data.logs.averages import Averages
 from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.equation import EquationOfMotionRegression
 from pinn_dyn.data.logs.measurement import Measurement, Verdict, judged
 from pinn_dyn.data.logs.recording import Recording
 
@@ -18,19 +20,35 @@ _CLEAR = 0.8  # correlation from which the factor is determined
 _AT_REST, _ALL_AT_REST = 0.9, 0.98  # shares of samples at rest of a warning and of a stop
 _STILL = 1e-12  # range of a coordinate that does not move, m or rad
 _TENTHS, _MOST_ODD = 10, 0.6  # parts of a stretch; largest share of parts that disagree
-_SMOOTH, _PERIODIC = 0.03, 0.6  # s; of the acceleration: largest share that periodic terms leave
+_PERIODIC = 0.6  # of the acceleration: largest share that periodic terms leave
 _FREE = 0.03  # largest share of the acceleration of a free motor that its input leaves
+_NEXT = 0.02  # median steps of q between an input and the next q
+_LAGS, _LAGGED = 0.2, 0.5  # of v: longest, s; share over that without a lag
 _MOVING, _LEFT = 0.05, 0.7  # of a tenth: share of the mean square, share of Δq² that k v leaves
 
 
-def check_inputs(training: list[Recording], u: Columns) -> list[Measurement]:
-    """Measure the range of each input in the training."""
+def check_inputs(training: list[Recording], q: Columns, u: Columns) -> list[Measurement]:
+    """Measure the range of each input in the training, and compare it with the next q."""
     ranges = np.ptp(np.vstack([item.u[:, : len(u.columns)] for item in training]), axis=0)
     text = "input {!r} is constant in the training runs: its effect cannot be learned"
-    return [
+    results = [
         judged("range of the input", name, size, "above 0", size == 0, text.format(name))
         for name, size in zip(u.columns, ranges, strict=True)
     ]
+    steps = np.vstack([np.diff(item.q, axis=0) for item in training])
+    usual = np.median(np.abs(steps), axis=0).clip(min=1e-300)
+    for i, name in enumerate(u.columns):
+        following = np.vstack([item.u[:-1, [i]] - item.q[1:] for item in training])
+        distance = np.median(np.abs(following), axis=0) / usual
+        k = int(distance.argmin())
+        text = (
+            f"input {name!r} is {q.columns[k]!r} of the next row, not a command: any model "
+            "predicts q from it, and no controller can use it; log the command that is sent"
+        )
+        bad = bool(distance[k] < _NEXT)
+        measured = ("distance of the input from the next q", name, distance[k])
+        results.append(judged(*measured, f"above {_NEXT:g} steps", bad, text, "stop"))
+    return results
 
 
 def check_angles(recordings: list[Recording], q: Columns, step: float) -> list[Measurement]:
@@ -56,21 +74,21 @@ def _turns(recordings: list[Recording], k: int, step: float) -> bool:
     path, last = sum(np.abs(x).sum() for x in steps), sum(abs(x[-1]) * len(x) for x in steps)
     if sum(abs(x.sum()) for x in steps) > 0.9 * path and last > 0.1 * path:
         return True
-    samples = max(_SMOOTH / step, 1.5)
-    n, m = recordings[0].q.shape[1], recordings[0].u.shape[1]
-    parts = []
-    for item in recordings:
-        v = np.gradient(item.q, step, axis=0)
-        smooth = [gaussian_filter1d(v, samples, 0, order) for order in (1, 0)]
-        drives = np.hstack([gaussian_filter1d(item.u, samples, 0), np.sign(smooth[1])])
-        trig = np.hstack([np.sin(item.q), np.cos(item.q)])
-        parts.append(np.hstack([smooth[0][:, [k]], np.ones((len(v), 1)), smooth[1], drives, trig]))
-    a, plain, drives, trig = np.split(np.vstack(parts), np.cumsum([1, 1 + n, n + m]), axis=1)
-    left = [
-        ((a - x @ np.linalg.lstsq(x, a, rcond=None)[0]) ** 2).sum()
-        for x in (plain, np.hstack([plain, trig]), np.hstack([plain, drives]))
-    ]
-    return bool(left[1] < _PERIODIC * left[0] or left[2] < _FREE * (a**2).sum())
+    data = Averages.of(recordings, step)
+    if data is None:
+        return False
+    columns = {
+        "a": data.a[:, k],
+        "plain": np.hstack([np.ones((len(data.t), 1)), data.v]),
+        "periodic": np.hstack([np.sin(data.q), np.cos(data.q)]),
+        "drives": np.hstack([data.u[:, 0], np.sign(data.v)]),
+    }
+    regression = EquationOfMotionRegression(columns, np.zeros(len(data.t), dtype=int))
+    plain, periodic, driven = (
+        float(regression.fit("a", x).shares()[0, 0])
+        for x in (["plain"], ["plain", "periodic"], ["plain", "drives"])
+    )
+    return periodic < _PERIODIC * plain or driven < _FREE
 
 
 def check_rest(splits: Mapping[str, list[Recording]], q: Columns) -> list[Measurement]:
@@ -153,6 +171,35 @@ def check_velocities(
         )
         expected = f"{low} to {high}"
         results.append(judged("dq/dt over v", f"{a}, {b}", ratio, expected, bool(cause), text))
+    return results
+
+
+def check_velocity_lag(
+    recordings: Sequence[Recording], q: Columns, v: Columns, step: float
+) -> list[Measurement]:
+    """Measure the lag of v behind dq/dt, as that of a filter or of another clock."""
+    parts = [replace(item, u=item.v) for item in recordings if item.v is not None]
+    last = max(2, min(round(_LAGS / step), min(map(len, parts)) // 4))
+    lags = np.unique(np.linspace(-last, last, 2 * min(last, 20) + 1).round().astype(int))
+    data = Averages.of(parts, step, lags=lags)
+    if data is None:
+        return []
+    results = []
+    for k, (a, b) in enumerate(zip(q.columns, v.columns, strict=True)):
+        columns = {"v": data.u[:, :, k], "slope": data.v[:, k], "one": np.ones(len(data.t))}
+        regression = EquationOfMotionRegression(columns, np.zeros(len(data.t), dtype=int))
+        shares = regression.fit("v", ["slope", "one"]).shares()[0]
+        best = int(shares.argmin())
+        # Lag l of a column means that it is read l samples earlier: a late v needs a negative one.
+        lag = -lags[best] * step
+        clear = shares[best] < min(_LAGGED * shares[lags == 0][0], 1 - _CLEAR**2)
+        bad = bool(clear and abs(lag) > 1.5 * step)
+        text = (
+            f"column {b!r} is {1e3 * abs(lag):.3g} ms {'behind' if lag > 0 else 'ahead of'} the "
+            f"derivative of {a!r}: is it filtered or from another clock? Leave out v (it is then "
+            "computed from q), or correct its times"
+        )
+        results.append(judged("lag of v [ms]", f"{a}, {b}", 1e3 * lag, "0", bad, text))
     return results
 
 

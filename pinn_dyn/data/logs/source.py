@@ -222,8 +222,9 @@ class LogSource(DataSource):
         measurements += plausibility.check_angles(everything, self.q, step)
         if self.v is not None:
             measurements += plausibility.check_velocities(everything, self.q, self.v, step)
+            measurements += plausibility.check_velocity_lag(everything, self.q, self.v, step)
         measurements += check_runs(everything, self.q, self.u, step)
-        measurements += plausibility.check_inputs(training, self.u)
+        measurements += plausibility.check_inputs(training, self.q, self.u)
         measurements += plausibility.check_rest(stretches, self.q)
         report.add("Splits", "train", summary(training, step))
         rollouts, earlier = {"train": training}, training

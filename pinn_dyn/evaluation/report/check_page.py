@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.figure import Figure
 
+from pinn_dyn.data.logs.averages import PARTS
 from pinn_dyn.evaluation.log_check import LogCheck
 from pinn_dyn.evaluation.log_figures import cleaning_figure
+from pinn_dyn.evaluation.plots import COLORS, TRUTH, legend_below, panels
 from pinn_dyn.evaluation.report.page import (
     Section,
     details,
@@ -17,6 +20,11 @@ from pinn_dyn.evaluation.report.page import (
     table,
 )
 
+_DRAWN = 1000  # rows of the equation of motion
+_FORCES = (
+    "The equation of motion is fitted to all runs. The residual is the part of an input that the "
+    "motion does not explain: friction that depends on the load, contacts, or a fault of the log."
+)
 _INPUTS = (
     "The curve shows the share of the equation of motion that stays unexplained if an input is "
     "shifted by a delay. The delay is at its minimum. The column ± is half its 95 % interval. "
@@ -25,10 +33,13 @@ _INPUTS = (
 
 
 def check_report(check: LogCheck, *, command: str) -> str:
-    """Return the HTML page of a check: verdict, measurements, delay curves, cleaning."""
+    """Return the HTML page of a check: verdict, forces, what is not ok, and the rest folded."""
     source = check.source
-    verdict = [paragraph(text) for text in check.problems or ["A training makes sense."]]
-    verdict += [paragraph(f"Warning: {text}") for text in check.warnings]
+    verdict = [paragraph(f"{check.verdict[0].upper()}{check.verdict[1:]}.")]
+    if check.equations and check.motion is not None:
+        text = "measured forces, the part that the equation of motion explains, and the residual"
+        verdict += [paragraph(_FORCES), drawing(_forces(check), text)]
+    verdict += [paragraph(text) for text in check.findings()]
     if check.steps:
         text = "Steps that follow from the measured delay and noise, to append to the data set:"
         verdict += [paragraph(text), preformatted(check.block)]
@@ -38,12 +49,10 @@ def check_report(check: LogCheck, *, command: str) -> str:
         source.cleaned[0], title=source.name, labels=source.labels, input_labels=source.input_labels
     )
     measurements = check.table()[["verdict", "measurement", "of", "value", "expected", "docs"]]
-    notes = details("Notes of each step", from_markdown(source.report))
-    sections = [
-        Section("Verdict", verdict),
-        Section("Measurements", [table(measurements)]),
-        Section("Clock", [table(check.runs)]),
-        Section("Coordinates", [table(check.coordinates)]),
+    parts = [
+        details("All measurements", table(measurements)),
+        details("Clock of each run", table(check.runs)),
+        details("Coordinates", table(check.coordinates)),
     ]
     if check.rigid is not None:
         text = (
@@ -51,14 +60,39 @@ def check_report(check: LogCheck, *, command: str) -> str:
             f"{check.rigid.condition:.3g}; below 100 a motion is well conditioned. "
             f"Not determined: {check.rigid.undetermined}."
         )
-        sections.append(Section("Rigid bodies", [paragraph(text), table(check.rigid.joints)]))
+        parts.append(details("Rigid bodies", paragraph(text), table(check.rigid.joints)))
     if check.delays:
         curves = drawing(_delays(check), "unexplained share over the delay")
-        parts = [paragraph(_INPUTS), table(check.inputs), curves]
-        sections.append(Section("Inputs and their delays", parts))
+        inputs = [paragraph(_INPUTS), table(check.inputs), curves]
+        parts.append(details("Inputs and their delays", *inputs))
     drawn = drawing(cleaning, "raw and cleaned signals")
-    sections.append(Section("Cleaning", [drawn, notes]))
+    parts.append(details("Cleaning", drawn, from_markdown(source.report)))
+    sections = [Section("Verdict", verdict), Section("Measurements", parts)]
     return page(f"{source.name}: check of the log", command, sections)
+
+
+def _forces(check: LogCheck) -> Figure:
+    """Draw y, X theta and the residual of each equation of motion in the longest run."""
+    assert check.motion is not None
+    runs, counts = np.unique(check.motion.block // PARTS, return_counts=True)
+    rows = np.flatnonzero(check.motion.block // PARTS == runs[counts.argmax()])[:_DRAWN]
+    t = check.motion.t[rows]
+    breaks = np.flatnonzero(np.diff(t) > 10 * np.median(np.diff(t))) + 1  # between stretches
+    pairs = [equation.predicted() for equation in check.equations]
+    measured, explained = (np.hstack(x)[rows] for x in zip(*pairs, strict=True))
+    labels = [label for equation in check.equations for label in equation.labels]
+    figure, (axes,) = panels([labels], t, title="Forces and the equation of motion, means removed")
+    curves = {
+        "measured": (measured, TRUTH),
+        "explained": (explained, COLORS[0]),
+        "residual": (measured - explained, COLORS[1]),
+    }
+    for name, (values, color) in curves.items():
+        gaps = np.insert(values, breaks, np.nan, axis=0)
+        for ax, column in zip(axes, gaps.T, strict=True):
+            ax.plot(np.insert(t, breaks, np.nan), column, color=color, linewidth=1.0, label=name)
+    legend_below(figure)
+    return figure
 
 
 def _delays(check: LogCheck) -> Figure:

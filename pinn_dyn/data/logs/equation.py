@@ -1,0 +1,155 @@
+"""Regression of the equation of motion of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pinn_dyn.data.logs.averages import Averages
+
+Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Maps q, v, a ``(R, N)`` to the Y ``(R, N, P)`` of rigid bodies: their torque is Y pi."""
+_RIDGE = 1e-9
+_MOST = 400  # terms, for the time that a regression takes
+_ITERATIONS = 7  # of reweighted least squares
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of S weighted least-squares fits of K columns y to P columns X.
+
+    Attributes:
+        theta: coefficients, ``(S, P, K)``.
+        weights: weights of the blocks, ``(S, B)``.
+        squares: sums of squares of the residual of each block, ``(S, B, K)``.
+        totals: sums of squares of y in each block, ``(B, K)``.
+    """
+
+    theta: np.ndarray
+    weights: np.ndarray
+    squares: np.ndarray
+    totals: np.ndarray
+
+    def shares(self) -> np.ndarray:
+        """Return the part of the mean square of y that X leaves, ``(S, K)``."""
+        left = (self.weights[:, :, None] * self.squares).sum(axis=1)
+        return (left / (self.weights @ self.totals).clip(min=1e-300)).clip(1e-12, 1)
+
+
+class EquationOfMotionRegression:
+    """Least squares between columns of an equation of motion::
+
+        y = X theta + r,     theta = argmin of sum over blocks b of w_b |y_b - X_b theta|^2
+
+    Every question to a log is a choice of y, X and w. With inverse dynamics, y is a force u(t - d)
+    and X holds terms of q, v and a (:func:`terms`, or the regressor of rigid bodies) and of dry
+    friction; the delay, a drift of the clock or a saturation is the candidate y with the smallest
+    residual, a bad run is one whose blocks have a large residual, and a coefficient is the dry
+    friction or the effective inertia of a joint. With more inputs than coordinates, y is v or a.
+    Fits need the inner products of columns alone, which are summed once for each block.
+
+    Args:
+        columns: columns by name, ``(R,)`` or ``(R, C)``.
+        block: block of each row, ``(R,)``.
+        rows: weights of the rows, ``(R, 1)``, or None.
+    """
+
+    def __init__(
+        self,
+        columns: Mapping[str, np.ndarray],
+        block: np.ndarray,
+        rows: np.ndarray | None = None,
+    ):
+        parts = {name: x.reshape(len(block), -1) for name, x in columns.items()}
+        ends = np.cumsum([x.shape[1] for x in parts.values()])
+        self.index = {
+            name: np.arange(end - x.shape[1], end)
+            for (name, x), end in zip(parts.items(), ends, strict=True)
+        }
+        self.numbers, self.block = np.unique(block, return_inverse=True)
+        values = np.hstack(list(parts.values()))
+        if rows is not None:
+            values = values * rows
+        self.scale = np.sqrt((values**2).mean(axis=0)).clip(min=1e-300)
+        values = values / self.scale
+        self.products = np.stack(
+            [x.T @ x for x in (values[self.block == b] for b in range(len(self.numbers)))]
+        )
+
+    def jackknife(self) -> np.ndarray:
+        """Return weights of the blocks: all, then all without each block, ``(1 + B, B)``."""
+        count = len(self.numbers)
+        return np.vstack([np.ones(count), 1 - np.eye(count)])
+
+    def fit(self, y: str, x: Sequence[str], weights: np.ndarray | None = None) -> Fit:
+        """Fit the columns ``y`` to the columns ``x``, with weights ``(S, B)``; None are ones."""
+        weights = np.ones((1, len(self.numbers))) if weights is None else weights
+        terms, target = np.concatenate([self.index[name] for name in x]), self.index[y]
+        gram = self.products[:, terms[:, None], terms]
+        cross, totals = self.products[:, terms[:, None], target], self.products[:, target, target]
+        normal = np.tensordot(weights, gram, 1)
+        size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / len(terms)
+        normal = normal + (_RIDGE * size + 1e-300) * np.eye(len(terms))
+        theta = np.linalg.solve(normal, np.tensordot(weights, cross, 1))
+        squares = totals - 2 * np.einsum("spk,bpk->sbk", theta, cross)
+        squares = squares + np.einsum("spk,sbpk->sbk", theta, gram[None] @ theta[:, None])
+        scale = self.scale[target]
+        return Fit(
+            theta * scale / self.scale[terms][:, None],
+            weights,
+            squares.clip(min=0) * scale**2,
+            totals * scale**2,
+        )
+
+    def robust_weights(self, y: str, x: Sequence[str], base: np.ndarray) -> np.ndarray:
+        """Return weights ``(1, B)`` that are small for blocks that disagree with the others.
+
+        The fits are reweighted with the loss of Geman and McClure (1985), from the weights ``base``
+        ``(B,)``.
+        """
+        weights = np.ones(len(base))
+        for cut in 0.5 ** np.arange(1, _ITERATIONS + 1):
+            residual = self.residuals(self.fit(y, x, (weights * base)[None]))
+            usual = np.median(residual, axis=0).clip(min=1e-3)
+            worst = (residual / usual).max(axis=1)
+            weights = 1 / (1 + (worst / max(2.5, cut * worst.max())) ** 2) ** 2
+        return (weights * base)[None]
+
+    def spreads(self, totals: np.ndarray) -> np.ndarray:
+        """Return the root mean squares of blocks over the median one, ``(B, K)``."""
+        means = np.sqrt(totals / np.bincount(self.block)[:, None])
+        usual = np.maximum(np.median(means, axis=0), 1e-9 * means.max(axis=0))
+        return means / usual.clip(min=1e-300)
+
+    def residuals(self, fit: Fit) -> np.ndarray:
+        """Return the residual of each block, ``(B, K)``, as a share of its root mean square of y.
+
+        The share is that of the median block if that block has a larger y.
+        """
+        spreads = self.spreads(fit.totals)
+        shares = np.sqrt(fit.squares[0] / fit.totals.clip(min=1e-300))
+        return shares * np.minimum(spreads, 1) * (spreads > 0)
+
+
+def terms(data: Averages, form: str) -> np.ndarray:
+    """Return the terms that explain the motion in a form apart from the input, ``(R, P)``.
+
+    1, q, q², sin q, cos q; except for increments v, v_i v_j and (for inverse dynamics) a, times 1,
+    sin q and cos q as far as the data are enough for so many; for acceleration dry friction.
+    """
+    q, v, a = data.q, data.v, data.a
+    trig = np.hstack([np.ones((len(q), 1)), np.sin(q), np.cos(q)])
+    parts = [trig, q, q**2]
+    if form != "increments":
+        i, j = np.triu_indices(q.shape[1])
+        parts += [v, data.sign] if form == "acceleration" else [v]
+        inertial = [v[:, i] * v[:, j], *([a] if form == "inverse dynamics" else [])]
+        products = [
+            (trig[:, :, None] * x[:, None, :]).reshape(len(x), -1) for x in [*inertial, trig[:, 1:]]
+        ]
+        count = sum(x.shape[1] for x in products)
+        rich = 12 * count < len(q) and count < _MOST
+        parts += products if rich else inertial
+    return np.hstack(parts)
