@@ -12,6 +12,7 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import clock_steps
+from pinn_dyn.data.logs.registers import check_registers
 from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
 from pinn_dyn.data.logs.table import Table
 
@@ -110,7 +111,8 @@ def check_rows(
     median of seven than ten (u: twenty) times the 99th percentile of all these medians.
 
     Raises:
-        LogError: on numbers that stand for "no value", an angle that wraps, two runs row by row.
+        LogError: on numbers that stand for "no value", unsigned registers, an angle that wraps, two
+            runs row by row.
     """
     if (large := np.abs(values) > _LARGEST).any():
         row, k = np.argwhere(large)[0]
@@ -120,6 +122,7 @@ def check_rows(
         )
     if len(t) < 2 * _NEIGHBORS:
         return []
+    check_registers(table, signal, columns, values)
     spacing = np.diff(t)
     in_step = (spacing > 0) & (spacing < 3 * np.median(spacing))
     warnings = []
