@@ -107,6 +107,14 @@ def csv(**options):
     return motion().to_csv(index=False, float_format="%.6f", **options)
 
 
+@pytest.mark.parametrize(("factor", "unit", "right"), [(1, "ms", "s"), (1000, "s", "ms")])
+def test_a_unit_of_time_that_is_wrong_by_a_thousand_is_named(tmp_path, factor, unit, right):
+    table = motion()[["t", "q1", "q2", "u1", "u2"]]
+    write(tmp_path, table.assign(t=factor * table.t))
+    with pytest.raises(LogError, match=f"the sample time would be.*write the unit {right}, or"):
+        source(tmp_path, time=dict(columns="t", unit=unit), v=None).load()
+
+
 def test_an_unsigned_register_is_named_with_the_number_to_subtract(tmp_path):
     table = motion()
     counts = (1000 * table["u1"]).round().astype(int)

@@ -24,6 +24,7 @@ _NEIGHBORS = 7
 _FEWEST_TICKS, _TICK_ERROR = 10, 0.1  # steps of a resolution; deviation from multiples of a half
 # Numbers that stand for "no value", in the unit of the file.
 _NO_VALUE = {-1, *(sign * x for sign in (1, -1) for x in (99, 999, 9999, 99999, 32767, 65535))}
+_FAST, _SHORT = 1e-4, 0.1  # s; so fast a clock over so short a run has another unit
 _LARGEST = 1e12  # SI units
 
 
@@ -60,13 +61,15 @@ def check_clock(
         )
     typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
     low, high = SAMPLE_TIMES
-    if not low <= typical <= high and (spacing >= 0).all():
+    usual = low <= typical <= high and not (typical < _FAST and np.ptp(t) < _SHORT)
+    if not usual and (spacing >= 0).all():
         shared = int(np.median(np.unique(t, return_counts=True)[1]))  # stamps in whole seconds
         unit = clock.plausible_unit(table, typical) if shared == 1 else ""
         cure = f"write the unit {unit}, or " if unit else ""
         raise LogError(
-            f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s, "
-            f"expected {low:g} to {high:g} s: {cure}{rate.format(shared / typical)}"
+            f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s in a "
+            f"run of {np.ptp(t):.4g} s, expected {low:g} to {high:g} s: "
+            f"{cure}{rate.format(shared / typical)}"
         )
     same = spacing == 0
     if same.any():  # a logger that is faster than its source repeats whole rows

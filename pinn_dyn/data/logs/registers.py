@@ -1,4 +1,4 @@
-"""Numbers of a log that are no measurements: unsigned registers, and rows before the first sample."""
+"""Numbers that are no measurements: unsigned registers, and rows before the first sample."""
 
 from __future__ import annotations
 
