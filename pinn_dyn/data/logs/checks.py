@@ -147,12 +147,17 @@ def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.
             f"{table.place(row + 1, name, 'q')}: the angle wraps from {q[row]:.5g} to "
             f"{q[row + 1]:.5g} rad ({len(wraps)} times): unwrap the column (numpy.unwrap) before"
         )
-    one_row, two_rows = (float(np.median(np.abs(q[n:] - q[:-n]))) for n in (1, 2))
-    if one_row > 0.02 * np.ptp(q) and two_rows < 0.2 * one_row:
+    if alternates(q):
         raise LogError(
-            f"{table.place(1, name, 'q')}: rows go to and fro by {one_row:.4g} {unit}: two runs "
-            "share the clock; name the column that tells them apart in 'trajectory'"
+            f"{table.place(1, name, 'q')}: rows go to and fro by {abs(q[1] - q[0]):.4g} {unit}: "
+            "two runs share the clock; name the column that tells them apart in 'trajectory'"
         )
+
+
+def alternates(x: np.ndarray) -> bool:
+    """Return true for numbers ``(T,)`` that go to and fro, as those of two sources by turns."""
+    one_row, two_rows = (float(np.median(np.abs(x[n:] - x[:-n]))) for n in (1, 2))
+    return one_row > 0.02 * np.ptp(x) and two_rows < 0.2 * one_row
 
 
 def _jumps(
