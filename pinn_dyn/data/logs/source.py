@@ -219,7 +219,9 @@ class LogSource(DataSource):
         measurements = report.measurements
         if self.test is None:
             times = {item.run: item.t for item in recordings}
-            self.validation, self.test, self.guard = default_split(times, self.seed)
+            self.validation, self.test, self.guard = default_split(
+                times, self.seed, float(self.input_delay.max(initial=0.0))
+            )
         parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
         pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
