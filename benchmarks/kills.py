@@ -57,8 +57,8 @@ MANY = [  # a simulation that lasts some seconds
 BLOCKS = [  # many steps of the optimizer between two checkpoints
     *("trainer.steps=600", "trainer.validations=3", "compile=false"),
 ]
-LOG = [  # pieces of a log, a learned delay and a residual torque
-    *("dataset=example_log", f"dataset.root={ROOT / 'examples'}", "model/delay=learned"),
+LOG = [  # pieces of a log and a residual torque
+    *("dataset=example_log", f"dataset.root={ROOT / 'examples'}"),
     *("model/residual=network", "data.pairs=64", "data.batch_size=32", "validator.horizon=0.5"),
     *("~callbacks.figures", "compile=false"),
 ]

@@ -37,11 +37,15 @@ class ModelPlant(Plant):
     Args:
         model: the learned system.
         step: longest step of the integration, s.
+        delay: time between an input and its action, ``(M,)``, s; None for none.
     """
 
-    def __init__(self, model: MechanicalSystem, *, step: PositiveFloat):
+    def __init__(
+        self, model: MechanicalSystem, *, step: PositiveFloat, delay: Tensor | None = None
+    ):
         self.num_coordinates, self.num_inputs = model.num_coordinates, model.num_inputs
         self._model, self._step = model, step
+        self._delay = torch.zeros(model.num_inputs) if delay is None else delay
 
     def start(self, q0: Tensor, v0: Tensor) -> None:
         p0 = v0 if self._model.state == "qv" else self._model.momentum(q0, v0)
@@ -50,14 +54,14 @@ class ModelPlant(Plant):
 
     def advance(self, u: Tensor, duration: float) -> tuple[Tensor, Tensor]:
         model = self._model
-        delay = model.learned_figures().get("input_delay_seconds", 0.0)
-        self._inputs = [*self._inputs, u][-(math.ceil(delay / duration) + 1) :]
-        starts = delay + duration * torch.arange(1 - len(self._inputs), 1, dtype=torch.float64)
-        signal = Signal(starts, torch.stack(self._inputs, dim=1), "hold")
+        longest = max(self._delay.tolist(), default=0.0)
+        self._inputs = [*self._inputs, u][-(math.ceil(longest / duration) + 1) :]
+        starts = duration * torch.arange(1 - len(self._inputs), 1, dtype=torch.float64)
+        signal = Signal(starts, torch.stack(self._inputs, dim=1), "hold").delayed(self._delay)
         # Steps of the integration end where a delayed input changes.
         count = math.ceil(duration / self._step - 1e-6)
         times = torch.linspace(0.0, duration, count + 1, dtype=torch.float64)
-        times = torch.cat([times, starts.clamp(0.0, duration)]).unique()
+        times = torch.cat([times, signal.t.clamp(0.0, duration)]).unique()
         with torch.no_grad():
             path = path_between(model, model.integrator, self._x, times, signal)
             self._x = self._x + path[:, -1]
@@ -114,7 +118,8 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         sample_time = float(train[0].t[1] - train[0].t[0])
         self.dt = step or (data.statistics.step if isinstance(data, Run) else sample_time)
         if isinstance(robot, Run):
-            robot = ModelPlant(double_copy(robot.system), step=robot.statistics.step)
+            delay, step_of_training = torch.from_numpy(robot.input_delay), robot.statistics.step
+            robot = ModelPlant(double_copy(robot.system), step=step_of_training, delay=delay)
         elif isinstance(robot, MechanicalSystem):
             robot = SystemPlant(double_copy(robot))
         self.plant = robot

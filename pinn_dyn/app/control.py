@@ -28,6 +28,7 @@ from pinn_dyn.control import (
     export_law,
     term_conditions,
 )
+from pinn_dyn.control.dead_time import compensated
 from pinn_dyn.data import DataSource, SimulationError
 from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation import close_loops
@@ -73,7 +74,10 @@ def _close_loops(run: Run, config: dict[str, Any], folder: Path) -> float:
     if config["guard"].get("threshold") is not None:
         laws["learned"] = _guarded(laws["learned"], config, source)
     if config["export"]:
-        _export(laws[config["exported_law"]], run, config)
+        _export(laws[config["exported_law"]], learned, run, config)
+    for name, part in config["controllers"].items():
+        model = learned if part["terms"] == "learned" else source.system
+        laws[name] = _compensated(laws[name], model, run, config)
     sensor = build_part("sensor", {"seed": config["seed"], **config["sensor"]})
     noisy = np.any(sensor.q_noise) or np.any(sensor.v_noise)
     result = close_loops(
@@ -131,7 +135,8 @@ def _without_robot(
     """Export the law on a model of measured data, and write how well it is conditioned."""
     source = run.source
     if config["export"]:
-        _export(build_law(config, config["exported_law"], learned, learned), run, config)
+        law = build_law(config, config["exported_law"], learned, learned)
+        _export(law, learned, run, config)
     q = torch.cat([_thinned(item.q) for item in source.load().train])
     table = term_conditions(learned, q)
     table.to_csv(folder / "conditions.csv", index=False)
@@ -145,12 +150,19 @@ def _without_robot(
     return float("nan")
 
 
-def _export(law: Controller, run: Run, config: dict[str, Any]) -> None:
+def _compensated(
+    law: Controller, model: MechanicalSystem, run: Run, config: dict[str, Any]
+) -> Controller:
+    actuator = build_part("actuator", config["actuator"])
+    return compensated(law, model, run.input_delay, config["rate"], actuator)
+
+
+def _export(law: Controller, learned: MechanicalSystem, run: Run, config: dict[str, Any]) -> None:
     try:
         if config["guard"].get("threshold") is not None and not isinstance(law, Guarded):
             law = _guarded(law, config, run.source)
         path = export_law(
-            law,
+            _compensated(law, learned, run, config),
             config["export"],
             actuator=build_part("actuator", config["actuator"]),
             period=config["rate"] and 1 / config["rate"],

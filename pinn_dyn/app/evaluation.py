@@ -93,8 +93,7 @@ def evaluate(
             model,
             seed=run.config["seed"],
             figures={k: run.metrics[k] for k in _COLUMNS if k in run.metrics}
-            | {"folder": str(run.folder)}
-            | run.model.learned_figures(),
+            | {"folder": str(run.folder)},
             members=run.ensemble,
         )
         for name, model, run, trained_on, own_step in zip(
@@ -167,5 +166,5 @@ def _require_fitting_test(run: Run, trained_on: DataSource, source: DataSource) 
             f"dataset: {source.name} has {sizes[0]} coordinates and {sizes[1]} inputs, "
             f"{run.folder} was trained on {expected[0]} and {expected[1]}"
         )
-    if run.log and isinstance(source, LogSource) and run.log.steps != source.steps:
+    if run.log and isinstance(source, LogSource) and run.log.cleaning != source.cleaning:
         log.warning("%s was trained with other steps than those of %s", run.folder, source.name)

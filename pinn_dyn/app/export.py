@@ -70,7 +70,6 @@ def export(
         "model": type(model).__name__,
         "num_coordinates": model.num_coordinates,
         "num_inputs": model.num_inputs,
-        **model.learned_figures(),
         **(about or {}),
     }
     return write([f for f in functions if what in (None, f.name)], path, info, real)

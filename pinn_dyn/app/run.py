@@ -134,6 +134,12 @@ class Run:
         return list(self.config["dataset"].get(key) or [f"{symbol}{k + 1}" for k in range(size)])
 
     @property
+    def input_delay(self) -> np.ndarray:
+        """Time between an input of the robot and its action, ``(M,)``, s: that of the data set."""
+        delay = self.log.input_delay if self.log else self.config["dataset"].get("delay", 0.0)
+        return np.resize(np.asarray(delay, dtype=float), self.model.num_inputs)
+
+    @property
     def members(self) -> list[Run]:
         """The members of an ensemble as single models; a single model is its only member."""
         if not isinstance(self.model, Ensemble):
@@ -163,7 +169,7 @@ class Run:
             what: name of a function to write.
             real: type of the numbers in a ``.c`` or ``.onnx`` file, ``double`` or ``float``.
         """
-        about = {"q": self.labels, "u": self.input_labels}
+        about = {"q": self.labels, "u": self.input_labels, "delay": self.input_delay.tolist()}
         statistics = self.statistics
         return export(self.model, path, what, real=real, statistics=statistics, about=about)
 
@@ -212,8 +218,9 @@ class Run:
         """Predict the motion from a start under an input, or along a data frame.
 
         ``predict(start, u, t)`` simulates the model, and returns the states x(t_k), ``(*batch, T,
-        2N)``. The input between its samples is interpolated as in the training data. Long motions
-        run as a loop in C if there is a C compiler.
+        2N)``. The input between its samples is interpolated as in the training data, and acts after
+        the ``delay`` of the data set; before the first sample it is constant. Long motions run as a
+        loop in C if there is a C compiler.
 
         ``predict(frame)`` returns q and v in the columns, units and index of a log, whose columns
         the frame needs. It is cleaned by the same steps. Every run starts from its first row.
@@ -285,6 +292,7 @@ class Run:
             raise ValueError(f"{shapes}, expected (*batch, T, {size}) and (T,)")
         part = self.config.get("log") or self.config["dataset"]
         signal = Signal(times, samples, part.get("interpolation", "linear"))
+        signal = signal.delayed(torch.from_numpy(self.input_delay))
         batch = torch.broadcast_shapes(x0.shape[:-1], signal.batch)
         signal = signal.mapped(lambda value: value.expand(*batch, *value.shape[-2:]))
         return x0.expand(*batch, -1), times, signal

@@ -135,11 +135,19 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         config = saved["hyper_parameters"]["config"]
         config.setdefault("ensemble", 1)
         config["dataset"].pop("cache", None)  # each user has their own
+        config["model"] = _without_delay(config["model"])
         saved["state_dict"].items()
     except Exception as error:  # a damaged archive or pickle raises nearly anything
         text = f"{path} cannot be read, it may be cut short: {in_one_line(error)}"
         raise ConfigError(text) from error
     return saved
+
+
+def _without_delay(part: Any) -> Any:
+    """Leave out the unused ``delay: null`` that earlier versions recorded for a model."""
+    if not isinstance(part, Mapping):
+        return part
+    return {key: _without_delay(x) for key, x in part.items() if (key, x) != ("delay", None)}
 
 
 def newest_checkpoint(folder: Path) -> tuple[Path | None, dict[str, Any]]:

@@ -146,7 +146,7 @@ class ControlSettings:
     robot: Mapping[str, Any]
     actuator: Actuator
     sensor: Sensor
-    delay: NonNegativeInt
+    delay: NonNegativeFloat
     guard: Guard | Mapping[str, Any]
     stability: Stability | Mapping[str, Any] | None
     export: str | None

@@ -87,7 +87,18 @@ MODELS: dict[str, ModelBuilder] = {
 """Models by their names in conf/model."""
 ADAMW = partial(AdamW, lr=0.005, weight_decay=1e-5, fused=True)
 TRAINER = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
-_COLUMNS = ("name", "time", "q", "u", "v", "trajectory", "steps", "interpolation", "angles")
+_COLUMNS = [
+    "name",
+    "time",
+    "q",
+    "u",
+    "v",
+    "trajectory",
+    "steps",
+    "delay",
+    "interpolation",
+    "angles",
+]
 
 log = logging.getLogger(__name__)
 
@@ -269,6 +280,7 @@ def _description(source: DataSource) -> dict[str, Any]:
         "labels": list(source.labels),
         "input_labels": list(source.input_labels),
         "angles": list(source.angles),
+        "delay": source.input_delay.tolist(),
     }
     if not isinstance(source, LogSource):
         return {"dataset": stored}
@@ -318,7 +330,6 @@ def _check_windows(model: Predictor, windows: DynamicsData) -> None:
         raise ValueError(
             f"{windows.source.name} has no momenta p: set model.state=qv, or use model=lnn"
         )
-    model.acting_input(windows.windows.input)  # a held input has no delay to learn
     if model.input_history > windows.history:
         raise ValueError(
             f"the model uses {model.input_history} s before its start, but data.history is "

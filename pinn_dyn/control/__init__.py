@@ -3,6 +3,7 @@
 from pinn_dyn.control.closed_loop import close_loop
 from pinn_dyn.control.continuous_loop import close_loop_continuous
 from pinn_dyn.control.contracts import Controller, Motion, Plant, Reference
+from pinn_dyn.control.dead_time import DelayCompensation
 from pinn_dyn.control.effects import Actuator, Sensor
 from pinn_dyn.control.export import export_law, load_law
 from pinn_dyn.control.helix import Helix
@@ -29,6 +30,7 @@ __all__ = [
     "ComputedTorque",
     "Controller",
     "DataRegion",
+    "DelayCompensation",
     "DisturbanceObserver",
     "Guarded",
     "Helix",

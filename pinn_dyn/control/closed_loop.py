@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict, deque
 
 import torch
@@ -26,7 +27,7 @@ def close_loop(
     rate: float,
     actuator: Actuator | None = None,
     sensor: Sensor | None = None,
-    delay: int = 0,
+    delay: float = 0.0,
     progress: str | None = None,
 ) -> ClosedLoopRecord:
     """Run a sampled closed loop, K copies at once, with the input held between instants::
@@ -46,7 +47,7 @@ def close_loop(
         rate: control instants per second, 1/s.
         actuator: limits of the input.
         sensor: noise of the measurement.
-        delay: dead time of the input in control instants, with zero input before.
+        delay: dead time of the input in control instants, also 1.5, with zero input before.
         progress: name of the task in lines of progress; None logs none.
 
     Raises:
@@ -54,11 +55,13 @@ def close_loop(
     """
     q0, v0 = q0.double(), v0.double()
     run = LoopRun(plant, controller, reference, q0, v0, duration, rate, actuator)
-    queue = deque([q0.new_zeros(len(q0), plant.num_inputs)] * delay)
+    waiting = math.ceil(delay)
+    share = delay - waiting + 1  # of an interval, before the next input in the queue acts
+    queue = deque([q0.new_zeros(len(q0), plant.num_inputs)] * waiting)
     if sensor is not None:
         sensor.reset()
     q, v, moving = q0.clone(), v0.clone(), run.running.clone()
-    k, u = 0, torch.empty(0)
+    k, pieces = 0, list[tuple[Tensor, float]]()
     try:
         with torch.no_grad(), Progress(progress, len(run.t), "instants") as lines:
             plant.start(q0, v0)
@@ -67,12 +70,16 @@ def close_loop(
                 if not torch.equal(moving, run.running):
                     moving = run.running.clone()
                     plant.start(q[moving], v[moving])
-                if k > 0:
-                    q[moving], v[moving] = plant.advance(u[moving], 1 / rate)
+                for acting, part in pieces:
+                    q[moving], v[moving] = plant.advance(acting[moving], part / rate)
                 run.observe(k, q, v)
                 run.measure(k, *((q, v) if sensor is None else sensor(q, v)))
                 queue.append(run.ask(k))
                 u = run.apply(k, queue.popleft())
+                pieces = [(u, share)]
+                if share < 1:
+                    following = (actuator or Actuator()).limit(queue[0], u, 1 / rate)
+                    pieces.append((following, 1 - share))
                 if not run.running.any():
                     break
     except KeyboardInterrupt:

@@ -104,9 +104,10 @@ def export_law(
         endings = ", ".join([*ENDINGS, ".pt2"])
         raise ValueError(f"{path} ends in {path.suffix!r}, expected one of {endings}")
     safe = SafeLaw(controller, actuator, period)
-    n, m = safe.law.num_coordinates, safe.law.num_inputs
+    n = safe.law.num_coordinates
     inputs = drawn_states({**dict.fromkeys(INPUTS, n), "memory_in": safe.memory_size}, ranges)
-    inputs["memory_in"][:, m : m + 1].round_()  # of an observer: called before or not
+    begin = safe.stored_inputs
+    inputs["memory_in"][:, begin : begin + 1].round_()  # of an observer: called before or not
     info = {
         "law": type(safe.law).__name__,
         "observer": safe.observer and {"bandwidth": safe.observer.bandwidth},
@@ -114,8 +115,9 @@ def export_law(
         and {key: getattr(safe.guard, key) for key in ("threshold", "fallback")},
         "limits": {key: getattr(safe.actuator, key) for key in ("low", "high", "rate")},
         "period": period,
+        "reference_ahead": safe.compensation.ahead if safe.compensation else 0.0,
         "num_coordinates": n,
-        "num_inputs": m,
+        "num_inputs": safe.law.num_inputs,
         "memory_size": safe.memory_size,
         **{key: getattr(safe.law, key).tolist() for key in ("position_gain", "velocity_gain")},
         **(about or {}),
@@ -124,6 +126,8 @@ def export_law(
         "Input u of the law. Returns the sum of 1 (limited), 2 (outside the training data) and 4 "
         "(not finite: the last input). Zero memory_in before the first call, then memory_out."
     )
+    if safe.compensation:
+        text += f" q_ref, v_ref and a_ref are the reference {safe.compensation.ahead:g} s ahead."
     law = ExportedFunction("control", safe, inputs, ("u", "status", "memory_out"), text)
     return write([law], path, info, real)
 

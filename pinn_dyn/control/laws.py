@@ -43,8 +43,6 @@ class ModelBasedLaw(Controller):
     in the feedback. Near a set point, the law is stable as with A A^T if J has full rank. This does
     not hold far from the set point or with slack tendons.
 
-    A learned delay of the input stays in the loop as dead time and limits the gains.
-
     Args:
         model: the mechanical system whose terms the law uses, in float64.
         position_gain, velocity_gain: diagonals of K_P and K_D, one number or N.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pinn_dyn.control.contracts import Controller, Motion
+from pinn_dyn.control.dead_time import DelayCompensation
 from pinn_dyn.control.effects import Actuator
 from pinn_dyn.control.laws import ModelBasedLaw
 from pinn_dyn.control.observer import DisturbanceObserver
@@ -29,13 +30,16 @@ class SafeLaw:
     3. If u is not finite, the last u replaces it. The observer keeps its memory while v is not.
     4. The actuator limits u.
 
+    A :class:`DelayCompensation` predicts q and v first; references are those at the end of the dead
+    time, and the memory holds the last n inputs instead of the last one.
+
     The status is the sum of 1 (the actuator changed u), 2 (outside the training data) and 4 (not
     finite). The memory is zero before the first call. It holds the last u ``(M,)``. An observer
     adds 1 after the first call, and r, M v and (f + A u) / 2, ``(N,)`` each. The observer
     computes as :class:`DisturbanceObserver` with the limits of the actuator.
 
     Args:
-        controller: a law of a model, also with an observer or a guard.
+        controller: a law of a model, also with an observer, a guard or a DelayCompensation.
         actuator: limits of the input.
         period: time between two calls, s; limits of the rate and observers need it.
 
@@ -50,6 +54,10 @@ class SafeLaw:
         actuator: Actuator | None = None,
         period: float | None = None,
     ):
+        self.compensation: DelayCompensation | None = None
+        if isinstance(controller, DelayCompensation):
+            self.compensation, period = controller, controller.period
+            controller = controller.law
         self.guard = controller if isinstance(controller, Guarded) else None
         law = self.guard.law if self.guard else controller
         self.observer = law if isinstance(law, DisturbanceObserver) else None
@@ -63,15 +71,19 @@ class SafeLaw:
         if period is None and (self.observer or self.actuator.rate is not None):
             raise ValueError("an observer or a limited rate needs a fixed period: give a rate")
         self.period = period
-        self.memory_size = law.num_inputs + (1 + 3 * law.num_coordinates) * bool(self.observer)
+        self.stored_inputs = law.num_inputs * (self.compensation.size if self.compensation else 1)
+        self.memory_size = self.stored_inputs + (1 + 3 * law.num_coordinates) * bool(self.observer)
 
     def __call__(
         self, q: Tensor, v: Tensor, q_ref: Tensor, v_ref: Tensor, a_ref: Tensor, memory_in: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return u ``(M,)``, the status ``()`` and the memory after the call."""
-        m = self.law.num_inputs
         reference = Motion(q_ref, v_ref, a_ref)
-        last, memory = memory_in[:m], memory_in[m:]
+        past, memory = memory_in.tensor_split([self.stored_inputs])
+        past = past.reshape(-1, self.law.num_inputs)
+        last = past[-1]
+        if self.compensation:
+            q, v = self.compensation.predict(q, v, past)
         u = self.law.law(q, v, *reference, last)
         if self.observer:
             u, finish = self._observed(self.observer, q, v, u, last, memory)
@@ -88,7 +100,10 @@ class SafeLaw:
         if self.observer:
             after = finish(applied)
             memory = torch.where(finite & (after.abs().sum() < torch.inf), after, memory)
-        return applied, status, torch.cat([applied, memory])
+        output, stored = applied, applied
+        if self.compensation:
+            output, stored = self.compensation.applied(past, applied)
+        return output, status, torch.cat([stored.flatten(), memory])
 
     def _observed(
         self,

@@ -76,6 +76,8 @@ class SimulatedSource(DataSource):
         test_duration: length of each validation and test trajectory, s; ``duration`` if None.
         step: sample time of the simulation, s.
         dead_time: time after which the recorded input acts on the system, s.
+        delay: dead time that is known, s, one or M; as for a log, the trajectories hold the inputs
+            as they act.
         keep_every: keep every n-th sample, for a lower rate from the same simulation.
         train_initial_states: number of initial states for training.
         train_inputs: number of inputs for training.
@@ -102,6 +104,7 @@ class SimulatedSource(DataSource):
     test_duration: PositiveFloat | None = None
     step: PositiveFloat
     dead_time: NonNegativeFloat = 0.0
+    delay: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.0
     keep_every: PositiveInt = 1
     train_initial_states: PositiveInt
     train_inputs: PositiveInt
@@ -153,9 +156,12 @@ class SimulatedSource(DataSource):
         splits: dict[str, list[Trajectory]] = {}
         for split in SPLITS:
             arrays_of_split = (arrays[f"{split}_{key}"][:, :: self.keep_every] for key in "qvu")
+            q, v, u = map(torch.from_numpy, arrays_of_split)
+            recorded = Signal(t[: u.shape[1]], u)
+            acting = recorded.delayed(torch.from_numpy(self.input_delay)).at(recorded.t)
             splits[split] = [
-                Trajectory(q, v, Signal(t[: len(u)], u), momentum=partial(momentum, self.system))
-                for q, v, u in zip(*map(torch.from_numpy, arrays_of_split), strict=True)
+                Trajectory(q, v, Signal(recorded.t, u), momentum=partial(momentum, self.system))
+                for q, v, u in zip(q, v, acting.movedim(0, 1).contiguous(), strict=True)
             ]
         return Splits(**splits)
 

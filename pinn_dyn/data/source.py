@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
+
 from pinn_dyn.mechanics import MechanicalSystem, Trajectory
 
 SPLITS = ("train", "validation", "test")
@@ -31,6 +33,8 @@ class DataSource(abc.ABC):
         angles: indices of the coordinates that repeat after a whole turn.
         system: the truth, or None for measured data.
         configurations: named configurations at which learned terms are looked at, ``(N,)`` each.
+        delay: time by which the inputs of the robot act late, s, one or M. The trajectories hold
+            the inputs as they act.
     """
 
     name: str
@@ -39,6 +43,12 @@ class DataSource(abc.ABC):
     angles: Sequence[int] = ()
     system: MechanicalSystem | None = None
     configurations: Mapping[str, Sequence[float]] = MappingProxyType({})
+    delay: float | Sequence[float] = 0.0
+
+    @property
+    def input_delay(self) -> np.ndarray:
+        """Time between an input of the robot and its action, ``(M,)``, s."""
+        return np.resize(np.asarray(self.delay, dtype=float), len(self.input_labels))
 
     @abc.abstractmethod
     def load(self) -> Splits:

@@ -20,7 +20,7 @@ class StoredSource(DataSource):
 
     Args:
         path: the file.
-        name, labels, input_labels, angles: as in the stored source.
+        name, labels, input_labels, angles, delay: as in the stored source.
 
     Raises:
         ValueError: if the file is missing or damaged, when it is read.
@@ -31,6 +31,7 @@ class StoredSource(DataSource):
     labels: list[str]
     input_labels: list[str]
     angles: Sequence[int] = ()
+    delay: float | Sequence[float] = 0.0
 
     def load(self) -> Splits:
         content = self._read()

@@ -54,11 +54,6 @@ class ContinuousStack(ContinuousPredictor):
 
     def __init__(self, members: Sequence[ContinuousPredictor]):
         first = members[0]
-        if first.input_history:
-            raise ValueError(
-                "the members learn an input delay (model/delay=learned), but take one input: train "
-                "the seeds one by one (train.py -m seed=0,1,2), or use the step InputDelay"
-            )
         super().__init__(first.num_coordinates, first.num_inputs, first.state)
         self.integrator = first.integrator
         self.learns_initial_state = first.learns_initial_state

@@ -24,12 +24,16 @@ from pinn_dyn.control import (
     close_loop_continuous,
 )
 from pinn_dyn.control import close_loop as close_sampled_loop
+from pinn_dyn.control.dead_time import compensated
 from pinn_dyn.control.references import check_limits
 from pinn_dyn.data.whole import whole
 from pinn_dyn.evaluation.control_metrics import ClosedLoopMetrics, closed_loop_metrics
 from pinn_dyn.evaluation.tables import write_table
 from pinn_dyn.mechanics import MechanicalSystem, double_copy
 from pinn_dyn.systems import HasDomain, HasLimits, Stepped
+
+RATE = 1000.0
+"""Default control instants per second, 1/s."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,9 @@ def close_loop(
     robot: MechanicalSystem,
     **settings: Any,
 ) -> ControlResult:
-    """Control a robot by a law on a trained model, and by the same law on the robot's true terms::
+    """Control a robot by a law on a trained model, and by the same law on the robot's true terms.
+
+    Both laws compensate the delay of the run's data set, see :class:`.DelayCompensation`::
 
         law = functools.partial(Tracking, position_gain=100.0, velocity_gain=10.0)
         result = pinn_dyn.close_loop(run, law, Sines([0.2, 0.0, 0.1], 0.1, 0.5), SoftArm())
@@ -92,8 +98,13 @@ def close_loop(
         robot: the true system, which also gives the terms of the law ``"truth"``.
         settings: keyword arguments of :func:`close_loops`.
     """
-    learned = double_copy(getattr(run, "model", run))
-    return close_loops({"learned": law(learned), "truth": law(robot)}, reference, robot, **settings)
+    systems = {"learned": double_copy(getattr(run, "model", run)), "truth": robot}
+    delay, rate = getattr(run, "input_delay", 0.0), settings.get("rate", RATE)
+    laws = {
+        name: compensated(law(system), system, delay, rate, settings.get("actuator"))
+        for name, system in systems.items()
+    }
+    return close_loops(laws, reference, robot, **settings)
 
 
 def close_loops(
@@ -102,14 +113,14 @@ def close_loops(
     robot: MechanicalSystem,
     *,
     duration: float = 2.0,
-    rate: float | None = 1000.0,
+    rate: float | None = RATE,
     samples_rate: float = 200.0,
     q0: Tensor | None = None,
     v0: Tensor | None = None,
     plant: Plant | None = None,
     actuator: Actuator | None = None,
     sensor: Sensor | None = None,
-    delay: int = 0,
+    delay: float = 0.0,
     settled_after: float | None = None,
     progress: bool = False,
 ) -> ControlResult:
@@ -127,7 +138,7 @@ def close_loops(
             :class:`~pinn_dyn.systems.Stepped` robot, and solves the equation of motion of others.
         actuator: limits of the input.
         sensor: noise of the measurement.
-        delay: dead time of the input, control instants.
+        delay: dead time of the input, control instants, also 1.5.
         settled_after: see :func:`closed_loop_metrics`.
         progress: log lines of progress.
 

@@ -207,8 +207,8 @@ def check(
     for name, curve, lag in zip(source.u.columns, delays, clear, strict=True):
         delay = np.nan if curve.delay is None else 1e3 * curve.delay
         text = (
-            f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the "
-            "InputDelay step below or learn the delay with the model (model/delay=learned)"
+            f"input {name!r} acts {1e3 * lag:.3g} ms after it is logged: add the InputDelay step "
+            "below"
         )
         measurements.append(_judged("delay [ms]", name, delay, "no clear delay", lag > 0, text))
     excitation = None

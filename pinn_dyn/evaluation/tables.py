@@ -34,7 +34,6 @@ _HEADERS = {
     "torque_share": "torque error / spread",
     "residual_share": "residual force, share",
     "window_(.*)s_within": r"errors in 95 % interval, reset every \1 s",
-    "input_delay_seconds": "input delay [s]",
     "pairs": "training pairs",
     "training_seconds": "training [s]",
 }

@@ -102,8 +102,7 @@ def part_shares(model: Sum, truth: Trajectory) -> pd.DataFrame:
 def _samples(model: MechanicalSystem, truth: Trajectory, limit: int) -> list[Tensor]:
     """Return S <= limit samples of q, v and the acting u, ``(S, .)``, in the model's precision."""
     like = next(model.parameters(), torch.empty(0, dtype=torch.float64))
-    u = model.acting_samples(truth).detach()
-    return [_thinned(x, limit).to(like) for x in (truth.q, truth.v, u)]
+    return [_thinned(x, limit).to(like) for x in (truth.q, truth.v, truth.u)]
 
 
 def _thinned(values: Tensor, limit: int) -> Tensor:

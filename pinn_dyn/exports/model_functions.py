@@ -54,11 +54,7 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
 
     def step(q: Tensor, v: Tensor, u: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         assert isinstance(model, ContinuousPredictor)
-        system = model if isinstance(model, MechanicalSystem) and model.state == "qp" else None
-        start = torch.cat([q, system.momentum(q, v) if system else v])
-        inputs = u.expand(len(model.integrator.nodes), m)
-        q, v = (start + model.integration_step(0 * start, start, inputs, h)).split(n)
-        return q, system.velocity(q, v) if system else v
+        return held_step(model, q, v, u, h)
 
     def next_state(q: Tensor, v: Tensor, u: Tensor, u_next: Tensor) -> tuple[Tensor, ...]:
         x = torch.cat([q, v])
@@ -85,3 +81,15 @@ def model_functions(model: Predictor, ranges: Ranges | None = None) -> list[Expo
             "without a memory, or a single member of an ensemble, such as run.members[0]"
         )
     return [exported(*function) for function in functions]
+
+
+def held_step(
+    model: ContinuousPredictor, q: Tensor, v: Tensor, u: Tensor, h: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return q and v ``(*batch, N)`` after a step of h seconds with the input u held."""
+    system = model if isinstance(model, MechanicalSystem) and model.state == "qp" else None
+    start = torch.cat([q, system.momentum(q, v) if system else v], dim=-1)
+    inputs = u.expand(len(model.integrator.nodes), *u.shape)
+    state = start + model.integration_step(0 * start, start, inputs, h)
+    q, v = state.split(model.num_coordinates, dim=-1)
+    return q, system.velocity(q, v) if system else v

@@ -15,7 +15,7 @@ from pinn_dyn.mechanics.arrays import jacobians, require_last_dim
 from pinn_dyn.mechanics.integrators import RK4, Integrator
 from pinn_dyn.mechanics.rollout import path_between, require_start
 from pinn_dyn.mechanics.signal import Signal
-from pinn_dyn.mechanics.trajectory import State, Trajectory
+from pinn_dyn.mechanics.trajectory import State
 
 
 class Predictor(nn.Module, abc.ABC):
@@ -54,22 +54,6 @@ class Predictor(nn.Module, abc.ABC):
     def penalty(self, q: Tensor, v: Tensor, a: Tensor, u: Tensor) -> Tensor:
         """Return a scalar that training adds to the loss, at data q, v, a and u ``(B, N or M)``."""
         return q.new_zeros(())
-
-    def acting_input(self, input: Signal) -> Signal:
-        """Return the input that acts on the robot. A model with a delay shifts it."""
-        return input
-
-    @final
-    def acting_samples(self, truth: Trajectory) -> Tensor:
-        """Return the acting input at the samples of a trajectory, ``(*batch, T, M)``."""
-        if not self.input_history:
-            return truth.u
-        input = self.acting_input(truth.since(self.input_history).input)
-        return input.at(truth.t).movedim(0, -2)
-
-    def learned_figures(self) -> dict[str, float]:
-        """Return learned numbers by name, such as an input delay in s."""
-        return {}
 
     @final
     def predict(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
@@ -132,13 +116,8 @@ class ContinuousPredictor(Predictor):
             sample_time: T, s; None returns the continuous pair.
 
         Raises:
-            ValueError: on shapes, or a model with a learned input delay, which needs more states.
+            ValueError: on shapes.
         """
-        if self.input_history:
-            raise ValueError(
-                "the model has a learned input delay, which A and B do not contain: set its "
-                "attribute delay to None, and add the delay of learned_figures() to the design"
-            )
         require_last_dim("q", q, self.num_coordinates, "N")
         require_last_dim("v", v, self.num_coordinates, "N")
         require_last_dim("u", u, self.num_inputs, "M")
@@ -169,11 +148,7 @@ class ContinuousPredictor(Predictor):
     @final
     def increments(self, x0: Tensor, t: Tensor, input: Signal) -> Tensor:
         """Integrate the state derivative. Increments are relative to the measured ``x0``."""
-        input = self.acting_input(input)
-        first = input.u[..., 0, :]
-        if self.input_history:  # the signal begins before the start
-            (first,) = input.at(t[:1]).to(x0)
-        start = self.initial_state(x0, first)
+        start = self.initial_state(x0, input.u[..., 0, :])
         increments = path_between(self, self.integrator, start, t, input)
         if start is x0:
             return increments

@@ -11,6 +11,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+_ROUNDING = 1e-9  # s between shifted times that are the same
+
 Interpolation = Literal["hold", "linear", "cubic"]
 """Interpolation between two samples: the earlier sample, a line, or a cubic."""
 
@@ -82,14 +84,14 @@ class Signal:
         """Return the signal with times relative to ``start``, ``()``, s."""
         return self._changed(self.t - start, lambda value: value)
 
-    def delayed(self, delay: Tensor) -> Signal:
-        """Return u(t - d), for d ``()`` in s, of an input that is not held."""
-        if self.interpolation == "hold":
-            raise ValueError(
-                "interpolation is 'hold', which hides delays: set dataset.interpolation=linear, or "
-                "measure the delay by check.py and shift the input by the step InputDelay"
-            )
-        return self._changed(self.t + delay.to(self.t), lambda value: value)
+    def delayed(self, delays: Tensor) -> Signal:
+        """Return u_i(t - d_i), for d ``(M,)`` in s. Its samples are at all shifted times."""
+        if not len(delays.unique()) > 1:
+            return self.since(-delays[:1].sum())
+        t = torch.cat([self.t + d for d in delays.unique().to(self.t)]).sort().values
+        t = t[torch.cat([t.diff() > _ROUNDING, t.new_ones(1).bool()])]
+        inputs = [self.since(-d).at(t)[..., i] for i, d in enumerate(delays.to(self.t))]
+        return Signal(t, torch.stack(inputs, dim=-1).movedim(0, -2), self.interpolation)
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Signal:
         """Apply a change of the batch, such as ``lambda u: u[index]``, to samples and rates."""

@@ -34,19 +34,13 @@ class Sum(MechanicalSystem):
         integrator: the integration method.
 
     Raises:
-        ValueError: if the sizes of the parts differ, or a part learns a delay.
+        ValueError: if the sizes of the parts differ.
     """
 
     def __init__(self, parts: Mapping[str, MechanicalSystem], integrator: Integrator | None = None):
         sizes = {name: (part.num_coordinates, part.num_inputs) for name, part in parts.items()}
         if len(set(sizes.values())) != 1:
             raise ValueError(f"the parts of a sum have (N, M) {sizes}, expected the same for all")
-        for name, part in parts.items():
-            if part.input_history:
-                raise ValueError(
-                    f"the part {name} of a sum learns a delay of the input, which all parts share: "
-                    f"use ~{name}.delay, and shift the input by the step InputDelay"
-                )
         super().__init__(*next(iter(sizes.values())))
         self.parts = nn.ModuleDict(parts)
         self.input_affine = all(part.input_affine for part in parts.values())

@@ -205,8 +205,8 @@ class MechanicalSystem(ContinuousPredictor):
           tau lies in the range of A.
 
         If the force is not linear in u, :class:`InputSolver` finds u; for M > N, the solution
-        closest to :meth:`typical_input`. With a learned delay, u acts after the delay. Entries are
-        infinite or NaN where A loses its rank, or no input gives the force.
+        closest to :meth:`typical_input`. Entries are infinite or NaN where A loses its rank, or no
+        input gives the force.
 
         Raises:
             ValueError: on shapes, or a model that :meth:`require_invertible_input` refuses.

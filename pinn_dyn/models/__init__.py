@@ -7,7 +7,6 @@ from pinn_dyn.models.cholesky import (
     FixedCholesky,
     NetworkCholesky,
 )
-from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.models.elastic import ElasticJoints
 from pinn_dyn.models.friction import (
     AsymmetricCoulomb,
@@ -61,7 +60,6 @@ __all__ = [
     "KnownSystem",
     "LagrangianNetwork",
     "LearnedConstants",
-    "LearnedDelay",
     "LearnedVelocity",
     "NetworkCholesky",
     "NetworkInput",

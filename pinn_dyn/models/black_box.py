@@ -8,8 +8,7 @@ import torch
 from pydantic import NonNegativeInt, PositiveInt
 from torch import Tensor
 
-from pinn_dyn.mechanics import RK4, Integrator, Predictor, Signal
-from pinn_dyn.models.delay import DelayedPredictor, LearnedDelay
+from pinn_dyn.mechanics import RK4, ContinuousPredictor, Integrator, Predictor, Signal
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import MLP, Activation
 from pinn_dyn.models.scales import Scales
@@ -66,7 +65,7 @@ class NextStateMLP(Predictor):
         return self.scale * self.network(torch.cat([x, u, u_next], dim=-1))
 
 
-class AccelerationMLP(DelayedPredictor):
+class AccelerationMLP(ContinuousPredictor):
     """dv/dt = s * network(q, v, u), integrated by the same RK4 as the structured models.
 
     dq/dt = v holds by construction, and any step is possible. s is the standard deviation of the
@@ -78,7 +77,6 @@ class AccelerationMLP(DelayedPredictor):
         angles: coordinates that are angles. The network uses their sine and cosine.
         integrator: the integration method.
         initial_velocity: builder of the head for the initial velocity.
-        delay: delay of the input. The default has no delay.
     """
 
     scale: Tensor
@@ -91,7 +89,6 @@ class AccelerationMLP(DelayedPredictor):
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         initial_velocity: InitialVelocityHead | None = None,
-        delay: LearnedDelay | None = None,
     ):
         size, inputs = statistics.num_coordinates, statistics.num_inputs
         super().__init__(size, inputs)
@@ -102,7 +99,6 @@ class AccelerationMLP(DelayedPredictor):
         scales = Scales(statistics, statistics.v_std, tuple(angles))
         self.initial_velocity = initial_velocity and initial_velocity(scales)
         self.learns_initial_state = initial_velocity is not None
-        self.delay = delay
 
     def initial_state(self, x0: Tensor, u0: Tensor) -> Tensor:
         return start_of(self.initial_velocity, x0, u0)

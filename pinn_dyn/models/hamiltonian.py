@@ -11,7 +11,6 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, State
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
-from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.statistics import Statistics
 from pinn_dyn.models.triangular import lower_solve, upper_solve
@@ -39,7 +38,6 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         angles: coordinates that are angles. The heads use their sine and cosine.
         integrator: the integration method; Rosenbrock if damping dominates inertia.
         state: "qp" for (q, p), which needs data with momenta, or "qv" for (q, v).
-        delay: delay of the input. The default has no delay.
 
     Raises:
         ValueError: if the head of the inverse mass is transposed.
@@ -56,10 +54,9 @@ class HamiltonianNetwork(structured.StructuredNetwork):
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
         state: State = "qp",
-        delay: LearnedDelay | None = None,
     ):
         heads = potential, damping, friction, input, None
-        super().__init__(statistics, state, *heads, angles, integrator, delay)
+        super().__init__(statistics, state, *heads, angles, integrator)
         if state == "qp":
             inverse_mass_scale = statistics.v_std / statistics.p_std
         else:

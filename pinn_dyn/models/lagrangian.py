@@ -11,7 +11,6 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator
 from pinn_dyn.mechanics.arrays import matvec
 from pinn_dyn.models import structured
-from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.models.friction import NoFriction
 from pinn_dyn.models.initial_velocity import InitialVelocityHead, start_of
 from pinn_dyn.models.mlp import Tape
@@ -36,7 +35,6 @@ class LagrangianNetwork(structured.StructuredNetwork):
         mass, potential, damping, input, friction, residual, initial_velocity: builders of heads.
         angles: coordinates that are angles. The heads use their sine and cosine.
         integrator: the integration method; Rosenbrock if damping dominates inertia.
-        delay: delay of the input. The default has no delay.
 
     Raises:
         ValueError: if the mass head is for a chain but not transposed.
@@ -54,10 +52,9 @@ class LagrangianNetwork(structured.StructuredNetwork):
         initial_velocity: InitialVelocityHead | None = None,
         angles: Sequence[NonNegativeInt] = (),
         integrator: Integrator | None = None,
-        delay: LearnedDelay | None = None,
     ):
         heads = potential, damping, friction, input, residual
-        super().__init__(statistics, "qv", *heads, angles, integrator, delay)
+        super().__init__(statistics, "qv", *heads, angles, integrator)
         inertia = self.input.typical_force(statistics.u_rms) / statistics.acceleration
         self.mass = mass(self._scales(statistics, inertia.sqrt()))
         if self.mass.chain and not self.mass.transposed:

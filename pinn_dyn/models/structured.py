@@ -11,7 +11,6 @@ from torch import Tensor
 from pinn_dyn.mechanics import Integrator, MechanicalSystem, State
 from pinn_dyn.mechanics.integrators import with_friction
 from pinn_dyn.models.cholesky import CholeskyFactor, NetworkCholesky
-from pinn_dyn.models.delay import DelayedPredictor, LearnedDelay
 from pinn_dyn.models.friction import Friction
 from pinn_dyn.models.input_matrix import InputMatrix, NetworkInput, NoInput
 from pinn_dyn.models.positivity import Positive
@@ -34,7 +33,7 @@ INPUT = partial(NetworkInput, hidden=(16, 16))
 """Default heads, those of the options named ``network`` in conf/model."""
 
 
-class StructuredNetwork(DelayedPredictor, MechanicalSystem):
+class StructuredNetwork(MechanicalSystem):
     """Mechanical system with learned V, D, F, A and residual force. Subclasses add the mass.
 
     The scales of the heads come from the data: with the root mean square f of the input, A ~ f/u;
@@ -53,10 +52,8 @@ class StructuredNetwork(DelayedPredictor, MechanicalSystem):
         residual: ResidualHead | None,
         angles: Sequence[int],
         integrator: Integrator | None,
-        delay: LearnedDelay | None,
     ):
         super().__init__(statistics.num_coordinates, statistics.num_inputs, state)
-        self.delay = delay
         self.angles = tuple(angles)
         u_rms = statistics.u_rms
         head = input if len(u_rms) else NoInput

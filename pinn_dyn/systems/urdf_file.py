@@ -20,6 +20,7 @@ from pinn_dyn.systems.mjcf import mjcf_to_urdf
 
 TEXT = "URDF text"
 """Path of a URDF that was passed as text."""
+_DEFINITIONS = ("arg", "include", "macro", "property")  # of xacro
 _TURNING = ("revolute", "continuous")
 _MOVING = (*_TURNING, "prismatic")
 _HELD = ("floating", "planar", "spherical")
@@ -231,6 +232,9 @@ def _read(urdf: str) -> tuple[Path, ET.Element]:
     if root.tag == "mujoco":
         root = ET.fromstring(mjcf_to_urdf(urdf if is_text(urdf) else path))
         path = Path("MJCF text") if is_text(urdf) else path
+    if root.find("{*}link") is not None:  # definitions that are left over add no link
+        for child in [x for x in root if "xacro" in x.tag and x.tag.endswith(_DEFINITIONS)]:
+            root.remove(child)
     if any("xacro" in x.tag or "${" in "".join(x.attrib.values()) for x in root.iter()):
         raise ValueError(
             f"{path} is a xacro file, expected a URDF: convert it by "
@@ -258,7 +262,7 @@ def _open(urdf: str) -> tuple[Path, bytes]:
 
 
 def _parse(content: bytes) -> ET.Element:
-    """Parse XML, also with another encoding than it states, or undeclared prefixes of tags."""
+    """Parse XML, also with another encoding than it states, or undeclared prefixes."""
     try:
         return ET.fromstring(content)
     except (ET.ParseError, LookupError, ValueError):
@@ -267,4 +271,5 @@ def _parse(content: bytes) -> ET.Element:
             text = content.decode(encoding)
         except UnicodeDecodeError:
             text = content.decode("cp1252", "replace")
-        return ET.fromstring(re.sub(r"(</?[\w.-]+):", r"\1_", text.strip("\ufeff \r\n\t")))
+        prefixes = r"""(</?[\w.-]+|\s[\w.-]+(?=:[\w.-]+\s*=\s*["'])):"""
+        return ET.fromstring(re.sub(prefixes, r"\1_", text.strip("\ufeff \r\n\t")))

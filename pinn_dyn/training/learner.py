@@ -224,7 +224,6 @@ class DynamicsLearner(L.LightningModule):
         """Roll out all validation trajectories."""
         figures = self.validator(self.model, batch)
         named = {f"val/{key}": value for key, value in figures.items()}
-        named |= {f"model/{key}": value for key, value in self.model.learned_figures().items()}
         self.log_dict(named, batch_size=1, sync_dist=True)
 
     def on_validation_model_zero_grad(self) -> None:

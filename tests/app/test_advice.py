@@ -40,13 +40,7 @@ COMMANDS = {
         *("train.py", *TINY, "model=lnn", "ensemble=2", "optimizer=soap"),
         "optimizer._target_=torch.optim.Adafactor",
     ],
-    "delay of a held input": [
-        *("train.py", *LOG, "model=lnn", "model/delay=learned", "data.history=0.1"),
-        "dataset.interpolation=hold",
-    ],
-    "delay without history": [
-        *("train.py", *LOG, "model=lnn", "model/delay=learned", "data.history=0.01"),
-    ],
+    "memory without history": ["train.py", *LOG, "model=subnet", "data.history=0.01"],
     "no compiler": ["train.py", *TINY, "model=mlp", "compile=true"],
     "option of a group": ["train.py", *TINY, "model=lnn", "model.damping=constant"],
     "chain of M^-1": ["train.py", *TINY, "model=hnn", "model.inverse_mass.transposed=true"],

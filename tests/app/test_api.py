@@ -2,6 +2,7 @@
 
 import inspect
 import itertools
+import shutil
 import subprocess
 import sys
 from functools import partial
@@ -16,7 +17,7 @@ import pinn_dyn
 from pinn_dyn.app.build import training_arguments
 from pinn_dyn.app.config import composed
 from pinn_dyn.data import DynamicsData
-from pinn_dyn.data.logs import MovingAverage
+from pinn_dyn.data.logs import InputDelay, MovingAverage
 from pinn_dyn.evaluation import RolloutValidator
 from pinn_dyn.models import AccelerationMLP, LagrangianNetwork
 from tests.app.entry import ROOT, TINY_DATA, run_script
@@ -272,6 +273,33 @@ def test_a_cleaning_step_reaches_the_prediction(tmp_path):
     loaded = pinn_dyn.load(tmp_path / "run")
     assert list(loaded.log.steps) == ["smooth"]
     pd.testing.assert_frame_equal(loaded.predict(log()[:51]), run.predict(log()[:51]))
+
+
+def test_a_delay_of_the_data_reaches_predictions_files_and_environments(tmp_path):
+    delays = [0.015, 0.0, 0.03]
+    run = fit(cleaning={"late": InputDelay(delays)})
+    run.save(tmp_path / "run")
+    loaded = pinn_dyn.load(tmp_path / "run")
+    np.testing.assert_array_equal(loaded.input_delay, delays)
+    t = np.arange(11) * 0.01
+    u = np.random.default_rng(0).normal(size=(11, 3)) * 0.1
+    fine = np.arange(21) * 0.005
+    acting = np.stack([np.interp(fine - d, t, x) for d, x in zip(delays, u.T, strict=True)], 1)
+    signal = pinn_dyn.Signal(torch.tensor(fine), torch.tensor(acting))
+    start = torch.zeros(6).double()
+    expected = run.model.predict(start, torch.tensor(t), signal).numpy()
+    np.testing.assert_allclose(loaded.predict(start, u, t), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_run_of_earlier_versions_without_a_learned_delay_loads(tmp_path, lnn_run):
+    """Their configuration has the key delay of the model, empty."""
+    folder = shutil.copytree(lnn_run, tmp_path / "run")
+    path = folder / "checkpoints" / "best.ckpt"
+    saved = torch.load(path, weights_only=True)
+    saved["hyper_parameters"]["config"]["model"]["delay"] = None
+    torch.save(saved, path)
+    expected = pinn_dyn.load(lnn_run).model.state_dict()
+    torch.testing.assert_close(pinn_dyn.load(folder).model.state_dict(), expected)
 
 
 def test_a_training_leaves_the_random_numbers_and_the_threads_alone():

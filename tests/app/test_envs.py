@@ -10,7 +10,6 @@ import pinn_dyn
 from pinn_dyn.control import SimulatorPlant
 from pinn_dyn.data import DataSource, Splits
 from pinn_dyn.mechanics import Signal, Trajectory
-from pinn_dyn.models.delay import LearnedDelay
 from pinn_dyn.testing import damped_oscillators, exact_solution
 from tests.support.closed_loops import Vanishing
 from tests.support.simulated_arms import simulated_by
@@ -94,14 +93,14 @@ def test_longer_steps_are_integrated_in_those_of_the_training(lnn_run):
     np.testing.assert_allclose(coarse, expected, rtol=0, atol=1e-10)
 
 
-def test_a_learned_delay_shifts_the_inputs(lnn_run):
+def test_the_delay_of_the_data_shifts_the_inputs(lnn_run):
     """A delay of two steps: the robot moves as without the delay and with two zeros before."""
     run = pinn_dyn.load(lnn_run)
     env = RobotEnv(run)
     actions = actions_of(env, 5)
     env.action_space = gymnasium.spaces.Box(-9, 9, actions[0].shape)
     expected = rolled_out(env, [*np.zeros((2, actions.shape[1])), *actions])
-    run.model.delay = LearnedDelay(longest=4 * env.dt, initial=2 * env.dt).double()
+    run.config["dataset"]["delay"] = 2 * env.dt
     delayed = RobotEnv(run)
     states = rolled_out(delayed, [*actions, *actions[:2]])
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-10)

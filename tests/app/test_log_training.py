@@ -1,6 +1,5 @@
 """The example log, from the script that writes it to its evaluation, and logs with a mistake."""
 
-import json
 import runpy
 import shutil
 from functools import partial
@@ -86,27 +85,6 @@ def test_evaluate_takes_a_run_on_a_log_with_its_own_settings(run, tmp_path, caps
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_learned_delay_is_reported_in_seconds(at_root, tmp_path, monkeypatch):
-    run_script(
-        "train.py",
-        *TINY,
-        "model/delay=learned",
-        "model.delay.initial=0.02",
-        "trainer.steps=4",
-        f"hydra.run.dir={tmp_path / 'run'}",
-    )
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())["validation"]
-    seconds = found["model/input_delay_seconds"]
-    assert 0.01 < seconds < 0.03
-    assert seconds != 0.02
-    short = ["horizon=1", "windows=[0.2]"]
-    run_script("evaluate.py", *evaluation_of(tmp_path / "run", tmp_path / "out"), *short)
-    delays = pd.read_csv(tmp_path / "out" / "summary.csv")["input_delay_seconds"]
-    assert delays[0] == pytest.approx(seconds, abs=1e-3)
-    assert delays[1:].isna().all()
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_runs_whose_inputs_were_prepared_differently_are_refused(run, tmp_path, capsys):
     words = [f"dataset.root='{run.parent}'", f"hydra.run.dir={tmp_path / 'late'}"]
     words += ["+dataset.steps.delay={_target_: pinn_dyn.data.logs.InputDelay, delay: 0.04}"]
@@ -160,11 +138,6 @@ def test_evaluate_names_the_log_that_is_gone(run, tmp_path, capsys):
         ("dataset.root=nowhere", [f"root is '{ROOT / 'nowhere'}'", "no folder"]),
         ("dataset.time.unit=min", ["example_log.csv, column 't'", "sample time would be 1.2 s"]),
         ("dataset.test.piece=7.0", ["test: ", "no stretch lasts 7 s"]),
-        ("model/delay=learned dataset.interpolation=hold", ["dataset.interpolation=linear"]),
-        (
-            "model/delay=learned data.history=0.05",
-            ["uses 0.1 s before its start", "set data.history=0.1"],
-        ),
     ],
 )
 def test_a_mistake_about_a_log_ends_with_its_name_and_place(

@@ -103,7 +103,7 @@ def test_options_of_a_users_own_folder_are_checked(tmp_path):
         ("~validator", "no value for validator"),
         ("data=[1]", "Hydra cannot use data=[1]"),
         ("optimizer=adam", "did you mean adamw"),
-        ("model.delay=learned", "write model/delay=learned"),
+        ("model.friction=coulomb", "write model/friction=coulomb"),
         ("data.pairs=${oc.env:NOWHERE_AT_ALL}", "NOWHERE_AT_ALL"),
         ("seed=[1", "no viable alternative"),
         ("seed=${seed}", "Recursive interpolation"),

@@ -163,3 +163,36 @@ def test_the_rate_in_an_hdf5_file_without_clock_is_named(tmp_path):
     with pytest.raises(LogError, match=r"write time: \{rate: 100\}.*log/q \(601, 2\).*log@fps"):
         source(tmp_path, **HDF5).load()
     assert_motion(source(tmp_path, **HDF5 | {"time": {"rate": 100}}))
+
+
+@pytest.mark.parametrize("kind", ["arrays", "runs", "records", "vectors", "lines"])
+def test_json_holds_arrays_runs_or_records(tmp_path, kind):
+    tables = [motion(phase=0.5 * k) for k in range(2 if kind == "runs" else 1)]
+    names = {key: [f"{key}1", f"{key}2"] for key in "qvu"}
+    arrays = [
+        {"t": x["t"].tolist(), "state": {"q": x[names["q"]].to_numpy().tolist()}}
+        | {key: x[names[key]].to_numpy().tolist() for key in "vu"}
+        for x in tables
+    ]
+    records = tables[0].to_dict("records")
+    values = arrays[0]["t"], arrays[0]["state"]["q"], arrays[0]["v"], arrays[0]["u"]
+    rows = zip(*values, strict=True)
+    vectors = [{"t": t, "state": {"q": q}, "v": v, "u": u} for t, q, v, u in rows]
+    contents = {"arrays": arrays[0], "runs": arrays, "records": records, "vectors": vectors}
+    text = json.dumps(contents.get(kind))
+    if kind == "lines":
+        text = "\n".join(map(json.dumps, vectors))
+    (tmp_path / f"log.{'jsonl' if kind == 'lines' else 'json'}").write_text(text)
+    bases = {"q": "state.q", "v": "v", "u": "u"}
+    columns = {key: [f"{base}_1", f"{base}_2"] for key, base in bases.items()}
+    units = dict(q="rad", v="rad/s", u="Nm")
+    if kind == "records":
+        columns = names
+    signals = {key: dict(columns=columns[key], unit=units[key]) for key in "qvu"}
+    log = source(tmp_path, files="log.*", **signals)
+    assert len({part.raw.run for part in log.cleaned}) == len(tables)
+    for part in log.cleaned:
+        table = tables[int(part.raw.run) if kind == "runs" else 0]
+        rows = np.round(100 * part.raw.t).astype(int)
+        for key in "qvu":
+            np.testing.assert_allclose(getattr(part.raw, key), table[names[key]].to_numpy()[rows])

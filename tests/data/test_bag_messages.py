@@ -175,6 +175,17 @@ def test_a_second_publisher_of_the_same_joints_is_left_out(tmp_path):
     assert note == "291 of 592 messages of /joint_states of another publisher are dropped"
 
 
+def test_two_publishers_that_the_bag_does_not_tell_apart_are_named(tmp_path):
+    """ROS 2: the second node sends other values 0.4 ms after the first."""
+    items = []
+    for k, (time, message) in enumerate(states()):
+        stamp = START + round(1e9 * time) + 400_000
+        items += [(time, message), (time + 4e-4, joint_state(k, stamp=stamp, q=Q[k] + 0.5))]
+    write(tmp_path / "bag", items)
+    with pytest.raises(LogError, match=r"two nodes publish /joint_states.*remap one"):
+        read(tmp_path / "bag")
+
+
 def test_messages_that_come_late_are_sorted(tmp_path):
     items = states()
     items[5:8] = [(t, m) for (t, _), (_, m) in zip(items[5:8], items[5:8][::-1], strict=True)]

@@ -107,6 +107,38 @@ def csv(**options):
     return motion().to_csv(index=False, float_format="%.6f", **options)
 
 
+@pytest.mark.parametrize(("factor", "unit", "right"), [(1, "ms", "s"), (1000, "s", "ms")])
+def test_a_unit_of_time_that_is_wrong_by_a_thousand_is_named(tmp_path, factor, unit, right):
+    table = motion()[["t", "q1", "q2", "u1", "u2"]]
+    write(tmp_path, table.assign(t=factor * table.t))
+    with pytest.raises(LogError, match=f"the sample time would be.*write the unit {right}, or"):
+        source(tmp_path, time=dict(columns="t", unit=unit), v=None).load()
+
+
+def test_an_unsigned_register_is_named_with_the_number_to_subtract(tmp_path):
+    table = motion()
+    counts = (1000 * table["u1"]).round().astype(int)
+    write(tmp_path, table.assign(u1=0.25 * (counts % 2**16)))
+    first = int((counts < 0).to_numpy().argmax())
+    with pytest.raises(LogError, match=rf"line {first + 2}, column 'u1'.*16 bits.*subtract 16384 "):
+        source(tmp_path).load()
+    for u in (0.25 * counts, 0.25 * (counts + 30000), 16383.75 * (counts > 0)):
+        write(tmp_path, table.assign(u1=u))  # signed, an offset, on and off
+        source(tmp_path).load()
+
+
+@pytest.mark.parametrize(("count", "named"), [(0, False), (1, True), (3, True)])
+def test_zeros_before_the_first_sample_are_left_out(tmp_path, count, named):
+    table = motion()
+    table[["q1", "q2"]] += 5.0
+    table.loc[: count - 1, ["q1", "q2", "v1", "v2"]] = 0.0
+    write(tmp_path, table)
+    log = source(tmp_path)
+    assert len(log.load().train[0].t) == 601 - count
+    assert any(f"q jumps after the first {count} rows" in x for x in log.warnings) == named
+    assert len(log.warnings) == named
+
+
 def test_the_named_step_is_the_cure(tmp_path):
     write(tmp_path, clock(repeat))
     steps = {"deduplicate": Deduplicate(), **RESAMPLE}

@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pinn_dyn.data import draw_windows
-from pinn_dyn.data.logs import UNITS, Butterworth, Columns, LogError, SplitGaps
+from pinn_dyn.data.logs import (
+    UNITS,
+    Butterworth,
+    Columns,
+    InputDelay,
+    LogError,
+    SplitGaps,
+)
 from pinn_dyn.data.logs.splits import default_split
 from pinn_dyn.data.stored import StoredSource, store
 from pinn_dyn.mechanics import stack
@@ -36,6 +43,27 @@ def test_a_clean_log_arrives_as_it_is(folder):
     assert draw_windows(splits.train, count=50, steps=2, stride=5, seed=0).q.shape == (50, 2)
     assert stack(splits.validation).q.shape == (2, 51, 2)
     assert stack(splits.test).t[-1] == pytest.approx(1.0)
+
+
+def test_files_may_be_absolute_paths(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "root").mkdir()
+    write(tmp_path / "elsewhere", motion())
+    expected = source(tmp_path / "elsewhere").load().train[0]
+    for files in (f"{tmp_path}/elsewhere/run.csv", [f"{tmp_path}/else*/*.csv"]):
+        log = source(tmp_path / "root", files=files)
+        assert torch.equal(log.load().train[0].q, expected.q)
+        assert log.cleaned[0].raw.run == "run"
+
+
+def test_the_delay_of_a_data_set_is_the_last_step(folder):
+    """After the cleaning, so that no input is interpolated across a gap."""
+    late = InputDelay([0.015, 0.02])
+    expected = source(folder, steps={"smooth": Butterworth(5.0), "late": late}).load()
+    log = source(folder, steps={"smooth": Butterworth(5.0)}, delay=[0.015, 0.02])
+    torch.testing.assert_close(log.load().train[0].u, expected.train[0].u, rtol=0, atol=0)
+    both = source(folder, steps={"late": late}, delay=0.1)
+    np.testing.assert_allclose(both.input_delay, [0.115, 0.12])
 
 
 def test_units_signs_scales_and_offsets(folder):

@@ -40,6 +40,14 @@ def test_signals_in_files_with_the_same_rows_are_one_run(tmp_path, clock):
     assert not log.warnings
 
 
+def test_the_clock_of_a_joined_run_is_that_of_q(tmp_path):
+    """The stamps of u are 2 % of a sample late, and its file comes first by its name."""
+    write(tmp_path, TABLE[T + U].assign(t=TABLE.t + 2e-4), "1_eff.csv")
+    write(tmp_path, TABLE[T + Q + V], "2_pos.csv")
+    for part in source(tmp_path).cleaned:
+        np.testing.assert_allclose(100 * part.raw.t, np.round(100 * part.raw.t), atol=1e-9)
+
+
 NAMES = ["{run}_{part}", "{run}/{part}", "{part}/{run}", "{part}{number}", "x-{part}_01_{number}"]
 
 

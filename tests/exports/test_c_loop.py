@@ -10,9 +10,9 @@ from pinn_dyn.ensembles import Ensemble
 from pinn_dyn.evaluation.prediction import model_for_rollouts
 from pinn_dyn.exports import c_library, c_loop
 from pinn_dyn.mechanics import RK4, Rosenbrock, Signal
-from pinn_dyn.models import AccelerationMLP, LearnedDelay, Servo
+from pinn_dyn.models import Servo
 from pinn_dyn.testing import LinearSystem
-from tests.models.builders import VARIANTS, make_model, make_statistics, make_structured, perturb
+from tests.models.builders import VARIANTS, make_model, make_structured, perturb
 from tests.support.known import elastic_model, known_model
 
 NETWORK = VARIANTS["constant-mass-fixed-damping-constant-input-3x3"]
@@ -39,9 +39,6 @@ MODELS = {
     "rosenbrock": partial(known_model, integrator=Rosenbrock(2)),
     "substeps": partial(make_structured, "lnn", integrator=RK4(3), **NETWORK),
     "momentum": partial(make_structured, "hnn", **NETWORK),
-    "delay": lambda: perturb(
-        AccelerationMLP(make_statistics(2, 2), hidden=[6], delay=LearnedDelay(0.1, 0.03))
-    ),
     "acceleration": partial(make_model, "acceleration"),
     "passive": partial(LinearSystem, [[1.0]], [[2.0]], [[0.1]], torch.zeros(1, 0).tolist()),
     "ensemble": partial(make_ensemble, "lnn"),

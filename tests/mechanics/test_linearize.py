@@ -8,7 +8,7 @@ import torch
 from scipy.signal import cont2discrete
 
 from pinn_dyn.mechanics import Signal
-from pinn_dyn.models import LearnedDelay, Servo
+from pinn_dyn.models import Servo
 from pinn_dyn.systems import SoftArm, TendonArm
 from pinn_dyn.testing import assert_near
 from pinn_dyn.testing.finite_differences import partial_derivatives
@@ -88,13 +88,3 @@ def test_the_sampled_pair_is_the_slope_of_a_simulation_from_rest(kind):
     expected = partial_derivatives(end, start[None], 1e-3)[0]
     pair = model.linearize(q, 0 * q, u, sample_time=0.2)
     assert_near(torch.cat(pair, -1), expected, 1e-6)
-
-
-def test_a_learned_delay_is_refused_and_says_how_to_go_on():
-    model = make_structured("lnn")
-    model.delay = LearnedDelay(0.1, 0.02)
-    q, v, u = states(model)
-    with pytest.raises(ValueError, match="attribute delay to None"):
-        model.linearize(q, v, u)
-    model.delay = None
-    model.linearize(q, v, u)

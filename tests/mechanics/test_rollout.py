@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, Trajectory, rollout
+from pinn_dyn.mechanics import RK4, Rosenbrock, Signal, rollout
 from pinn_dyn.mechanics.rollout import path_between
 from pinn_dyn.systems import SoftArm
 from pinn_dyn.testing import LinearSystem, damped_oscillators, exact_solution
@@ -157,26 +157,6 @@ def test_increments_are_relative_to_the_measured_start(system):
     start = torch.cat([START[:2], START[2:] + u[0]])
     assert torch.equal(found[0], START)
     torch.testing.assert_close(found[1:], system.predict(start, t, Signal(t, u))[1:])
-
-
-class Delayed(LinearSystem):
-    """Masses on which the input acts 0.13 s later."""
-
-    input_history = 0.3
-
-    def acting_input(self, input):
-        return input.delayed(torch.tensor(0.13))
-
-
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_a_delayed_input_comes_from_the_past(system, interpolation):
-    """The ramp u = 3 t, which began before the first sample, acts as 3 (t - 0.13)."""
-    late = Delayed(system.mass, system.stiffness, system.damping, system.inputs)
-    t = torch.arange(-3, 11, dtype=torch.float64)[:, None] / 10
-    q = torch.zeros(11, 2, dtype=torch.float64)
-    signal = Signal(t[3:, 0], 3 * t[3:], interpolation)
-    truth = Trajectory(q, q, signal, past=3 * t[:3])
-    torch.testing.assert_close(late.acting_samples(truth), 3 * (t[3:] - 0.13))
 
 
 # Bad input.

@@ -147,3 +147,16 @@ def test_bad_input_is_refused_by_name(change, message):
     values = {"t": torch.arange(4.0), "u": torch.zeros(4, 1), "interpolation": "linear"} | change
     with pytest.raises(ValueError, match=message):
         Signal(**values)
+
+
+@pytest.mark.parametrize("kind", ["hold", "linear"])
+def test_each_input_is_delayed_by_its_own_time(kind):
+    """One delay is a whole number of samples, so some of the shifted times coincide."""
+    signal = make_signal(kind, 8, seed=1)
+    step = float(signal.t[1] - signal.t[0])
+    delays = torch.tensor([0.0, 2 * step, 0.7 * step, 0.3][: signal.num_inputs]).double()
+    late = signal.delayed(delays)
+    grid = torch.linspace(0.01, 1, 50).double() * (signal.t[-1] - signal.t[0]) + signal.t[0]
+    for i, delay in enumerate(delays):
+        expected = signal.at(grid - delay)[..., i]
+        torch.testing.assert_close(late.at(grid)[..., i], expected, rtol=0, atol=1e-9)

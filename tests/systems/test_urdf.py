@@ -29,6 +29,8 @@ def joint(name, parent, child):
         ('ixx="0.09" ixy="0" ixz="0" iyy="0.05"', 'ixx="0.1" ixy="0" ixz="0" iyy="0"'),  # a rod
         ('ixx="0.09" ixy="0" ixz="0" iyy="0.05"', 'ixx="0.05" ixy="0" ixz="0" iyy="0.05"'),  # flat
         ('type="fixed">', 'type="fixed"><axis xyz="0 0 0"/>'),  # as in the Panda's
+        ("<link", '<x:arg name="n" xmlns:x="http://wiki.ros.org/xacro"/><link'),
+        ("<link", '<xacro:property name="m" value="${n}"/><drake:joint drake:k="1"/><link'),
         ('<link name="base"/>', f'<link name="base">{INERTIAL}</inertial></link>'),  # does not move
     ],
 )
@@ -49,7 +51,7 @@ WRONG = {
     "empty": (ARM, "", "is not valid XML"),
     "a web page": (ARM, "<!DOCTYPE html><html><br></html>", "it is a web page"),
     "SDF": (ARM, '<sdf version="1.9"><model name="x"/></sdf>', "is SDF, expected the URDF"),
-    "xacro": ("<link", '<x:arg xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
+    "xacro": ("<link", '<x:arm xmlns:x="http://wiki.ros.org/xacro"/><link', "is a xacro file"),
     "a xacro number": ('value="1.5"', 'value="${m}"', "is a xacro file"),
     "no joint": (ARM, '<robot name="x"><link name="a"/></robot>', "there is no <joint>"),
     "two links of a name": ('name="lower"', 'name="upper"', r"the same name: \['upper'\]"),

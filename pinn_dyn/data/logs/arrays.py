@@ -7,6 +7,7 @@ that are runs have the columns ``data/*/q``.
 
 from __future__ import annotations
 
+import json
 import pickle
 import re
 from collections.abc import Collection, Iterator, Mapping
@@ -19,7 +20,7 @@ import torch
 
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.matlab import elements, matlab_variables
-from pinn_dyn.data.logs.table import Request, optional
+from pinn_dyn.data.logs.table import Request, optional, vector_columns
 from pinn_dyn.spelling import did_you_mean
 
 _KINDS = "fiubmMUTO"  # of arrays that may be columns
@@ -100,6 +101,30 @@ def read_torch(path: Path, request: Request) -> dict[str, pd.DataFrame]:
             f"{path}: holds Python objects, which are not loaded: save plain tensors, as in "
             "torch.save({'t': t, 'q': q, 'u': u}, path)"
         ) from error
+    return _of_runs(path, request, content)
+
+
+def read_json(path: Path, request: Request) -> dict[str, pd.DataFrame]:
+    """Read JSON: a mapping of arrays, a list of such runs, or a list of records.
+
+    A record is a mapping of the numbers of a row. A file ``.jsonl`` has one in each line. Nested
+    mappings are joined, as ``state.q``. Vectors of records are the columns ``q_1``, ``q_2``.
+    """
+    text = path.read_text(encoding="utf-8-sig")
+    lines = text.splitlines() if path.suffix.lower() == ".jsonl" else []
+    content = [json.loads(line) for line in lines if line.strip()] or json.loads(text)
+    frame = pd.json_normalize(content)
+    if isinstance(content, Mapping) or isinstance(frame.get(request.time, [None])[0], list):
+        return _of_runs(path, request, content)
+    columns: dict[str, pd.Series] = {}
+    for name, cells in frame.items():
+        is_vector = any(isinstance(x, list) for x in cells)
+        columns |= vector_columns(str(name), cells) if is_vector else {str(name): cells}
+    return {"": pd.DataFrame(columns).set_axis(frame.index + 1)}
+
+
+def _of_runs(path: Path, request: Request, content: Any) -> dict[str, pd.DataFrame]:
+    """Return the tables of a mapping of arrays, or of those of a list of runs."""
     if not isinstance(content, list):
         return _of_python(path, request, content)
     tables = [_of_python(path, request, values) for values in content]

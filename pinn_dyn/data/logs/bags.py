@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from pinn_dyn.data.cache import load_or_make
+from pinn_dyn.data.logs.checks import alternates
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.messages import open_bag
 from pinn_dyn.data.logs.table import Request, Table
@@ -23,6 +24,7 @@ from pinn_dyn.data.logs.table import Request, Table
 # Names of the entries of arrays, in sensor_msgs, trajectory_msgs and control_msgs.
 _NAMES = ("name", "joint_names", "interface_names")
 _LATEST = 1.0  # s; a message that is later than this begins a new run
+_FEW = 20  # messages from which two publishers can be told
 _RECEIVED = ""  # column of the times of receipt
 
 
@@ -133,8 +135,14 @@ def _topic(
         if mask.any():
             notes.append(f"{mask.sum()} of {len(rows)} messages of {topic} {reason} are dropped")
     stays = ~zero & ~foreign & (publishers == usual)
-    frame = pd.DataFrame(values, times, columns).assign(**{_RECEIVED: received})
-    return frame[stays]
+    frame = pd.DataFrame(values, times, columns).assign(**{_RECEIVED: received})[stays]
+    for name in (columns[k] for k in signals if len(frame) > _FEW):
+        if alternates(frame[name].to_numpy()):
+            raise LogError(
+                f"{path}: {name!r} goes to and fro from message to message: two nodes publish "
+                f"{topic}, and the bag does not record which. Stop or remap one, and record again"
+            )
+    return frame
 
 
 def _merged(topics: Sequence[pd.DataFrame], last: str) -> pd.DataFrame:

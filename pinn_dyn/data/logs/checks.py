@@ -12,6 +12,7 @@ from pinn_dyn.data.logs.columns import Columns
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement, judged
 from pinn_dyn.data.logs.recording import clock_steps
+from pinn_dyn.data.logs.registers import check_registers
 from pinn_dyn.data.logs.stamps import SAMPLE_TIMES, Clock
 from pinn_dyn.data.logs.table import Table
 
@@ -23,6 +24,7 @@ _NEIGHBORS = 7
 _FEWEST_TICKS, _TICK_ERROR = 10, 0.1  # steps of a resolution; deviation from multiples of a half
 # Numbers that stand for "no value", in the unit of the file.
 _NO_VALUE = {-1, *(sign * x for sign in (1, -1) for x in (99, 999, 9999, 99999, 32767, 65535))}
+_FAST, _SHORT = 1e-4, 0.1  # s; so fast a clock over so short a run has another unit
 _LARGEST = 1e12  # SI units
 
 
@@ -59,13 +61,15 @@ def check_clock(
         )
     typical = float(spacing.mean() if "bursts" in repairs else np.median(spacing[spacing > 0]))
     low, high = SAMPLE_TIMES
-    if not low <= typical <= high and (spacing >= 0).all():
+    usual = low <= typical <= high and not (typical < _FAST and np.ptp(t) < _SHORT)
+    if not usual and (spacing >= 0).all():
         shared = int(np.median(np.unique(t, return_counts=True)[1]))  # stamps in whole seconds
         unit = clock.plausible_unit(table, typical) if shared == 1 else ""
         cure = f"write the unit {unit}, or " if unit else ""
         raise LogError(
-            f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s, "
-            f"expected {low:g} to {high:g} s: {cure}{rate.format(shared / typical)}"
+            f"{table.name}, column {clock.name!r}: the sample time would be {typical:.6g} s in a "
+            f"run of {np.ptp(t):.4g} s, expected {low:g} to {high:g} s: "
+            f"{cure}{rate.format(shared / typical)}"
         )
     same = spacing == 0
     if same.any():  # a logger that is faster than its source repeats whole rows
@@ -110,7 +114,8 @@ def check_rows(
     median of seven than ten (u: twenty) times the 99th percentile of all these medians.
 
     Raises:
-        LogError: on numbers that stand for "no value", an angle that wraps, two runs row by row.
+        LogError: on numbers that stand for "no value", unsigned registers, an angle that wraps, two
+            runs row by row.
     """
     if (large := np.abs(values) > _LARGEST).any():
         row, k = np.argwhere(large)[0]
@@ -120,6 +125,7 @@ def check_rows(
         )
     if len(t) < 2 * _NEIGHBORS:
         return []
+    check_registers(table, signal, columns, values)
     spacing = np.diff(t)
     in_step = (spacing > 0) & (spacing < 3 * np.median(spacing))
     warnings = []
@@ -141,12 +147,17 @@ def _check_angle(table: Table, name: str, q: np.ndarray, unit: str, in_step: np.
             f"{table.place(row + 1, name, 'q')}: the angle wraps from {q[row]:.5g} to "
             f"{q[row + 1]:.5g} rad ({len(wraps)} times): unwrap the column (numpy.unwrap) before"
         )
-    one_row, two_rows = (float(np.median(np.abs(q[n:] - q[:-n]))) for n in (1, 2))
-    if one_row > 0.02 * np.ptp(q) and two_rows < 0.2 * one_row:
+    if alternates(q):
         raise LogError(
-            f"{table.place(1, name, 'q')}: rows go to and fro by {one_row:.4g} {unit}: two runs "
-            "share the clock; name the column that tells them apart in 'trajectory'"
+            f"{table.place(1, name, 'q')}: rows go to and fro by {abs(q[1] - q[0]):.4g} {unit}: "
+            "two runs share the clock; name the column that tells them apart in 'trajectory'"
         )
+
+
+def alternates(x: np.ndarray) -> bool:
+    """Return true for numbers ``(T,)`` that go to and fro, as those of two sources by turns."""
+    one_row, two_rows = (float(np.median(np.abs(x[n:] - x[:-n]))) for n in (1, 2))
+    return one_row > 0.02 * np.ptp(x) and two_rows < 0.2 * one_row
 
 
 def _jumps(

@@ -13,6 +13,8 @@ from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.recording import SIGNALS, Recording
 from pinn_dyn.data.logs.step import Step
 
+_ROUNDING = 1e-3  # of a sample time
+
 
 @dataclass(frozen=True)
 class Deduplicate(Step):
@@ -105,19 +107,25 @@ class Resample(Step):
 class InputDelay(Step):
     """Shift each input to the time at which it acts: u_i(t) becomes u_i(t - d_i).
 
+    Between two samples u is interpolated linearly. For an input that is held between its samples,
+    the result is the mean of u(t - d) over each sample. The first max(d) s are dropped.
+
     Args:
-        delay: d, s, rounded to samples of a uniform clock; one, or one per input.
+        delay: d, s; one, or one per input. Rates that InputRates has appended have the delays of
+            their inputs.
     """
 
     delay: NonNegativeFloat | Sequence[NonNegativeFloat]
 
     def apply(self, recording: Recording) -> tuple[list[Recording], str]:
-        step = recording.sample_time("InputDelay")
-        lags = np.atleast_1d(np.round(np.asarray(self.delay) / step).astype(int))
-        lags = np.broadcast_to(lags, recording.u.shape[1])
-        longest, samples = int(lags.max()), len(recording)
-        if samples - longest < 2:
+        delays, t, inputs = np.atleast_1d(self.delay), recording.t, recording.u.shape[1]
+        if inputs % len(delays):
+            raise LogError(f"delay has {len(delays)} entries, expected 1 or {inputs}")
+        pairs = zip(np.resize(delays, inputs), recording.u.T, strict=True)
+        u = [np.interp(t - d, t, x) for d, x in pairs]
+        # Times are rounded.
+        kept = t >= t[0] + delays.max() - _ROUNDING * np.median(np.diff(t))
+        if kept.sum() < 2:
             raise LogError(f"{recording.place}: shorter than the input delay: drop the run")
-        u = np.column_stack([recording.u[longest - k : samples - k, i] for i, k in enumerate(lags)])
-        text = ", ".join(f"{lag} samples ({lag * step:.4g} s)" for lag in dict.fromkeys(lags))
-        return [replace(recording.rows(slice(longest, None)), u=u)], f"u delayed by {text}"
+        shifted = replace(recording, u=np.column_stack(u)).rows(kept)
+        return [shifted], f"u delayed by {listed(f'{d:.4g} s' for d in dict.fromkeys(delays))}"

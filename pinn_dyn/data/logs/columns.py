@@ -23,7 +23,7 @@ _FACTORS: dict[str, dict[str, float]] = {
     "1/s": {"1/s": 1.0},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
     "rad": {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "rev": _TURN},
-    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "rpm": _TURN / 60},
+    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "rev/s": _TURN, "rpm": _TURN / 60},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
     "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
     "Nm": {"Nm": 1.0, "mNm": 1e-3},
@@ -43,6 +43,8 @@ _SPELLINGS = {
     **dict.fromkeys(("°", "º", "degree", "degrees"), "deg"),
     **dict.fromkeys(("sec", "second", "seconds"), "s"),
     **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("turn", "turns", "revolution", "revolutions"), "rev"),
+    "rps": "rev/s",
     **{"µs": "us", "μs": "us", "µm": "um", "μm": "um", "-": "1"},
 }
 """Spellings of the parts of units in files."""

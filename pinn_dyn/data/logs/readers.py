@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from pinn_dyn.data.logs.arrays import read_hdf5, read_mat, read_npy, read_npz, read_torch
+from pinn_dyn.data.logs.arrays import read_hdf5, read_json, read_mat, read_npy, read_npz, read_torch
 from pinn_dyn.data.logs.bags import read_bag
 from pinn_dyn.data.logs.errors import LogError, listed
 from pinn_dyn.data.logs.parquet import read_parquet
@@ -38,6 +38,7 @@ READERS: dict[str, Reader] = {
     ".npz": read_npz,
     ".npy": read_npy,
     **dict.fromkeys((".pt", ".pth"), read_torch),
+    **dict.fromkeys((".json", ".jsonl"), read_json),
     ".parquet": read_parquet,
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
@@ -83,7 +84,7 @@ def read_tables(path: Path, request: Request) -> dict[str, Table]:
 
 
 def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
-    """Return the files of names or glob patterns in a folder, in order of their names.
+    """Return the files of names or glob patterns in a folder, or of absolute paths, in order.
 
     Raises:
         LogError: if the folder does not exist, or a pattern matches nothing.
@@ -94,19 +95,22 @@ def find_files(root: str, patterns: str | Sequence[str]) -> list[Path]:
     files: set[Path] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = []
-        for path in folder.glob(pattern):
+        start = Path(pattern).expanduser()
+        names = start.relative_to(start.anchor)  # of an absolute path, from its root on
+        for path in (folder / start.anchor).glob(str(names)):
             parts = [*path.glob("*.mcap"), *path.glob("*.db3")]  # of a bag without metadata
             matches += [path] if path.is_file() or _is_bag(path) else parts
         if not matches:
-            names = listed(sorted(path.name for path in folder.iterdir()))
+            present = listed(sorted(path.name for path in folder.iterdir()))
             raise LogError(
-                f"files: nothing matches {pattern!r} in the folder {folder.absolute()}: {names}"
+                f"files: nothing matches {pattern!r} in the folder {folder.absolute()}: {present}"
             )
         files.update(matches)
     return sorted(files)
 
 
 def run_name(path: Path, root: str) -> str:
-    """Return the name of a file's run: its path in the folder, without its suffix."""
-    inside = path.relative_to(Path(root).expanduser())
+    """Return the name of a file's run: its path in the folder or its name, without suffix."""
+    folder = Path(root).expanduser()
+    inside = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.name)
     return (inside.with_suffix("") if inside.suffix == ".gz" else inside).with_suffix("").as_posix()

@@ -16,6 +16,7 @@ from pinn_dyn.data.logs.filling import fill
 from pinn_dyn.data.logs.joining import joined, widened
 from pinn_dyn.data.logs.readers import find_files, read_tables, run_name
 from pinn_dyn.data.logs.recording import Recording, Report
+from pinn_dyn.data.logs.registers import rows_before_first_sample
 from pinn_dyn.data.logs.stamps import Clock
 from pinn_dyn.data.logs.table import Request, Table
 
@@ -129,6 +130,11 @@ class Layout:
         if np.isnan(item.values()).any() and (np.diff(item.t) >= 0).all():  # or check_clock raises
             splits = "gaps" in self.repairs
             stays = fill(item, self.signals, part, self.request.max_age, report, splits=splits)
+            rows, item, part = rows[stays], item.rows(stays), part.select(stays)
+        if count := rows_before_first_sample(item.q):
+            text = "the robot is not yet measured: left out"
+            report.warn("rows", f"{part.place(0)}: q jumps after the first {count} rows, {text}")
+            stays = np.arange(count, len(item))
             rows, item, part = rows[stays], item.rows(stays), part.select(stays)
         report.measurements += check_clock(item.t, part, self.time, self.repairs)
         for signal, columns in self.signals.items():

@@ -14,6 +14,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from pinn_dyn.data.logs import plausibility
 from pinn_dyn.data.logs.cleaning import clean, long_enough
+from pinn_dyn.data.logs.clock import InputDelay
 from pinn_dyn.data.logs.columns import UNITS, Columns, described
 from pinn_dyn.data.logs.errors import LogError
 from pinn_dyn.data.logs.measurement import Measurement
@@ -61,6 +62,7 @@ class LogSource(DataSource):
         long: column that names the joint, of a log with a row per joint and time. Other columns
             are then ``<name>/<joint>``.
         steps: names and steps of the cleaning, in order; None entries are left out.
+        delay: time by which the inputs act late, s, one or M: :class:`InputDelay` as the last step.
         validation, test: whole runs, ``{runs: 2, piece: 5.0}``, or the ends of runs,
             ``{seconds: 3.0, piece: 3.0}``, see :class:`Part`; None takes :func:`default_split`.
         guard: time left out between training, validation and test of one run, s.
@@ -88,6 +90,7 @@ class LogSource(DataSource):
         max_age: PositiveFloat = 0.1,
         sep: str | None = None,
         steps: Mapping[str, Step | None] | None = None,
+        delay: NonNegativeFloat | Sequence[NonNegativeFloat] = 0.0,
         validation: Part | Mapping[str, Any] | None = None,
         test: Part | Mapping[str, Any] | None = None,
         guard: NonNegativeFloat = 0.5,
@@ -117,6 +120,7 @@ class LogSource(DataSource):
         self.max_age = max_age
         self.sep = sep
         self.steps = {key: step for key, step in (steps or {}).items() if step is not None}
+        self.delay = delay
         self._repairs = {fault for step in self.steps.values() for fault in step.repairs}
         if (validation is None) != (test is None):
             raise LogError("expected both validation and test, or neither for the default split")
@@ -142,6 +146,16 @@ class LogSource(DataSource):
         names = pd.Index([x for columns in self._signals.values() for x in columns.columns])
         if names.has_duplicates:
             raise LogError(f"column {names[names.duplicated()][0]!r} is twice in q, v and u")
+
+    @property
+    def cleaning(self) -> dict[str, Step]:
+        """The steps, and the shift of the inputs by the delay."""
+        return self.steps | ({"input delay": InputDelay(self.delay)} if np.any(self.delay) else {})
+
+    @property
+    def input_delay(self) -> np.ndarray:
+        delays = [x.delay for x in self.steps.values() if isinstance(x, InputDelay)]
+        return sum((np.resize(x, len(self.input_labels)) for x in delays), super().input_delay)
 
     def load(self) -> Splits:
         """Return the cleaned trajectories, or raise a LogError on a file that cannot be used."""
@@ -183,7 +197,7 @@ class LogSource(DataSource):
         column = self.trajectory
         runs = table.runs(column if column and column in table else None, "the frame")
         raws = self._layout.recordings(table, runs, report)
-        cleaned = clean([Cleaned("", raw, [raw]) for _, raw in raws], self.steps, report)
+        cleaned = clean([Cleaned("", raw, [raw]) for _, raw in raws], self.cleaning, report)
         for part in cleaned:
             if (count := len(part.clean)) != 1:
                 raise LogError(f"{part.raw.place}: the steps leave {count} stretches, expected one")
@@ -205,13 +219,15 @@ class LogSource(DataSource):
         measurements = report.measurements
         if self.test is None:
             times = {item.run: item.t for item in recordings}
-            self.validation, self.test, self.guard = default_split(times, self.seed)
+            self.validation, self.test, self.guard = default_split(
+                times, self.seed, float(self.input_delay.max(initial=0.0))
+            )
         parts = split(recordings, self.validation, self.test, guard=self.guard, seed=self.seed)
         cleaned = [Cleaned(key, raw, [raw]) for key, raws in parts.items() for raw in raws]
         pieces = {"train": "whole", "validation": self.validation.piece, "test": self.test.piece}
         limits = {key: self.shortest if x == "whole" else x for key, x in pieces.items()}
         cleaned = long_enough("splitting", cleaned, limits, report)
-        cleaned = clean(cleaned, self.steps, report, limits)
+        cleaned = clean(cleaned, self.cleaning, report, limits)
         stretches = {
             name: [item for part in cleaned if part.split == name for item in part.clean]
             for name in SPLITS

@@ -46,19 +46,22 @@ class Part:
         return [] if self.runs is None or isinstance(self.runs, int) else [*map(str, self.runs)]
 
 
-def default_split(runs: Mapping[str, np.ndarray], seed: int) -> tuple[Part, Part, float]:
+def default_split(
+    runs: Mapping[str, np.ndarray], seed: int, lost: float = 0.0
+) -> tuple[Part, Part, float]:
     """Choose validation, test and guard (s) of a log from the times of its runs, s.
 
     Of five runs or more, 15 % are the test and as many the validation, drawn by the seed among the
     runs of at least the median length. Of fewer runs, the last 15 % of each are the test and the
-    15 % before them the validation. Both are cut into pieces of at most 5 s.
+    15 % before them the validation. Both are cut into pieces of at most 5 s, which are still
+    possible after the cleaning has dropped ``lost`` s of each stretch.
     """
     spacing = np.concatenate([np.diff(t) for t in runs.values()])
     step = float(np.median(spacing[spacing > 0]))
     lengths = {name: float(np.ptp(t)) for name, t in runs.items()}
     whole_runs = len(runs) >= _WHOLE_RUNS
     median, shortest = float(np.median([*lengths.values()])), min(lengths.values())
-    longest = min(_PIECE, median if whole_runs else _SHARE * shortest)
+    longest = min(_PIECE, (median if whole_runs else _SHARE * shortest) - lost)
     # A multiple of the sample time.
     piece = round(max(int(longest / step + 1e-6), 1) * step, 9)
     if whole_runs:

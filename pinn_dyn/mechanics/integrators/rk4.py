@@ -34,8 +34,6 @@ class RK4(Integrator):
         return increment + h * (first + 3 * (second + third) + fourth) / 8
 
     def path(self, dynamics: Dynamics, start: Tensor, grid: Tensor, signal: Signal) -> Tensor:
-        if signal.t.requires_grad:  # torchdiffeq has no gradient by t, which a learned delay needs
-            return super().path(dynamics, start, grid, signal)
         from torchdiffeq import odeint  # imports scipy.integrate, which takes a second
 
         f = dynamics.state_derivative

@@ -75,7 +75,7 @@ class MidpointLoss(WindowLoss):
         x0, dx = windows.start(model.state), windows.increments(model.state).squeeze(-2)
         h = (windows.t[1] - windows.t[0]).to(x0)
         middle = midpoint(h, x0, dx) if model.state == "qv" else x0 + 0.5 * dx
-        (mean_input,) = model.acting_input(windows.input).means(windows.t).to(x0)
+        (mean_input,) = windows.input.means(windows.t).to(x0)
         residual = h * model.state_derivative(middle, mean_input) - dx
         return torch.mean((residual[..., self.compared] / self.scale) ** 2, dim=(-2, -1))
 

@@ -43,5 +43,5 @@ class Penalized(WindowLoss):
         q, v = windows.start("qv").chunk(2, dim=-1)
         step = (windows.t[1] - windows.t[0]).to(q)
         a = windows.increments("qv")[..., 0, model.num_coordinates :] / step
-        mean_input = model.acting_input(windows.input).means(windows.t)[0].to(q)
+        mean_input = windows.input.means(windows.t)[0].to(q)
         return self.loss(model, windows) + model.penalty(q, v, a, mean_input)

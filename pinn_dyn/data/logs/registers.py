@@ -1,0 +1,58 @@
+"""Numbers that are no measurements: unsigned registers, and rows before the first sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pinn_dyn.data.logs.columns import Columns
+from pinn_dyn.data.logs.errors import LogError
+from pinn_dyn.data.logs.table import Table
+
+_BITS = (16, 32)
+_CONTINUOUS = 0.1  # largest step of the signed numbers over that of the unsigned ones
+_FIRST_STEP = 10.0  # times the largest later step, of a step from rows before the first sample
+_FEW = 0.1  # share of the rows that may lie before the first sample
+
+
+def check_registers(table: Table, signal: str, columns: Columns, values: np.ndarray) -> None:
+    """Refuse negative numbers of a register that the log reads as unsigned.
+
+    All numbers ``(T, K)`` are multiples of a step, in the unit of the file. Some lie in the lower
+    half of 2^16 or 2^32 steps, others in the upper half, and the numbers are continuous if this
+    period is subtracted from the upper ones.
+
+    Raises:
+        LogError: naming the first such row, and the number to subtract.
+    """
+    for name, raw in zip(columns.columns, columns.from_si(values).T, strict=True):
+        if raw.min() < 0 or not np.ptp(raw):
+            continue
+        spacing = np.diff(np.unique(raw))
+        step = spacing[spacing > 1e-12 * raw.max()].min()
+        counts = (raw / step).round()
+        for bits in _BITS:
+            upper = counts >= 2 ** (bits - 1)
+            signed = np.where(upper, counts - 2**bits, counts)
+            smooth = np.abs(np.diff(signed)).max() < _CONTINUOUS * np.abs(np.diff(counts)).max()
+            whole = np.abs(raw / step - counts).max() < 0.1 and counts.max() < 2**bits
+            if whole and smooth and upper.any():
+                row, period = int(upper.argmax()), 2**bits * step
+                raise LogError(
+                    f"{table.place(row, name, signal)}: {raw[row]:.6g} is a negative number of an "
+                    f"unsigned register of {bits} bits ({int(upper.sum())} such rows): subtract "
+                    f"{period:.6g} from all values above {period / 2:.6g} before"
+                )
+
+
+def rows_before_first_sample(q: np.ndarray) -> int:
+    """Return the number of equal first rows of q ``(T, N)`` from which q jumps to its first sample.
+
+    A jump is ten times as large as all later steps of its column. Zeros that a logger writes
+    before the first message of a robot are such rows.
+    """
+    steps = np.abs(np.diff(q, axis=0))
+    moving = steps.any(axis=1)
+    first = int(moving.argmax())
+    later = steps[first + 1 :].max(axis=0, initial=0.0)
+    jumps = moving.any() and (steps[first] > _FIRST_STEP * later)[later > 0].any()
+    return first + 1 if jumps and first + 1 < _FEW * len(q) else 0

@@ -1,0 +1,152 @@
+"""Laws that compensate dead time, on a plant whose inputs act late."""
+
+import numpy as np
+import pytest
+import torch
+
+from pinn_dyn.control import (
+    Actuator,
+    DelayCompensation,
+    DisturbanceObserver,
+    PredictiveControl,
+    Sines,
+    Tracking,
+    close_loop,
+    export_law,
+)
+from pinn_dyn.control.contracts import Plant
+from pinn_dyn.testing import LinearSystem
+from tests.support.c_code import function_of
+
+RATE, PIECES = 100.0, 10
+MASS = np.array([[0.5, 0.1], [0.1, 0.2]])
+GRAVITY, DAMPING, INPUTS = (
+    np.diag([6.0, 2.0]),
+    np.diag([0.2, 0.1]),
+    np.array([[1.0, 0], [0.2, 0.9]]),
+)
+REFERENCE = Sines([0.2, -0.1], [0.8, 0.6], [0.9, 1.3], rise_time=0.5)
+
+
+class Pendulums(LinearSystem):
+    """Two coupled pendulums: M a + D v + K sin q = A u."""
+
+    def potential_energy(self, q):
+        return -(self.stiffness.diagonal() * q.cos()).sum(-1)
+
+    def _potential_force(self, q):
+        return self.stiffness.diagonal() * q.sin()
+
+
+class LatePendulums(Plant):
+    """Their equation of motion in NumPy, and a queue of held inputs that each arrive late."""
+
+    num_coordinates = num_inputs = 2
+
+    def __init__(self, delays):
+        self.lags = [round(d * RATE * PIECES) for d in delays]
+
+    def start(self, q0, v0):
+        self.x = torch.cat([q0, v0], -1).numpy()
+        self.queue = [np.zeros((len(q0), 2))] * (max(self.lags) + 1)
+
+    def advance(self, u, duration):
+        h = duration / PIECES
+        for _ in range(PIECES):
+            self.queue = [*self.queue[1:], u.numpy()]
+            force = np.stack([self.queue[-1 - n][:, i] for i, n in enumerate(self.lags)], -1)
+            k1 = self.slope(self.x, force)
+            k2 = self.slope(self.x + h / 2 * k1, force)
+            self.x = self.x + h * self.slope(self.x + h / 2 * k2, force)
+        return tuple(torch.from_numpy(x.copy()) for x in np.split(self.x, 2, -1))
+
+    @staticmethod
+    def slope(x, u):
+        q, v = np.split(x, 2, -1)
+        force = u @ INPUTS.T - v @ DAMPING.T - np.sin(q) @ GRAVITY
+        return np.hstack([v, force @ np.linalg.inv(MASS)])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return Pendulums(MASS, GRAVITY, DAMPING, INPUTS).requires_grad_(False)
+
+
+def closed(law, delays=(0.0, 0.0), plant=None, **settings):
+    start = REFERENCE(0.0)
+    plant = plant or LatePendulums(delays)
+    record = close_loop(
+        plant, law, REFERENCE, start.q[None], start.v[None], duration=1.0, rate=RATE, **settings
+    )
+    assert record.stopped == [None]
+    return record
+
+
+def tracking_error(*arguments):
+    record = closed(*arguments)
+    return float((record.q - record.reference.q).square().mean().sqrt())
+
+
+def tracking(model):
+    return Tracking(model, 25.0, 4.0)
+
+
+def observed(model):
+    return DisturbanceObserver(tracking(model), 20.0)
+
+
+def predictive(model):
+    return PredictiveControl(model, 0.2, 0.02, position_weight=100.0, input_weight=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("make", "delays"),
+    [
+        (tracking, (0.015, 0.015)),
+        (tracking, (0.03, 0.03)),
+        (tracking, (0.03, 0.013)),
+        (observed, (0.03, 0.013)),
+        (predictive, (0.03, 0.013)),
+    ],
+)
+def test_dead_time_costs_less_than_a_third_of_the_tracking_error(model, make, delays):
+    if make is predictive:
+        pytest.importorskip("casadi")
+    expected = tracking_error(make(model))
+    law = DelayCompensation(make(model), model, delays, 1 / RATE)
+    assert tracking_error(law, delays) < 1.3 * expected
+    if make is tracking:
+        assert tracking_error(make(model), delays) > 2 * expected
+
+
+def test_the_file_gives_the_inputs_of_the_loop(model, tmp_path, few_states):
+    """Dead times of 2.6 and 1 samples, an observer, and limits that act."""
+    limits = dict(low=-2.0, high=8.0, rate=300.0)
+    inner = DisturbanceObserver(tracking(model), 20.0, actuator=Actuator(**limits))
+    law = DelayCompensation(inner, model, [0.026, 0.01], 1 / RATE, Actuator(**limits))
+    path = export_law(law, tmp_path / "law.c", actuator=Actuator(**limits))
+    call, memory = function_of(path, "law_control"), np.zeros(3 * 2 + 7)
+    limited = Actuator(**limits)
+    statuses = set()
+    for k in range(40):
+        q, v, _ = REFERENCE(k / RATE)
+        reference = REFERENCE(k / RATE + law.ahead)
+        expected, _ = limited(law(k / RATE, 0.9 * q, v, reference), 1 / RATE)
+        u, memory, status = call(0.9 * q, v, *reference, memory)
+        np.testing.assert_allclose(u, expected, rtol=1e-9, atol=1e-12)
+        statuses.add(status)
+    assert statuses == {0, 1}
+
+
+def test_the_loop_delays_by_parts_of_a_period(model):
+    limits = dict(low=-1.0, high=3.0, rate=100.0)
+    late = closed(tracking(model), (0.016, 0.016), actuator=Actuator(**limits))
+    loop = closed(tracking(model), delay=1.6, actuator=Actuator(**limits))
+    np.testing.assert_allclose(loop.q, late.q, atol=1e-5)
+    assert np.abs(loop.q - closed(tracking(model)).q).max() > 1e-3
+
+
+def test_another_period_than_that_of_the_loop_is_refused(model):
+    law = DelayCompensation(tracking(model), model, 0.02, 2 / RATE)
+    with pytest.raises(ValueError, match=r"0.01 s after 0 s, expected steps of the period 0.02 s"):
+        closed(law)
